@@ -56,7 +56,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/servers.py
 	$(BIN)/python benchmarks/camera.py
 	$(BIN)/python benchmarks/pictures.py
-	$(BIN)/python benchmarks/coverage.py
+	$(BIN)/python benchmarks/intervals.py
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

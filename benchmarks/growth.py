@@ -1,18 +1,21 @@
 """How time and memory grow with the decisions of a run, and time with the workers.
 
 Decisions: `harness eval --model proxy`, report included, on the first layouts of the shipped dataset, and on
-all of them many times over where they are too few. The limit of the time is what the proxy takes to answer
-all that is asked; that of the memory, a process that only holds the decisions as a table and the page's text.
+all of them many times over where they are too few; beyond a million, under more seeds of the channel. The
+limit of the time is what the proxy takes to answer all that is asked; that of the memory, a process that only
+holds the decisions as a table and the page's text. Where Chromium is, it opens the page: the time until every
+decision can be filtered and opened, the least of three.
 Workers: chunks that wait for a second, four a worker, so that any number of them fits the cores that are
 here; the limit is those four seconds.
 
-    python benchmarks/growth.py [--decisions 1000 10000 100000 1000000] [--workers 1 2 4 8 16 32 64]
-                                [--picture growth.svg]
+    python benchmarks/growth.py [--decisions 1000 10000 100000 1000000 10000000]
+                                [--workers 1 2 4 8 16 32 64] [--picture growth.svg]
 """
 
 import argparse
 import json
 import math
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -20,10 +23,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import perf_counter, process_time
 
+import pyarrow.parquet as pq
 from commands import HERE, copied, run
 from executors import nap
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
+from playwright.sync_api import sync_playwright
+from report import FLAGS, times
 
 from harness.backends import cards
 from harness.backends.registry import open_backend
@@ -39,6 +45,7 @@ from harness.report.drawing.colours import BAD, GREY, INK
 from harness.report.drawing.pictures import save, styled
 from harness.runs import folder
 
+MOST = 1_000_000  # decisions under five seeds: ten times as many layouts would be 80 GB
 FIRST = 20  # layouts that tell how many decisions a layout has, and how long an answer takes
 A_WORKER = 4
 AIM_MB = 2000
@@ -56,7 +63,7 @@ Row = Mapping[str, float]
 def main() -> None:
     """Print two tables and one line of JSON, and draw them."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    arguments.add_argument("--decisions", type=int, nargs="*", default=[1_000, 10_000, 100_000, 1_000_000])
+    arguments.add_argument("--decisions", type=int, nargs="*", default=[10**n for n in range(3, 8)])
     arguments.add_argument("--workers", type=int, nargs="*", default=[1, 2, 4, 8, 16, 32, 64])
     arguments.add_argument("--picture", type=Path)
     given = arguments.parse_args()
@@ -79,17 +86,23 @@ def of_decisions(sizes: Sequence[int], scratch: Path) -> list[Row]:
     answer_s = of_an_answer()
     rows: list[Row] = []
     for size in sizes:
-        layouts, options = math.ceil(size / each), ["--limit", str(math.ceil(size / each))]
+        again = math.ceil(size / MOST)
+        layouts = math.ceil(size / again / each)
+        options = ["--limit", str(layouts), "--seeds", f"0:{5 * again}"]
         if layouts > len(shipped.episodes):
-            large = copied(math.ceil(layouts / len(shipped.episodes)), scratch / f"large-{size}")
-            options = ["--dataset", str(large)]
+            large = scratch / f"large-{layouts}"
+            if not large.exists():
+                copied(math.ceil(layouts / len(shipped.episodes)), large)
+            options += ["--dataset", str(large)]
         made, row = evaluated(options, scratch)
         command = [sys.executable, "-c", HOLDS, str(made.path)]
         held = subprocess.run(command, capture_output=True, check=True, text=True).stdout
         answers = (made.path / "answers.jsonl").read_bytes().count(b"\n")
         rows.append({
-            "decisions": len(made.decisions), **row, "limit_s": answer_s * answers, "limit_mb": float(held),
+            "decisions": pq.read_metadata(made.path / "decisions.parquet").num_rows, **row,
+            "limit_s": answer_s * answers, "limit_mb": float(held), "opened_s": opened(made.path),
         })  # fmt: skip
+        print(json.dumps(rows[-1]), flush=True)  # the next may take long
     return rows
 
 
@@ -99,6 +112,16 @@ def evaluated(options: Sequence[str], scratch: Path) -> tuple[folder.Run, Row]:
     cpu_s, peak_mb = run(HERE, ["eval", "--model", "proxy", "--quiet", *options, "--out", "OUT"], scratch)
     row = {"wall_s": perf_counter() - start, "cpu_s": cpu_s, "peak_mb": peak_mb}
     return folder.read(scratch / "run"), row
+
+
+def opened(run: Path) -> float:
+    """Seconds until a run's page is ready in Chromium, the least of three; NaN without one."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        return math.nan
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        return min(times(browser, run / "report.html", "body[data-drawn]")[1] for _ in range(3))
 
 
 def of_an_answer() -> float:
@@ -160,7 +183,7 @@ def drawn(decisions: Sequence[Row], workers: Sequence[Row]) -> Figure:
         axes.xaxis.set_major_formatter(lambda n, _: f"10{str(round(math.log10(n))).translate(powers)}")
         axes.yaxis.set_major_formatter(lambda n, _: f"{n:g}")
         axes.yaxis.set_minor_formatter(NullFormatter())
-    memory.set_yticks([200, 500, 1000, 2000])
+    memory.set_yticks([200, 500, 1000, 2000, 5000, 10000])
     for axes in (time, memory, hands):
         axes.legend(fontsize=6, frameon=False)
         axes.spines[["top", "right"]].set_visible(False)

@@ -47,7 +47,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "parse": [(asking, "parse")],
     "coordinate": [(walk, "exchange"), (walk, "fuse")],
     "record": [
-        (asking, "_keep"), (run, "table"), (run, "_gathered"),
+        (asking, "_keep"), (run, "table"), (run, "_gather"),
         (folders, "part_files"), (folders, "write_part"),
     ],
 }  # fmt: skip

@@ -35,6 +35,7 @@ from harness.report.runs import Runs, gather
 from harness.runs import folder
 from harness.runs.decisions import Decisions, Labels
 
+FLAGS = ["--no-sandbox", "--disable-gpu"]
 READY = "() => document.body.dataset.ready ?? document.readyState === 'complete'"
 PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? 0"
 
@@ -59,7 +60,7 @@ def main() -> None:
         )
         evaluate(spec, base / "run", lambda done: None)
         runs = gather([base / "run"])
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         for n in given.decisions:
             many = repeated(runs, n, base / str(n))
             found.append(measured(many, base / f"{n}.html", browser, given.repeats))

@@ -70,7 +70,7 @@ def row(scenario: Scenario, layouts: int, at_once: int) -> dict[str, float]:
     same = [frames_of(scenario, range(n, min(n + at_once, layouts))) for n in range(0, layouts, at_once)]
     alone_s, together_s, frames, differ = np.sum(same, axis=0).tolist()
     still = [World.start(scenario, FIRST_SEED + n) for n in range(at_once)]
-    fleet = lockstep._Fleet(lockstep._lanes(scenario.road), still)  # type: ignore[arg-type]
+    fleet = lockstep.Fleet(lockstep._lanes(scenario.road), still)  # type: ignore[arg-type]
     return {
         "plain_us": plain_us(scenario), "alone_us": alone_s * 1e6 / frames,
         "together_us": together_s * 1e6 / frames, "frame_us": step_us(fleet, at_once),
@@ -87,7 +87,7 @@ def started(scenario: Scenario, layouts: Sequence[int]) -> list[World]:
     return worlds
 
 
-def step_us(fleet: lockstep._Fleet, worlds: int) -> float:
+def step_us(fleet: lockstep.Fleet, worlds: int) -> float:
     """A frame of a world among many: movement, collisions and whether the episode is over."""
     start = process_time()
     for _ in range(FRAMES):

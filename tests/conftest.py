@@ -21,6 +21,11 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 settings.register_profile("harness", deadline=None, derandomize="CI" in os.environ)
 settings.load_profile("harness")
 
+# Containers often set this: then every process that a test starts compiles the harness anew, and every worker
+# rewrites all the tests.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # Before anyone imports torch: threads of several workers that wait for each other make tiny models a
 # hundred times slower.
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -21,6 +21,7 @@ from harness.evaluate.spec import Spec
 
 CHANGES = ("fsync", "mkdir", "replace", "rmdir", "unlink")
 TREES_AT_ONCE = 2  # so that some die between two parts of a run
+WALKS_AT_ONCE = 1  # and some between the walks of two seeds
 
 
 def die_before(n: int) -> None:
@@ -59,7 +60,7 @@ def forked(spec: Spec, out: Path, before: int = 0) -> int:
 def main(dataset: Path, folder: Path) -> None:
     spec = spec_of(load(dataset))
     run(spec, folder / "whole")
-    evaluation.TREES_AT_ONCE = TREES_AT_ONCE
+    evaluation.TREES_AT_ONCE, evaluation.WALKS_AT_ONCE = TREES_AT_ONCE, WALKS_AT_ONCE
     began = time.monotonic()
     run(spec, folder / "again")
     took_s = time.monotonic() - began

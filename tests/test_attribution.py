@@ -32,6 +32,7 @@ from harness.runs.attribution import Attribution, LeftOut
 from harness.runs.records import Decision
 from harness.studies import attribution, stored
 from harness.studies.attribution import attribute, draw, headline, rows
+from harness.studies.axes import Setting
 from harness.studies.stored import Stored
 from harness.world.perception.graph import scene_graph
 
@@ -358,5 +359,5 @@ def test_other_readers_do_not_mind_the_file(made: Callable[..., Path], tmp_path:
     attribution.write(attribute(Stored(path), SIXG.name, 3, 0), path)
     assert answers_of(path) == before
     copied = Path(shutil.copytree(path, tmp_path / "copy"))
-    [walked] = Stored(copied).walked(SIXG, 4, (0, 1))
+    [[walked]] = Stored(copied).walked([Setting("6g", SIXG, 4)], (0, 1))
     assert not np.isnan(walked.ends["success_rate"]).any()

@@ -37,6 +37,7 @@ from harness.evaluate.spec import Spec
 from harness.report.decisions import Decisions
 from harness.report.runs import gather
 from harness.runs import folder
+from harness.studies.axes import Setting
 from harness.studies.stored import Stored
 
 BLIND = named_point("6g:messages=blind")
@@ -172,15 +173,17 @@ def test_a_sweep_has_them_asks_for_them_or_says_that_it_lacks_them(
     less = run(spec_of(small, points=CONDITIONS[:2]), tmp_path / "less").out
     point = CONDITIONS[2]
     assert point.asks_blind
+    blind = [Setting(point.name, point, 4)]
     with pytest.raises(UserError, match="lacks answers of helpers that are shown nothing, which messages=bl"):
-        list(Stored(less, asks=False).walked(point, 4, (0, 1)))
+        list(Stored(less, asks=False).walked(blind, (0, 1)))
     asked: list[int] = []
-    [more] = Stored(less, more=asked.append).walked(point, 4, (0, 1))
+    [[more]] = Stored(less, more=asked.append).walked(blind, (0, 1))
     assert sum(asked) > 0
-    [stored] = Stored(Path(shutil.copytree(done.out, tmp_path / "run")), asks=False).walked(point, 4, (0, 1))
+    copied = Path(shutil.copytree(done.out, tmp_path / "run"))
+    [[stored]] = Stored(copied, asks=False).walked(blind, (0, 1))
     assert np.array_equal(stored.ends["success_rate"], more.ends["success_rate"])
     asked.clear()
-    list(Stored(less, more=asked.append).walked(point, 4, (0, 1)))
+    list(Stored(less, more=asked.append).walked(blind, (0, 1)))
     assert asked == []
 
 

@@ -47,7 +47,8 @@ from harness.evaluate.walk import Due, heard_codes
 from harness.prompts.versions import load as prompt
 from harness.radio.channel import Draws
 from harness.runs.records import Latency
-from harness.studies.stored import Stored
+from harness.studies.axes import Setting
+from harness.studies.stored import MORE, Stored
 
 FUSION = named_point("6g:consensus=ego-prompt")
 LANGUAGE_MODEL = "swarm-tiny"  # its card: answers come from a script, or from itself
@@ -331,21 +332,39 @@ def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(done: Evaluated, tmp
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
     asked: list[int] = []
     source = Stored(folder, more=asked.append)
-    [same] = source.walked(FUSION, 4, source.seeds)
+    [[same]] = source.walked([Setting("6g", FUSION, 4)], source.seeds)
     assert asked == [], "the run's own seeds delivered nothing else"
     assert same.ends["success_rate"].mean() == pytest.approx(figure(done, FUSION.name, "success_rate").value)
-    [fewer] = source.walked(FUSION, 2, source.seeds)
+    [[fewer]] = source.walked([Setting("6g", FUSION, 2)], source.seeds)
     assert sum(asked) > 0
     again: list[int] = []
     source = Stored(folder, more=again.append)
     for vehicles, before in ((4, same), (2, fewer)):
-        [now] = source.walked(FUSION, vehicles, source.seeds)
+        [[now]] = source.walked([Setting("6g", FUSION, vehicles)], source.seeds)
         assert np.array_equal(now.columns["latency_ms"], before.columns["latency_ms"])
     assert again == []
+
+
+def test_points_that_are_walked_together_make_the_calls_of_each(done: Evaluated, tmp_path: Path) -> None:
+    """Each set of messages is asked about once, and answers are what each point has alone."""
+    texts = ("loss=0", "loss=0.3", "loss=0.3,defence=quoted+schema", "attack=injection:share=1/3")
+    points = [named_point(f"{FUSION.name},{text}") for text in texts]
+    settings = [Setting(point.name, point, 4) for point in points]
+    folder = Path(shutil.copytree(done.out, tmp_path / "run"))
+    asked: list[int] = []
+    together = list(Stored(folder, more=asked.append).walked(settings, (0, 1, 2)))
+    kept = (folder / MORE).read_text().splitlines()
+    assert 0 < len(kept) == sum(asked)
+    alone = Path(shutil.copytree(done.out, tmp_path / "alone"))
+    for setting, [walked] in zip(settings, together, strict=True):
+        [[expected]] = Stored(alone).walked([setting], (0, 1, 2))
+        assert np.array_equal(walked.ends["success_rate"], expected.ends["success_rate"])
+        for name, values in expected.columns.items():
+            assert np.array_equal(walked.columns[name], values, equal_nan=True), (setting, name)
 
 
 def test_a_run_whose_prompt_has_changed_is_not_asked_more(done: Evaluated, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
     configure(folder, prompt={**done.manifest.prompt, "sha256": "0" * 64})
     with pytest.raises(UserError, match="prompt v2 has changed since"):
-        list(Stored(folder).walked(FUSION, 3, (0,)))
+        list(Stored(folder).walked([Setting("6g", FUSION, 3)], (0,)))

@@ -10,6 +10,7 @@ from typing import Any
 
 import msgspec
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from evaluating import (
     FILES,
@@ -66,15 +67,30 @@ def test_the_batch_size_changes_no_byte_of_the_proxys_run(
     assert same_files(tmp_path / "run", proxy_run)
 
 
-@pytest.mark.parametrize(("trees", "workers"), [(1, 1), (3, 1), (1, 2)])
-def test_how_many_trees_are_walked_at_once_and_by_whom_changes_no_byte(
-    trees: int, workers: int, proxy_run: Path, small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(
+    ("trees", "walks", "workers"), [(1, 99, 1), (3, 99, 1), (1, 99, 2), (9, 1, 1), (1, 1, 2)]
+)
+def test_how_many_walks_are_taken_at_once_and_by_whom_changes_no_byte(
+    trees: int, walks: int, workers: int, proxy_run: Path, small: Dataset, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     monkeypatch.setattr("harness.evaluate.run.TREES_AT_ONCE", trees)
+    monkeypatch.setattr("harness.evaluate.run.WALKS_AT_ONCE", walks)  # 1: one seed at a time
     answered, owed = list[int](), list[int]()
     evaluate(spec_of(small), tmp_path / "run", answered.append, more=owed.append, workers=workers)
     assert same_files(tmp_path / "run", proxy_run)
     assert sum(answered) == sum(owed) == len(answers_of(proxy_run))
+
+
+def test_decisions_in_row_groups_are_the_same_rows(
+    proxy_run: Path, small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("harness.evaluate.run.TREES_AT_ONCE", 1)
+    monkeypatch.setattr("harness.runs.decisions.ROW_GROUP", 1)
+    run(spec_of(small), tmp_path / "run")
+    groups = pq.ParquetFile(tmp_path / "run" / "decisions.parquet").num_row_groups
+    assert groups == len(small.episodes) > 1
+    assert rows_of(tmp_path / "run") == rows_of(proxy_run)
 
 
 @pytest.fixture(scope="module")

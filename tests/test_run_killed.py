@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from evaluating import FILES, run, same_files, spec_of, walked
-from killed_run import TREES_AT_ONCE
+from killed_run import TREES_AT_ONCE, WALKS_AT_ONCE
 
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
@@ -33,6 +33,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(
     killed: Path, small: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("harness.evaluate.run.TREES_AT_ONCE", TREES_AT_ONCE)
+    monkeypatch.setattr("harness.evaluate.run.WALKS_AT_ONCE", WALKS_AT_ONCE)
     outs = sorted(killed.glob("at-*"), key=lambda p: int(p.name[3:]))
     assert len(outs) > 20
     begun = [out for out in outs if not (out / "run.json").exists()]
@@ -44,6 +45,7 @@ def test_killed_at_any_time_and_resumed_it_is_the_same_run(
     killed: Path, small: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("harness.evaluate.run.TREES_AT_ONCE", TREES_AT_ONCE)
+    monkeypatch.setattr("harness.evaluate.run.WALKS_AT_ONCE", WALKS_AT_ONCE)
     _all_become_whole(sorted(killed.glob("after-*")), killed, small)
 
 

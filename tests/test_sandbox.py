@@ -1,11 +1,15 @@
 """A template reads a scene's members, and nothing that the sandbox forbids."""
 
+import math
+from itertools import product
+
 import pytest
 from jinja2 import StrictUndefined, UndefinedError
 from jinja2.exceptions import SecurityError, TemplateAssertionError
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
-from harness.prompts.versions import LOOP, Sandbox
+from harness.prompts.sandbox import LOOP, Sandbox
+from harness.prompts.template import Template
 
 SANDBOX = Sandbox(undefined=StrictUndefined)
 
@@ -62,3 +66,71 @@ def test_filters_that_pad_are_gone(template):
 
 def test_numbers_are_multiplied_and_formatted():
     assert rendered("{{ (0.25 * 100) | round | int }} {{ '%.2f' | format(0.5) }} {{ 7 % 4 }}") == "25 0.50 3"
+
+
+ALIKE = [
+    "100 % of {{ n }}%{{ n }}%s",
+    "{% for a in names %}{{ loop.index }}/{{ loop.index0 }}{{ a }}{{ ', ' if not loop.last }}{% endfor %}",
+    "{% for a in 'SIF' %}{{ loop.first }}{{ loop.last }}{% else %}none{% endfor %}",
+    "{% for a in range(40) | list %}{{ loop.index }}{{ ';' if not loop.last }}{% endfor %}",
+    "{% for a in [] %}{{ loop.last }}{% else %}none{% endfor %}",
+    "{% for a in names %}{{ loop.cycle('x', 'y') }}{{ loop.length }}{{ loop.revindex }}{% endfor %}",
+    "{% for a in names %}{% for b in 'xy' %}{{ a }}{{ loop.last }}{% endfor %}{{ loop.last }}{% endfor %}",
+    "{% for a in [[1], 3] recursive %}{{ loop.depth }}{{ loop(a) if a is sequence else a }}{% endfor %}",
+    "{% for a in names if a != 'b' %}{{ a }}{{ loop.last }}{% endfor %}",
+    "{% for a, b in graph.items() %}{{ a }}{{ b }}{{ loop.first }}{% endfor %}",
+    "{% for a in names %}{% set outer = loop %}{{ outer.last }}{% endfor %}",
+    "{{ 2.5 | round | int }} {{ 3.5 | round | int }} {{ -0.4 | round | int }} {{ 7 | round | int }}",
+    "{{ big | round | int }} {{ nan | round | int }} {{ true | round | int }} {{ n | round(1) | int }}",
+    "{{ n * 100 }} {{ 3 * 2.5 }} {{ n * n }} {{ true * 2 }} {{ (n * 100) | round | int }}",
+    "{{ n is none }} {{ none is none }} {{ 'x' if n is not none else '?' }} {{ nothing is none }}",
+    "{% autoescape true %}<{{ '<' }}>{{ graph.ego.id }}{% endautoescape %}{{ '<' }}",
+    "{% set x %}[{{ n }}]{% endset %}{{ x }}{% macro m(a) %}({{ a.id }}){% endmacro %}{{ m(graph.ego) }}",
+    "{% filter upper %}a{{ graph.ego.id }}{% endfilter %}{% block inner %}{{ graph.ego.id }}%{% endblock %}",
+    "{{ graph.ego }} {{ graph['ego'].id }} {{ graph.ego.id.upper() }} {{ names.index('b') }} {{ names.0 }}",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("template", ALIKE)
+def test_shorter_code_renders_what_the_plain_sandbox_does(template):
+    values = {
+        "n": 0.25, "names": ["a", "b", "c"], "graph": {"ego": {"id": "<v1>"}}, "big": 1e20, "nan": math.nan,
+        "nothing": None,
+    }  # fmt: skip
+    plain = ImmutableSandboxedEnvironment(undefined=StrictUndefined).from_string(template)
+    assert rendered(template, **values) == plain.render(values)
+
+
+@pytest.mark.parametrize(
+    "template", ["{{ x * 100 }}", "{{ 100 * x }}", "{{ x | round | int }}", "{{ x.egg }}", "{{ x.ljust(9) }}"]
+)
+def test_a_text_is_no_number_and_pads_nothing(template):
+    with pytest.raises((SecurityError, TypeError, UndefinedError)):
+        rendered(template, x="9")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{{ graph.ego.id }}", "{{ words.task }}", "{{ actions | join('|') }}", "{{ graph.ego }}",
+     "{% for a in actions %}{{ a }}{{ graph.ego.id if loop.last }}{% endfor %}",
+     "{% if graph.ego.id == 'v1' %}{{ words.task }}{% else %}{{ n }}{% endif %}",
+     "{{ graph.ego['id'] }}", "{% set x = n %}{{ x }}", "{{ self.other() }}", "{{ graph.speed }}",
+     "{% for graph in actions %}{{ graph }}{% endfor %}{{ n }}"],
+)  # fmt: skip
+def test_a_kept_text_is_the_one_that_would_be_rendered(text):
+    text = f"{{% block system %}}{text}{{% endblock %}}{{% block other %}}{{{{ n }}}}{{% endblock %}}"
+    template = Template(text)
+    for ego, task, actions, n in product(
+        ("v1", "v2"), ("drive", "turn"), (("A", "B"), ("A",), ["A"]), (1, True, 1.0)
+    ):
+        values = {
+            "graph": {"ego": {"id": ego}, "speed": n}, "words": {"task": task}, "actions": actions, "n": n
+        }  # fmt: skip
+        for _ in range(2):
+            assert template.render(values, ("system",)) == Template(text).render(values, ("system",))
+
+
+def test_what_draws_is_rendered_each_time():
+    template = Template("{% block system %}{{ actions | random }}{{ lipsum() }}{% endblock %}")
+    actions = tuple("ABCDEFGH")
+    assert len({template.render({"actions": actions}, ("system",))[0] for _ in range(9)}) > 1

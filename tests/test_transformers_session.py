@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 from transformers import Gemma3ForCausalLM, Gemma3TextConfig, Qwen3Config, Qwen3ForCausalLM
 
 from harness.backends.transformers import prefixes
-from harness.backends.transformers.prefixes import LEAST_TOKENS, Prefix, Prefixes, common
+from harness.backends.transformers import session as reading
+from harness.backends.transformers.memory import PAGE
+from harness.backends.transformers.prefixes import LEAST_TOKENS, Prefix, Prefixes, alike, common
 from harness.backends.transformers.session import Reader
 
 SHAPE: dict[str, Any] = {
@@ -161,6 +163,50 @@ def test_what_a_batch_begins_with_in_common_is_read_once(qwen: Any) -> None:
     ]
 
 
+OTHER = [(11 * i + 3) % 64 for i in range(50)]
+
+
+def test_a_batch_with_two_beginnings_reads_each_once(qwen: Any) -> None:
+    """An ego's prompts and its helpers' have other system texts."""
+    reader = Reader(qwen)
+    prompts = [*([*SYSTEM, i, i] for i in range(4)), *([*OTHER, i] for i in range(3))]
+    mixed = [prompts[place] for place in (0, 4, 1, 5, 2, 6, 3)]
+    expected = naive(qwen, mixed)
+    for first in ([(1, 50), (3, 1), (1, 40), (4, 2)], [(3, 1), (4, 2)]):
+        with widths(qwen) as seen, closing(reader.begin(mixed)) as session:
+            np.testing.assert_allclose(session.log_probs(EVERY), expected, atol=1e-4)
+        assert sorted(seen) == sorted(first)
+
+
+def test_short_prompts_are_not_padded_to_the_longest_of_all(
+    qwen: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is read together is bounded on a CPU; what goes forward afterwards is one batch again."""
+    monkeypatch.setattr(reading, "CPU_TOKENS", 24)
+    prompts = [[i] * n for i, n in enumerate((3, 30, 8, 5, 12, 7), start=1)]
+    ends = ([9], [], [8, 7], [1], [2], [3, 4, 5])
+    longer = [[*prompt, *end] for prompt, end in zip(prompts, ends, strict=True)]
+    before, after = naive(qwen, prompts), naive(qwen, longer)
+    with widths(qwen) as seen, closing(Reader(qwen).begin(prompts)) as session:
+        np.testing.assert_allclose(session.log_probs(EVERY), before, atol=1e-4)
+        session.advance(ends)
+        np.testing.assert_allclose(session.log_probs(EVERY), after, atol=1e-4)
+    assert seen == [(1, 30), (2, 12), (3, 7), (6, 3)]
+
+
+def test_an_answer_of_several_pages_is_what_one_forward_says(qwen: Any) -> None:
+    sequences = [[1, 2, 3], [4, 5]]
+    with closing(Reader(qwen).begin(sequences)) as session:
+        for token in range(2 * PAGE):
+            session.advance([[token % 64], [(token + 7) % 64]])
+            if token == PAGE:  # memory with room is selected from as well
+                session.keep([1, 0])
+                session.keep([1, 0])
+        ends = ([t % 64 for t in range(2 * PAGE)], [(t + 7) % 64 for t in range(2 * PAGE)])
+        longer = [[*ids, *end] for ids, end in zip(sequences, ends, strict=True)]
+        np.testing.assert_allclose(session.log_probs(EVERY), naive(qwen, longer), atol=1e-4)
+
+
 def test_a_prompt_alone_reads_on_where_the_last_ones_part_from_it(qwen: Any) -> None:
     reader = Reader(qwen)
     with widths(qwen) as seen:
@@ -245,6 +291,31 @@ def test_only_the_part_in_common_is_given_back() -> None:
     found = kept.longest([*SYSTEM[:20], 63, 63])
     assert found.ids == SYSTEM[:20]
     assert [t.flatten().tolist() for t in found.layers[0]] == [SYSTEM[:20]] * 2
+
+
+@given(st.lists(st.lists(st.integers(0, 1), max_size=30), min_size=1, max_size=9), st.integers(1, 40))
+def test_each_sequence_is_in_one_group_and_groups_save_what_they_must(
+    sequences: list[list[int]], least: int
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prefixes, "LEAST_SAVED", least)
+        groups = list(alike(sequences))
+    assert sorted(place for group in groups for place in group) == list(range(len(sequences)))
+
+    def shared(places: Sequence[int]) -> int:
+        return len(common([sequences[place] for place in places]))
+
+    together = len(sequences) * shared(range(len(sequences)))
+    apart = sum(len(group) * shared(group) - (len(group) > 1) * shared(group) for group in groups)
+    assert len(groups) == 1 or apart + shared(range(len(sequences))) >= together
+
+
+def test_groups_are_split_where_that_saves_enough() -> None:
+    egos, helpers = ([[n] * 40 + [i] for i in range(3)] for n in (1, 2))
+    assert sorted(map(sorted, alike([*egos, *helpers]))) == [[0, 1, 2], [3, 4, 5]]
+    assert list(alike([[1] * 40, [2] * 40, [3] * 40])) == [[0, 1, 2]]  # nobody shares anything
+    deeper = [[1] * 40 + [n] * 40 + [i] for n in (5, 6) for i in range(3)]
+    assert sorted(map(sorted, alike([*deeper, [9]]))) == [[0, 1, 2], [3, 4, 5], [6]]
 
 
 @given(st.lists(st.lists(st.integers(0, 1), max_size=6), min_size=1, max_size=5))

@@ -3,7 +3,9 @@
 Heavy packages load inside the commands, so that `harness --help` answers at once.
 """
 
+import atexit
 import errno
+import gc
 import os
 import shlex
 import signal
@@ -77,6 +79,9 @@ MACHINE = frozenset({
 })  # fmt: skip
 
 
+COLLECT_AFTER = 50_000  # new objects; at 700, as usual, imports and tables are walked again and again
+
+
 class _Terminated(KeyboardInterrupt):
     """SIGTERM, which ends a command as Ctrl-C does."""
 
@@ -87,6 +92,8 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 
 def main() -> None:
     """Entry point: what a user can mend is one line on stderr and exit code 2."""
+    gc.set_threshold(COLLECT_AFTER, 10, 10)
+    atexit.register(gc.freeze)  # all memory goes as the process ends; its last collections would walk it all
     out = sys.stdout
     try:
         try:

@@ -17,7 +17,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.robust import outvoted
 from harness.coordination.rules import EGO_PROMPT, RULES
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints, any_of
 from harness.radio.channel import Draws
 
 # From who was heard, `(..., H)`, to the fusion call's answer: the ego's intent `(..., A)`, NaN if it failed
@@ -91,7 +91,7 @@ def fuse(
     weights = inverse_distance_weights(distance_m, heard.on_time, point.min_distance_m)
     if point.weight_cap < 1:
         weights = capped(weights, point.weight_cap)
-    heard_any = np.any(heard.on_time, axis=-1)
+    heard_any = any_of(heard.on_time)
     trust = np.full(heard.on_time.shape, np.nan)
     latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)
     if point.consensus == EGO_PROMPT:

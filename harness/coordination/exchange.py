@@ -31,7 +31,7 @@ from harness.coordination.operating_point import FUSION, OperatingPoint
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import Known, chosen
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints, any_of, count_of
 from harness.core.errors import UserError, printable
 from harness.core.statistics import known_mean
 from harness.radio.channel import Channel, Draws, Links, Physical
@@ -87,17 +87,17 @@ class Exchange:
     @cached_property
     def messages(self) -> Ints:
         """The number of scheduled replies, `(...)`; like the paper, it does not count the request."""
-        return np.asarray(np.sum(self.asked, axis=-1))
+        return count_of(self.asked)
 
     @cached_property
     def lost(self) -> Ints:
         """The number of messages that did not arrive, `(...)`."""
-        return np.asarray(np.sum(self.asked & ~self.delivered, axis=-1))
+        return count_of(self.asked & ~self.delivered)
 
     @cached_property
     def late(self) -> Ints:
         """The number of messages that arrived after the window, `(...)`."""
-        return np.asarray(np.sum(self.delivered & ~self.on_time, axis=-1))
+        return count_of(self.delivered & ~self.on_time)
 
     @cached_property
     def observed_loss(self) -> Floats:
@@ -117,11 +117,11 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         triggers, asked = np.zeros_like(own_failed), np.zeros_like(in_radius)
     elif asked is None:
         worth, threshold = _worth(point, known, intents, draws), point.asks_above
-        triggers = np.any(worth > threshold, axis=-1)
+        triggers = any_of(worth > threshold)
         asked = chosen(worth, threshold, in_radius, intents.range_m, point.max_helpers)
     else:
         asked = asked & in_radius
-        triggers = np.any(asked, axis=-1)
+        triggers = any_of(asked)
     request_s, outcome, waits_until_s = _ask_helpers(point, intents, asked, in_radius, draws)
     delivered = outcome.up if intents.silent is None else outcome.up & ~intents.silent
     loss, arrival_s = outcome.loss, np.where(delivered, request_s + outcome.end_s, np.inf)
@@ -169,7 +169,7 @@ def _ask_helpers(
 
 def own_intent(point: OperatingPoint, intents: Intents) -> tuple[Bools, Floats]:
     """Return whether the ego's answer failed, `(...)`, and its intent after the fallback, `(..., A)`."""
-    failed = np.any(np.isnan(intents.own), axis=-1)
+    failed = any_of(np.isnan(intents.own))
     fallback = fallback_intent(point.fallback, intents.own.shape[-1])
     return failed, np.where(failed[..., None], fallback, intents.own)
 
@@ -235,7 +235,7 @@ def _ask_directly(
     request = channel.request(links.request_bits, draws)
     heard_s = np.asarray(request.heard_s)[..., None]
     up, end_s, loss, airtime_s = channel.deliver(replace(links, ready_s=ready(heard_s)), draws)
-    requested, delivered = np.any(links.asked, axis=-1), links.asked & up
+    requested, delivered = any_of(links.asked), links.asked & up
     replies_s = np.sum(np.where(links.asked, airtime_s, 0.0), axis=-1)
     return Consulted(
         asked=links.asked,

@@ -12,6 +12,24 @@ Texts = NDArray[np.str_]
 
 
 def summed(values: Floats, axis: int) -> Floats:
-    """Sum along a short axis, such as that of actions, several times as fast as `np.sum`."""
-    total: Floats = reduce(np.add, np.moveaxis(values, axis, 0))
+    """Sum along a short axis, the last (-1) or the one before (-2), such as that of actions.
+
+    This is several times as fast as `np.sum`, which has a loop for every sum.
+    """
+    terms = values.swapaxes(axis, -1)
+    total: Floats = reduce(np.add, [terms[..., k] for k in range(terms.shape[-1])])
     return total
+
+
+def any_of(flags: Bools) -> Bools:
+    """Whether any is true along a short last axis, such as that of helpers; faster than `np.any`."""
+    first = np.zeros(flags.shape[:-1], dtype=bool)
+    found: Bools = reduce(np.logical_or, [flags[..., k] for k in range(flags.shape[-1])], first)
+    return found
+
+
+def count_of(flags: Bools) -> Ints:
+    """How many are true along a short last axis, such as that of helpers; faster than `np.sum`."""
+    none = np.zeros(flags.shape[:-1], dtype=np.int64)
+    count: Ints = reduce(np.add, [flags[..., k] for k in range(flags.shape[-1])], none)
+    return count

@@ -17,6 +17,7 @@ OPTIONAL = {
     "inspect_ai": ("inspect-ai", "inspect"),
     "imageio_ffmpeg": ("imageio-ffmpeg", "video"),
     "ray": ("ray", "ray"),
+    "numba": ("numba", "fast"),
     "llama_cpp": ("llama-cpp-python", "llama-cpp"),
     "torch": ("torch", "transformers"),
     "transformers": ("transformers", "transformers"),

@@ -1,5 +1,6 @@
 """Registries of plug-ins: built-in ones, and those that installed packages add by entry points."""
 
+import os
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -74,8 +75,10 @@ class FilesAndPlugins(Plugins[T]):
 
     def file(self, name: str) -> Path | None:
         """Return the file of a plug-in; None if it is not a file."""
-        is_file = name not in self.built_in and name in resources.names(self.folder)
-        return resources.find(self.folder, f"{name}.toml") if is_file else None
+        if name in self.built_in or Path(f"{name}.toml").stem != name:  # a path is no name
+            return None
+        file = resources.find(self.folder, f"{name}.toml")
+        return file if os.path.lexists(file) else None
 
     def __getitem__(self, name: str) -> T:
         """Raises KeyError for an unknown name and UserError for a file or a package that does not work."""

@@ -1,7 +1,7 @@
 """Scores of intents, and confidence intervals of means, shares and differences.
 
 A score has one value per decision; an interval turns values into an `Estimate`. Steps of one episode are not
-independent trials, so intervals are over episodes or over seeds. `benchmarks/coverage.py` measures how often
+independent trials, so intervals are over episodes or over seeds. `benchmarks/intervals.py` measures how often
 they cover the true value.
 """
 

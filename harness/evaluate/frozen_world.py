@@ -11,6 +11,7 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.select import ALL, Selection
 from harness.evaluate.walk import Decided, Due, Placed, channel_draws
+from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World
 from harness.runs.records import Episode, FrozenScenes
@@ -93,30 +94,46 @@ class FrozenWorld(Placed):
     def __init__(self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]) -> None:
         self._dataset, self._forest, self._seeds = dataset, dataset.forest, np.array(seeds)
         self.scenario = dataset.scenario
-        self._walks = {point.name: _Walks(len(seeds), self._forest.root) for point in points}
+        self._walks = {point: _Walks(len(seeds), self._forest.root) for point in points}
         self._decided: list[tuple[Ints, Ints, Floats]] = []  # where, which action, after how many seconds
+        self._luck: tuple[Bools, Draws] | None = None  # of the moments just shown
 
     def observe(self) -> Sequence[Scene]:
         """Every decision point to which some walk has come."""
         places = np.unique(np.concatenate([walks.at.ravel() for walks in self._walks.values()]))
-        self._moments = places[places >= 0]
+        self._moments, self._luck = places[places >= 0], None
         self.scenes = self._dataset.scenes([self._forest.ids[n] for n in self._moments.tolist()])
         self._helpers = max((len(scene.viewers) for scene in self.scenes), default=1) - 1
         return self.scenes
 
     def due(self, point: OperatingPoint) -> Due:
         """Return a decision for each walk of the condition that is not at its end."""
-        walks, forest = self._walks[point.name], self._forest
-        seed_index, tree = np.nonzero(walks.at >= 0)
-        at = np.searchsorted(self._moments, walks.at[seed_index, tree])
-        p = self.scenario.parameters
-        seed, step = self._seeds[seed_index], forest.step[self._moments[at]]
-        draws = channel_draws(seed, forest.seeds[tree], step, p.decisions, self._helpers)
-        return Due(at, forest.episodes[tree], seed, draws)
+        walks, forest = self._walks[point], self._forest
+        undecided = walks.at >= 0
+        seed_index, tree = np.nonzero(undecided)
+        at = np.searchsorted(self._moments, walks.at[undecided])
+        drawn, draws = self._draws()
+        if len(at) < np.count_nonzero(drawn):
+            draws = draws.take(undecided[drawn])
+        return Due(at, forest.episodes[tree], self._seeds[seed_index], draws)
+
+    def _draws(self) -> tuple[Bools, Draws]:
+        """Return which seeds and episodes have a decision now under any condition, (S, E), and their draws.
+
+        All decisions of an episode that are due now are of one step, whatever their condition.
+        """
+        if self._luck is None:
+            forest, decisions = self._forest, self.scenario.parameters.decisions
+            latest = np.max([walks.at for walks in self._walks.values()], axis=0)
+            seed_index, tree = np.nonzero(latest >= 0)
+            seed, step = self._seeds[seed_index], forest.step[latest[seed_index, tree]]
+            draws = channel_draws(seed, forest.seeds[tree], step, decisions, self._helpers)
+            self._luck = latest >= 0, draws
+        return self._luck
 
     def leave_out(self, point: OperatingPoint, moments: Bools) -> None:
         """End the walks that are at these of the moments just shown, and leave them out of the results."""
-        walks = self._walks[point.name]
+        walks = self._walks[point]
         undecided = walks.at >= 0
         ended = np.zeros_like(undecided)
         ended[undecided] = moments[np.searchsorted(self._moments, walks.at[undecided])]
@@ -126,7 +143,7 @@ class FrozenWorld(Placed):
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         """Follow the edge of each action."""
         for part in decided:
-            walks, action = self._walks[part.point.name], part.result.action
+            walks, action = self._walks[part.point], part.result.action
             undecided = walks.at >= 0
             at = walks.at[undecided]
             edge = np.full_like(walks.at, -1)
@@ -157,7 +174,7 @@ class FrozenWorld(Placed):
 
     def ends(self, point: OperatingPoint) -> dict[str, Floats]:
         """Return success, failure and lateness under a condition, (S, E); NaN where a walk was left out."""
-        walks, trees = self._walks[point.name], np.arange(len(self._forest.root))
+        walks, trees = self._walks[point], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])
         success = self._forest.succeeds(walks.last, trees)
         ends = {"success_rate": success, "unsafe_rate": ~cleared, "late_rate": cleared & ~success}
@@ -166,8 +183,8 @@ class FrozenWorld(Placed):
     def episodes(self) -> list[Episode]:
         """Return how each episode ended under each condition and seed."""
         return [
-            self._episode(condition, walks, place)
-            for condition, walks in self._walks.items()
+            self._episode(point.name, walks, place)
+            for point, walks in self._walks.items()
             for place in np.ndindex(*walks.at.shape)
         ]
 

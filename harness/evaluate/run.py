@@ -39,12 +39,12 @@ from harness.evaluate.lifecycle import (
     unfinished,
 )
 from harness.evaluate.spec import Spec
-from harness.evaluate.walk import table, walk
+from harness.evaluate.walk import of_all_seeds, table, walk
 from harness.runs import folder
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
-from harness.runs.records import Answer, ClosedLoop, Latency, Manifest
-from harness.runs.summary import counted, scores
+from harness.runs.records import Answer, ClosedLoop, Episode, Latency, Manifest
+from harness.runs.summary import Figures, counted
 
 if TYPE_CHECKING:  # only driving loads the simulator
     from harness.evaluate.live_world import LiveSource, LiveWorld
@@ -53,6 +53,7 @@ Opens = Callable[..., Backend]  # as `open_backend` is called
 NOTHING: Mapping[str, Answer] = MappingProxyType({})
 EPISODES_AT_ONCE = 16  # fewest episodes of a closed-loop chunk
 TREES_AT_ONCE = 256  # decision trees of a chunk of frozen scenes
+WALKS_AT_ONCE = 1 << 14  # most walks, by layout, seed and condition, that frozen scenes hold in memory
 LEAST_VIEWERS = 4  # requests at once for each closed-loop episode: the ego and three helpers
 
 
@@ -156,15 +157,31 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
         return _gather(out, whole, chunks, place)
 
 
-def _walk_world(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> dict[str, bytes]:
-    """Walk a world to its end and return the files of this part of the run, by name."""
-    decided = list(chain.from_iterable(walk(world, spec.points, asker)))
-    decisions = table(decided, world.columns(), spec.actions)
-    if spec.device_profile:
-        answers = asker.answers.values()
-        joules = device.energy(spec.device_profile, asker.latency, spec.points, decisions, answers)
-        decisions = decisions.replace(**joules)
-    return folder.part_files(decisions.rounded(), world.episodes(), asker.answers.values())
+def _walk(
+    spec: Spec, chunk: Sequence[int], asker_of: Callable[[int, Mapping[str, Answer]], Asker]
+) -> dict[str, bytes]:
+    """Walk a chunk's episodes to their ends and return the files of this part of the run, by name.
+
+    Frozen scenes are walked for some seeds at a time: the decisions of all would not fit into memory.
+    `asker_of` returns the asker of the n-th of these walks, which is given the answers so far.
+    """
+    at_once = len(spec.seeds)
+    if isinstance(spec.source, FrozenSource):
+        at_once = max(1, WALKS_AT_ONCE // (len(chunk) * len(spec.points)))
+    answers: Mapping[str, Answer] = {}
+    tables, episodes = list[Decisions](), list[Episode]()
+    for n, seeds in enumerate(_split(spec.seeds, at_once)):
+        world, asker = _world_of(spec, chunk, seeds), asker_of(n, answers)
+        decided = list(chain.from_iterable(walk(world, spec.points, asker)))
+        answers, decisions = asker.answers, table(decided, world.columns(), spec.actions)
+        if spec.device_profile:
+            joules = device.energy(
+                spec.device_profile, asker.latency, spec.points, decisions, answers.values()
+            )
+            decisions = decisions.replace(**joules)
+        tables.append(decisions.rounded())
+        episodes += world.episodes()
+    return folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values())
 
 
 def _frozen(
@@ -180,13 +197,17 @@ def _frozen(
     begun = begin(spec, out, begun, identity, latency)
     chunks = _split(dataset.episodes, TREES_AT_ONCE)
     with work.working(out, begun, "run.json") as place:
-        backend, answers_path = together(spec.cards, models, cache), place / "answers.jsonl"
+        backend = together(spec.cards, models, cache)
         todo = [chunk for chunk in chunks if not (place / _folder_name(chunk)).is_dir()]
         in_workers = len(todo) > 1 and workers != 1 and _reproducible(spec) and not given
 
+        def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
+            # Each has a file of its own, so that a resumed run asks in the same chunks.
+            kept = place / (f"answers-{n + 1}.jsonl" if n else "answers.jsonl")
+            return Asker(spec, lambda: backend, latency, kept, {**given, **so_far}, progress, more)
+
         def walk_here(chunk: Sequence[int]) -> dict[str, bytes]:
-            asker = Asker(spec, lambda: backend, latency, answers_path, given, progress, more)
-            return _walk_world(spec, _world_of(spec, chunk), asker)
+            return _walk(spec, chunk, asker_of)
 
         def report_kept(chunk: Sequence[int]) -> None:
             n_answers = folder.answers_in(place / _folder_name(chunk))
@@ -195,7 +216,8 @@ def _frozen(
 
         def keep(index: int, files: dict[str, bytes]) -> None:
             folder.write_part(place / _folder_name(todo[index]), files)
-            answers_path.unlink(missing_ok=True)
+            for kept in place.glob("answers*.jsonl"):
+                kept.unlink()
             if in_workers:
                 report_kept(todo[index])
 
@@ -281,31 +303,41 @@ def _walk_chunk(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[in
             )
         return combined
 
-    return _walk_world(spec, _world_of(spec, chunk), Asker(spec, backend, begun.latency))
+    return _walk(spec, chunk, lambda n, so_far: Asker(spec, backend, begun.latency, answers=so_far))
 
 
-def _world_of(spec: Spec, chunk: Sequence[int]) -> "FrozenWorld | LiveWorld":
-    """Return the world of a chunk's episodes."""
+def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "FrozenWorld | LiveWorld":
+    """Return the world of a chunk's episodes under some seeds."""
     if isinstance(spec.source, FrozenSource):
         episodes = spec.source.dataset.of_episodes(frozenset(chunk))
-        return FrozenWorld(episodes, spec.points, spec.seeds)
+        return FrozenWorld(episodes, spec.points, seeds)
     from harness.evaluate.live_world import LiveWorld
 
     source = cast("LiveSource", spec.source)
-    return LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
+    return LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, seeds, spec.ego_alone)
 
 
 def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
     """Score the chunks in a working folder and write the files of the finished run."""
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
-    grid = Grid(names, tuple(settings["seeds"]), tuple(chain.from_iterable(chunks)))
+
+    def scored(chunk: Sequence[int], part: Path) -> tuple[list[Episode], Figures]:
+        decisions, ended, answers = folder.read_part(part, settings["actions"])
+        grid = Grid(names, tuple(settings["seeds"]), tuple(chunk))
+        episodes = counted(grid, decisions, ended)
+        return episodes, Figures.of(settings["world"]["kind"], grid, decisions, episodes, answers)
+
     with uncollected():
-        contents = [folder.read_part(part, settings["actions"]) for part in parts]
-        decisions = Decisions.concat([decisions for decisions, _, _ in contents])
-        answers = [answer for _, _, answers in contents for answer in answers]
-        episodes = counted(grid, decisions, [episode for _, episodes, _ in contents for episode in episodes])
-        summary = scores(settings["world"]["kind"], grid, decisions, episodes, answers)
+        # One part after the other: the decisions of all would not fit into memory.
+        by_part, figures = zip(*map(scored, chunks, parts), strict=True)
+        whole = Figures.joined(figures)
+        answers, summary = [answer for answer, _ in whole.answers], whole.scores()
+        cells = len(names) * len(settings["seeds"])
+        episodes = [
+            episode for cell in range(cells) for chunk, of_part in zip(chunks, by_part, strict=True)
+            for episode in of_part[cell * len(chunk) : (cell + 1) * len(chunk)]
+        ]  # fmt: skip
         manifest = msgspec.convert({
             "format": FORMAT, "name": out.name, "created": begun.created,
             "command": shlex.join([*begun.command, "--out", str(out)]), "tags": begun.tags, **settings,
@@ -316,7 +348,8 @@ def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Pat
             "retries": sum(answer.retries for answer in answers),
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
-        folder.write(out, manifest, decisions, episodes, folder.lines_of(parts), summary)
+        decisions_of_all = folder.decisions_of(parts, settings["actions"])
+        folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)
 
 

@@ -19,7 +19,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.scheduling import Outlook
 from harness.core import noise
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints, any_of
 from harness.dataset.load import Scene
 from harness.evaluate.attackers import Attackers, Said
 from harness.evaluate.claims import claims
@@ -157,12 +157,13 @@ def walk(
     world: World[Moment], points: Sequence[OperatingPoint], ask: Ask[Moment]
 ) -> Iterator[Sequence[Decided[Moment]]]:
     """Walk a world under some conditions until every episode is decided; yield the decisions of each step."""
-    memories: dict[str, Memory] = {point.name: Memory() for point in points}
-    attackers = {point.name: Attackers(point) for point in points}
+    memories = {point: Memory() for point in points}
+    attackers = {point: Attackers(point) for point in points}
+    physical = {point for point in points if isinstance(point.channel, Physical)}
     while moments := world.observe():
         intents = ask(moments)
         due = {point: of_point for point in points if len((of_point := world.due(point)).at)}
-        if any(isinstance(point.channel, Physical) for point in due):
+        if not physical.isdisjoint(due):
             intents = replace(intents, site=world.site({point.unit for point in due if point.unit}))
         if any(point.needs("outlook") for point in due):
             intents = replace(intents, outlook=world.outlook())
@@ -171,8 +172,10 @@ def walk(
         asked_blind = [of_point.at for point, of_point in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(asked_blind))) if asked_blind else None
         said = {
-            point: attackers[point.name].said(
-                heard(point, intents, blind, of_point), of_point.draws, of_point.episodes
+            point: attackers[point].said(
+                heard(point, intents, blind, of_point),
+                of_point.draws,
+                of_point.episodes if point.attack else (),
             )
             for point, of_point in due.items()
         }
@@ -182,11 +185,11 @@ def walk(
         for point, due_here in due.items():
             said_here = said[point]
             call = calls[point.rewrites](due_here.at, shown(point, said_here)) if point.asks_again else None
-            fusion = Fusion(call, memories[point.name].recall(due_here))
+            fusion = Fusion(call, memories[point].recall(due_here))
             result = fuse(point, sent[point], said_here.intents, fusion)
             decided.append(Decided(point, moments, due_here, result, said_here))
         for part in decided:
-            memories[part.point.name].keep(part.due, part.result.state)
+            memories[part.point].keep(part.due, part.result.state)
         yield decided
         world.step(decided)
 
@@ -198,7 +201,8 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
     they come from another layout: the next one in which the same seed has a decision at this step. If there
     is none, the ego hears nobody. Who is asked, the distances and the times stay the same.
     """
-    own = intents.take(due.at)
+    every = np.array_equal(due.at, np.arange(len(intents.own)))
+    own = intents if every else intents.take(due.at)
     if point.asks_blind:
         assert blind is not None
         said = blind.take(due.at)
@@ -290,7 +294,7 @@ def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers
     )
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=1 << 10)
 def busy_ratio(point: OperatingPoint) -> float:
     """Return the channel busy ratio under the background load; NaN if the channel has no such figure."""
     channel = point.channel
@@ -300,7 +304,7 @@ def busy_ratio(point: OperatingPoint) -> float:
 def columns(decided: Decided[Any]) -> dict[str, Any]:
     """Return the numeric columns of decisions (n,) by name; NaN where unknown."""
     c, point = decided.result, decided.point
-    anybody = c.on_time.any(axis=-1)
+    anybody = any_of(c.on_time)
     return {
         "messages": c.messages, "requests": c.requests, "request_bits": c.request_bits,
         "reply_bits": c.reply_bits, "airtime_ms": c.airtime_s * 1000, "triggered": c.triggered,
@@ -379,6 +383,17 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
         },
     }  # fmt: skip
     return Decisions.of({**values, **labels}, actions, helpers).take(order)
+
+
+def of_all_seeds(tables: Sequence[Decisions], points: Sequence[OperatingPoint]) -> Decisions:
+    """Return tables of the same episodes and of different seeds, in their order, as `table` makes one."""
+    if len(tables) == 1:
+        return tables[0]
+    whole = Decisions.concat(tables)
+    ids = sorted(set().union(*(part.scenes for part in tables)))
+    condition = whole.codes("condition", [point.name for point in points])
+    order = np.lexsort((condition, whole.codes("scene", ids), whole.whole("step"), whole.whole("episode")))
+    return whole.take(order)
 
 
 def _labels(of_scenes: Sequence[str | None], at: Ints, mask: Any = True) -> Labels:

@@ -6,7 +6,6 @@ versions are pinned by digest in `prompts/released.toml`: a changed text is a ne
 """
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -15,11 +14,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
-from jinja2 import StrictUndefined, Template, TemplateSyntaxError
-from jinja2.exceptions import SecurityError
-from jinja2.nodes import EvalContext
-from jinja2.runtime import Context, LoopContext
-from jinja2.sandbox import ImmutableSandboxedEnvironment
+from jinja2 import TemplateSyntaxError
 
 from harness.core.config import Count, convert, loads
 from harness.core.errors import UserError, printable, unknown
@@ -27,6 +22,7 @@ from harness.core.files import canonical_json, sha256_bytes, text_of, write_whol
 from harness.core.resources import entries, find
 from harness.prompts.examples import EXAMPLES, Examples
 from harness.prompts.examples import read as read_examples
+from harness.prompts.template import Template
 from harness.world.scenario import Scenario
 
 Graph = Mapping[str, Any]
@@ -36,54 +32,6 @@ NO_WORDS: Mapping[str, str] = MappingProxyType({})
 # Digest of v1, which asks for reasons first and was released before prompt.toml could say so.
 REASONS_FIRST = {"139fe002c5c6d680d758a35b92e1d6c1a1db69481a4b3a76336829cfceae8df8": ROLES}
 OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})  # shipped versions that only describe crossings
-LOOP = frozenset({"first", "last", "index", "index0"})  # attributes of a loop that are plain values
-
-WIDE = re.compile(r"\d{3}|\*")  # in a format: a width of 100 characters or more, or one given as an argument
-PADDING = frozenset({"center", "ljust", "rjust", "zfill", "expandtabs", "format", "format_map", "translate"})
-
-
-class Sandbox(ImmutableSandboxedEnvironment):
-    """Jinja environment for untrusted templates: nothing in it can build a text or number that fills memory.
-
-    `graph.ego` always means the member of that name; no method of a mapping hides it.
-    """
-
-    intercepted_binops = frozenset({"*", "**", "%"})
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        for name in ("center", "indent"):
-            del self.filters[name]
-        self.filters["format"] = _formatted
-
-    def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:
-        """Allow the intercepted operators on numbers only, and only small powers."""
-        numbers = all(isinstance(side, int | float) for side in (left, right))
-        if not numbers or (operator == "**" and not (abs(left) < 1e6 and abs(right) < 64)):
-            raise SecurityError(f"{operator} is not allowed on such values")
-        return super().call_binop(context, operator, left, right)
-
-    def is_safe_attribute(self, obj: Any, attr: str, value: Any) -> bool:
-        """Refuse the methods of strings that pad."""
-        return not (isinstance(obj, str) and attr in PADDING) and super().is_safe_attribute(obj, attr, value)
-
-    def getattr(self, obj: Any, attribute: str) -> Any:
-        """Return a member of a mapping, or whatever else the sandbox allows."""
-        # These cases are nearly all that a template reads, and plain data needs no check of the sandbox.
-        if type(obj) is dict and attribute in obj:
-            return obj[attribute]
-        if type(obj) is LoopContext and attribute in LOOP:
-            return getattr(obj, attribute)
-        if isinstance(obj, str) and attribute in PADDING:
-            return self.unsafe_undefined(obj, attribute)
-        return super().getattr(obj, attribute)
-
-
-def _formatted(text: str, *values: Any) -> str:
-    """Apply Jinja's `format` filter, for narrow fields only."""
-    if WIDE.search(text):
-        raise SecurityError(f"a format as wide as {text!r} is not allowed")
-    return text % values
 
 
 @dataclass(frozen=True)
@@ -140,22 +88,16 @@ class Prompt:
 
     @cached_property
     def _templates(self) -> dict[str, Template]:
-        environment = Sandbox(undefined=StrictUndefined, keep_trailing_newline=False)
         compiled = {}
         for role, text in self.texts.items():
             try:
-                compiled[role] = environment.from_string(text)
+                compiled[role] = Template(text)
             except TemplateSyntaxError as error:
                 raise UserError(
                     f"prompt {self.version} {role}.j2 line {error.lineno} is no Jinja: "
                     f"{printable(error.message)}"
                 ) from None
         return compiled
-
-    @cached_property
-    def _contexts(self) -> dict[str, Context]:
-        """Contexts without variables by role: Jinja's own functions and the template's blocks."""
-        return {role: template.new_context() for role, template in self._templates.items()}
 
     @cached_property
     def repair_turn(self) -> tuple[str, ...]:
@@ -226,11 +168,12 @@ class Prompt:
             "graph": graph,
             "actions": actions,
             "objects": objects,
-            "conflicts": soonest(graph["conflicts"])[: self.max_conflicts],
             "more": len(graph["nodes"]) - len(objects),
             "messages": messages,
             "words": words,
         }
+        if "conflicts" in self._templates[graph["role"]].reads:
+            variables["conflicts"] = soonest(graph["conflicts"])[: self.max_conflicts]
         needs = (
             "it needs the blocks system and user, and may use graph, actions, objects, more, conflicts, "
             "messages, words"
@@ -241,33 +184,24 @@ class Prompt:
         self, role: str, variables: Mapping[str, Any], blocks: Sequence[str], needs: str
     ) -> list[str]:
         """Render blocks of a role's template. Raises UserError, whose message ends with `needs`."""
-        template, empty = self._templates[role], self._contexts[role]
         try:
-            shared = _context(empty, variables)
-            return ["".join(template.blocks[block](shared)) for block in blocks]
+            return self._templates[role].render(variables, blocks)
         except Exception as error:  # a template is a program and may fail in any way
             raise UserError(
                 f"prompt {self.version} {role}.j2 does not render: {printable(error)}; {needs}"
             ) from None
 
 
-def _context(empty: Context, variables: Mapping[str, Any]) -> Context:
-    """Return a new context with these variables. `Template.new_context` takes a fifth of a prompt's time."""
-    context = object.__new__(Context)
-    vars(context).update(
-        vars(empty), vars={}, parent={**empty.parent, **variables}, eval_ctx=EvalContext(empty.environment)
-    )
-    return context
-
-
 def shown(graph: Graph, most: int) -> list[Mapping[str, Any]]:
     """Return the objects that a prompt lists: those in conflict with the ego first, then the nearest."""
-    in_conflict = {c["with"] for c in graph["conflicts"]}
 
-    def order(node: Mapping[str, Any]) -> tuple[bool, float]:
-        return node["id"] not in in_conflict, node["forward_m"] ** 2 + node["left_m"] ** 2
+    def away(node: Mapping[str, Any]) -> Any:
+        return node["forward_m"] ** 2 + node["left_m"] ** 2
 
-    return sorted(graph["nodes"], key=order)[:most]
+    near = sorted(graph["nodes"], key=away)
+    if in_conflict := {conflict["with"] for conflict in graph["conflicts"]}:
+        near.sort(key=lambda node: node["id"] not in in_conflict)
+    return near[:most]
 
 
 def soonest(conflicts: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

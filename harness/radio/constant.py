@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import Meta
 
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints, count_of
 from harness.core.config import Seconds
 from harness.radio.channel import Broadcast, Delivery, Draws, Links, served_s
 
@@ -48,7 +48,7 @@ class Radio:
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """A serial medium serves the first helper that is ready, so a slow helper delays no other."""
         active = links.in_radius if self.density_coupled else links.rounds
-        loss = density_coupled_loss(1 + np.sum(active, axis=-1, keepdims=True))
+        loss = density_coupled_loss(1 + count_of(active)[..., None])
         loss = loss if self.density_coupled else np.maximum(self.loss, loss)
         hops = 2 if self.roadside_edge else 1
         airtime_s = hops * links.payload_bits / self.bandwidth_bps

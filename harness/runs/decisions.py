@@ -1,7 +1,7 @@
 """The table of decisions, `decisions.parquet`: one row for each decision point, condition and seed."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import BytesIO
@@ -50,6 +50,7 @@ DECIMALS = {  # enough for every figure, and few enough to be the same on every 
 }  # fmt: skip
 
 ROWS = 2048  # how many rows become mappings at a time
+ROW_GROUP = 1 << 18  # least rows of a group in the file but the last: about 0.1 GB in memory
 
 
 def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
@@ -234,12 +235,7 @@ class Decisions:
 
     def _write(self, target: Path | BytesIO) -> None:
         unknown = [name for name in OPTIONAL if self.table[name].null_count == len(self)]
-        table = self.table.drop_columns(unknown).combine_chunks()
-        columns = [
-            column.cast(pa.string()).dictionary_encode() if column.type == LABEL else column
-            for column in table.columns
-        ]
-        pq.write_table(pa.table(columns, schema=table.schema), target, compression="zstd")
+        _write(target, [self], schema(self.actions, self.helpers), unknown)
 
     @classmethod
     def read(cls, path: Path, actions: Sequence[str]) -> "Decisions":
@@ -249,7 +245,7 @@ class Decisions:
         for name in OPTIONAL:
             if name not in table.column_names:
                 table = table.append_column(name, pa.nulls(len(table), NUMBER))
-        helpers = sum(name.startswith("helper_") for name in table.column_names)
+        helpers = _helpers(table.column_names)
         expected = schema(actions, helpers)
         if missing := [name for name in expected.names if name not in table.column_names]:
             raise ValueError(f"it lacks {', '.join(missing)}")
@@ -263,6 +259,59 @@ class Decisions:
         import pandas as pd
 
         return cast("pd.DataFrame", self.table.to_pandas(types_mapper={FLAG: pd.BooleanDtype()}.get))
+
+
+@dataclass(frozen=True)
+class DecisionFiles:
+    """Decisions in Parquet files, in order, which need not all fit into memory.
+
+    Attributes:
+        files: what `Decisions.write` wrote.
+        actions: the meta-actions of all of them.
+    """
+
+    files: Sequence[Path]
+    actions: tuple[str, ...]
+
+    def write(self, path: Path) -> None:
+        """Write one Parquet file. Raises what `Decisions.read` raises."""
+        columns = [set(pq.read_schema(file).names) for file in self.files]
+        helpers = max(_helpers(names) for names in columns)
+        unknown = set(OPTIONAL).difference(*columns)
+        with replacing(path) as part:
+            decisions = (Decisions.read(file, self.actions) for file in self.files)
+            _write(part, decisions, schema(self.actions, helpers), unknown)
+
+
+def _helpers(columns: Iterable[str]) -> int:
+    return sum(name.startswith("helper_") for name in columns)
+
+
+def _write(
+    target: Path | BytesIO, parts: Iterable[Decisions], columns: pa.Schema, left_out: Collection[str]
+) -> None:
+    """Write decisions as one Parquet file with these columns but some; whole parts share a row group."""
+    kinds = pa.schema([column for column in columns if column.name not in left_out])
+    with pq.ParquetWriter(target, kinds, compression="zstd") as writer:
+        group = [kinds.empty_table()]
+        for part in parts:
+            group.append(part.table.drop_columns(list(left_out)))
+            if sum(map(len, group)) >= ROW_GROUP:
+                writer.write_table(_row_group(group))
+                group = [kinds.empty_table()]
+        if len(group) > 1:
+            writer.write_table(_row_group(group))
+
+
+def _row_group(tables: Sequence[pa.Table]) -> pa.Table:
+    """Return tables as one, of the first one's columns; names are numbered in the order of the rows."""
+    kinds = tables[0].schema
+    table = pa.concat_tables(tables, promote_options="default").select(kinds.names).combine_chunks()
+    columns = [
+        column.cast(pa.string()).dictionary_encode() if column.type == LABEL else column
+        for column in table.columns
+    ]
+    return pa.table(columns, schema=kinds)
 
 
 def arrow_file(path: Path) -> pa.OSFile:

@@ -29,7 +29,7 @@ from harness.dataset.load import Dataset, find, load
 from harness.runs import attribution
 from harness.runs.answers import Answers
 from harness.runs.attribution import Attribution
-from harness.runs.decisions import Decisions, arrow_file
+from harness.runs.decisions import DecisionFiles, Decisions, arrow_file
 from harness.runs.metrics import Grid, World
 from harness.runs.records import (
     Answer,
@@ -251,7 +251,7 @@ def read(path: Path) -> Run:
 
 
 def write(
-    out: Path, manifest: Manifest, decisions: Decisions, episodes: Sequence[Episode],
+    out: Path, manifest: Manifest, decisions: Decisions | DecisionFiles, episodes: Sequence[Episode],
     answers: Iterable[bytes], scores: Sequence[Score],
 ) -> None:  # fmt: skip
     """Write a run's files, the manifest last.
@@ -302,6 +302,11 @@ def read_part(
         Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
         _FACTS.decode_lines((part / "answers.jsonl").read_bytes()),
     ))  # fmt: skip
+
+
+def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:
+    """Return the decisions of a run's parts."""
+    return DecisionFiles([part / "decisions.parquet" for part in parts], tuple(actions))
 
 
 def answers_in(part: Path) -> int:

@@ -1,10 +1,12 @@
 """Compute `summary.csv` and `episodes.csv` from decisions, answers and how episodes ended."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
-from msgspec.structs import replace
+from msgspec import structs
 
 from harness.core.arrays import Floats
 from harness.core.statistics import (
@@ -39,6 +41,63 @@ BASELINE = "single-local"
 ROLES: tuple[Role, ...] = ("ego", "helper", "merge", "blind")
 
 
+@dataclass(frozen=True)
+class Figures:
+    """What the scores of some episodes of a run are computed from.
+
+    Attributes:
+        grid: the episodes.
+        values: each metric's values by episode, (C, S, E).
+        latency_ms: the decisions' latencies for each condition and seed, in the order of the grid.
+        answers: the answers, each with its episode.
+    """
+
+    grid: Grid
+    values: Mapping[str, Floats]
+    latency_ms: Sequence[Floats]
+    answers: Sequence[tuple[Answer | AnswerFacts, int]]
+
+    @classmethod
+    def of(
+        cls, world: World, grid: Grid, decisions: Decisions, episodes: Sequence[Episode],
+        answers: Iterable[Answer | AnswerFacts],
+    ) -> "Figures":  # fmt: skip
+        """Compute the figures; `episodes` are in the order of the grid."""
+        latency_ms, places = decisions["latency_ms"], grid.places(decisions) // len(grid.episodes)
+        order = np.argsort(places, kind="stable")
+        starts = np.searchsorted(places[order], np.arange(1, len(grid.conditions) * len(grid.seeds)))
+        numbers = decisions.whole("episode")
+        episode_of = {scene: int(numbers[rows.start]) for scene, rows in decisions.scenes.items()}
+        return cls(
+            grid, by_episode(metrics_of(world), grid, decisions, episodes),
+            np.split(latency_ms[order], starts), [(answer, episode_of[answer.scene]) for answer in answers],
+        )  # fmt: skip
+
+    @classmethod
+    def joined(cls, parts: Sequence["Figures"]) -> "Figures":
+        """Join the figures of parts of a run, which differ in their episodes."""
+        episodes = tuple(chain.from_iterable(part.grid.episodes for part in parts))
+        return cls(
+            replace(parts[0].grid, episodes=episodes),
+            {name: np.concatenate([part.values[name] for part in parts], axis=2) for name in parts[0].values},
+            [np.concatenate(each) for each in zip(*(part.latency_ms for part in parts), strict=True)],
+            list(chain.from_iterable(part.answers for part in parts)),
+        )
+
+    def scores(self) -> list[Score]:
+        """Return every score."""
+        values = {
+            name: v for name, v in self.values.items()
+            if not (METRICS[name].optional and np.isnan(v).all())
+        }  # fmt: skip
+        return [
+            *of_conditions(self.grid.conditions, values),
+            *of_latencies(self.grid, self.latency_ms),
+            *_gains(self.grid.conditions, values[SUCCESS]),
+            *_of_answers(self.answers),
+        ]
+
+
 def scores(
     world: World,
     grid: Grid,
@@ -47,15 +106,7 @@ def scores(
     answers: Sequence[Answer | AnswerFacts],
 ) -> list[Score]:
     """Return every score of a run; `episodes` are in the order of the grid."""
-    values = by_episode(metrics_of(world), grid, decisions, episodes)
-    values = {name: v for name, v in values.items() if not (METRICS[name].optional and np.isnan(v).all())}
-    latency_ms, places = decisions["latency_ms"], grid.places(decisions) // len(grid.episodes)
-    return [
-        *of_conditions(grid.conditions, values),
-        *of_latencies(grid, [latency_ms[places == n] for n in range(len(grid.conditions) * len(grid.seeds))]),
-        *_gains(grid.conditions, values[SUCCESS]),
-        *_of_answers(answers, decisions),
-    ]
+    return Figures.of(world, grid, decisions, episodes, answers).scores()
 
 
 def of_conditions(conditions: Sequence[str], values: Mapping[str, Floats]) -> Iterator[Score]:
@@ -91,33 +142,29 @@ def _gains(conditions: Sequence[str], success: Floats) -> Iterator[Score]:
                 yield Score.of(condition, name, rate_difference(own.T, baseline.T), "episodes")
 
 
-def _of_answers(answers: Sequence[Answer | AnswerFacts], decisions: Decisions) -> Iterator[Score]:
+def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator[Score]:
     """Yield by role how answers were parsed, and how long they and their prompts are.
 
     Intervals are over episodes, since the answers of one episode are not independent.
     """
-    numbers = decisions.whole("episode")
-    episodes = {scene: numbers[rows.start] for scene, rows in decisions.scenes.items()}
-    by_role = {role: [answer for answer in answers if answer.role == role] for role in ROLES}
-    for role, role_answers in by_role.items():
+    of_roles = {role: [(a, episode) for a, episode in answers if a.role == role] for role in ROLES}
+    by_role = {role: tuple(zip(*of_role, strict=True)) for role, of_role in of_roles.items() if of_role}
+    for role, (role_answers, episodes) in by_role.items():
         for verdict in ("strict", "recovered", "failed"):
-            if role_answers:
-                hits = np.array([float(answer.verdict == verdict) for answer in role_answers])
-                episode = np.array([episodes[answer.scene] for answer in role_answers])
-                yield Score.of(ALL, f"{verdict}_rate_{role}", rate_interval(hits, episode), "answers")
-    for role, role_answers in by_role.items():
+            hits = np.array([float(answer.verdict == verdict) for answer in role_answers])
+            yield Score.of(ALL, f"{verdict}_rate_{role}", rate_interval(hits, np.array(episodes)), "answers")
+    for role, (role_answers, episodes) in by_role.items():
         if any(answer.turns > 1 for answer in role_answers):
-            episode = np.array([episodes[answer.scene] for answer in role_answers])
             after = np.array([answer.verdict != "failed" for answer in role_answers])
             before = after & np.array([answer.turns == 1 for answer in role_answers])
             for when, hits in (("at_first", before), ("after_repair", after)):
-                estimate = rate_interval(hits.astype(float), episode)
+                estimate = rate_interval(hits.astype(float), np.array(episodes))
                 yield Score.of(ALL, f"valid_{when}_rate_{role}", estimate, "answers")
-    for role, role_answers in by_role.items():
+    for role, (role_answers, episodes) in by_role.items():
         for what in ("prompt_tokens", "completion_tokens", "label_mass"):
             counts = [
-                (value, episodes[answer.scene])
-                for answer in role_answers
+                (value, episode)
+                for answer, episode in zip(role_answers, episodes, strict=True)
                 if (value := getattr(answer, what)) is not None
             ]
             if counts:
@@ -147,6 +194,6 @@ def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> li
     if not np.isnan(decisions["acted"]).all():
         columns["never_acted"] = totals(1.0 - decisions["acted"])
     return [
-        replace(episode, **dict(zip(columns, values, strict=True)))
+        structs.replace(episode, **dict(zip(columns, values, strict=True)))
         for episode, *values in zip(ordered, *columns.values(), strict=True)
     ]

@@ -24,9 +24,10 @@ import numpy as np
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.core import noise
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints, any_of
 from harness.evaluate.walk import Decided, Due, Fuses
 from harness.radio.channel import Draws, Unit
+from harness.studies.axes import Setting
 from harness.studies.play import Walked, walk_through
 
 VERSION = "3"
@@ -110,9 +111,16 @@ class _Drawn:
 
     def step(self, number: int) -> "_Drawn":
         """The rows of one step."""
-        at = slice(number, None, STEPS)
+        at = np.arange(number, len(self.right), STEPS)
         return _Drawn(
             self.right[at], self.intents.take(at), self.knowing[at], self.witness[at], self.draws.take(at)
+        )
+
+    def of_first(self, helpers: int) -> "_Drawn":
+        """The same with only the first helpers, whose draws no other moves."""
+        draws = Draws(self.draws.link[:, :helpers], self.draws.jitter[:, :helpers])
+        return replace(
+            self, intents=self.intents.of_first(helpers), witness=self.witness[:, :helpers], draws=draws
         )
 
 
@@ -134,8 +142,8 @@ class CalibratedWorld:
     An ego that has fused the witness's message knows from its next decision on. The last decision decides.
     """
 
-    def __init__(self, drawn: _Drawn, seeds: Sequence[int], numbers: Ints) -> None:
-        self._drawn = drawn  # of all seeds, one below the other, with as many episodes each as `numbers`
+    def __init__(self, steps: Sequence[_Drawn], seeds: Sequence[int], numbers: Ints) -> None:
+        self._steps = steps  # of all seeds, one below the other, with as many episodes each as `numbers`
         self._seed, self._episode = np.repeat(seeds, len(numbers)), np.tile(numbers, len(seeds))
         self._step = -1
         self._knows = np.zeros(len(self._seed), dtype=bool)
@@ -144,8 +152,10 @@ class CalibratedWorld:
     def observe(self) -> Sequence[int]:
         """The episodes, while there are decisions to make."""
         self._step += 1
-        self._now = self._drawn.step(self._step)
-        return range(len(self._knows)) if self._step < STEPS else ()
+        if self._step == STEPS:
+            return ()
+        self._now = self._steps[self._step]
+        return range(len(self._knows))
 
     def __call__(self, moments: Sequence[int]) -> Intents:
         """What every vehicle intends at this step."""
@@ -176,7 +186,7 @@ class CalibratedWorld:
     def step(self, decided: Sequence[Decided[int]]) -> None:
         """Learn what was heard, and see whether the last action is the right one."""
         [part] = decided
-        self._knows = self._knows | (part.result.on_time & self._now.witness).any(axis=1)
+        self._knows = self._knows | any_of(part.result.on_time & self._now.witness)
         self.success = part.result.action == self._now.right
 
 
@@ -194,7 +204,7 @@ class Calibrated:
     def __init__(self, episodes: int, parameters: Parameters | None = None) -> None:
         self.parameters = parameters or Parameters()
         self.episodes = episodes
-        self._of_seeds = lru_cache(maxsize=6)(self._drawn)
+        self._of_seeds = lru_cache(maxsize=6)(self._drawn)  # all points of a panel have the same draws
 
     def manifest(self) -> dict[str, Any]:
         """What a reader needs to know of where the intents come from."""
@@ -207,13 +217,20 @@ class Calibrated:
             "episodes_per_seed": self.episodes,
         }
 
-    def walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
+    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Sequence[Walked]]:
         """Episodes of every seed, `CHUNK` at a time, which bounds memory."""
+        most = max((setting.vehicles for setting in settings), default=1) - 1
+        for setting in settings:
+            yield list(self._walked(setting, most, seeds))
+
+    def _walked(self, setting: Setting, most: int, seeds: Sequence[int]) -> Iterator[Walked]:
         for first in range(0, self.episodes, CHUNK):
             numbers = first + np.arange(min(CHUNK, self.episodes - first))
-            drawn = self._of_seeds(tuple(seeds), vehicles - 1, first)
-            world = CalibratedWorld(drawn, seeds, numbers)
-            columns, places = walk_through(world, point, world, seeds, numbers)
+            steps = self._of_seeds(tuple(seeds), most, first)
+            if setting.vehicles <= most:
+                steps = [step.of_first(setting.vehicles - 1) for step in steps]
+            world = CalibratedWorld(steps, seeds, numbers)
+            [(columns, places)] = walk_through(world, [setting.point], world, seeds, numbers)
             success = world.success.reshape(len(seeds), len(numbers)).astype(float)
             ends = {
                 "success_rate": success,
@@ -222,8 +239,10 @@ class Calibrated:
             }
             yield Walked(numbers, ends, columns, places)
 
-    def _drawn(self, seeds: tuple[int, ...], helpers: int, first: int) -> _Drawn:
-        return _below([self._draw(seed, helpers, first) for seed in seeds])
+    def _drawn(self, seeds: tuple[int, ...], helpers: int, first: int) -> Sequence[_Drawn]:
+        """The rows of each step."""
+        drawn = _below([self._draw(seed, helpers, first) for seed in seeds])
+        return [drawn.step(number) for number in range(STEPS)]
 
     def _draw(self, seed: int, helpers: int, first: int) -> _Drawn:
         """A helper's draws do not depend on how many there are, nor an episode's on the operating point."""

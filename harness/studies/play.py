@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -71,27 +70,32 @@ class Source(Protocol):
         """What a reader needs to know of where the intents come from."""
         ...
 
-    def walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
-        """Walks at one operating point, some episodes at a time; every point has the same draws.
+    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Sequence[Walked]]:
+        """Walks at each grid point in turn, in parts of some episodes; every point has the same draws.
 
-        `vehicles` is how many there are, the ego included: the nearest ones.
+        A grid point's vehicles are the nearest ones.
         """
         ...
 
 
 def walk_through(
-    world: World[Any], point: OperatingPoint, ask: Ask[Any], seeds: Sequence[int], episodes: Ints
-) -> tuple[dict[str, Floats], Ints]:
-    """The `columns` and `places` of a world's decisions, rounded as rows are; `episodes` (E,) ascending."""
-    decided = list(chain.from_iterable(walk(world, [point], ask)))
-    parts = [columns(part) for part in decided]
-    of_seed = {seed: place for place, seed in enumerate(seeds)}
-    row = np.array([of_seed[seed] for part in decided for seed in part.due.seed.tolist()])
-    column = np.searchsorted(episodes, np.concatenate([part.due.episode for part in decided]))
-    joint = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    for name in joint.keys() & DECIMALS.keys():
-        joint[name] = joint[name].round(DECIMALS[name])
-    return joint, row * len(episodes) + column
+    world: World[Any], points: Sequence[OperatingPoint], ask: Ask[Any], seeds: Sequence[int], episodes: Ints
+) -> Iterator[tuple[dict[str, Floats], Ints]]:
+    """The `columns` and `places` of each point's decisions, as rows round them; `episodes` (E,) ascending."""
+    parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
+    places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
+    ascending = np.argsort(seeds)
+    for decided in walk(world, points, ask):
+        for part in decided:
+            parts[part.point].append(columns(part))
+            row = ascending[np.searchsorted(seeds, part.due.seed, sorter=ascending)]
+            place = row * len(episodes) + np.searchsorted(episodes, part.due.episode)
+            places[part.point].append(place)
+    for point, steps in parts.items():
+        joint = {column: np.concatenate([step[column] for step in steps]) for column in steps[0]}
+        for column in joint.keys() & DECIMALS.keys():
+            joint[column] = joint[column].round(DECIMALS[column])
+        yield joint, np.concatenate(places[point])
 
 
 @dataclass(frozen=True)
@@ -125,9 +129,8 @@ def play(
 
     rows: list[dict[str, Any]] = []
     episodes: list[dict[str, Floats]] = []
-    for setting in settings:
+    for setting, walked in zip(settings, source.walked(settings, seeds), strict=True):
         place = (source.name, panel, setting.condition, setting.variable, setting.value)
-        walked = list(source.walked(setting.point, setting.vehicles, seeds))
         metrics = {name: np.hstack([w.ends[name] for w in walked]) for name in ENDS}
         metrics |= {name: np.hstack([_metric(name, w, len(seeds)) for w in walked]) for name in PER_DECISION}
         latency_ms = np.array([

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any, cast
 
@@ -37,8 +38,10 @@ from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 from harness.runs.folder import dataset_of, read
 from harness.runs.records import Answer
+from harness.studies.axes import Setting
 from harness.studies.play import Walked, walk_through
 
+WALKS = 1 << 15  # most that are walked together, unless one grid point has more: some 100 MB
 MORE = "more-answers.jsonl"  # answers at decision points that the run did not come to, and its fusion calls
 
 
@@ -118,17 +121,35 @@ class Stored:
             "decision_points_without_answer": sorted(self.left_out),
         }  # fmt: skip
 
-    def walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
+    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Sequence[Walked]]:
         """All episodes, with the ego and so many of the nearest vehicles.
 
         Raises:
-            UserError: the point has the run's model fuse, and it cannot.
+            UserError: a point has the run's model fuse, and it cannot.
         """
-        replace(self._asker.spec, points=(point,))  # which checks that they go together
-        world = FrozenWorld(self.dataset, [point], seeds)
-        ask = _Nearest(self, vehicles - 1, partial(world.leave_out, point))
-        columns, places = walk_through(world, point, ask, seeds, world.numbers)
-        yield Walked(world.numbers, world.ends(point), columns, places)
+        for setting in settings:
+            replace(self._asker.spec, points=(setting.point,))  # which checks that they go together
+        at_once = max(1, WALKS // (len(seeds) * len(self.dataset.episodes)))
+        for vehicles, alike in groupby(settings, lambda setting: setting.vehicles):
+            points = [setting.point for setting in alike]
+            for first in range(0, len(points), at_once):
+                yield from self._walked(points[first : first + at_once], vehicles, seeds)
+
+    def _walked(
+        self, points: Sequence[OperatingPoint], vehicles: int, seeds: Sequence[int]
+    ) -> Iterator[Sequence[Walked]]:
+        """The same at points that are walked together."""
+        different = list(dict.fromkeys(points))
+        world = FrozenWorld(self.dataset, different, seeds)
+
+        def leave_out(moments: Bools) -> None:
+            for point in different:
+                world.leave_out(point, moments)
+
+        walks = walk_through(world, different, _Nearest(self, vehicles - 1, leave_out), seeds, world.numbers)
+        walked = dict(zip(different, walks, strict=True))
+        for point in points:
+            yield [Walked(world.numbers, world.ends(point), *walked[point])]
 
     def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> tuple[Floats, float]:
         """Joules of each vehicle's answer, (n, 1+H), and watts of a radio that sends; NaN where unknown."""

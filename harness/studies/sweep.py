@@ -137,12 +137,14 @@ def _asks(point: OperatingPoint) -> bool:
 def tables(summary: "pd.DataFrame") -> dict[str, list[Row]]:
     """A study's main figures, a table a source and curve, by its title."""
     found: dict[str, list[Row]] = {}
-    places = ["source", "panel", "condition", "value"]
-    for place, rows in summary.groupby(places, sort=False, dropna=False):
-        source, panel, condition, value = place
+    places: dict[tuple[Any, ...], list[dict[Any, Any]]] = {}
+    for row in summary.to_dict("records"):
+        value = None if row["panel"] == CORE else row["value"]
+        places.setdefault((row["source"], row["panel"], row["condition"], value), []).append(row)
+    for (source, panel, condition, value), rows in places.items():
         title = str(source) if panel == CORE else f"{source} · {condition} over {panel}"
         # Over episodes, but where a seed has episodes of its own.
-        of = {row["metric"]: row for row in sorted(rows.to_dict("records"), key=_over_episodes)}
+        of = {row["metric"]: row for row in sorted(rows, key=_over_episodes)}
         success = of["success_rate"]
         ends = (100 * success[name] for name in ("mean", "ci_low", "ci_high"))
         others = {name: f"{scale * of[metric]['mean']:.1f}" for name, metric, scale in COLUMNS}

@@ -3,15 +3,18 @@
 The arithmetic is that of `simulator` and of highway-env, operation by operation, so worlds end up the same to
 the last bit: NumPy computes a number in an array as it does alone, and `vecdot` sums as `dot` does. Rare
 events (two vehicles touch, an episode ends) are left to highway-env and to `World`. A test drives both side
-by side.
+by side. Where numba is installed, `compiled` has the same frame in less time.
 
 Arrays are (B, V): worlds, and the vehicles of each by number, the ego first. If a world has fewer vehicles,
 the other columns stand for vehicles in lanes of their own, which affect nobody.
 """
 
+import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 
@@ -20,6 +23,7 @@ from highway_env.road.lane import AbstractLane, CircularLane, StraightLane
 from highway_env.vehicle.controller import ControlledVehicle
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import printable
 from harness.world.perception.rays import turned
 from harness.world.road import Lane, Road
 from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M, Traffic
@@ -29,6 +33,9 @@ from harness.world.world import World, least_gaps_m
 ALONE = 2  # up to this many worlds are as fast one by one
 SLOW_MPS = 1e-2  # least speed to divide by, as in highway-env's `not_zero`
 AT_ONCE = 128  # more worlds do not fit into the processor's cache
+COMPILED_AFTER = 2000  # frames with NumPy: about those that loading the compiled form pays for
+
+_frames: Counter[type] = Counter()  # simulated in this process, by the class of their fleet
 
 
 def advance(worlds: Sequence[World], until_frames: Sequence[int]) -> None:
@@ -51,11 +58,11 @@ def advance(worlds: Sequence[World], until_frames: Sequence[int]) -> None:
         _together(lanes, *zip(*going[begin:end], strict=True))
 
 
-def _together(lanes: "_Lanes", worlds: Sequence[World], until_frames: Sequence[int]) -> None:
+def _together(lanes: "Lanes", worlds: Sequence[World], until_frames: Sequence[int]) -> None:
     begun = np.array([world.frame for world in worlds])
     until = np.array(until_frames)
     speeds_mps = [float(world.vehicles[0].speed) for world in worlds]
-    fleet = _Fleet(lanes, worlds)
+    fleet = _form()(lanes, worlds)
     sizes_m, there = fleet.size, fleet.there
     poses = np.full((len(worlds), int((until - begun).max()), *fleet.speed.shape[1:], 4), np.nan)
     going = np.arange(len(worlds))
@@ -76,6 +83,7 @@ def _together(lanes: "_Lanes", worlds: Sequence[World], until_frames: Sequence[i
         if over.any():
             going = going[~over]
             fleet.keep(~over)
+    _frames[type(fleet)] += passed
     poses[..., :2] -= worlds[0].scenario.road().origin_m
     np.copyto(poses, np.nan, where=~there[:, None, :, None])
     before_m = np.array([world.outcome.least_gap_m for world in worlds])
@@ -85,8 +93,29 @@ def _together(lanes: "_Lanes", worlds: Sequence[World], until_frames: Sequence[i
         world.passed(frames[: world.frame - first, : len(world.vehicles)], speed_mps, gap_m)
 
 
+def _form() -> "type[Fleet]":
+    """Return the class that simulates faster from here on: loading the compiled one takes half a second."""
+    return compiled_fleet() or Fleet if _frames[Fleet] >= COMPILED_AFTER else Fleet
+
+
+@cache
+def compiled_fleet() -> "type[Fleet] | None":
+    """Return the class of fleets whose frames are compiled; None where numba is missing or does not work."""
+    if find_spec("numba") is None:
+        return None
+    try:
+        from harness.world.compiled import CompiledFleet
+    except Exception as error:  # whatever goes wrong in there, NumPy's numbers are the same
+        print(
+            f"harness: frames are simulated without numba, which does not work here: {printable(error)}",
+            file=sys.stderr,
+        )
+        return None
+    return CompiledFleet
+
+
 @dataclass(frozen=True)
-class _Lanes:
+class Lanes:
     """The lanes of a network as arrays; each is a straight lane or an arc.
 
     Attributes:
@@ -142,7 +171,7 @@ class _Lanes:
 
 
 @lru_cache(maxsize=64)
-def _lanes(road: Callable[[], Road]) -> _Lanes | None:
+def _lanes(road: Callable[[], Road]) -> Lanes | None:
     """Return the lanes of a road; None if some are neither straight nor arcs."""
     graph = road().network().graph
     of = {
@@ -161,7 +190,7 @@ def _lanes(road: Callable[[], Road]) -> _Lanes | None:
         )
 
     nowhere = np.zeros(2)
-    return _Lanes(
+    return Lanes(
         {name: n for n, name in enumerate(of)}, list(of),
         each("start", nowhere, False) + each("center", nowhere, True),
         each("direction", nowhere, False), each("direction_lateral", nowhere, False),
@@ -171,10 +200,10 @@ def _lanes(road: Callable[[], Road]) -> _Lanes | None:
     )  # fmt: skip
 
 
-class _Fleet:
+class Fleet:
     """The vehicles of some worlds, as arrays (B, V); positions and impacts are (B, V, 2)."""
 
-    def __init__(self, lanes: _Lanes, worlds: Sequence[World]) -> None:
+    def __init__(self, lanes: Lanes, worlds: Sequence[World]) -> None:
         scenario = worlds[0].scenario
         p = scenario.parameters
         self.lanes, self.scenario, self.dt = lanes, scenario, 1 / p.simulation_hz
@@ -252,16 +281,9 @@ class _Fleet:
         self.stood = self.crashed.copy()
         self._act()
         self._move()
+        on_road = self._place_ego()
         self.frame = self.frame + 1
         self._collide()
-        ego_lane = self.lane_now[:, 0]
-        along, lateral = self.lanes.coordinates(self.xy[:, 0], ego_lane)
-        room_m, length_m = AbstractLane.VEHICLE_LENGTH, self.lanes.length[ego_lane]
-        on_road = (
-            (np.abs(lateral) <= self.lanes.width[ego_lane] / 2)
-            & (-room_m <= along)
-            & (along < length_m + room_m)
-        )
         xy = np.where(self.there[..., None], self.xy, np.nan)
         cleared = self.scenario.cleared(xy, self.approach, self.scenario.parameters)
         crashes = (self.crashed != self.stood).any(axis=1)
@@ -342,26 +364,38 @@ class _Fleet:
         self.heading = self.heading + self.speed * np.sin(slip) / (self.size[..., 0] / 2) * self.dt
         self.speed = self.speed + acceleration * self.dt
         self.lane_now = np.where(self.there, self.lane, self.lane_now)
+
+    def _place_ego(self) -> Bools:
+        """Set the ego's lane to the nearest of its ways; return whether the road is below it, (B,)."""
         if self.ways.size:
             places = np.broadcast_to(self.xy[:, None, 0], (len(self.xy), len(self.ways), 2))
             _, off_m = self.lanes.coordinates(places, np.broadcast_to(self.ways, places.shape[:-1]))
             self.lane_now[:, 0] = self.ways[np.abs(off_m).argmin(axis=1)]
+        lane = self.lane_now[:, 0]
+        along, lateral = self.lanes.coordinates(self.xy[:, 0], lane)
+        room_m, length_m = AbstractLane.VEHICLE_LENGTH, self.lanes.length[lane]
+        return np.asarray(
+            (np.abs(lateral) <= self.lanes.width[lane] / 2) & (-room_m <= along) & (along < length_m + room_m)
+        )
 
-    def _collide(self) -> None:
-        """Do what `_Road.step` does: highway-env checks the pairs that may touch within the frame."""
+    def _near(self) -> Ints:
+        """Return pairs of vehicles that may touch within the frame: world, number and number, (n, 3)."""
         x, y = self.xy[..., 0], self.xy[..., 1]
         dx, dy = x[:, None] - x[:, :, None], y[:, None] - y[:, :, None]
         within = self.reach[:, :, None] + self.reach[:, None] + (self.speed * self.dt)[:, :, None] + NEAR_M
         near = np.triu(dx * dx + dy * dy < within * within, 1)
         near &= self.there[:, :, None] & self.there[:, None]
         if not near.any():
-            return
+            return np.empty((0, 3), dtype=int)
         b, n, other = np.nonzero(near)
         poses = np.concatenate([self.xy, self.heading[..., None]], axis=-1)
         apart_m = separation_m(poses[b, n], self.size[b, n], poses[b, other], self.size[b, other])
         moves_m = (np.abs(self.speed[b, n]) + np.abs(self.speed[b, other])) * self.dt + NEAR_M
-        touching = apart_m <= moves_m
-        for row, one, two in np.stack([b, n, other], axis=-1)[touching].tolist():
+        return np.stack([b, n, other], axis=-1)[apart_m <= moves_m]
+
+    def _collide(self) -> None:
+        """Do what `_Road.step` does: highway-env checks the pairs that may touch."""
+        for row, one, two in self._near().tolist():
             vehicles = self.worlds[row].vehicles
             for k in (one, two):
                 v, at = vehicles[k], (row, k)

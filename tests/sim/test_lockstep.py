@@ -1,5 +1,9 @@
 """Worlds that are simulated together are, to the last bit, what each becomes alone."""
 
+import sys
+from collections import Counter
+from importlib.util import find_spec
+
 import numpy as np
 import one_way_crossing
 import pytest
@@ -9,6 +13,19 @@ from harness.world.world import World
 
 WORLDS = 14
 EVERY = [*map(scenarios.get, scenarios.names()), one_way_crossing.SCENARIO]
+COMPILED = pytest.param(
+    0, id="compiled", marks=pytest.mark.skipif(not find_spec("numba"), reason="needs the fast extra")
+)
+
+
+@pytest.fixture(params=[pytest.param(10**9, id="numpy"), COMPILED])
+def form(request, monkeypatch):
+    """One of the two forms, which must have simulated all frames in the end."""
+    monkeypatch.setattr(lockstep, "COMPILED_AFTER", request.param)
+    monkeypatch.setattr(lockstep, "_frames", Counter())
+    yield
+    [used] = lockstep._frames
+    assert used is (lockstep.Fleet if request.param else lockstep.compiled_fleet())
 
 
 def everything(world):
@@ -32,7 +49,7 @@ def everything(world):
 
 
 @pytest.mark.parametrize("scenario", EVERY, ids=lambda s: s.name)
-def test_together_is_as_alone(scenario):
+def test_together_is_as_alone(scenario, form):
     """Whatever each decides, and whenever: none is in step with another, and they end one by one."""
     rng = np.random.default_rng(7)
     alone = [World.start(scenario, 2000 + n // 2) for n in range(WORLDS)]
@@ -54,7 +71,7 @@ def test_together_is_as_alone(scenario):
     assert all(world.frame <= p.time_limit_s * p.simulation_hz for world in together)
 
 
-def test_wrecks_stay_where_they_are_and_their_worlds_go_on():
+def test_wrecks_stay_where_they_are_and_their_worlds_go_on(form):
     """Two others that run into each other: everything that highway-env does with wrecks is done."""
     scenario = scenarios.get("occluded-intersection")
     seed = next(
@@ -83,3 +100,45 @@ def test_environments_are_simulated_by_highway_env():
     for world, frame in zip(alone, (5, 7, 60), strict=True):
         world.advance(frame)
     assert [world.state() for world in worlds] == [world.state() for world in alone]
+
+
+def simulated(frames):
+    """Simulate frames of some worlds; the names of the classes that did."""
+    lockstep._frames.clear()
+    worlds = [World.start(scenarios.get("occluded-intersection"), 2000 + n) for n in range(WORLDS)]
+    for frame in range(10, frames + 1, 10):
+        lockstep.advance(worlds, [frame] * WORLDS)
+    return {form.__name__: count for form, count in lockstep._frames.items()}
+
+
+@pytest.fixture
+def anew():
+    """Nothing is known of numba, before and after."""
+    lockstep.compiled_fleet.cache_clear()
+    yield
+    lockstep.compiled_fleet.cache_clear()
+
+
+def test_numba_is_loaded_after_some_frames(monkeypatch, anew):
+    pytest.importorskip("numba", reason="needs the fast extra")
+    monkeypatch.setattr(lockstep, "COMPILED_AFTER", 20)
+    assert simulated(50) == {"Fleet": 20, "CompiledFleet": 30}
+
+
+def test_without_numba_frames_are_numpys_and_nothing_is_said(monkeypatch, anew, capsys):
+    monkeypatch.setattr(lockstep, "COMPILED_AFTER", 0)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    assert simulated(20) == {"Fleet": 20}
+    assert capsys.readouterr().err == ""
+
+
+def test_a_numba_that_does_not_work_is_named_once(monkeypatch, anew, capsys, tmp_path):
+    (tmp_path / "numba.py").write_text("raise ImportError('Numba needs NumPy 2.2 or less. Got NumPy 9.9.')")
+    monkeypatch.setattr(lockstep, "COMPILED_AFTER", 0)
+    monkeypatch.delitem(sys.modules, "numba", raising=False)
+    monkeypatch.delitem(sys.modules, "harness.world.compiled", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert simulated(30) == {"Fleet": 30}
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith("harness: ")
+    assert "Got NumPy 9.9." in line

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.coordination.trigger import entropy_nats
 from harness.core.arrays import Bools, Floats
+from harness.studies.axes import Setting
 from harness.studies.calibrated import (
     ACTIONS,
     CUT,
@@ -29,7 +30,8 @@ SURE = OperatingPoint("6g", "6g", loss=0.0)  # nothing is lost
 
 
 def walked(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0) -> Walked:
-    return next(source.walked(point, vehicles, [seed]))
+    [[made]] = source.walked([Setting("", point, vehicles)], [seed])
+    return made
 
 
 def success(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0) -> Bools:

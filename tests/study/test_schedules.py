@@ -25,6 +25,7 @@ from harness.evaluate import asking
 from harness.evaluate.outlook import outlook
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, of_decisions
+from harness.studies import axes
 from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.learning import fit, layouts
 from harness.studies.schedules import Compared, Play, Setting, _area, compare
@@ -55,7 +56,7 @@ def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: Stored, text:
     point = named_point(text)
     every = made(stored, text)
     success, costs = every.played(every.scheduled(point))
-    [walked] = stored.walked(point, stored.vehicles, stored.seeds)
+    [[walked]] = stored.walked([axes.Setting(text, point, stored.vehicles)], stored.seeds)
     assert np.array_equal(success, walked.ends["success_rate"])
     for cost, metric in (("messages", "messages_per_episode"), ("airtime_ms", "airtime_ms")):
         values = of_decisions(METRICS[metric], walked.columns, walked.places, success.size)
@@ -70,7 +71,7 @@ def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: Stored, text:
 
 def test_of_nobody_to_ask_the_oracle_is_the_ego_alone(stored: Stored):
     every = made(stored, "6g:max_helpers=0")
-    [alone] = stored.walked(POINTS["single-local"], stored.vehicles, stored.seeds)
+    [[alone]] = stored.walked([axes.Setting("", POINTS["single-local"], stored.vehicles)], stored.seeds)
     success, costs = every.oracle()
     assert np.array_equal(success, alone.ends["success_rate"])
     assert not costs[..., 0].any()

@@ -1,17 +1,21 @@
 """A run's stored answers at other operating points."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 from evaluating import figure, run, spec_of
 
+from harness.coordination.operating_point import POINTS, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import Evaluated
-from harness.studies.axes import AXES, grid
+from harness.studies import stored
+from harness.studies.axes import AXES, Setting, grid
 from harness.studies.stored import Stored
 from harness.studies.sweep import run_sweep, settings
 
@@ -62,6 +66,44 @@ def test_every_axis_gives_its_panels(source: Stored, tmp_path: Path) -> None:
     names |= {"index.html", *(f"sweep.{kind}" for kind in ("json", "svg", "pdf", "png"))}
     assert {p.name for p in tmp_path.iterdir()} == names
     assert json.loads((tmp_path / "sweep.json").read_text())["panels"]["consensus"][0]["value"] == "linear"
+
+
+TOGETHER = (
+    "6g", "6g:tau_nats=0.3", "6g:loss=0.4", "6g:loss=0.4", "v2x", "6g:on_demand=true,helper_rounds=true",
+    "mode2", "its-g5:edge=fusion", "6g:messages=shuffled", "6g:messages=blind", "6g:consensus=trust",
+    "6g:attack=liar+spoof:share=1/3", "6g:attack=replay", "mode4:schedule=deadline",
+    "6g:schedule=coverage", "single-local",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("asks", [True, False])
+def test_points_that_are_walked_together_are_each_as_alone(
+    small: Dataset, asks: bool, tmp_path: Path
+) -> None:
+    """The run came to few decision points: at others its model is asked, or walks are left out."""
+    few = run(spec_of(small, points=(POINTS["single-local"],)), tmp_path / "few").out
+    names = [name for name in TOGETHER if asks or "blind" not in name]
+    points = [Setting(name, named_point(name), vehicles) for vehicles in (4, 2) for name in names]
+    source = Stored(few, asks=asks)
+    together = list(source.walked(points, (0, 1, 5)))
+    assert bool(source.left_out) != asks
+    for setting, [walked] in zip(points, together, strict=True):
+        alone = Stored(Path(shutil.copytree(few, tmp_path / "copy", dirs_exist_ok=True)), asks=asks)
+        [[expected]] = alone.walked([setting], (0, 1, 5))
+        assert alone.left_out <= source.left_out
+        for name, values in expected.ends.items():
+            assert np.array_equal(walked.ends[name], values, equal_nan=True), (setting, name)
+        for name, values in expected.columns.items():
+            assert np.array_equal(walked.columns[name], values, equal_nan=True), (setting, name)
+        assert np.array_equal(walked.places, expected.places)
+
+
+def test_many_points_are_walked_in_parts(
+    source: Stored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = swept(source, tmp_path / "whole", "tau")
+    monkeypatch.setattr(stored, "WALKS", 5 * 8)  # of four episodes with two seeds
+    assert swept(source, tmp_path / "parts", "tau").equals(whole)
 
 
 def test_runs_are_paired(source: Stored, small: Dataset, tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ Importing this imports torch.
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -56,6 +56,13 @@ class Eyes:
         for key in _pictures(prompt):
             self._encoded.pop(key, None)
 
+    def encode(self, tokens: Iterable[int]) -> None:
+        """Encode the pictures among some tokens together, unless they are too many to be kept."""
+        keys = list(dict.fromkeys(_pictures(tokens)))
+        if 0 < len(keys) <= KEPT:
+            with torch.inference_mode():
+                self._encodings(keys)
+
     def inputs(self, ids: torch.Tensor) -> dict[str, Any]:
         """Return the model's inputs for tokens (n, width): their ids, and their pictures in order."""
         keys = _pictures(ids.flatten().tolist())
@@ -101,7 +108,7 @@ class Eyes:
         return encodings
 
 
-def _pictures(tokens: Sequence[int]) -> list[int]:
+def _pictures(tokens: Iterable[int]) -> list[int]:
     """Return the pictures whose first token is among these, in order."""
     pictures = (picture_of(token) for token in tokens if token < 0)
     return [key for key, place in pictures if place == 0]

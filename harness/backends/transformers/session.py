@@ -5,6 +5,9 @@ A mask hides the pads and positions skip them, so full attention gives the same 
 Other kinds of layer do not (a sliding window counts pads, a recurrent state reads them): a model that has one
 reads each sequence on its own.
 
+Prompts are read in groups that begin alike, and are joined when they advance: a batch of an ego's and its
+helpers' prompts reads neither system text again, and a short prompt is not padded to the longest of all.
+
 Importing this imports torch.
 """
 
@@ -14,12 +17,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from transformers.cache_utils import DynamicCache, DynamicLayer
+from torch.nn.functional import pad
+from transformers.cache_utils import Cache, DynamicCache, DynamicLayer
 
 from harness.backends.engine import Session, check_logits
 from harness.backends.transformers.eyes import Eyes
-from harness.backends.transformers.prefixes import LEAST_TOKENS, NOTHING, Prefix, Prefixes, common
+from harness.backends.transformers.memory import PagedLayer, joined
+from harness.backends.transformers.prefixes import LEAST_TOKENS, NOTHING, Prefix, Prefixes, alike, common
 from harness.core.arrays import Floats
+
+CPU_TOKENS = 1024  # most tokens that a CPU reads together: what more of them need does not stay in its cache
 
 
 class Reader:
@@ -34,7 +41,8 @@ class Reader:
         self._prefixes = Prefixes()
         self._failed = False
         self._positions = "position_ids" in signature(model.forward).parameters
-        layers = self.cache().layers
+        layers = DynamicCache(config=model.config).layers
+        self._layers = len(layers)
         self.together = self._positions and all(type(layer) is DynamicLayer for layer in layers)
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
@@ -44,29 +52,66 @@ class Reader:
             if self._model.device.type == "cuda":
                 torch.cuda.empty_cache()
         self._failed = True  # until reading has succeeded
-        session = self._read(prompts)
+        session = self._read([list(prompt) for prompt in prompts])
         self._failed = False
         return session
 
-    def _read(self, prompts: Sequence[Sequence[int]]) -> Session:
+    def _read(self, prompts: list[list[int]]) -> Session:
         if not self.together:
-            return Apart([Rows(self, NOTHING, [prompt]) for prompt in prompts])
+            return Apart([Rows.read(self, NOTHING, [p], self.positions([p])) for p in prompts])
         # Each prompt's last token is always read, for the distribution after it.
-        shared = common([list(prompt[:-1]) for prompt in prompts])
+        beginnings = [prompt[:-1] for prompt in prompts]
+        if len(prompts) == 1:
+            return self._read_alone(prompts[0], beginnings[0])
+        positions = self.positions(prompts)
+        if self._eyes:
+            self._eyes.encode(token for prompt in prompts for token in prompt)
+        parts = []
+        for group in alike(beginnings):
+            prefix = self._prefix([beginnings[place] for place in group])
+            for piece in self._pieces(group, [len(prompt) - len(prefix.ids) for prompt in prompts]):
+                at = positions and [positions[place] for place in piece]
+                parts.append((piece, Rows.read(self, prefix, [prompts[place] for place in piece], at)))
+        return Rows.joined(parts, positions)
+
+    def _read_alone(self, prompt: list[int], beginning: list[int]) -> Session:
         # A prompt that is repeated alone is read again, or its time would not be an answer's time.
-        if self._eyes and len(prompts) == 1 and self._prefixes.holds(list(prompts[0])):
-            self._eyes.forget(prompts[0])
-        prefix = self._prefixes.longest(shared, but=prompts[0] if len(prompts) == 1 else ())
-        if len(prompts) > 1 and len(shared) - len(prefix.ids) >= LEAST_TOKENS:
-            prefix = Prefix(shared, Rows(self, prefix, [shared]).layers())
-            self._prefixes.keep(prefix)
-        rows = Rows(self, prefix, prompts)
-        if len(prompts) == 1:  # its common beginning with the next prompt is not known yet
-            self._prefixes.keep(Prefix(list(prompts[0]), rows.layers()))
+        if self._eyes and self._prefixes.holds(prompt):
+            self._eyes.forget(prompt)
+            beginning = beginning[: next((i for i, token in enumerate(prompt) if token < 0), len(prompt))]
+        prefix = self._prefixes.longest(beginning, but=prompt)
+        rows = Rows.read(self, prefix, [prompt], self.positions([prompt]))
+        self._prefixes.keep(Prefix(prompt, rows.layers()))  # what the next prompt shares is not known yet
         return rows
 
-    def cache(self) -> DynamicCache:
+    def _prefix(self, beginnings: list[list[int]]) -> Prefix:
+        """Return what some prompts begin with, read if it was not kept."""
+        shared = common(beginnings)
+        prefix = self._prefixes.longest(shared)
+        if len(beginnings) > 1 and len(shared) - len(prefix.ids) >= LEAST_TOKENS:
+            prefix = Prefix(shared, Rows.read(self, prefix, [shared], self.positions([shared])).layers())
+            self._prefixes.keep(prefix)
+        return prefix
+
+    def _pieces(self, group: Sequence[int], lengths: Sequence[int]) -> list[list[int]]:
+        """Split a group's places into those that are read together, the longest first.
+
+        Args:
+            group: places of prompts.
+            lengths: number of tokens to read of each prompt.
+        """
+        most = CPU_TOKENS if self._model.device.type == "cpu" else sum(lengths)
+        pieces: list[list[int]] = []
+        for place in sorted(group, key=lengths.__getitem__, reverse=True):
+            if not pieces or (len(pieces[-1]) + 1) * lengths[pieces[-1][0]] > most:
+                pieces.append([])
+            pieces[-1].append(place)
+        return [sorted(piece) for piece in pieces]
+
+    def cache(self) -> Cache:
         """Return an empty cache of the model's layers."""
+        if self.together:
+            return Cache(layers=[PagedLayer() for _ in range(self._layers)])
         return DynamicCache(config=self._model.config)
 
     def positions(self, prompts: Sequence[Sequence[int]]) -> list[Any] | None:
@@ -76,7 +121,7 @@ class Reader:
         places = [self._eyes.positions(prompt) for prompt in prompts]
         return None if places[0] is None else places
 
-    def forward(self, cache: DynamicCache, ids: Any, mask: Any, places: Any = None) -> Any:
+    def forward(self, cache: Cache, ids: Any, mask: Any, places: Any = None) -> Any:
         """Read tokens and return the logits after the last column, (n, vocabulary).
 
         Args:
@@ -103,17 +148,49 @@ class Reader:
 class Rows:
     """A `Session` of sequences in one batch."""
 
-    def __init__(self, reader: Reader, prefix: Prefix, prompts: Sequence[Sequence[int]]) -> None:
+    def __init__(
+        self, reader: Reader, parts: list[tuple[Sequence[int], Cache]], mask: Any, logits: Any, places: Any
+    ) -> None:
+        """Hold sequences that were read.
+
+        Args:
+            reader: what reads.
+            parts: caches, each with the places of its sequences.
+            mask: 1 for a token and 0 for a pad, (n, columns), on the CPU.
+            logits: after each sequence, (n, vocabulary); None if nothing was read.
+            places: positions of each prompt's tokens; None if they are consecutive.
+        """
+        self._reader, self._parts, self._mask, self._logits = reader, parts, mask, logits
+        self._places = places
+
+    @classmethod
+    def read(cls, reader: Reader, prefix: Prefix, prompts: Sequence[Sequence[int]], places: Any) -> "Rows":
         """Read prompts that all begin with `prefix` and are longer."""
-        n, known = len(prompts), len(prefix.ids)
-        self._reader = reader
-        self._cache = reader.cache()
+        n, known, cache = len(prompts), len(prefix.ids), reader.cache()
         for i, (keys, values) in enumerate(prefix.layers):
-            self._cache.update(keys.expand(n, -1, -1, -1), values.expand(n, -1, -1, -1), i)
-        self._mask = torch.ones(n, known, dtype=torch.long)
-        self._logits: Any = None
-        self._places = reader.positions(prompts)
-        self.advance([prompt[known:] for prompt in prompts])
+            cache.update(keys.expand(n, -1, -1, -1), values.expand(n, -1, -1, -1), i)
+        rows = cls(reader, [(range(n), cache)], torch.ones(n, known, dtype=torch.long), None, places)
+        rows.advance([prompt[known:] for prompt in prompts])
+        return rows
+
+    @classmethod
+    def joined(cls, parts: Sequence[tuple[Sequence[int], "Rows"]], positions: Any) -> "Rows":
+        """Return the sequences of several sessions as one, each at its place."""
+        if len(parts) == 1:
+            return parts[0][1]
+        order = torch.tensor([place for piece, _ in parts for place in piece]).argsort()
+        columns = max(rows._mask.shape[1] for _, rows in parts)
+        mask = torch.cat([pad(rows._mask, (0, columns - rows._mask.shape[1])) for _, rows in parts])
+        logits = torch.cat([rows._logits for _, rows in parts])
+        caches = [(piece, rows._cache) for piece, rows in parts]
+        return cls(parts[0][1]._reader, caches, mask[order], logits[order.to(logits.device)], positions)
+
+    @property
+    def _cache(self) -> Cache:
+        """The cache of all sequences: of several parts one is made here, so never for a read-out."""
+        if len(self._parts) > 1:
+            self._parts = [(range(len(self._mask)), joined(self._parts))]
+        return self._parts[0][1]
 
     def layers(self) -> list[tuple[Any, Any]]:
         """Return each layer's keys and values, (n, heads, tokens, dim); advancing never alters them."""
@@ -121,14 +198,11 @@ class Rows:
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
         check_logits(self._logits.amax(-1).tolist())
-        best = []
-        for row, tokens in zip(self._logits, among, strict=True):
-            if tokens is None:
-                best.append(row.argmax())
-            else:
-                ids = torch.tensor(sorted(tokens), device=row.device)
-                best.append(ids[row[ids].argmax()])
-        chosen: list[int] = torch.stack(best).tolist()
+        chosen: list[int] = self._logits.argmax(-1).tolist()
+        for row, tokens in enumerate(among):
+            if tokens is not None:
+                ids = sorted(tokens)
+                chosen[row] = ids[int(self._logits[row, ids].argmax())]
         return chosen
 
     def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
@@ -142,12 +216,8 @@ class Rows:
         width = max(map(len, chunks))
         if width == 0:
             return
-        ids = torch.zeros(len(chunks), width, dtype=torch.long)  # pads stay 0 and are masked
-        new = torch.zeros_like(ids)
-        for row, chunk in enumerate(chunks):
-            if chunk:
-                ids[row, width - len(chunk) :] = torch.tensor(chunk)
-                new[row, width - len(chunk) :] = 1
+        ids = torch.tensor([[0] * (width - len(chunk)) + list(chunk) for chunk in chunks])
+        new = torch.tensor([[0] * (width - len(chunk)) + [1] * len(chunk) for chunk in chunks])
         self._mask = torch.cat([self._mask, new], dim=1)
         logits = self._reader.forward(self._cache, ids, self._mask, self._positions(chunks, width))
         advanced = new[:, -1:].bool().to(logits.device)
@@ -178,7 +248,7 @@ class Rows:
         self._cache.batch_select_indices(rows.to(self._logits.device))
 
     def close(self) -> None:
-        self._cache = self._logits = None
+        self._parts, self._logits = [], None
 
 
 class Apart:

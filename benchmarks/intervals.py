@@ -6,7 +6,7 @@ is how alike the seeds, or the answers, of one episode are: their intraclass cor
 changes anything. `<` marks less than 94 %, `>` more than 96 %; with 2 000 runs a cell of exactly 95 % is
 measured within 1 point of it.
 
-    python benchmarks/coverage.py [--runs 2000] [--seed 0]
+    python benchmarks/intervals.py [--runs 2000] [--seed 0]
 """
 
 import argparse

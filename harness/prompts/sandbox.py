@@ -1,0 +1,174 @@
+"""The environment in which prompt templates are compiled: Jinja's sandbox, narrower, with shorter code."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from jinja2 import nodes
+from jinja2.compiler import CodeGenerator, Frame, optimizeconst
+from jinja2.exceptions import SecurityError
+from jinja2.runtime import Context, LoopContext
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+WIDE = re.compile(r"\d{3}|\*")  # in a format: a width of 100 characters or more, or one given as an argument
+PADDING = frozenset({"center", "ljust", "rjust", "zfill", "expandtabs", "format", "format_map", "translate"})
+SHORT = 32  # most items of a loop whose places are made beforehand
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """What a loop says of itself at one item, where a template asks for these alone."""
+
+    index: int
+    index0: int
+    first: bool
+    last: bool
+
+
+LOOP = frozenset(Place.__dataclass_fields__)
+
+
+class Code(CodeGenerator):
+    """Jinja's compiler with shorter code for what prompts do most; every template renders the same text.
+
+    `_at` is a variable of the code, which no template can name.
+    """
+
+    @optimizeconst
+    def visit_Getattr(self, node: nodes.Getattr, frame: Frame) -> None:
+        # The first cases of `Sandbox.getattr`, without the call.
+        of_loop = _is_loop(node.node) and node.attr in LOOP
+        self.write(f"(_at.{node.attr}" if of_loop else f"(_at[{node.attr!r}]")
+        self.write(" if type(_at := ")
+        self.visit(node.node, frame)
+        self.write(") is Place" if of_loop else f") is dict and {node.attr!r} in _at")
+        self.write(f" else environment.getattr(_at, {node.attr!r}))")
+
+    @optimizeconst
+    def visit_Filter(self, node: nodes.Filter, frame: Frame) -> None:
+        rounded = node.node
+        if not (_bare(node, "int") and isinstance(rounded, nodes.Filter) and _bare(rounded, "round")):
+            super().visit_Filter(node, frame)
+            return
+        assert rounded.node is not None
+        self.write("(round(_at) if type(_at := ")
+        self.visit(rounded.node, frame)
+        self.write(") is float and -1e15 < _at < 1e15 else environment.whole(_at))")
+
+    @optimizeconst
+    def visit_Mul(self, node: nodes.BinExpr, frame: Frame) -> None:
+        if not (isinstance(node.right, nodes.Const) and type(node.right.value) in (int, float)):
+            super().visit_Mul(node, frame)
+            return
+        self.write("(_at * ")
+        self.visit(node.right, frame)
+        self.write(" if type(_at := ")
+        self.visit(node.left, frame)
+        self.write(") is float else environment.call_binop(context, '*', _at, ")
+        self.visit(node.right, frame)
+        self.write("))")
+
+    @optimizeconst
+    def visit_Test(self, node: nodes.Test, frame: Frame) -> None:
+        if node.name != "none":
+            super().visit_Test(node, frame)
+            return
+        self.write("(")
+        self.visit(node.node, frame)
+        self.write(" is None)")
+
+    def visit_Output(self, node: nodes.Output, frame: Frame) -> None:
+        escapes = frame.eval_ctx.volatile or frame.eval_ctx.autoescape
+        if frame.buffer is not None or frame.require_output_check or escapes:
+            super().visit_Output(node, frame)
+            return
+        # One text in place of one for each part. Python compiles a `%` of a constant as it does an f-string.
+        data = [part.data if isinstance(part, nodes.TemplateData) else None for part in node.nodes]
+        text = "".join("%s" if part is None else part.replace("%", "%%") for part in data)
+        self.writeline(f"yield {text!r} % (", node)
+        for part in node.nodes:
+            if not isinstance(part, nodes.TemplateData):
+                self.visit(part, frame)
+                self.write(", ")
+        self.write(")")
+
+
+def _is_loop(node: nodes.Node) -> bool:
+    return isinstance(node, nodes.Name) and node.name == "loop"
+
+
+def _bare(node: nodes.Filter, name: str) -> bool:
+    """Whether a filter is the one of this name, without arguments, and applied to an expression."""
+    given = node.args or node.kwargs or node.dyn_args or node.dyn_kwargs
+    return node.name == name and not given and node.node is not None
+
+
+@lru_cache(maxsize=SHORT + 1)
+def _places(n: int) -> tuple[Place, ...]:
+    return tuple(Place(i + 1, i, i == 0, i == n - 1) for i in range(n))
+
+
+def placed(items: Any, undefined: Any) -> Iterable[tuple[Any, Any]]:
+    """Return items with their places, as `LoopContext` does for loops that are asked for no more."""
+    if type(items) in (list, tuple) and len(items) <= SHORT:
+        return zip(items, _places(len(items)), strict=True)
+    return LoopContext(items, undefined)
+
+
+class Sandbox(ImmutableSandboxedEnvironment):
+    """Jinja environment for untrusted templates: nothing in it can build a text or number that fills memory.
+
+    `graph.ego` always means the member of that name; no method of a mapping hides it.
+    """
+
+    intercepted_binops = frozenset({"*", "**", "%"})
+    code_generator_class = Code
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        for name in ("center", "indent"):
+            del self.filters[name]
+        self.filters["format"] = _formatted
+
+    def _generate(
+        self, source: nodes.Template, name: str | None, filename: str | None, defer_init: bool = False
+    ) -> str:
+        code = super()._generate(source, name, filename, defer_init)
+        read = [node for node in source.find_all(nodes.Getattr) if _is_loop(node.node) and node.attr in LOOP]
+        loops = [node for node in source.find_all(nodes.Name) if node.name == "loop"]
+        recursive = any(node.recursive for node in source.find_all(nodes.For))
+        loop = "LoopContext" if recursive or len(loops) > len(read) else "placed as LoopContext"
+        return f"{code}\nfrom {__name__} import Place, {loop}\n"  # at the end, so lines keep their numbers
+
+    def whole(self, value: Any) -> Any:
+        """Return what `value | round | int` is."""
+        return self.filters["int"](self.filters["round"](value))
+
+    def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:
+        """Allow the intercepted operators on numbers only, and only small powers."""
+        numbers = all(isinstance(side, int | float) for side in (left, right))
+        if not numbers or (operator == "**" and not (abs(left) < 1e6 and abs(right) < 64)):
+            raise SecurityError(f"{operator} is not allowed on such values")
+        return super().call_binop(context, operator, left, right)
+
+    def is_safe_attribute(self, obj: Any, attr: str, value: Any) -> bool:
+        """Refuse the methods of strings that pad."""
+        return not (isinstance(obj, str) and attr in PADDING) and super().is_safe_attribute(obj, attr, value)
+
+    def getattr(self, obj: Any, attribute: str) -> Any:
+        """Return a member of a mapping, or whatever else the sandbox allows."""
+        # Nearly all that a template reads is plain data, which needs no check of the sandbox.
+        if type(obj) is dict and attribute in obj:
+            return obj[attribute]
+        if isinstance(obj, str) and attribute in PADDING:
+            return self.unsafe_undefined(obj, attribute)
+        return super().getattr(obj, attribute)
+
+
+def _formatted(text: str, *values: Any) -> str:
+    """Apply Jinja's `format` filter, for narrow fields only."""
+    if WIDE.search(text):
+        raise SecurityError(f"a format as wide as {text!r} is not allowed")
+    return text % values
