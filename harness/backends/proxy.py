@@ -14,7 +14,7 @@ from harness.backends.cards import Card
 from harness.backends.failures import Failures, drawn, spoilt
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded
-from harness.world.planner import plan
+from harness.world.planner import plan, plans
 from harness.world.scenario import Scenario
 
 VERSION = "proxy/1"
@@ -39,10 +39,9 @@ class Proxy:
         self._failures = failures
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        return [self._completion(request) for request in requests]
+        return [self._completion(*each) for each in zip(requests, answers(requests), strict=True)]
 
-    def _completion(self, request: Request) -> Completion:
-        text = answer(request)
+    def _completion(self, request: Request, text: str) -> Completion:
         finish_reason: FinishReason = "stop"
         slow_s = 0.0
         if self._failures:
@@ -63,9 +62,26 @@ class Proxy:
 
 def answer(request: Request) -> str:
     """Return the text of the answer to a request."""
-    if request.view is None or request.scenario is None:
-        raise ValueError(f"request {request.id} has no view of a scenario; the proxy reads nothing else")
-    intent = distribution(request.scenario, request.view)
+    [text] = answers([request])
+    return text
+
+
+def answers(requests: Sequence[Request]) -> list[str]:
+    """Return the texts of the answers to some requests."""
+    views: dict[int, tuple[Scenario, list[Mapping[str, Any]]]] = {}
+    for request in requests:  # those of a run are all of one scenario
+        if request.view is None or request.scenario is None:
+            raise ValueError(f"request {request.id} has no view of a scenario; the proxy reads nothing else")
+        views.setdefault(id(request.scenario), (request.scenario, []))[1].append(request.view)
+    planned = {key: iter(plans(*of)) for key, of in views.items()}
+    return [_told(request, next(planned[id(request.scenario)])) for request in requests]
+
+
+def _told(request: Request, planned: str) -> str:
+    """Return the text of the answer to a request, given the planner's action."""
+    assert request.view is not None
+    assert request.scenario is not None
+    intent = _hedged(request.scenario.actions, planned, request.view)
     if request.role == "ego":
         body: dict[str, Any] = {"action_distribution": intent}
     else:
@@ -77,7 +93,10 @@ def answer(request: Request) -> str:
 
 def distribution(scenario: Scenario, view: Mapping[str, Any]) -> dict[str, float]:
     """Return a viewer's intent: the planner's action on its graph, hedged by what it cannot see."""
-    actions, planned = scenario.actions, plan(scenario, view)
+    return _hedged(scenario.actions, plan(scenario, view), view)
+
+
+def _hedged(actions: Sequence[str], planned: str, view: Mapping[str, Any]) -> dict[str, float]:
     if planned == "SLOWER":
         braking = SURE_SLOWER
     else:

@@ -15,7 +15,7 @@ from harness.core.files import digest
 from harness.dataset.schema import Branching, Edge, End
 from harness.world import lockstep
 from harness.world.beacons import known
-from harness.world.drivers import DRIVERS, choose
+from harness.world.drivers import DRIVERS, choices
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import Graph, scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
@@ -95,11 +95,9 @@ def _drivers(
     scenario: Scenario, states: Sequence[WorldState], seen: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, str]]:
     """Return each reference driver's action at some decision points; `seen` has the ego's scene graphs."""
-    truths = truth_graphs(scenario, states)
-    return [
-        {driver: choose(scenario, driver, graph, truth) for driver in DRIVERS}
-        for graph, truth in zip(seen, truths, strict=True)
-    ]
+    known = list(zip(seen, truth_graphs(scenario, states), strict=True))
+    actions = iter(choices(scenario, [(driver, *graphs) for graphs in known for driver in DRIVERS]))
+    return [dict(zip(DRIVERS, actions, strict=False)) for _ in known]
 
 
 def scene_id(episode: int, state: WorldState) -> str:

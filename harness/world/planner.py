@@ -8,14 +8,14 @@ stands. The planner does not guess what it cannot see, so occlusion has a cost.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import Any
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.world.road import Path, Road
+from harness.world.road import Path, PathKey, Road
 from harness.world.scenario import Parameters, Scenario
 from harness.world.state import SIZES_M
 
@@ -36,76 +36,159 @@ Point = tuple[Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
-class Rollouts:
-    """Sequences of actions and the motion of the ego under each.
+class Sequences:
+    """Sequences of actions that the ego may take.
 
     Attributes:
-        actions: the sequences, (n,).
-        travelled_m: distance along the ego's way, (n, steps).
-        right_m: distance to the right of the way that the ego is on now, (n, steps); None if it stays.
+        first: first action of each, (n,).
+        levels: levels by which each decision changes the target speed, (n, decisions).
         ends: final way, counted to the right from the present one, (n,).
+        calm: place of each among all of them, the calmest first, (n,).
+        right_m: distance to the right of the way that the ego is on now, (n, steps); None if it stays.
+        shift: number of the motion to the side that each has, (n,).
     """
 
-    actions: Sequence[tuple[str, ...]]
+    first: Sequence[str]
+    levels: Ints
+    ends: Ints
+    calm: Ints
+    right_m: Floats | None
+    shift: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Rollouts:
+    """The motions of the ego under some sequences; sequences that move it alike share one.
+
+    Attributes:
+        travelled_m: distance along the ego's way, (motions, steps).
+        right_m: distance to the right of the way that the ego is on now, (motions, steps); None if it stays.
+        motion: number of each sequence's motion, (n,).
+    """
+
     travelled_m: Floats
     right_m: Floats | None
-    ends: Ints
+    motion: Ints
+
+    @cached_property
+    def speed_mps(self) -> Floats:
+        """Speed in each step, (motions, steps)."""
+        return np.asarray(np.diff(self.travelled_m, axis=1, prepend=self.travelled_m[:, :1]) / STEP_S)
+
+    @cached_property
+    def fastest_mps(self) -> float:
+        """Highest speed of any motion."""
+        return float(self.speed_mps.max())
+
+
+Start = tuple[float, float, int, tuple[int, int]]  # speed, its target, decisions left, ways on either side
 
 
 def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
     """Return the planner's meta-action for a scene graph."""
-    p, road, ego = scenario.parameters, scenario.road(), graph["ego"]
-    own = _way(road, ego)
-    at_m = road.zone_arc_m - ego["zone_m"]
-    beside = road.beside(own, at_m)
-    sides = int("left" in beside), int("right" in beside)
-    tried = _rollouts(
-        scenario.actions, ego["speed_mps"], ego["target_speed_mps"], p.decisions - graph["step"], sides, p
-    )
+    [action] = plans(scenario, [graph])
+    return action
+
+
+def plans(scenario: Scenario, graphs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the planner's meta-action for each scene graph."""
+    p, road = scenario.parameters, scenario.road()
+    places = [(_way(road, graph["ego"]), road.zone_arc_m - graph["ego"]["zone_m"]) for graph in graphs]
+    beside = [road.beside(own, at_m) for own, at_m in places]
+    starts: list[Start] = [
+        (
+            graph["ego"]["speed_mps"], graph["ego"]["target_speed_mps"], p.decisions - graph["step"],
+            (int("left" in ways), int("right" in ways)),
+        )
+        for graph, ways in zip(graphs, beside, strict=True)
+    ]  # fmt: skip
+    tried = _rollouts(scenario.actions, starts, p)
+    return [
+        _chosen(scenario, graph, at_m, ways["own"], _sequences(scenario.actions, *start[2:], p), tried[start])
+        for graph, (_, at_m), ways, start in zip(graphs, places, beside, starts, strict=True)
+    ]
+
+
+def _chosen(
+    scenario: Scenario, graph: Mapping[str, Any], at_m: float, own: PathKey, sequences: Sequences,
+    tried: Rollouts,
+) -> str:  # fmt: skip
+    """Return the first action of the best sequence, for an ego at an arc length of its own way."""
+    p, road = scenario.parameters, scenario.road()
     # The goal lies well behind the conflict points, so that a late burst of speed counts too.
-    to_go = ego["zone_m"] + 15.0 if road.goal_m is None else road.goal_m(p) - at_m
-    under_way = True if road.goal_m is None else tried.travelled_m < to_go
-    gap = np.full(len(tried.actions), np.inf)
+    to_go = graph["ego"]["zone_m"] + 15.0 if road.goal_m is None else road.goal_m(p) - at_m
+    short = tried.travelled_m < to_go
+    under_way = True if road.goal_m is None else short
+    gap = np.full(len(tried.travelled_m), np.inf)
     for motion in predicted(road, graph, tried.travelled_m.shape[1]):
         gap = np.minimum(gap, least_gap(tried, motion, under_way))
     gap = np.where(_too_fast(road.paths[own], at_m, tried, under_way), np.minimum(gap, 0.0), gap)
-    arrival = (tried.travelled_m < to_go).sum(axis=1) * STEP_S - 1e-3 * tried.travelled_m[:, -1]
+    arrival = (short.sum(axis=1) * STEP_S - 1e-3 * tried.travelled_m[:, -1])[tried.motion]
     if road.ways:
-        arrival += AWAY_S * (road.ways.index(beside["own"]) + tried.ends != road.ways.index(road.ego))
-    safe = gap > 0
-    score = np.where(safe, -arrival, -1e3 + np.minimum(gap, 0.0))
-    best: list[int] = np.flatnonzero(score >= score.max() - 1e-9).tolist()
-    return min((tried.actions[i] for i in best), key=lambda s: [CALM[a] for a in s])[0]
+        arrival += AWAY_S * (road.ways.index(own) + sequences.ends != road.ways.index(road.ego))
+    gap = gap[tried.motion]
+    score = np.where(gap > 0, -arrival, -1e3 + np.minimum(gap, 0.0))
+    best = np.flatnonzero(score >= score.max() - 1e-9)
+    return sequences.first[int(best[sequences.calm[best].argmin()])]
 
 
 def _too_fast(way: Path, at_m: float, tried: Rollouts, under_way: Bools | bool) -> Bools:
-    """Whether each sequence takes a bend faster than tyres hold, (n,)."""
-    speed_mps = np.diff(tried.travelled_m, axis=1, prepend=tried.travelled_m[:, :1]) / STEP_S
-    if speed_mps.max() ** 2 * way.bends.max() <= LATERAL_MPS2:  # most ways are straight; the look-up costs
-        return np.zeros(len(tried.actions), dtype=np.bool_)
+    """Whether each motion takes a bend faster than tyres hold, (motions,)."""
+    if tried.fastest_mps**2 * way.sharpest <= LATERAL_MPS2:  # most ways are straight; the look-up costs
+        return np.zeros(len(tried.travelled_m), dtype=np.bool_)
     places = np.searchsorted(way.arc_m, at_m + tried.travelled_m).clip(0, len(way.arc_m) - 1)
-    return np.asarray(((speed_mps**2 * way.bends[places] > LATERAL_MPS2) & under_way).any(axis=1))
+    return np.asarray(((tried.speed_mps**2 * way.bends[places] > LATERAL_MPS2) & under_way).any(axis=1))
 
 
-def _way(road: Road, ego: Mapping[str, Any]) -> tuple[str, str]:
+def _way(road: Road, ego: Mapping[str, Any]) -> PathKey:
     """Return the key of the ego's way."""
     return (road.ego[0], ego["route"]) if "route" in ego else road.ego
 
 
-# Cached, since every viewer of a scene knows the ego's speed, so they share one set of rollouts.
 @lru_cache(maxsize=64)
-def _rollouts(
-    actions: tuple[str, ...], speed_mps: float, target_mps: float, left: int, sides: tuple[int, int],
-    parameters: Parameters,
-) -> Rollouts:  # fmt: skip
-    """Play every sequence through. The result is shared and must not be written to."""
+def _sequences(
+    actions: tuple[str, ...], left: int, sides: tuple[int, int], parameters: Parameters
+) -> Sequences:
+    """Return every sequence that `left` decisions and the ways on either side allow; a shared value."""
     known = [a for a in actions if a in CALM and (a not in SIDE or sides[SIDE[a] > 0])]
     sequences = list(product(known, repeat=min(HORIZON, left)))
     ends = np.cumsum([[SIDE.get(a, 0) for a in s] for s in sequences], axis=1)
     stays = (ends.min(axis=1) >= -sides[0]) & (ends.max(axis=1) <= sides[1])
     sequences, ends = [s for s, fits in zip(sequences, stays, strict=True) if fits], ends[stays]
-    travelled = travelled_m(sequences, speed_mps, target_mps, left, parameters)
-    return Rollouts(sequences, travelled, _right_m(ends, parameters) if any(sides) else None, ends[:, -1])
+    order = sorted(range(len(sequences)), key=lambda n: [CALM[a] for a in sequences[n]])
+    return Sequences(
+        [s[0] for s in sequences], _levels(sequences), ends[:, -1], np.argsort(order),
+        _right_m(ends, parameters) if any(sides) else None,
+        np.unique(ends, axis=0, return_inverse=True)[1].reshape(-1),
+    )  # fmt: skip
+
+
+def _levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
+    return np.array([[SPEED.get(a, 0) for a in s] for s in sequences])
+
+
+def _rollouts(
+    actions: tuple[str, ...], starts: Sequence[Start], parameters: Parameters
+) -> dict[Start, Rollouts]:
+    """Play every sequence through from each start."""
+    alike: dict[tuple[int, tuple[int, int]], list[Start]] = {}
+    for start in dict.fromkeys(starts):
+        alike.setdefault(start[2:], []).append(start)
+    found = {}
+    for (left, sides), some in alike.items():
+        tried = _sequences(actions, left, sides, parameters)
+        speeds, targets = np.array([start[:2] for start in some]).T
+        for start, travelled in zip(
+            some, _distances(tried.levels, speeds, targets, left, parameters), strict=True
+        ):
+            _, place = np.unique(travelled[:, -1], return_inverse=True)
+            both = place * len(place) + tried.shift
+            _, first, motion = np.unique(both, return_index=True, return_inverse=True)
+            if not np.array_equal(travelled[first][motion], travelled):  # others come as far in the end
+                first = motion = np.arange(len(travelled))
+            right_m = None if tried.right_m is None else tried.right_m[first]
+            found[start] = Rollouts(travelled[first], right_m, motion)
+    return found
 
 
 def travelled_m(
@@ -116,27 +199,32 @@ def travelled_m(
     Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
     present speed, and IDLE keeps the target. `left` is the number of remaining decisions.
     """
-    levels = np.array(parameters.target_speeds_mps)
+    starts = np.array([speed_mps]), np.array([target_mps])
+    return np.asarray(_distances(_levels(sequences), *starts, left, parameters)[0])
+
+
+def _distances(
+    moves: Ints, speeds_mps: Floats, targets_mps: Floats, left: int, parameters: Parameters
+) -> Floats:
+    """Return `travelled_m` for speeds and targets (s,) and moves of the sequences (n, k), (s, n, steps)."""
+    levels, shape = np.array(parameters.target_speeds_mps), (len(speeds_mps), len(moves))
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
-    moves = np.array([[SPEED.get(a, 0) for a in s] for s in sequences])
-    speed, target = np.full(len(sequences), speed_mps), np.full(len(sequences), target_mps)
-    travelled = np.empty((len(sequences), steps))
-    gone = np.zeros(len(sequences))
+    speed, target = (np.broadcast_to(each[:, None], shape) for each in (speeds_mps, targets_mps))
+    travelled = np.empty((steps, *shape))
+    gone = np.zeros(shape)
     spacing = (levels[-1] - levels[0]) / (len(levels) - 1)
     for k in range(steps):
         n = k // every
         if k % every == 0 and n < left:
-            move = moves[:, n] if n < moves.shape[1] else np.ones(len(sequences), dtype=int)
+            move = moves[:, n] if n < moves.shape[1] else np.ones(len(moves), dtype=int)
             nearest = np.round((speed - levels[0]) / spacing).clip(0, len(levels) - 1).astype(int)
             level = np.clip(nearest + move, 0, len(levels) - 1)
             target = np.where(move == 0, target, levels[level])
-        change = np.clip(
-            (target - speed) / RESPONSE_S, -parameters.braking_mps2, parameters.acceleration_mps2
-        )
+        change = ((target - speed) / RESPONSE_S).clip(-parameters.braking_mps2, parameters.acceleration_mps2)
         gone = gone + speed * STEP_S
         speed = np.maximum(speed + change * STEP_S, 0.0)
-        travelled[:, k] = gone
-    return travelled
+        travelled[k] = gone
+    return np.ascontiguousarray(np.moveaxis(travelled, 0, -1))
 
 
 def _right_m(ends: Ints, parameters: Parameters) -> Floats:
@@ -212,28 +300,48 @@ def _travelled_m(other: Mapping[str, Any], time_s: Floats) -> Floats:
     return np.asarray(other["speed_mps"] * until_s - EMERGENCY_MPS2 / 2 * until_s**2)
 
 
-def least_gap(tried: Rollouts, motion: Motion, under_way: Bools | bool = True) -> Floats:
-    """Return the smallest gap (m) to another vehicle while the ego is under way, (n,); below 0 they meet."""
-    away, reach = cover(*motion.size_m)
-    (x, y), own_reach = _ego_discs(tried, motion.way, motion.begin_m)
-    squared = np.full(tried.travelled_m.shape, np.inf)
-    # A running minimum over pairs, since arrays of all pairs would not fit into the processor's cache.
-    for its_x, its_y in zip(*_discs(motion.path, motion.arc_m, away), strict=True):
-        np.minimum(squared, ((x - its_x) ** 2 + (y - its_y) ** 2).min(axis=0), out=squared)
-    return np.asarray(
-        np.sqrt(squared.min(axis=1, where=under_way, initial=np.inf)) - reach - own_reach - MARGIN_M
-    )
+def least_gap(
+    tried: Rollouts, motion: Motion, under_way: Bools | bool = True, within_m: float = 0.0
+) -> Floats:
+    """Return the smallest gap (m) to another vehicle while the ego is under way, (motions,).
+
+    Below 0 they meet. A gap wider than `within_m` may be infinite, since only moments are looked at in which
+    both are near.
+    """
+    (own, own_reach), (away, reach) = cover(*SIZES_M["car"]), cover(*motion.size_m)
+    (x, y), off_m = _middles(tried, motion.way, motion.begin_m)
+    its_x, its_y, _ = motion.path.places(motion.arc_m)
+    near_m = own.max() + away.max() + own_reach + reach + MARGIN_M + off_m + within_m
+    sequence, step = np.nonzero(((x - its_x) ** 2 + (y - its_y) ** 2 < near_m**2) & under_way)
+    squared = np.full(len(x), np.inf)
+    if len(step):
+        right_m = None if tried.right_m is None else tried.right_m[sequence, step]
+        x, y = _discs(motion.way, motion.begin_m + tried.travelled_m[sequence, step], own, right_m)
+        its_x, its_y = (part[:, None, step] for part in _discs(motion.path, motion.arc_m, away))
+        np.minimum.at(squared, sequence, ((x - its_x) ** 2 + (y - its_y) ** 2).min(axis=(0, 1)))
+    return np.asarray(np.sqrt(squared) - reach - own_reach - MARGIN_M)
 
 
 @lru_cache(maxsize=8)  # the ego meets others on few ways
-def _ego_discs(tried: Rollouts, way: Path, begin_m: float) -> tuple[Point, float]:
-    """Return the ego's discs along a way, (discs, n, steps), and their radius. Shared: do not write to it."""
-    own, reach = cover(*SIZES_M["car"])
-    return _discs(way, begin_m + tried.travelled_m, own, tried.right_m), reach
+def _middles(tried: Rollouts, way: Path, begin_m: float) -> tuple[Point, float]:
+    """Return about where the ego is along a way, (motions, steps), and how far off that may be, m.
+
+    Shared: do not write to it.
+    """
+    spacing_m, off_m = float(way.arc_m[1]), way.uneven_m
+    point = np.rint((begin_m + tried.travelled_m) / spacing_m).astype(int).clip(0, len(way.arc_m) - 1)
+    x, y = way.columns[0][point], way.columns[1][point]
+    if tried.right_m is None:
+        return (x, y), spacing_m + off_m
+    heading = way.headings_rad[point]
+    x, y = x - np.sin(heading) * tried.right_m, y + np.cos(heading) * tried.right_m
+    turned_rad = way.kink_rad * (1 + off_m / spacing_m)
+    return (x, y), spacing_m + off_m + turned_rad * float(np.abs(tried.right_m).max())
 
 
+@lru_cache(maxsize=64)
 def cover(length_m: float, width_m: float) -> tuple[Floats, float]:
-    """Return discs that cover a vehicle: their positions on its long axis, and their radius."""
+    """Return discs that cover a vehicle: their positions on its long axis, shared, and their radius."""
     count = max(3, round(length_m / width_m))
     places = (np.arange(count) - (count - 1) / 2) * length_m / count
     return places, float(np.hypot(length_m / count / 2, width_m / 2))

@@ -9,7 +9,7 @@ import numpy as np
 from harness.core.parallel import Workers, spread
 from harness.core.statistics import Estimate, rate_interval
 from harness.world import lockstep
-from harness.world.drivers import DRIVERS, PRIVILEGED, choose
+from harness.world.drivers import DRIVERS, PRIVILEGED, choices
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
@@ -28,11 +28,10 @@ def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[str]:
             states[driver].append(world.state())
     seen = iter(scene_graphs(scenario, [(state, state.ego.id) for state in states["local-view"]]))
     truths = iter(truth_graphs(scenario, states[PRIVILEGED]))
-    graphs = [
-        (next(seen) if driver == "local-view" else {}, next(truths) if driver == PRIVILEGED else None)
+    return choices(scenario, [
+        (driver, next(seen) if driver == "local-view" else {}, next(truths) if driver == PRIVILEGED else None)
         for driver in drivers
-    ]
-    return [choose(scenario, driver, *graph) for driver, graph in zip(drivers, graphs, strict=True)]
+    ])  # fmt: skip
 
 
 def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:

@@ -92,6 +92,21 @@ class Path:
         padded = np.pad(turned, reach, mode="edge")
         return np.asarray(np.abs(padded[2 * reach :] - padded[: -2 * reach]) / (2 * BEND_M))
 
+    @cached_property
+    def sharpest(self) -> float:
+        """Largest of `bends`, 1/m."""
+        return float(self.bends.max())
+
+    @cached_property
+    def uneven_m(self) -> float:
+        """Largest distance of a point from where it would be if all were as far apart as the first two."""
+        return float(np.abs(self.arc_m - self.arc_m[1] * np.arange(len(self.arc_m))).max())
+
+    @cached_property
+    def kink_rad(self) -> float:
+        """Largest change of the heading from one point to the next."""
+        return float(np.abs(np.diff(np.unwrap(self.headings_rad))).max())
+
     # Cached, since every viewer of a scene looks at the same vehicles, and branches of a scene share most.
     @lru_cache(maxsize=8192)  # noqa: B019 paths live as long as their road, which is never freed
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
@@ -335,7 +350,7 @@ class _Cells:
         """Do what `Road.project` says."""
         if not len(path):
             return np.empty(0), np.empty(0), np.empty(0)
-        (x, y), most = self.middles[:, path], self.reach.shape[1]
+        (x, y), most = self.middles.take(path, axis=1), self.reach.shape[1]
         away = np.sqrt((x - x_m[:, None]) ** 2 + (y - y_m[:, None]) ** 2)
         near = away - self.reach[path] <= (away.min(axis=1) + NEAR_M)[:, None]
         first, last = near.argmax(axis=1), most - 1 - near[:, ::-1].argmax(axis=1)

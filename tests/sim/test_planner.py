@@ -5,9 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from harness.world import scenarios
 from harness.world.drivers import DRIVERS, choose
-from harness.world.perception.graph import truth_graph
-from harness.world.planner import MARGIN_M, STEP_S, Rollouts, cover, least_gap, plan, predicted, travelled_m
+from harness.world.perception.graph import truth_graph, truth_graphs
+from harness.world.planner import (
+    MARGIN_M,
+    STEP_S,
+    Rollouts,
+    cover,
+    least_gap,
+    plan,
+    plans,
+    predicted,
+    travelled_m,
+)
 from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import SIZES_M, VehicleState, WorldState
 from harness.world.world import World
@@ -30,9 +41,9 @@ def from_left(x_m, speed_mps=10.0):
 
 def gap(travelled_m, scene):
     """The least gap of an ego that keeps its lane to the only other vehicle of a graph."""
-    tried = Rollouts([], travelled_m, None, np.zeros(len(travelled_m), dtype=int))
+    tried = Rollouts(travelled_m, None, np.arange(len(travelled_m)))
     (motion,) = predicted(SCENARIO.road(), scene, travelled_m.shape[1])
-    return least_gap(tried, motion)
+    return least_gap(tried, motion, within_m=100.0)
 
 
 def test_on_an_empty_road_it_keeps_going():
@@ -100,3 +111,35 @@ def test_only_the_full_view_driver_reads_the_truth():
     assert chosen == {"cruise": "IDLE", "brake": "SLOWER", "local-view": "IDLE", "full-view": "SLOWER"}
     with pytest.raises(ValueError, match="reads the truth"):
         choose(SCENARIO, "full-view", hidden, None)
+
+
+@pytest.mark.parametrize("name", scenarios.names())
+def test_many_graphs_are_planned_together_as_each_alone(name):
+    scenario = scenarios.get(name)
+    states = []
+    for seed in range(4):
+        world = World.start(scenario, seed)
+        for step in range(4):
+            states.append(world.state())
+            world.act(scenario.actions[(seed + step) % len(scenario.actions)])
+    graphs = truth_graphs(scenario, states)
+    assert plans(scenario, graphs) == [plan(scenario, graph) for graph in graphs]
+
+
+@pytest.mark.parametrize("name", scenarios.names())
+def test_gaps_are_those_of_all_moments_wherever_the_ego_would_touch_somebody(name):
+    """Moments in which two are far apart are left out; what is left decides each gap that is not wide."""
+    scenario, rng = scenarios.get(name), np.random.default_rng(0)
+    road, touched = scenario.road(), 0
+    for seed in range(12):
+        world = World.start(scenario, seed)
+        world.advance(50)
+        graph = truth_graph(scenario, world.state())
+        speeds = rng.uniform(0.0, 14.0, (8, 1))
+        travelled = speeds * STEP_S * np.arange(1, 91)
+        tried = Rollouts(travelled, None, np.arange(8))
+        for motion in predicted(road, graph, 90):
+            near, all_moments = (least_gap(tried, motion, within_m=within_m) for within_m in (0.0, 1e4))
+            assert np.array_equal(np.minimum(near, 0.0), np.minimum(all_moments, 0.0))
+            touched += int((near < 0).sum())
+    assert touched

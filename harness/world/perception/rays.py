@@ -175,7 +175,7 @@ def _swept(around: Surfaces, of: Bools) -> tuple[Floats, Ints]:
         told = cast[target]
         surface, ray, target = surface[told], ray[told], target[told]
     walls = _walls(around.origins_m[around.viewer], around.corners_m)
-    t, _ = _met(walls[:, :, surface], *_all_round()[1][:, ray])
+    t, _ = _met(walls.take(surface, axis=2), *_all_round()[1].take(ray, axis=1))
     return _first(surface, target, t.min(axis=0), len(around.ids) * RAYS)
 
 
