@@ -129,6 +129,36 @@ def test_log_probabilities_are_of_the_whole_vocabulary(model: Any) -> None:
         assert whole.dtype == np.float64
 
 
+@given(st.data())
+def test_of_a_guess_stays_what_the_model_would_have_written(model: Any, data: st.DataObject) -> None:
+    """Sequences go forward by right, wrong and empty guesses, and end where one forward of each does."""
+    sequences = data.draw(st.lists(st.lists(tokens, min_size=1, max_size=9), min_size=1, max_size=4))
+    reader = Reader(model)
+    with closing(reader.begin(sequences)) as session:
+        for _ in range(data.draw(st.integers(1, 3))):
+            chunks = [[data.draw(tokens)] for _ in sequences]
+            sequences = [[*ids, *chunk] for ids, chunk in zip(sequences, chunks, strict=True)]
+            guesses, right = [], []
+            for ids in sequences:
+                guess: list[int] = []
+                for _ in range(data.draw(st.integers(0, 3))):
+                    guess.append(int(naive(model, [[*ids, *guess]]).argmax()))
+                right.append(len(guess))
+                if data.draw(st.booleans()):  # a token that is not the likeliest, and more after it
+                    wrong = int(naive(model, [[*ids, *guess]]).argmin())
+                    guess += [wrong, *data.draw(st.lists(tokens, max_size=2))]
+                guesses.append(guess)
+            counts = session.follow(chunks, guesses)
+            assert counts == (right if reader.together else [0] * len(guesses))
+            sequences = [
+                [*ids, *guess[:count]] for ids, guess, count in zip(sequences, guesses, counts, strict=True)
+            ]
+            if len(sequences) > 1 and data.draw(st.booleans()):
+                session.keep(range(1, len(sequences)))
+                sequences = sequences[1:]
+            np.testing.assert_allclose(session.log_probs(EVERY), naive(model, sequences), atol=1e-4)
+
+
 def test_only_full_attention_is_padded() -> None:
     """A window that counts tokens would count the pads: such a model reads its prompts one by one."""
     for make, together in ((full_attention, True), (sliding_window, False)):
