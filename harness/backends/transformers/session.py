@@ -20,10 +20,11 @@ import torch
 from torch.nn.functional import pad
 from transformers.cache_utils import Cache, DynamicCache, DynamicLayer
 
+from harness.backends.beginnings import alike
 from harness.backends.engine import Session, check_logits
 from harness.backends.transformers.eyes import Eyes
 from harness.backends.transformers.memory import PagedLayer, joined
-from harness.backends.transformers.prefixes import LEAST_TOKENS, NOTHING, Prefix, Prefixes, alike, common
+from harness.backends.transformers.prefixes import LEAST_TOKENS, NOTHING, Prefix, Prefixes, common
 from harness.core.arrays import Floats
 
 CPU_TOKENS = 1024  # most tokens that a CPU reads together: what more of them need does not stay in its cache
