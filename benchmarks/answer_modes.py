@@ -117,8 +117,6 @@ def measure(card: cards.Card, given: argparse.Namespace) -> tuple[dict[str, floa
         for name, each in work.items():
             found[name].append(len(texts) / seconds_of(each))
     flops_per_s = product_rate(engine.model)
-    shown = f"readout, batch {given.batch_size}"
-    print(f"{shown}: {', '.join(f'{part} {share:.0%}' for part, share in shares(work[shown]).items())}")
     limits = {mode: limit(backend, asked[mode], flops_per_s) for mode in MODES}
     return {name: median(rates) for name, rates in found.items()}, limits
 
@@ -141,18 +139,6 @@ def product_rate(model: Any) -> float:
     fastest_s = min(seconds_of(work) for _ in range(5))
     operations: int = 2 * rows.numel() * config.intermediate_size * times
     return operations / fastest_s
-
-
-def shares(work: Callable[[], Any]) -> dict[str, float]:
-    """Shares of CPU time in matrix products and in attention, by torch's profiler."""
-    from torch.profiler import ProfilerActivity, profile
-
-    with profile(activities=[ProfilerActivity.CPU]) as profiled:
-        seconds = seconds_of(work)
-    spent = {event.key: event.self_cpu_time_total / 1e6 for event in profiled.key_averages()}
-    products = sum(s for name, s in spent.items() if name in {"aten::mm", "aten::addmm", "aten::bmm"})
-    attention = sum(s for name, s in spent.items() if "scaled_dot_product" in name)
-    return {"products": products / seconds, "attention": attention / seconds}
 
 
 def limit(backend: Any, asked: Sequence[Request], flops_per_s: float) -> tuple[float, float, float]:
