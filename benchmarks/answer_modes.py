@@ -74,7 +74,8 @@ def main() -> None:
     plainly, peer = rates["a: generate, batch 1"], rates.get(PEER, float("nan"))
     for name, rate in rates.items():
         print(f"{name:<40}{rate:9.2f} decisions/s{rate / plainly:7.1f} of (a){rate / peer:7.1f} of (b)")
-    for mode, limit in limits.items():
+    for mode, (limit, own, of_all) in limits.items():
+        print(f"{mode}: {own:.0f} of {of_all:.0f} tokens of a prompt are its own")
         ours, aim = rates[f"{mode}, batch {given.batch_size}"], AIMS.get(mode)
         aimed = f", aim {aim:g} of (b)" if aim else ""
         of_b = f"{limit / peer:.1f} of (b){aimed}"
@@ -93,8 +94,8 @@ def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[
     return [replace(r, max_tokens=most) for r in egos] if most and mode == "json" else egos
 
 
-def measure(card: cards.Card, given: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
-    """Rates of transformers, plain, by lm-evaluation-harness and by ours; and the limit of each mode."""
+def measure(card: cards.Card, given: argparse.Namespace) -> tuple[dict[str, float], dict[str, Any]]:
+    """Rates of transformers, plain, by lm-evaluation-harness and by ours; and the `limit` of each mode."""
     most = JSON_TOKENS if given.shape else None
     asked = {mode: asked_of(card, mode, given.prompts, most) for mode in MODES}
     backend = open_backend(card, device=given.device, dtype=given.dtype, batch_size=given.batch_size)
@@ -140,8 +141,11 @@ def product_rate(model: Any) -> float:
     return operations / fastest_s
 
 
-def limit(backend: Any, asked: Sequence[Request], flops_per_s: float) -> float:
-    """Decisions a second of the matrix products alone, in layers, attention and the output."""
+def limit(backend: Any, asked: Sequence[Request], flops_per_s: float) -> tuple[float, float, float]:
+    """Decisions a second of the matrix products alone, in layers, attention and the output.
+
+    Also the mean number of a prompt's tokens after what all begin with, and of all its tokens.
+    """
     config, net = backend.engine.model.config, backend.engine.model
     prompts = [backend.tokens(request) for request in asked]
     known = common_length([prompt[:-1] for prompt in prompts])
@@ -153,7 +157,8 @@ def limit(backend: Any, asked: Sequence[Request], flops_per_s: float) -> float:
         end, chosen = len(prompt) + completion.completion_tokens - 1, completion.completion_tokens
         flops += 2 * weights * (end - known) + a_context * sum(range(known + 1, end + 1))
         flops += 2 * config.vocab_size * config.hidden_size * chosen
-    return float(len(asked) * flops_per_s / flops)
+    mean = sum(map(len, prompts)) / len(prompts)
+    return len(asked) * flops_per_s / flops, mean - known, mean
 
 
 def of_llama(card: cards.Card, given: argparse.Namespace) -> dict[str, float]:

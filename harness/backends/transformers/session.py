@@ -43,7 +43,6 @@ class Reader:
         self._failed = False
         self._positions = "position_ids" in signature(model.forward).parameters
         layers = DynamicCache(config=model.config).layers
-        self._layers = len(layers)
         self.together = self._positions and all(type(layer) is DynamicLayer for layer in layers)
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
@@ -86,12 +85,14 @@ class Reader:
         return rows
 
     def _prefix(self, beginnings: list[list[int]]) -> Prefix:
-        """Return what some prompts begin with, read if it was not kept."""
+        """Return what some prompts begin with; what is read of it is kept, unless half of it was."""
         shared = common(beginnings)
         prefix = self._prefixes.longest(shared)
-        if len(beginnings) > 1 and len(shared) - len(prefix.ids) >= LEAST_TOKENS:
+        known = len(prefix.ids)
+        if len(beginnings) > 1 and len(shared) - known >= LEAST_TOKENS:
             prefix = Prefix(shared, Rows.read(self, prefix, [shared], self.positions([shared])).layers())
-            self._prefixes.keep(prefix)
+            if 2 * known < len(shared):
+                self._prefixes.keep(prefix)
         return prefix
 
     def _pieces(self, group: Sequence[int], lengths: Sequence[int]) -> list[list[int]]:
@@ -111,9 +112,10 @@ class Reader:
 
     def cache(self) -> Cache:
         """Return an empty cache of the model's layers."""
+        cache = DynamicCache(config=self._model.config)
         if self.together:
-            return Cache(layers=[PagedLayer() for _ in range(self._layers)])
-        return DynamicCache(config=self._model.config)
+            cache.layers = [PagedLayer() for _ in cache.layers]
+        return cache
 
     def positions(self, prompts: Sequence[Sequence[int]]) -> list[Any] | None:
         """Return the positions of each prompt's tokens, (3, tokens); None if they are consecutive."""
