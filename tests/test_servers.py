@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -428,7 +429,10 @@ def test_an_interrupted_run_ends_at_once_and_goes_on(small_path: Path, project: 
     with serving(play) as there:
         command = [sys.executable, "-m", "harness", "eval", "--model", "mine", "--server", there.url]
         command += ["--dataset", str(small_path), "--no-cache", "--out", "run"]
-        with subprocess.Popen(command, cwd=project, stderr=subprocess.PIPE, text=True) as process:
+        restored = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a background job may ignore it
+        with subprocess.Popen(
+            command, cwd=project, stderr=subprocess.PIPE, text=True, preexec_fn=restored
+        ) as process:
             assert came.wait(60)
             process.send_signal(signal.SIGINT)
             _, err = process.communicate(timeout=30)
