@@ -35,6 +35,7 @@ EYE_M = 1.4  # height of a camera above the road
 BUILDING_M = 6.0
 HORIZON = 0.36  # share of a camera's rows that are above the horizon
 REACH_M, CELL_M = 160.0, 0.2  # reach of the ground map from the origin (grass beyond), and its cell size
+BLOCK = 32  # cells of the map along a side of what is judged at once
 LINE_M = 0.4  # width of a painted line
 DASH_M, GAP_M = 3.0, 4.5
 NOBODY = -1
@@ -295,28 +296,43 @@ def _ground_map(scenario: Scenario) -> Pixels:
     """Map the ground in cells of `CELL_M`, (y, x) from the north-west: 0 grass, 1 asphalt, 2 paint."""
     ground = scenario.road().ground(REACH_M)
     middles = (np.arange(round(2 * REACH_M / CELL_M)) + 0.5) * CELL_M - REACH_M
-    x, y = np.meshgrid(middles, middles)
     edges = [shapely.Polygon(edge * NORTH) for edge in ground.outlines]
     marks = [dash for mark in ground.marks for dash in _dashes(shapely.LineString(mark * NORTH))]
     marks += [shapely.LineString(stop * NORTH) for stop in ground.stops]
-    surface = np.zeros(x.shape, dtype=np.uint8)
+    surface = np.zeros((len(middles), len(middles)), dtype=np.uint8)
+    sides = np.asarray(middles, dtype=np.float64).reshape(-1, BLOCK)
+    blocks = surface.reshape(len(sides), BLOCK, len(sides), BLOCK).swapaxes(1, 2)  # a view of it
     for edge in edges:  # the area inside of two edges is an island and no road
-        surface ^= _inside(edge, x, y)
+        row, column, inside = _inside(edge, sides)
+        blocks[row, column] ^= inside
     for line in (*marks, *(edge.exterior for edge in edges)):
-        surface[_inside(line.buffer(LINE_M / 2, cap_style="flat"), x, y) & (surface > 0)] = 2
+        row, column, inside = _inside(line.buffer(LINE_M / 2, cap_style="flat"), sides)
+        blocks[row, column] = np.where(inside & (blocks[row, column] > 0), 2, blocks[row, column])
     surface[[0, -1]] = surface[:, [0, -1]] = 0  # grass, since look-ups beyond the map are clipped to its edge
     return surface
 
 
-def _inside(area: shapely.Geometry, x: Floats, y: Floats) -> NDArray[np.bool_]:
-    """Return which of the grid's points lie in an area."""
-    inside = np.zeros(x.shape, dtype=bool)
+def _inside(
+    area: shapely.Geometry, sides: Floats
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
+    """Return the blocks that an area touches, by row and column, and which of each one's cells lie in it.
+
+    Args:
+        area: in the map's coordinates, m.
+        sides: middles of the cells along each side of the map, block by block, (blocks, BLOCK) m.
+    """
     west, north, east, south = area.bounds
-    columns = slice(*np.searchsorted(x[0], (west, east)))
-    rows = slice(*np.searchsorted(y[:, 0], (north, south)))
+    columns = np.flatnonzero((sides[:, -1] >= west) & (sides[:, 0] <= east))
+    rows = np.flatnonzero((sides[:, -1] >= north) & (sides[:, 0] <= south))
+    column, row = (block.ravel() for block in np.meshgrid(columns, rows))
+    boxes = shapely.box(sides[column, 0], sides[row, 0], sides[column, -1], sides[row, -1])
     shapely.prepare(area)
-    inside[rows, columns] = shapely.contains_xy(area, x[rows, columns], y[rows, columns])
-    return inside
+    touched = shapely.intersects(area, boxes)
+    column, row, boxes = column[touched], row[touched], boxes[touched]
+    inside = np.ones((len(boxes), BLOCK, BLOCK), dtype=bool)
+    part = ~shapely.contains_properly(area, boxes)
+    inside[part] = shapely.contains_xy(area, sides[column[part], None, :], sides[row[part], :, None])
+    return row, column, inside
 
 
 def _dashes(line: shapely.LineString) -> list[shapely.Geometry]:
