@@ -5,6 +5,7 @@ lead to the same trajectories; alone and together are compared to the last bit. 
 a Python that has it.
 
     python benchmarks/worlds.py [--layouts 500] [--worlds 128] [--envpool PYTHON]
+    python benchmarks/worlds.py --trees     # only what a decision point costs that is frozen, together
 """
 
 import argparse
@@ -47,7 +48,12 @@ def main() -> None:
     arguments.add_argument("--layouts", type=int, default=500)
     arguments.add_argument("--worlds", type=int, default=128)
     arguments.add_argument("--envpool", help="a Python interpreter that has EnvPool")
+    arguments.add_argument("--trees", action="store_true", help="measure only freezing, together")
     given = arguments.parse_args()
+    if given.trees:
+        for name in scenarios.names():
+            print(f"{name:<24}freezing, together: {tree_ms(scenarios.get(name)):.1f} ms a decision point")
+        return
     rows = {name: row(scenarios.get(name), given.layouts, given.worlds) for name in scenarios.names()}
     print(f"{'CPU µs a frame':<24}{'plain':>8}{'alone':>8}{'together':>10}{'frame':>8}{'plain /':>9}")
     for name, r in rows.items():
