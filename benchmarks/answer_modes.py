@@ -1,13 +1,15 @@
 """Decisions a second of each answer mode, against a plain `generate` loop and lm-evaluation-harness.
 
-    python benchmarks/answer_modes.py [--model swarm-tiny] [--prompts 32] [--batch-size 8]
+    python benchmarks/answer_modes.py [--model swarm-tiny] [--prompts 32] [--batch-size 8] [--repeats 1]
     python benchmarks/answer_modes.py --shape 0.6b --tokenizer GGUF --dtype bfloat16 --prompts 4
 
 All on the same prompts: the ego's of the shipped dataset, with prompt v2. The baseline (a) is transformers'
 `generate`, one prompt at a time, greedy. (b) is lm-evaluation-harness's `hf` model on the rendered prompts
 (left out where `lm_eval` is not installed). `--shape` takes random weights of a Qwen3's shape and Qwen's
 vocabulary: such weights never stop, so every free answer is given the tokens of a JSON answer. CPU seconds of
-this process (wall on CUDA); what llama.cpp does in its own process is its answers' wall time.
+this process (wall on CUDA), the median of repeats in turn; what llama.cpp does in its own process is its
+answers' wall time. The limit has the matrix products alone, of each prompt's tokens after what all begin with
+and of the answer's, at the rate of one such product.
 """
 
 import argparse
@@ -18,12 +20,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import shapes
 
 from harness.backends import cards
 from harness.backends.base import Request
+from harness.backends.engine import common_length
+from harness.backends.language_model import LanguageModel
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.resources import DATASET
@@ -35,7 +40,10 @@ from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 
 JSON_TOKENS = 43  # of a compact answer with three actions, in Qwen's vocabulary
-AIMS = {"constrained": 4.0, "readout": 12.0}
+PEER = "b: lm-evaluation-harness"
+MODES = ("json", "constrained", "readout")
+AIMS = {"json": 3.0, "readout": 6.0}  # times lm-evaluation-harness at the same batch size
+PRODUCT_ROWS = 1024  # tokens in the matrix product that the limit is taken from
 
 
 def main() -> None:
@@ -49,6 +57,7 @@ def main() -> None:
     arguments.add_argument("--prompts", type=int, default=32)
     arguments.add_argument("--batch-size", type=int, default=8)
     arguments.add_argument("--threads", type=int, default=1)
+    arguments.add_argument("--repeats", type=int, default=1)
     given = arguments.parse_args()
 
     import torch
@@ -59,15 +68,19 @@ def main() -> None:
         if given.shape:
             model = str(shapes.build(given.shape, given.tokenizer, Path(folder) / "shape"))
         card = cards.resolve(model, "transformers")
-        rates = measure(card, given)
+        rates, limits = measure(card, given)
         if not given.shape:
             rates |= of_llama(cards.resolve(given.model, "llama-cpp"), given)
-    base = rates["a: generate, batch 1"]
+    plainly, peer = rates["a: generate, batch 1"], rates.get(PEER, float("nan"))
     for name, rate in rates.items():
-        print(f"{name:<40}{rate:9.2f} decisions/s   {rate / base:6.1f} of (a)")
-    ratios = {mode: rates[f"{mode}, batch {given.batch_size}"] / base for mode in ("json", *AIMS)}
-    print("; ".join(f"{mode} {ratios[mode]:.1f}x, aim {aim:g}x" for mode, aim in AIMS.items()))
-    print(json.dumps({"rates": rates, "ratios": ratios, **vars(given)}, default=str))
+        print(f"{name:<40}{rate:9.2f} decisions/s{rate / plainly:7.1f} of (a){rate / peer:7.1f} of (b)")
+    for mode, (limit, own, of_all) in limits.items():
+        print(f"{mode}: {own:.0f} of {of_all:.0f} tokens of a prompt are its own")
+        ours, aim = rates[f"{mode}, batch {given.batch_size}"], AIMS.get(mode)
+        aimed = f", aim {aim:g} of (b)" if aim else ""
+        of_b = f"{limit / peer:.1f} of (b){aimed}"
+        print(f"{mode}: limit {limit:.0f} decisions/s, {of_b}; reached {ours / limit:.2f} of it")
+    print(json.dumps({"rates": rates, "limits": limits, **vars(given)}, default=str))
 
 
 def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[Request]:
@@ -81,30 +94,78 @@ def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[
     return [replace(r, max_tokens=most) for r in egos] if most and mode == "json" else egos
 
 
-def measure(card: cards.Card, given: argparse.Namespace) -> dict[str, float]:
-    """Rates of transformers, plain, by lm-evaluation-harness and by ours."""
+def measure(card: cards.Card, given: argparse.Namespace) -> tuple[dict[str, float], dict[str, Any]]:
+    """Rates of transformers, plain, by lm-evaluation-harness and by ours; and the `limit` of each mode."""
     most = JSON_TOKENS if given.shape else None
-    free = asked_of(card, "json", given.prompts, most)
+    asked = {mode: asked_of(card, mode, given.prompts, most) for mode in MODES}
     backend = open_backend(card, device=given.device, dtype=given.dtype, batch_size=given.batch_size)
-    chat, model = backend.chat, backend.engine.model  # type: ignore[attr-defined]
-    texts = [chat.render(r.messages, thinking=False) for r in free]
-    found = {"a: generate, batch 1": rate(len(free), lambda: plain(model, chat, texts, free))}
-    by_others = lm_eval(model, chat, texts, free, given.batch_size)
+    chat, engine = backend.chat, backend.engine  # type: ignore[attr-defined]
+    texts = [chat.render(r.messages, thinking=False) for r in asked["json"]]
+    work: dict[str, Callable[[], Any]] = {
+        "a: generate, batch 1": lambda: plain(engine.model, chat, texts, asked["json"])
+    }
+    by_others = lm_eval(engine.model, chat, texts, asked["json"], given.batch_size)
     if by_others:
-        found[f"b: lm-evaluation-harness, batch {given.batch_size}"] = rate(len(free), by_others)
+        work[PEER] = by_others
     for size in (1, given.batch_size):
-        for mode in ("json", *AIMS):
-            fresh = open_backend(card, device=given.device, dtype=given.dtype, batch_size=size)
-            asked = asked_of(card, mode, given.prompts, most)
-            found[f"{mode}, batch {size}"] = rate(len(asked), partial(fresh.complete, asked))
-    return found
+        for mode in MODES:
+            work[f"{mode}, batch {size}"] = partial(LanguageModel(engine, size).complete, asked[mode])
+    for each in work.values():
+        each()  # to warm up
+    found: dict[str, list[float]] = {name: [] for name in work}
+    for _ in range(given.repeats):
+        for name, each in work.items():
+            found[name].append(len(texts) / seconds_of(each))
+    flops_per_s = product_rate(engine.model)
+    limits = {mode: limit(backend, asked[mode], flops_per_s) for mode in MODES}
+    return {name: median(rates) for name, rates in found.items()}, limits
+
+
+def product_rate(model: Any) -> float:
+    """Floating-point operations a second of a product of the model's own shape."""
+    import torch
+
+    config, dtype, device = model.config, model.dtype, model.device
+    weights = torch.ones(config.intermediate_size, config.hidden_size, dtype=dtype, device=device)
+    rows = torch.ones(PRODUCT_ROWS, config.hidden_size, dtype=dtype, device=device)
+    times = 1 + int(1e10 // (rows.numel() * config.intermediate_size))
+
+    def work() -> None:
+        for _ in range(times):
+            product = torch.nn.functional.linear(rows, weights)
+        product.sum().item()
+
+    work()
+    fastest_s = min(seconds_of(work) for _ in range(5))
+    operations: int = 2 * rows.numel() * config.intermediate_size * times
+    return operations / fastest_s
+
+
+def limit(backend: Any, asked: Sequence[Request], flops_per_s: float) -> tuple[float, float, float]:
+    """Decisions a second of the matrix products alone, in layers, attention and the output.
+
+    Also the mean number of a prompt's tokens after what all begin with, and of all its tokens.
+    """
+    config, net = backend.engine.model.config, backend.engine.model
+    prompts = [backend.tokens(request) for request in asked]
+    known = common_length([prompt[:-1] for prompt in prompts])
+    weights = sum(p.numel() for p in net.model.layers.parameters() if p.ndim == 2)
+    a_context = 4 * config.num_hidden_layers * config.num_attention_heads * config.head_dim
+    flops = 0
+    for prompt, completion in zip(prompts, backend.complete(asked), strict=True):
+        # The last token of an answer is never read.
+        end, chosen = len(prompt) + completion.completion_tokens - 1, completion.completion_tokens
+        flops += 2 * weights * (end - known) + a_context * sum(range(known + 1, end + 1))
+        flops += 2 * config.vocab_size * config.hidden_size * chosen
+    mean = sum(map(len, prompts)) / len(prompts)
+    return len(asked) * flops_per_s / flops, mean - known, mean
 
 
 def of_llama(card: cards.Card, given: argparse.Namespace) -> dict[str, float]:
     """Rates of llama.cpp, one at a time, by the answers' own seconds."""
     backend = open_backend(card, device="cpu", batch_size=1)
     found = {}
-    for mode in ("json", *AIMS):
+    for mode in MODES:
         asked = asked_of(card, mode, given.prompts, None)
         backend.complete(asked[:1])
         seconds = sum(c.seconds or 0 for c in backend.complete(asked))
@@ -112,15 +173,14 @@ def of_llama(card: cards.Card, given: argparse.Namespace) -> dict[str, float]:
     return found
 
 
-def rate(count: int, work: Callable[[], Any]) -> float:
-    """Decisions a second, after one round to warm up."""
+def seconds_of(work: Callable[[], Any]) -> float:
+    """CPU seconds of this process, or wall seconds where there is a GPU."""
     import torch
 
     clock = time.perf_counter if torch.cuda.is_available() else time.process_time
-    work()
     start = clock()
     work()
-    return count / (clock() - start)
+    return clock() - start
 
 
 def plain(model: Any, chat: Any, texts: Sequence[str], asked: Sequence[Request]) -> None:

@@ -1,4 +1,4 @@
-"""Live driving: where time goes, and what a second worker adds.
+"""Live driving: where time goes, and what a second worker and compiled frames add.
 
 The parts are measured in one process with the proxy, whose answers cost next to nothing, so that the
 harness's own share is the largest it can be.
@@ -11,6 +11,8 @@ import json
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -33,6 +35,9 @@ from harness.world import reference as live
 from harness.world.scenarios.occluded_intersection import SCENARIO
 
 LATENCY = Latency("card", "the proxy's card", 0.145, 0.145, 0.145)
+FORMS = {"NumPy alone": 10**9}
+if find_spec("numba"):  # the first of these loads it
+    FORMS |= {"as it is": lockstep.COMPILED_AFTER, "compiled from the first frame": 0}
 # Functions whose time makes up a part: the simulator, what is seen, and who drives. The rest is our own.
 PARTS: dict[str, tuple[Any, str]] = {
     "frames": (lockstep, "advance"),
@@ -55,6 +60,8 @@ def main() -> None:
     lives = given.episodes * len(spec.points) * len(spec.seeds)
 
     drive(spec, range(1))  # pays for imports and compiled templates
+    cpu_s(replace(spec, source=LiveSource(0, 1)), 10**9)
+    cpus = {form: cpu_s(spec, after) for form, after in FORMS.items()}
     parts, frames, frames_lived = shares(spec, range(given.episodes))
     walls = {workers: wall_s(spec, workers, 2) for workers in (1, 2)}
     total = sum(parts.values())
@@ -67,10 +74,11 @@ def main() -> None:
     print(f"  {lives / total:.0f} episodes a second of that CPU time")
     for workers, seconds in walls.items():
         print(f"  {workers} workers: {lives / seconds:7.1f} episodes/s")
+    print("  one worker, CPU: " + ", ".join(f"{form} {seconds:.2f} s" for form, seconds in cpus.items()))
     print(f"  a second worker makes it {walls[1] / walls[2]:.2f} times as fast")
     print(json.dumps({
         "episodes": lives, "frames": frames,
-        "frames_lived": frames_lived, "parts_s": parts, "wall_s": walls,
+        "frames_lived": frames_lived, "parts_s": parts, "wall_s": walls, "cpu_s": cpus,
     }))  # fmt: skip
 
 
@@ -111,6 +119,15 @@ def shares(spec: Spec, numbers: range) -> tuple[dict[str, float], int, int]:
     lived_s = sum(episode.time_s or 0.0 for episode in episodes)
     lived = round(lived_s * SCENARIO.parameters.simulation_hz)
     return {**spent, "own": total - sum(spent.values())}, simulated, lived
+
+
+def cpu_s(spec: Spec, compiled_after: int) -> float:
+    """CPU time of a whole run in one process, which loads what numba compiled after so many frames."""
+    with patch.object(lockstep, "COMPILED_AFTER", compiled_after), tempfile.TemporaryDirectory() as folder:
+        lockstep._frames.clear()
+        start = process_time()
+        evaluate(spec, Path(folder) / "run", lambda done: None, workers=1)
+        return process_time() - start
 
 
 def wall_s(spec: Spec, workers: int, repeats: int) -> float:

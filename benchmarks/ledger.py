@@ -72,7 +72,7 @@ def coverage(sets: int) -> list[dict[str, object]]:
                 next(source.walked([setting], range(first, first + SEEDS)))
                 for first in range(1000, 1000 + SEEDS * sets, SEEDS)
             )
-            measured = _covered([walked[0].ends["success_rate"] for walked in walks])
+            measured = _covered([part.ends["success_rate"] for [part] in walks])
             print(
                 f"{panel.name:<8}{setting.value:>10}{panel.episodes:>10}"
                 + "".join(f"{number:>10.2f}" for number in measured.values()), flush=True,

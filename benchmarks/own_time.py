@@ -21,7 +21,7 @@ from time import process_time
 from typing import Any
 from unittest.mock import patch
 
-from copies import Copies, copies
+import copies
 
 from harness.backends import cards
 from harness.backends.proxy import Proxy
@@ -42,7 +42,7 @@ AIM_MS = 0.3
 # Functions whose time makes up a part; what the backend and the copies take is no part of the harness.
 PARTS: dict[str, list[tuple[Any, str]]] = {
     "proxy": [(Proxy, "complete")],
-    "copies": [(Copies, "scenes")],
+    "copies": [(copies.Copies, "scenes"), (copies, "_tree")],
     "prompt": [(Prompt, "render")],
     "parse": [(asking, "parse")],
     "coordinate": [(walk, "exchange"), (walk, "fuse")],
@@ -68,9 +68,9 @@ def main() -> None:
     start = process_time()
     dataset = load.load(load.find(given.dataset))
     loading_ms = (process_time() - start) * 1000 / len(dataset.forest.ids)
+    agent = Agent(cards.resolve("proxy"), prompts.load(given.prompt))
     specs = [
-        Spec(Agent(cards.resolve("proxy"), prompts.load(given.prompt)), FrozenSource(copies(dataset, size)),
-             tuple(POINTS.values()), tuple(range(5)))
+        Spec(agent, FrozenSource(copies.copies(dataset, size)), tuple(POINTS.values()), tuple(range(5)))
         for size in given.sizes
     ]  # fmt: skip
     first = evaluated(specs[0], OTHERS)  # pays for imports and compiled templates

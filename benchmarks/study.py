@@ -11,15 +11,21 @@ import resource
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from time import perf_counter, process_time
 
 import numpy as np
+import pandas as pd
 
 from harness.coordination.operating_point import POINTS
+from harness.report.drawing.pictures import FORMATS, save
 from harness.runs.folder import read
+from harness.studies import figures
 from harness.studies.axes import Setting
 from harness.studies.calibrated import STEPS, Calibrated
+from harness.studies.folder import lay_out
 from harness.studies.paper import panels
 from harness.studies.play import play
 
@@ -45,8 +51,8 @@ def campaign() -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         wall_s = timed([*HARNESS, "campaign", "paper", "--out", f"{folder}/paper"])
     start, decisions = process_time(), 0
-    for panel in panels():
-        play(Calibrated(panel.episodes), panel.name, panel.settings, SEEDS, lambda done: None)
+    sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels()}
+    played = [play(sources[p.episodes], p.name, p.settings, SEEDS, lambda done: None) for p in panels()]
     play_s = process_time() - start
     start = process_time()
     for panel in panels():
@@ -58,8 +64,26 @@ def campaign() -> dict[str, float]:
     return {
         "campaign_wall_s": wall_s, "campaign_decisions": decisions,
         "play_cpu_s": play_s, "draw_cpu_s": draw_s,
-        "play_over_draw": play_s / draw_s,
+        "play_over_draw": play_s / draw_s, **pictures([part.summary for part in played]),
     }  # fmt: skip
+
+
+def pictures(summaries: "Sequence[pd.DataFrame]") -> dict[str, float]:
+    """CPU of making the campaign's two figures, of laying them out, and of each format."""
+    core, *sweeps, _ = summaries
+    start = process_time()
+    drawn = [figures.composite_a(core), figures.along(sweeps)]
+    found = {"make_figures_cpu_s": process_time() - start}
+    start = process_time()
+    for figure in drawn:
+        lay_out(figure)
+    found["lay_out_cpu_s"] = process_time() - start
+    for kind in FORMATS:
+        start = process_time()
+        for figure in drawn:
+            save(figure, BytesIO(), kind, dpi=300)
+        found[f"{kind}_cpu_s"] = process_time() - start
+    return found
 
 
 def draw(generator: np.random.Generator, episodes: int, helpers: int) -> None:

@@ -5,6 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from harness.core.files import canonical_json
+from harness.evaluate.asking import payload_bits
 from harness.runs.answers import Answers
 from harness.runs.records import Answer
 
@@ -53,3 +55,18 @@ def test_one_that_is_there_twice_is_refused_wherever_it_stands(
 def test_another_number_of_probabilities_is_refused() -> None:
     with pytest.raises(ValueError, match=r"answer a/v has 3 probabilities"):
         Answers(written([msgspec.structs.replace(ANSWER, scene="a", viewer="v")]), 5)
+
+
+METRES = st.floats(-1e6, 1e6) | st.sampled_from([-0.0, -0.04, 0.05, 0.25, 12.35])
+SHARES = st.floats(0.0, 1.0) | st.sampled_from([0.005, 0.045, 0.1, 0.125, 0.995])
+SAYS = st.fixed_dictionaries({"evidence": st.none() | NAMES, "risk": st.none() | NAMES, "confidence": SHARES})
+
+
+@given(METRES, METRES, st.none() | st.tuples(SHARES, SHARES, SHARES), st.none() | SAYS, NAMES)
+def test_a_message_weighs_what_its_json_does(x_m, y_m, intent, message, viewer) -> None:
+    answer = msgspec.structs.replace(ANSWER, viewer=viewer, intent=intent, message=message)
+    says = {
+        "from": viewer, "xy_m": [round(x_m, 1), round(y_m, 1)],
+        "intent": intent and [round(share, 2) for share in intent], "says": message,
+    }  # fmt: skip
+    assert payload_bits((x_m, y_m), answer) == 8 * len(canonical_json(says).encode())

@@ -15,6 +15,7 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 
 import tiny_qwen3
 import torch
+from evaluating import scenes_of, spec_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from run_on_disk import UNTIMED
@@ -28,6 +29,8 @@ from harness.backends.registry import open_backend
 from harness.backends.transformers.engine import TransformersEngine
 from harness.core.errors import UserError
 from harness.core.rounding import rounded
+from harness.dataset.load import Dataset
+from harness.evaluate.asking import requests
 from harness.parsing.parse import parse
 from harness.prompts import readout
 
@@ -102,6 +105,24 @@ def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> Non
         assert completion.finish_reason == ("stop" if stopped else "length")
         lengths.add(len(said))
     assert len(lengths) > 2, "answers of one length would not show that rows leave their batch"
+
+
+def test_what_is_guessed_saves_forwards_and_changes_no_answer(small: Dataset) -> None:
+    """On the model that ships, whose texts have a shape that can be guessed."""
+    opened = open_backend(resolve("swarm-tiny", "transformers"), batch_size=16, device="cpu")
+    assert isinstance(opened, LanguageModel)
+    asked = list(requests(spec_of(small, "swarm-tiny"), scenes_of(small)))[:16]
+    asked += [replace(request, max_tokens=9) for request in asked[:3]]
+    alone = [opened.complete([request])[0] for request in asked]
+    forwards: list[object] = []
+    hook = engine_of(opened).model.register_forward_pre_hook(lambda *_: forwards.append(None))
+    together = opened.complete(asked[:16])
+    hook.remove()
+    together += opened.complete(asked[16:])
+    untimed = [replace(c, batch_size=1, **UNTIMED) for c in (*together, *alone)]
+    assert untimed[: len(asked)] == untimed[len(asked) :]
+    assert len({c.text for c in alone}) > 8
+    assert len(forwards) < 0.8 * max(c.completion_tokens or 0 for c in alone)
 
 
 # -- times ------------------------------------------------------------------------------------------

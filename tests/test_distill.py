@@ -2,8 +2,11 @@
 
 import json
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -51,12 +54,20 @@ def silent(*_: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def few(tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
+def once_drawn() -> Callable[..., Any]:
+    """What a layout teaches, drawn once for all tests."""
+    return cache(lessons.drawn)
+
+
+@pytest.fixture(scope="module")
+def few(once_drawn: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
     place = tmp_path_factory.mktemp("lessons")
-    return [
-        draw(scenario, versions, CURRICULUM.layouts, CURRICULUM.seed, place / scenario.name, 1, silent)
-        for scenario, versions in LEARNT.items()
-    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lessons, "drawn", once_drawn)
+        return [
+            draw(scenario, versions, CURRICULUM.layouts, CURRICULUM.seed, place / scenario.name, 1, silent)
+            for scenario, versions in LEARNT.items()
+        ]
 
 
 def test_of_each_level_as_many_are_learnt_from_as_a_whole_tree_has():
@@ -106,23 +117,15 @@ def asked(few: list[Lessons]) -> list[Question]:
 
 
 @pytest.fixture
-def drawn_before(few: list[Lessons], monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a layout teaches is drawn once for all tests."""
-    by_layout = {(each.scenario.name, n): _points(each, n) for each in few for n in range(CURRICULUM.layouts)}
-    monkeypatch.setattr(lessons, "drawn", lambda scenario, seed, n: by_layout[scenario.name, n])
-
-
-def _points(each: Lessons, number: int) -> list[dict[str, object]]:
-    return [
-        {"moment": scene.record, "label": each.labels[scene.id].tolist()}
-        for scene in each.scenes if scene.record["episode"] == number
-    ]  # fmt: skip
+def drawn_before(once_drawn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lessons, "drawn", once_drawn)
 
 
 @pytest.fixture(scope="module")
-def student(few: list[Lessons], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def student(once_drawn: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("distilled") / "student"
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lessons, "drawn", once_drawn)
         patch.setattr("harness.training.train.LOG_STEPS", 4)
         distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
     return out
@@ -375,4 +378,7 @@ def test_it_learns_from_every_level_of_a_tree(few: list[Lessons]) -> None:
 
 def test_a_layout_teaches_the_same_wherever_it_is_drawn(few: list[Lessons]) -> None:
     again = msgspec.json.encode(lessons.drawn(PASSING, CURRICULUM.seed + 1, 1))
-    assert msgspec.json.decode(again) == _points(few[1], 1)
+    assert msgspec.json.decode(again) == [
+        {"moment": scene.record, "label": few[1].labels[scene.id].tolist()}
+        for scene in few[1].scenes if scene.record["episode"] == 1
+    ]  # fmt: skip

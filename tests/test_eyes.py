@@ -72,6 +72,24 @@ def test_a_prompt_is_read_as_the_model_itself_reads_it(model: Any) -> None:
     assert np.abs(then - logits[-1].numpy()).max() < 2e-4
 
 
+def test_a_guess_after_a_picture_is_checked_at_its_own_places(model: Any) -> None:
+    asked = [question(model, 0, 1), question(model, 1, None, text="No picture")]
+    prompts = [model.tokens(request) for request in asked]
+    more = model.chat.encode('{"action')
+    plain = model.engine.begin(prompts)
+    written: list[list[int]] = []
+    for _ in range(4):
+        plain.advance([[more[0]], [more[0]]] if not written else [[token] for token in written[-1]])
+        written.append(plain.argmax([None, None]))
+    right, other = ([step[row] for step in written[:3]] for row in (0, 1))
+    session = model.engine.begin(prompts)
+    wrong = [(token + 1) % 100 for token in other[1:]]
+    assert session.follow([[more[0]], [more[0]]], [right, [other[0], *wrong]]) == [3, 1]
+    session.advance([[], [other[1]]])
+    session.advance([[], [other[2]]])
+    assert np.abs(session.log_probs() - plain.log_probs()).max() < 2e-4
+
+
 def test_a_picture_has_the_tokens_that_the_card_says(model: Any) -> None:
     vision = model.engine.card.vision
     tokens = model.tokens(question(model, 0, 1))

@@ -204,6 +204,7 @@ def test_a_beginning_kept_from_before_changes_nothing_and_is_not_computed_again(
         ([[*system[:90], 5], [*system[:90], 6]], 2),
         ([[*helper, 5, 7], [*helper, 8]], 3),
         ([[*helper, 5, 6]], 102),  # asked again alone, it is read again: else its time would be no answer's
+        ([[*system, 5], [*helper, 9], [*system, 6], [*helper, 7, 8]], 5),  # a batch with both
     ]:
         computed.clear()
         session = engine.begin(asked)

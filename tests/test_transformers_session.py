@@ -18,7 +18,7 @@ from transformers import Gemma3ForCausalLM, Gemma3TextConfig, Qwen3Config, Qwen3
 from harness.backends.transformers import prefixes
 from harness.backends.transformers import session as reading
 from harness.backends.transformers.memory import PAGE
-from harness.backends.transformers.prefixes import LEAST_TOKENS, Prefix, Prefixes, alike, common
+from harness.backends.transformers.prefixes import LEAST_TOKENS, Prefix, Prefixes, common
 from harness.backends.transformers.session import Reader
 
 SHAPE: dict[str, Any] = {
@@ -127,6 +127,36 @@ def test_log_probabilities_are_of_the_whole_vocabulary(model: Any) -> None:
         assert np.exp(whole).sum() == pytest.approx(1)
         assert session.log_probs([9, 2, 9]).tolist() == whole[:, [9, 2, 9]].tolist()
         assert whole.dtype == np.float64
+
+
+@given(st.data())
+def test_of_a_guess_stays_what_the_model_would_have_written(model: Any, data: st.DataObject) -> None:
+    """Sequences go forward by right, wrong and empty guesses, and end where one forward of each does."""
+    sequences = data.draw(st.lists(st.lists(tokens, min_size=1, max_size=9), min_size=1, max_size=4))
+    reader = Reader(model)
+    with closing(reader.begin(sequences)) as session:
+        for _ in range(data.draw(st.integers(1, 3))):
+            chunks = [[data.draw(tokens)] for _ in sequences]
+            sequences = [[*ids, *chunk] for ids, chunk in zip(sequences, chunks, strict=True)]
+            guesses, right = [], []
+            for ids in sequences:
+                guess: list[int] = []
+                for _ in range(data.draw(st.integers(0, 3))):
+                    guess.append(int(naive(model, [[*ids, *guess]]).argmax()))
+                right.append(len(guess))
+                if data.draw(st.booleans()):  # a token that is not the likeliest, and more after it
+                    wrong = int(naive(model, [[*ids, *guess]]).argmin())
+                    guess += [wrong, *data.draw(st.lists(tokens, max_size=2))]
+                guesses.append(guess)
+            counts = session.follow(chunks, guesses)
+            assert counts == (right if reader.together else [0] * len(guesses))
+            sequences = [
+                [*ids, *guess[:count]] for ids, guess, count in zip(sequences, guesses, counts, strict=True)
+            ]
+            if len(sequences) > 1 and data.draw(st.booleans()):
+                session.keep(range(1, len(sequences)))
+                sequences = sequences[1:]
+            np.testing.assert_allclose(session.log_probs(EVERY), naive(model, sequences), atol=1e-4)
 
 
 def test_only_full_attention_is_padded() -> None:
@@ -291,31 +321,6 @@ def test_only_the_part_in_common_is_given_back() -> None:
     found = kept.longest([*SYSTEM[:20], 63, 63])
     assert found.ids == SYSTEM[:20]
     assert [t.flatten().tolist() for t in found.layers[0]] == [SYSTEM[:20]] * 2
-
-
-@given(st.lists(st.lists(st.integers(0, 1), max_size=30), min_size=1, max_size=9), st.integers(1, 40))
-def test_each_sequence_is_in_one_group_and_groups_save_what_they_must(
-    sequences: list[list[int]], least: int
-) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(prefixes, "LEAST_SAVED", least)
-        groups = list(alike(sequences))
-    assert sorted(place for group in groups for place in group) == list(range(len(sequences)))
-
-    def shared(places: Sequence[int]) -> int:
-        return len(common([sequences[place] for place in places]))
-
-    together = len(sequences) * shared(range(len(sequences)))
-    apart = sum(len(group) * shared(group) - (len(group) > 1) * shared(group) for group in groups)
-    assert len(groups) == 1 or apart + shared(range(len(sequences))) >= together
-
-
-def test_groups_are_split_where_that_saves_enough() -> None:
-    egos, helpers = ([[n] * 40 + [i] for i in range(3)] for n in (1, 2))
-    assert sorted(map(sorted, alike([*egos, *helpers]))) == [[0, 1, 2], [3, 4, 5]]
-    assert list(alike([[1] * 40, [2] * 40, [3] * 40])) == [[0, 1, 2]]  # nobody shares anything
-    deeper = [[1] * 40 + [n] * 40 + [i] for n in (5, 6) for i in range(3)]
-    assert sorted(map(sorted, alike([*deeper, [9]]))) == [[0, 1, 2], [3, 4, 5], [6]]
 
 
 @given(st.lists(st.lists(st.integers(0, 1), max_size=6), min_size=1, max_size=5))

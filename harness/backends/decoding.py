@@ -11,9 +11,10 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 
 from harness.backends.base import FinishReason, Request, per_token_s
+from harness.backends.drafts import Drafts
 from harness.backends.engine import Engine, Session
 from harness.backends.sampling import Choice
-from harness.backends.skeleton import Skeleton, finished, tokens_after
+from harness.backends.skeleton import Skeleton, finished, parts, tokens_after
 from harness.core.errors import UserError, printable
 from harness.prompts.readout import letters, stated
 
@@ -87,14 +88,43 @@ class Decoding:
 
     def _free(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Answer]:
         written: list[list[int]] = [[] for _ in requests]
+        # An answer that is asked alone is timed, token by token.
+        drafts = self._drafts(requests) if len(requests) > 1 and not choice.draws else None
         live = list(range(len(requests)))
         while live:
             for i, token in zip(live, choice.next(session, live, [None] * len(live)), strict=True):
                 written[i].append(token)
             live = _narrow(session, live, [not self._over(written[i], requests[i]) for i in live])
-            if live:
+            if live and drafts:
+                self._follow(session, drafts, {i: (requests[i], written[i]) for i in live})
+            elif live:
                 session.advance([written[i][-1:] for i in live])
         return [self._ended(tokens) for tokens in written]
+
+    def _drafts(self, requests: Sequence[Request]) -> Drafts:
+        """Return guesses that know the fixed text of what each kind of request asks for."""
+        drafts = Drafts(self._chat)
+        for kind in {_kind(request) for request in requests}:
+            for option in (0, -1):  # two fillings, so that what differs is not guessed
+                text = "".join(part if isinstance(part, str) else part[option] for part in parts(*kind))
+                tokens = tokens_after(self._chat, "\n", text)
+                for end in range(1, len(tokens) + 1):
+                    drafts.learn(kind, tokens[:end])
+        return drafts
+
+    def _follow(
+        self, session: Session, drafts: Drafts, written: dict[int, tuple[Request, list[int]]]
+    ) -> None:
+        """Append the last token of each answer to the session, and to both what is guessed rightly."""
+        guesses = []
+        for request, tokens in written.values():
+            drafts.learn(_kind(request), tokens)
+            guesses.append(drafts.after(_kind(request), tokens, request.max_tokens - len(tokens) - 1))
+        width = sorted(map(len, guesses))[len(guesses) // 2]  # no wider than half of the answers fill
+        guesses = [guess[:width] for guess in guesses]
+        counts = session.follow([tokens[-1:] for _, tokens in written.values()], guesses)
+        for (_, tokens), guess, count in zip(written.values(), guesses, counts, strict=True):
+            tokens += guess[:count]
 
     def _over(self, tokens: list[int], request: Request) -> bool:
         return tokens[-1] in self._engine.stops or len(tokens) == request.max_tokens
@@ -124,7 +154,7 @@ class Decoding:
         ]
 
     def _skeleton(self, request: Request) -> Skeleton:
-        key = (request.role, request.form, request.actions)
+        key = _kind(request)
         if key not in self._skeletons:
             self._skeletons[key] = Skeleton(self._chat, *key)
         skeleton = self._skeletons[key]
@@ -158,6 +188,11 @@ class Decoding:
                 )
             self._letters[actions] = [token for (token,) in encodings]
         return self._letters[actions]
+
+
+def _kind(request: Request) -> tuple[str, str, tuple[str, ...]]:
+    """Return what decides the text that a request asks for, as `parts` takes it."""
+    return request.role, request.form, request.actions
 
 
 def _narrow(session: Session, live: list[int], unfinished: list[bool]) -> list[int]:

@@ -33,6 +33,16 @@ class Session(Protocol):
         """Append tokens to each sequence. An empty chunk leaves a sequence and its distribution unchanged."""
         ...
 
+    def follow(self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]) -> list[int]:
+        """Append a chunk to each sequence, and as much of its guess as is its own likeliest next tokens.
+
+        A chunk is not empty, a guess may be.
+
+        Returns:
+            How many tokens of each guess were appended; an engine that checks none appends none.
+        """
+        ...
+
     def keep(self, places: Sequence[int]) -> None:
         """Keep these sequences only, in this order: n becomes len(places)."""
         ...

@@ -20,6 +20,7 @@ class Choice:
     Attributes:
         first_at_s: when the first token was chosen, by `time.perf_counter`; None before.
         rounds: number of calls of `next`; for an answer that is asked alone, its number of chosen tokens.
+        draws: whether any token is drawn and not just the likeliest.
     """
 
     def __init__(self, requests: Sequence[Request], prompts: Sequence[Sequence[int]]) -> None:
@@ -30,6 +31,7 @@ class Choice:
             for place, (request, ids) in enumerate(zip(requests, prompts, strict=True))
             if request.temperature
         }
+        self.draws = bool(self._drawn)
 
     def next(
         self, session: Session, places: Sequence[int], among: Sequence[Sequence[int] | None]

@@ -10,6 +10,7 @@ import os
 import shlex
 import signal
 import sys
+from functools import cache
 from importlib import import_module
 from typing import Any
 
@@ -111,13 +112,19 @@ def main() -> None:
         _fail(f"{where}{error.strerror}; fix that, and type the same command again")
 
 
+@cache
+def _program() -> Any:
+    """Return the commands as one program, made once a process: tests type a thousand in one."""
+    program = get_command(app)
+    shell.hasten(program)
+    return program
+
+
 def _typed() -> None:
     signal.signal(signal.SIGTERM, _terminate)
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # Arrow's own takes 20 MB more, and time
-    program = get_command(app)
-    shell.hasten(program)
     try:
-        sys.exit(program(standalone_mode=False))
+        sys.exit(_program()(standalone_mode=False))
     except UserError as error:
         _fail(_noted(str(error), error))
     except ModuleNotFoundError as error:

@@ -24,13 +24,24 @@ _PLAIN = frozenset({str, int, bool, NoneType})
 
 def canonical_json(value: Any) -> str:
     """Return the one JSON text of a value: sorted keys, no spaces. Raises ValueError on NaN or infinity."""
+    quick = _quickly(value)
+    return _EXACT.encode(value) if quick is None else quick.decode()
+
+
+def canonical_bytes(value: Any) -> bytes:
+    """Return `canonical_json` in UTF-8. Raises UnicodeEncodeError, a ValueError, on a lone surrogate."""
+    quick = _quickly(value)
+    return _EXACT.encode(value).encode() if quick is None else quick
+
+
+def _quickly(value: Any) -> bytes | None:
     # Digests depend on this text, which the standard library defines; msgspec takes half the time for most.
     if _written_alike(value):
         try:
-            return _QUICK.encode(value).decode()
+            return _QUICK.encode(value)
         except (TypeError, UnicodeEncodeError):  # a key that is not a string, or a lone surrogate
             pass
-    return _EXACT.encode(value)
+    return None
 
 
 def _written_alike(value: Any) -> bool:
@@ -83,7 +94,7 @@ def sha256_file(path: Path) -> str:
 
 def digest(value: Any) -> str:
     """Return the hex SHA-256 digest of a JSON value; it is the same in every process."""
-    return sha256_bytes(canonical_json(value).encode())
+    return sha256_bytes(canonical_bytes(value))
 
 
 @contextmanager

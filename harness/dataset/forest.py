@@ -61,27 +61,31 @@ class Forest:
         starts, total = [], 0  # the first index of each level of each tree
         for tree in trees:
             starts.append([total := total + size for size in (0, *map(len, tree.levels))])
-        child, edge = np.full((total, len(actions)), -1), np.full((total, len(actions)), -1)
+        child: list[list[int]] = []
+        edge: list[list[int]] = []
         edges: list[Edge] = []
         points = [point for tree in trees for level in tree.levels for point in level]
         following = [
             start for tree, tree_starts in zip(trees, starts, strict=True)
             for level, start in zip(tree.levels, tree_starts[1:], strict=True) for _ in level
         ]  # fmt: skip
-        for n, (point, start) in enumerate(zip(points, following, strict=True)):
+        for point, start in zip(points, following, strict=True):
+            taken, leads = [-1] * len(actions), [-1] * len(actions)
             for branch in point.edges:
-                columns = [action_index[action] for action in branch.actions]
-                edge[n, columns] = len(edges)
-                if branch.to is not None:
-                    child[n, columns] = start + branch.to
+                to = -1 if branch.to is None else start + branch.to
+                for action in branch.actions:
+                    taken[action_index[action]], leads[action_index[action]] = len(edges), to
                 edges.append(branch)
+            edge.append(taken)
+            child.append(leads)
         sizes = [list(map(len, tree.levels)) for tree in trees]
         return cls(
             actions, allowance_s, np.array([t.episode for t in trees]),
             np.array([t.episode_seed for t in trees]), tuple(t.danger.sector for t in trees),
             np.array([tree_starts[0] for tree_starts in starts]), tuple(point.scene for point in points),
             np.repeat(np.arange(len(trees)), list(map(sum, sizes))),
-            np.concatenate([np.repeat(np.arange(len(s)), s) for s in sizes]), child, edge, tuple(edges),
+            np.concatenate([np.repeat(np.arange(len(s)), s) for s in sizes]),
+            np.array(child), np.array(edge), tuple(edges),
             {name: np.array([action_index[p.drivers[name]] for p in points]) for name in points[0].drivers},
         )  # fmt: skip
 

@@ -2,8 +2,9 @@
 
 import math
 import os
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from functools import partial
+import time
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from functools import cache, partial
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable
-from harness.core.files import canonical_json, digest
+from harness.core.files import canonical_bytes, digest
 from harness.dataset.load import Scene
 from harness.evaluate import repair
 from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of
@@ -31,43 +32,44 @@ from harness.runs.records import Role as RecordedRole
 from harness.world.perception.graph import blinded, truth_graph
 
 CHUNK = 64  # fewest requests that are asked, and kept, together
+SYNC_S = 1.0  # kept answers reach the disk this often; if power fails, those since are asked again
 
 
 def requests(spec: Spec, scenes: Sequence[Scene], blind: bool = False) -> Iterator[Request]:
     """Yield the requests of scenes, the ego's first; with `blind` only those of blind helpers."""
+    agents, actions, scenario, words = spec.agents, spec.actions, spec.scenario, spec.scenario.prompt_words
+    privileged, sees = any(agent.card.privileged for agent in agents), any(agent.sees for agent in agents)
+    blank = cache(partial(_blank, spec))
     for scene in scenes:
-        truth = None
-        if any(agent.card.privileged for agent in spec.agents):
-            truth = truth_graph(spec.scenario, scene.state)
+        truth = truth_graph(scenario, scene.state) if privileged else None
         for place, viewer in enumerate(spec.viewers(scene)):
+            if blind and not place:
+                continue
             graph, index = scene.record["graphs"][viewer], spec.agent(place)
-            agent, name = spec.agents[index], _id(scene, viewer, blind)
             if blind:
-                if not place:
-                    continue
                 graph = blinded(graph)
-            yield _request(
-                spec, index, name, graph["role"],
-                agent.messages(graph, spec.actions, spec.scenario.prompt_words),
-                image=picture(spec, index, scene, viewer, blind), view=graph,
-                truth=truth if agent.card.privileged else None, scenario=spec.scenario,
+            agent = agents[index]
+            yield blank(index, graph["role"]).alike(
+                id=_id(scene, viewer, blind), messages=agent.messages(graph, actions, words),
+                image=picture(spec, index, scene, viewer, blind) if sees else None, view=graph,
+                truth=truth if agent.card.privileged else None, scenario=scenario,
             )  # fmt: skip
 
 
 def _id(scene: Scene, viewer: str, blind: bool) -> str:
-    return f"{scene.id}/{viewer}{BLIND * blind}"
+    return f"{scene.record['scene']}/{viewer}{BLIND}" if blind else f"{scene.record['scene']}/{viewer}"
 
 
-def _request(
-    spec: Spec, index: int, name: str, role: Role, messages: tuple[Mapping[str, str], ...], **more: Any
-) -> Request:
+def _blank(spec: Spec, index: int, role: Role) -> Request:
+    """Return a request to an agent in a role, without what differs between such requests."""
     agent = spec.agents[index]
+    sampled: dict[str, Any] = {}
     if agent.samples:
-        more |= {"temperature": spec.temperature, "sample": spec.sampling_seed}
+        sampled = {"temperature": spec.temperature, "sample": spec.sampling_seed}
     return Request(
-        id=name, role=role, messages=messages, actions=spec.actions, max_tokens=agent.most_tokens(role),
+        id="", messages=(), role=role, actions=spec.actions, max_tokens=agent.most_tokens(role),
         form=agent.prompt.helper_answer, answer=agent.answer, thinking=agent.thinking,
-        reasons_first=role in agent.prompt.reasons_first, agent=index, **more,
+        reasons_first=role in agent.prompt.reasons_first, agent=index, **sampled,
     )  # fmt: skip
 
 
@@ -78,7 +80,7 @@ def fusion_request(
     graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders, spec.actions)
     messages = spec.ego.rendered(graph, spec.actions, heard, spec.scenario.prompt_words)
     image = picture(spec, 0, scene, scene.viewers[0])
-    return _request(spec, 0, _fusion_id(scene, senders), "ego", messages, image=image)
+    return _blank(spec, 0, "ego").alike(id=_fusion_id(scene, senders), messages=messages, image=image)
 
 
 def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:
@@ -87,8 +89,9 @@ def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:
 
 def answer_of(request: Request, completion: Completion) -> Answer:
     """Parse a completion into an answer."""
-    # A lone surrogate cannot be written to a file. The rest of the text stays as it is.
-    raw = completion.text.encode("utf-8", "replace").decode("utf-8")
+    raw = completion.text
+    if not raw.isascii():  # a lone surrogate cannot be written to a file; the rest of the text stays as it is
+        raw = raw.encode("utf-8", "replace").decode("utf-8")
     scene, _, viewers = request.id.partition("/")
     viewer, *heard = viewers.split("+")
     role: RecordedRole = "merge" if heard else "blind" if viewer.endswith(BLIND) else request.role
@@ -145,7 +148,7 @@ class Asker:
         """
         self.spec, self._backend, self._kept = spec, backend, kept
         self._progress, self._more = progress, more
-        self.latency = latency
+        self.latency, self._on_disk_s = latency, -math.inf
         self._given = frozenset(answers or {})
         self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
 
@@ -168,13 +171,20 @@ class Asker:
         for answers in _answer_chunks(
             partial(self._answered, backend), incomplete, 1 + math.ceil(window(backend) / size)
         ):
-            new_answers |= {answer.id: answer for answer in answers}
+            new_answers |= answers
             if self._kept:
-                _keep(self._kept, answers)
+                _keep(self._kept, answers.values(), self._to_disk())
             self._progress(len(answers))
         self.answers |= {request.id: new_answers[request.id] for chunk in incomplete for request in chunk}
 
-    def _answered(self, backend: Backend, chunk: Sequence[Request]) -> list[Answer]:
+    def _to_disk(self) -> bool:
+        """Whether the last answers reached the disk long enough ago."""
+        due = time.monotonic() - self._on_disk_s >= SYNC_S
+        if due:
+            self._on_disk_s = time.monotonic()
+        return due
+
+    def _answered(self, backend: Backend, chunk: Sequence[Request]) -> dict[str, Answer]:
         """Answer each request; one whose answer cannot be parsed gets a repair turn if its prompt has one."""
         words = self.spec.scenario.prompt_words
         answers = [answer_of(r, c) for r, c in zip(chunk, backend.complete(chunk), strict=True)]
@@ -186,56 +196,64 @@ class Asker:
         completions = backend.complete(list(repairs.values())) if repairs else []
         for place, completion in zip(repairs, completions, strict=True):
             answers[place] = repair.together(answers[place], answer_of(chunk[place], completion))
-        return answers
+        return {request.id: answer for request, answer in zip(chunk, answers, strict=True)}
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
         """Return what every viewer intends; NaN if it has no request or its answer failed."""
-        if any(self.lacks(moments)):
+        if any(self._lacking(moments, self.answers)):
             self.answer(list(requests(self.spec, self._not_given(moments))))
         return self.laid_out(moments)
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
         """Return intents where helpers are shown nothing; NaN for those of moments not in `at`."""
         blind_moments = [moments[n] for n in at.tolist()]
-        if any(self.lacks(blind_moments, blind=True)):
+        if any(self._lacking(blind_moments, self.answers, blind=True)):
             self.answer(list(requests(self.spec, self._not_given(blind_moments, blind=True), blind=True)))
         return self.laid_out(moments, blind=True)
 
     def lacks(self, moments: Sequence[Scene], blind: bool = False) -> list[bool]:
         """For each moment, whether a viewer's answer is missing; with `blind`, a blind helper's."""
-        return self._lacking(moments, self.answers, blind)
+        return list(self._lacking(moments, self.answers, blind))
 
     def _not_given(self, moments: Sequence[Scene], blind: bool = False) -> list[Scene]:
         """Return the moments whose answers were not all given; only their prompts are rendered."""
         lacks = self._lacking(moments, self._given, blind)
         return [scene for scene, lacking in zip(moments, lacks, strict=True) if lacking]
 
-    def _lacking(self, moments: Sequence[Scene], available: Container[str], blind: bool) -> list[bool]:
-        return [any(_id(s, v, blind) not in available for v in self.spec.viewers(s)[blind:]) for s in moments]
+    def _lacking(
+        self, moments: Sequence[Scene], available: Container[str], blind: bool = False
+    ) -> Iterator[bool]:
+        for scene in moments:
+            viewers = self.spec.viewers(scene)[blind:]
+            yield any(_id(scene, viewer, blind) not in available for viewer in viewers)
 
     def laid_out(self, moments: Sequence[Scene], blind: bool = False, width: int = 1) -> Intents:
         """Return the answers so far as arrays of at least `width` vehicles; NaN without an intent."""
         answers = [
             [self.answers.get(_id(s, v, blind and n > 0)) for n, v in enumerate(s.viewers)] for s in moments
         ]
-        width, actions = max(width, *map(len, answers)), len(self.spec.actions)
-        p = np.full((len(moments), width, actions), np.nan)
-        distance_m = np.full((len(moments), width), np.nan)
-        range_m = np.full((len(moments), width - 1), np.nan)
-        bits = np.zeros((len(moments), width - 1))
-        for i, (scene, row) in enumerate(zip(moments, answers, strict=True)):
-            positions = {v["id"]: (v["x_m"], v["y_m"]) for v in scene.record["state"]["vehicles"]}
-            for j, (viewer, answer) in enumerate(zip(scene.viewers, row, strict=True)):
-                distance_m[i, j] = scene.record["distance_m"][viewer]
-                if answer and answer.intent is not None:
-                    p[i, j] = answer.intent
-                if j:
-                    range_m[i, j - 1] = scene.record["range_m"][viewer]
-                    bits[i, j - 1] = payload_bits(positions[viewer], answer) if answer else 0
-            row += [None] * (width - len(row))
-        valid = ~np.isnan(p[:, 1:]).any(axis=-1)
-        seconds = inference_s(self.latency, answers)
-        return Intents(p[:, 0], p[:, 1:], valid, distance_m, range_m, bits, seconds)
+        width = max(width, *map(len, answers))
+        unknown = (math.nan,) * len(self.spec.actions)
+        p, distances_m, ranges_m, bits = [], [], [], []
+        for scene, row in zip(moments, answers, strict=True):
+            record, (ego, *helpers) = scene.record, scene.viewers
+            absent = width - len(row)
+            row += [None] * absent
+            p.append([answer.intent or unknown if answer else unknown for answer in row])
+            distance_m, range_m = record["distance_m"], record["range_m"]
+            distances_m.append([distance_m[ego], *[distance_m[v] for v in helpers], *[math.nan] * absent])
+            ranges_m.append([*[range_m[v] for v in helpers], *[math.nan] * absent])
+            xy_m = {v["id"]: (v["x_m"], v["y_m"]) for v in record["state"]["vehicles"]}
+            sent = zip(helpers, row[1:], strict=False)
+            bits.append([*[payload_bits(xy_m[v], a) if a else 0 for v, a in sent], *[0] * absent])
+        intents = np.array(p, dtype=float)
+        valid = ~np.isnan(intents[:, 1:]).any(axis=-1)
+        shape = len(moments), width - 1
+        return Intents(
+            intents[:, 0], intents[:, 1:], valid, np.array(distances_m, dtype=float),
+            np.array(ranges_m, dtype=float).reshape(shape), np.array(bits, dtype=float).reshape(shape),
+            inference_s(self.latency, answers),
+        )  # fmt: skip
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         """Return the ego's answers to these sets of messages, rewritten as `rewrites` says."""
@@ -267,11 +285,11 @@ class Asker:
 
 
 def _answer_chunks(
-    work: Callable[[Sequence[Request]], list[Answer]], chunks: Sequence[Sequence[Request]], calls: int
-) -> Iterator[list[Answer]]:
-    """Yield the answers of each chunk as they come; up to `calls` chunks are asked at the same time.
+    work: Callable[[Sequence[Request]], dict[str, Answer]], chunks: Sequence[Sequence[Request]], calls: int
+) -> Iterator[dict[str, Answer]]:
+    """Yield the answers of each chunk as they come, by request id.
 
-    With several at work, no chunk waits for the last answer of another.
+    Up to `calls` chunks are asked at the same time, so that no chunk waits for the last answer of another.
     """
     if calls == 1 or len(chunks) == 1:
         yield from map(work, chunks)
@@ -292,14 +310,17 @@ def _heard_sets(
 
 
 def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
-    """Return the bits of a helper's message: id, position, intent, evidence and risk, as compact JSON."""
-    message = {
-        "from": answer.viewer,
-        "xy_m": [round(x, 1) for x in xy_m],
-        "intent": answer.intent and [round(x, 2) for x in answer.intent],
-        "says": answer.message,
-    }
-    return 8 * len(canonical_json(message).encode())
+    """Return the bits of a helper's message: id, position, intent, evidence and risk, as compact JSON.
+
+    Positions have one decimal and probabilities two at most.
+    """
+    intent = "null"
+    if answer.intent:
+        shares = [f"{share:.2f}" for share in answer.intent]
+        intent = f"[{','.join([share[:-1] if share[-1] == '0' else share for share in shares])}]"
+    numbers = f'{{"from":,"intent":{intent},"says":,"xy_m":[{xy_m[0]:.1f},{xy_m[1]:.1f}]}}'
+    texts = canonical_bytes([answer.viewer, answer.message])
+    return 8 * (len(numbers) + len(texts) - len("[,]"))
 
 
 def read_kept(kept: Path) -> dict[str, Answer]:
@@ -320,11 +341,13 @@ def read_kept(kept: Path) -> dict[str, Answer]:
     return {answer.id: answer for answer in answers}
 
 
-_DECODER = msgspec.json.Decoder(Answer)
+_DECODER, _ENCODER = msgspec.json.Decoder(Answer), msgspec.json.Encoder()
 
 
-def _keep(kept: Path, answers: Sequence[Answer]) -> None:
+def _keep(kept: Path, answers: Iterable[Answer], to_disk: bool) -> None:
+    """Append answers to a file; with `to_disk`, return once it is on the disk."""
     with kept.open("ab") as file:
-        file.write(b"".join(msgspec.json.encode(answer) + b"\n" for answer in answers))
+        file.write(_ENCODER.encode_lines(answers))
         file.flush()
-        os.fsync(file.fileno())
+        if to_disk:
+            os.fsync(file.fileno())

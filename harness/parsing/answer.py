@@ -1,8 +1,10 @@
 """Read an answer-shaped object in each role: an intent, and a helper's message."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from harness.core.errors import printable
 from harness.parsing import values
@@ -15,8 +17,7 @@ FIELDS = {
 }
 
 
-@dataclass(frozen=True)
-class Answer:
+class Answer(Struct, frozen=True):
     """An intent, its sum as stated, a helper's message, and the repairs that reading them took."""
 
     intent: values.Intent

@@ -6,8 +6,9 @@ before repaired JSON, and two answers that differ are no answer.
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
+
+from msgspec import Struct
 
 from harness.core import errors
 from harness.parsing import candidates, reasoning
@@ -34,8 +35,7 @@ _INVISIBLE = re.compile(rf"[{_NO_WIDTH}{_SPACES}]")
 _NO_WIDTHS, _SPACE = re.compile(rf"[{_NO_WIDTH}]+"), re.compile(rf"[{_SPACES}]")
 
 
-@dataclass(frozen=True)
-class Parsed:
+class Parsed(Struct, frozen=True):
     """The result of parsing one completion.
 
     Attributes:

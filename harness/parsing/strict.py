@@ -38,7 +38,7 @@ def _answer(answer: Any, role: str, actions: tuple[str, ...]) -> Answer | None:
         mass = math.fsum(shares)
         if abs(mass - 1) > EXACT:
             return None
-        intent = tuple(abs(p) / mass for p in shares)
+        intent = tuple([abs(p) / mass for p in shares])
         confidence = max(intent)
         maneuver = actions[intent.index(confidence)]
     else:

@@ -13,7 +13,7 @@ What decides success is drawn stratified. Every seed has each kind of episode, b
 and who reads it rightly, in its share to within one, and each link's luck is spread evenly over each kind.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from operator import attrgetter
@@ -204,7 +204,7 @@ class Calibrated:
     def __init__(self, episodes: int, parameters: Parameters | None = None) -> None:
         self.parameters = parameters or Parameters()
         self.episodes = episodes
-        self._of_seeds = lru_cache(maxsize=6)(self._drawn)  # all points of a panel have the same draws
+        self._of_seeds = lru_cache(maxsize=2)(self._drawn)  # all points of a panel have the same draws
 
     def manifest(self) -> dict[str, Any]:
         """What a reader needs to know of where the intents come from."""
@@ -217,11 +217,11 @@ class Calibrated:
             "episodes_per_seed": self.episodes,
         }
 
-    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Sequence[Walked]]:
+    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Iterable[Walked]]:
         """Episodes of every seed, `CHUNK` at a time, which bounds memory."""
         most = max((setting.vehicles for setting in settings), default=1) - 1
         for setting in settings:
-            yield list(self._walked(setting, most, seeds))
+            yield self._walked(setting, most, seeds)
 
     def _walked(self, setting: Setting, most: int, seeds: Sequence[int]) -> Iterator[Walked]:
         for first in range(0, self.episodes, CHUNK):

@@ -20,10 +20,7 @@ def write(out: Path, figures: Mapping[str, Figure], tables: "Mapping[str, pd.Dat
     """Write figures as SVG, PDF and PNG, and tables as CSV and JSON Lines, each file whole or not at all."""
     out.mkdir(parents=True, exist_ok=True)
     for stem, figure in figures.items():
-        # Where things go is laid out once and not for every format: it is half of the work.
-        if layout := figure.get_layout_engine():
-            layout.execute(figure)
-            figure.set_layout_engine("none")
+        lay_out(figure)
         for kind in FORMATS:
             save(figure, out / f"{stem}.{kind}", kind, dpi=300)
     for stem, table in tables.items():
@@ -31,6 +28,13 @@ def write(out: Path, figures: Mapping[str, Figure], tables: "Mapping[str, pd.Dat
             with replacing(out / f"{stem}.{ending}") as part, part.open("wb") as file:
                 for rows in written(table):
                     file.write(rows)
+
+
+def lay_out(figure: Figure) -> None:
+    """Lay a figure out once, and not again for every format: it is half of the work."""
+    if layout := figure.get_layout_engine():
+        layout.execute(figure)
+        figure.set_layout_engine("none")
 
 
 def write_manifest(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:

@@ -1,9 +1,9 @@
 """Plays a source of intents at every point of a panel, and sums up with intervals."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -36,6 +36,7 @@ PER_DECISION = (
     "latency_proxy_ms", "deadline_miss_rate", "trigger_rate", "messages_per_episode", "effective_loss",
     "observed_reply_loss",
 )  # fmt: skip
+COLUMNS = ("latency_ms", "deadline_missed", "triggered", "messages", "effective_loss", "observed_loss")
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Walked:
     Attributes:
         episodes: their numbers, (E,).
         ends: each of `ENDS`, (S, E); NaN where an episode was left out.
-        columns: numbers of the decisions (n,) by name.
+        columns: numbers of the decisions (n,) by name, `COLUMNS`, which these metrics are of.
         places: the episode of each decision, counted row by row in (S, E), (n,).
     """
 
@@ -70,10 +71,10 @@ class Source(Protocol):
         """What a reader needs to know of where the intents come from."""
         ...
 
-    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Sequence[Walked]]:
+    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Iterable[Walked]]:
         """Walks at each grid point in turn, in parts of some episodes; every point has the same draws.
 
-        A grid point's vehicles are the nearest ones.
+        A grid point's vehicles are the nearest ones. Its parts are taken before the next point.
         """
         ...
 
@@ -81,14 +82,15 @@ class Source(Protocol):
 def walk_through(
     world: World[Any], points: Sequence[OperatingPoint], ask: Ask[Any], seeds: Sequence[int], episodes: Ints
 ) -> Iterator[tuple[dict[str, Floats], Ints]]:
-    """The `columns` and `places` of each point's decisions, as rows round them; `episodes` (E,) ascending."""
+    """`COLUMNS` and `places` of each point's decisions, rounded as rows are; `episodes` (E,) ascending."""
     parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
     places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
     ascending = np.argsort(seeds)
     for decided in walk(world, points, ask):
         for part in decided:
-            parts[part.point].append(columns(part))
-            row = ascending[np.searchsorted(seeds, part.due.seed, sorter=ascending)]
+            every = columns(part)
+            parts[part.point].append({name: every[name] for name in COLUMNS})
+            row = ascending[np.searchsorted(seeds, part.due.seed, "right", sorter=ascending) - 1]
             place = row * len(episodes) + np.searchsorted(episodes, part.due.episode)
             places[part.point].append(place)
     for point, steps in parts.items():
@@ -131,17 +133,16 @@ def play(
     episodes: list[dict[str, Floats]] = []
     for setting, walked in zip(settings, source.walked(settings, seeds), strict=True):
         place = (source.name, panel, setting.condition, setting.variable, setting.value)
-        metrics = {name: np.hstack([w.ends[name] for w in walked]) for name in ENDS}
-        metrics |= {name: np.hstack([_metric(name, w, len(seeds)) for w in walked]) for name in PER_DECISION}
-        latency_ms = np.array([
-            percentiles(np.concatenate([_of_seed(w, n) for w in walked])) for n in range(len(seeds))
-        ])  # fmt: skip
+        parts = [_part(w, len(seeds)) for w in walked]
+        metrics = {name: np.hstack([part.metrics[name] for part in parts]) for name in parts[0].metrics}
+        of_seeds = zip(*(part.latency_ms for part in parts), strict=True)
+        latency_ms = np.array([percentiles(np.concatenate(of_seed)) for of_seed in of_seeds])
         rows += [
             {**dict(zip(PLACE, place, strict=True)), "metric": metric, "mean": e.value, "ci_low": e.low,
              "ci_high": e.high, "n": e.n, "interval": interval}
             for metric, e, interval in _estimates(source, metrics, latency_ms)
         ]  # fmt: skip
-        numbers = np.concatenate([w.episodes for w in walked])
+        numbers = np.concatenate([part.episodes for part in parts])
         episodes.append({name: metrics[name].ravel() for name in EPISODE_METRICS} | {
             "seed": np.repeat(seeds, len(numbers)), "episode": np.tile(numbers, len(seeds)),
         })  # fmt: skip
@@ -149,16 +150,24 @@ def play(
     return Played(pd.DataFrame(rows), _episode_table(source.name, panel, settings, episodes))
 
 
-def _metric(name: str, walked: Walked, seeds: int) -> Floats:
-    """A metric of the decisions by episode, (S, E)."""
-    n = len(walked.episodes)
-    values = of_decisions(METRICS[name], walked.columns, walked.places, seeds * n).reshape(seeds, n)
-    return np.where(np.isnan(walked.ends["success_rate"]), np.nan, values)
+class _Part(NamedTuple):
+    """What stays of some episodes: their numbers (E,), metrics (S, E), and each seed's latencies (n,)."""
+
+    episodes: Ints
+    metrics: Mapping[str, Floats]
+    latency_ms: Sequence[Floats]
 
 
-def _of_seed(walked: Walked, place: int) -> Floats:
-    """Latencies of the decisions of the seed at this place."""
-    return np.asarray(walked.columns["latency_ms"][walked.places // len(walked.episodes) == place])
+def _part(walked: Walked, seeds: int) -> _Part:
+    n, left_out = len(walked.episodes), np.isnan(walked.ends["success_rate"])
+
+    def metric(name: str) -> Floats:
+        values = of_decisions(METRICS[name], walked.columns, walked.places, seeds * n).reshape(seeds, n)
+        return np.where(left_out, np.nan, values)
+
+    seed, latency_ms = walked.places // n, walked.columns["latency_ms"]
+    metrics = {**{name: walked.ends[name] for name in ENDS}, **{name: metric(name) for name in PER_DECISION}}
+    return _Part(walked.episodes, metrics, [latency_ms[seed == place] for place in range(seeds)])
 
 
 def _estimates(

@@ -41,7 +41,7 @@ from harness.runs.records import Answer
 from harness.studies.axes import Setting
 from harness.studies.play import Walked, walk_through
 
-WALKS = 1 << 15  # most that are walked together, unless one grid point has more: some 100 MB
+WALKS = 1 << 17  # most that are walked together, unless one grid point has more: some 120 MB
 MORE = "more-answers.jsonl"  # answers at decision points that the run did not come to, and its fusion calls
 
 

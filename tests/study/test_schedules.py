@@ -22,7 +22,9 @@ from harness.core.resources import MARKER, find
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 from harness.evaluate import asking
+from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.outlook import outlook
+from harness.evaluate.walk import columns, walk
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, of_decisions
 from harness.studies import axes
@@ -57,11 +59,14 @@ def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: Stored, text:
     every = made(stored, text)
     success, costs = every.played(every.scheduled(point))
     [[walked]] = stored.walked([axes.Setting(text, point, stored.vehicles)], stored.seeds)
+    world = FrozenWorld(stored.dataset, [point], stored.seeds)
+    airtime_ms = np.concatenate([columns(part)["airtime_ms"] for [part] in walk(world, [point], stored)])
+    of = {**walked.columns, "airtime_ms": airtime_ms}
     assert np.array_equal(success, walked.ends["success_rate"])
     for cost, metric in (("messages", "messages_per_episode"), ("airtime_ms", "airtime_ms")):
-        values = of_decisions(METRICS[metric], walked.columns, walked.places, success.size)
+        values = of_decisions(METRICS[metric], of, walked.places, success.size)
         assert costs[..., COSTS.index(cost)] == pytest.approx(values.reshape(success.shape), abs=1e-3)
-    mean = of_decisions(METRICS["latency_proxy_ms"], walked.columns, walked.places, success.size)
+    mean = of_decisions(METRICS["latency_proxy_ms"], of, walked.places, success.size)
     latency, decisions = costs[..., COSTS.index("latency_ms")], costs[..., COSTS.index("decisions")]
     assert latency / decisions == pytest.approx(mean.reshape(success.shape), abs=1e-2)
     best, fewest = every.oracle()

@@ -4,10 +4,11 @@ import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from harness.backends.beginnings import alike
 from harness.backends.cards import Card
 from harness.backends.chat import Chat
 from harness.backends.engine import check_logits, common_length
@@ -22,7 +23,7 @@ from harness.core.errors import UserError
 from harness.core.files import sha256_bytes, sha256_file
 from harness.core.image import Image
 
-BEGINNINGS = 3  # beginnings of prompts kept between calls: one for each role, and one of a batch with both
+BEGINNINGS = 3  # beginnings of prompts kept between calls: one for each role, and one more
 _ANSWER = 256  # tokens of an answer for which memory is allocated in advance
 _PICTURES = ("<|image_pad|>", "<image>")  # tokens that chat templates write for a picture
 
@@ -42,6 +43,24 @@ def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> La
     if card.vision and card.projector:
         projector = Projector(card.name, file.with_name(card.projector), model, card.vision)
     return LanguageModel(LlamaEngine(card, file, model, batch_size, projector), batch_size)
+
+
+class _Group(NamedTuple):
+    """Prompts of a call that begin alike.
+
+    Attributes:
+        places: places of their sequences.
+        shared: what they begin with.
+        nearest: the kept beginning that the first is forked from.
+        known: number of tokens of it.
+        kept: most tokens of `shared` in any kept beginning.
+    """
+
+    places: list[int]
+    shared: list[int]
+    nearest: int
+    known: int
+    kept: int
 
 
 class LlamaEngine:
@@ -78,9 +97,9 @@ class LlamaEngine:
         return self._projector.tokens(image)
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> "LlamaSession":
-        """Read some prompts, none of them empty; their common beginning is computed once.
+        """Read some prompts, none of them empty; what several begin with is computed once.
 
-        The beginning is kept for later calls, unless half of it is part of one that is kept already.
+        A beginning is kept for later calls, unless half of it is part of one that is kept already.
         """
         if len(prompts) > len(self._free):
             raise ValueError(f"{len(prompts)} prompts for {len(self._free)} free places")
@@ -93,35 +112,54 @@ class LlamaEngine:
         return LlamaSession(self, places, logits)
 
     def _read(self, prompts: dict[int, list[int]]) -> Logits:
-        first, *rest = prompts
-        # The last token of each prompt is always read, for its logits.
-        common = 0 if self._model.whole_state else common_length([p[:-1] for p in prompts.values()])
-        shared = prompts[first][:common]
+        places = list(prompts)
         self._context.reserve(max(map(len, prompts.values())) + _ANSWER)
-        kept = {b: common_length([self._context.tokens.get(b, []), shared]) for b in self._beginnings}
-        new = 2 * max(kept.values()) < common
-        if (
-            not rest
-        ):  # a repeated prompt is read again, since its time would otherwise not be an answer's time
-            if self._projector and max(kept.values()) == common:
-                self._projector.forget(shared)
-            kept = {b: n if n < common else 0 for b, n in kept.items()}
-        nearest = max(self._beginnings, key=kept.__getitem__)
-        known = kept[nearest]
-        self._context.fork(nearest, first, known)
-        if rest and common > known:
-            self._context.extend({first: shared[known:]})
-        for place in rest:
-            self._context.fork(first, place, common)
+        # The last token of each prompt is always read, for its logits.
+        heads = [[] if self._model.whole_state else prompt[:-1] for prompt in prompts.values()]
+        groups = [
+            self._group([places[i] for i in group], [heads[i] for i in group]) for group in alike(heads)
+        ]
+        if len(prompts) == 1:
+            groups = [self._read_again(groups[0])]
+        for group in groups:
+            self._context.fork(group.nearest, group.places[0], group.known)
+        firsts = {g.places[0]: g.shared[g.known :] for g in groups if len(g.places) > 1}
+        if unread := {place: tokens for place, tokens in firsts.items() if tokens}:
+            self._context.extend(unread)
+        for group in groups:
+            for place in group.places[1:]:
+                self._context.fork(group.places[0], place, len(group.shared))
         logits = self._context.extend({p: ids[len(self._context.tokens[p]) :] for p, ids in prompts.items()})
-        if known:
-            self._used(nearest)
-        if new:
-            oldest = self._beginnings[0]
-            self._context.drop(oldest)
-            self._context.fork(first, oldest, common)
-            self._used(oldest)
+        for group in groups:
+            if group.known:
+                self._used(group.nearest)
+        for group in groups:
+            if len(group.shared) > 2 * group.kept and (len(group.places) > 1 or len(prompts) == 1):
+                oldest = self._beginnings[0]
+                self._context.drop(oldest)
+                self._context.fork(group.places[0], oldest, len(group.shared))
+                self._used(oldest)
         return logits
+
+    def _group(self, places: list[int], heads: list[list[int]]) -> _Group:
+        """Find the longest kept part of what some prompts begin with."""
+        shared = heads[0][: common_length(heads)]
+        nearest, known = self._nearest(shared)
+        return _Group(places, shared, nearest, known, known)
+
+    def _nearest(self, shared: list[int], but: int | None = None) -> tuple[int, int]:
+        """Return the kept beginning with most of some tokens, and how many: not `but` of them."""
+        kept = {b: common_length([self._context.tokens.get(b, []), shared]) for b in self._beginnings}
+        kept = {b: 0 if n == but else n for b, n in kept.items()}
+        nearest = max(self._beginnings, key=kept.__getitem__)
+        return nearest, kept[nearest]
+
+    def _read_again(self, group: _Group) -> _Group:
+        """Leave what is kept of a whole prompt: if repeated alone, its time would not be an answer's time."""
+        if self._projector and group.known == len(group.shared):
+            self._projector.forget(group.shared)
+        nearest, known = self._nearest(group.shared, but=len(group.shared))
+        return group._replace(nearest=nearest, known=known)
 
     def _used(self, beginning: int) -> None:
         self._beginnings.remove(beginning)
@@ -199,6 +237,10 @@ class LlamaSession:
         rows = [row for row, chunk in enumerate(chunks) if chunk]
         if rows:
             self._logits[rows] = self._engine.extend({self._places[row]: chunks[row] for row in rows})
+
+    def follow(self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]) -> list[int]:
+        self.advance(chunks)  # guesses are not checked
+        return [0] * len(guesses)
 
     def keep(self, places: Sequence[int]) -> None:
         kept = [self._places[place] for place in places]

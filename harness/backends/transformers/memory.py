@@ -54,6 +54,11 @@ class PagedLayer(DynamicLayer):  # type: ignore[misc]  # transformers is untyped
         for memory, states in zip(self._memory, (keys, values), strict=True):
             memory[index, :, : states.shape[-2]] = states
 
+    def reset(self) -> None:
+        """Let go of everything."""
+        self._memory = []
+        super().reset()
+
     def batch_select_indices(self, indices: Any) -> None:
         """Keep these rows, in this order."""
         end = self.keys.shape[-2]
@@ -88,4 +93,6 @@ def joined(parts: Sequence[tuple[Sequence[int], Cache]]) -> Cache:
             part = cache.layers[i]
             layer.place(places, part.keys, part.values, n, columns)
             part.reset()
-    return Cache(layers=layers)
+    whole = parts[0][1]
+    whole.layers = layers
+    return whole

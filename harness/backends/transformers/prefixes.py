@@ -1,13 +1,11 @@
 """Cache of common prompt beginnings: the keys and values of prompts that were read before."""
 
-from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from harness.backends.engine import common_length
 
 LEAST_TOKENS = 16  # a shorter beginning is cheaper to read again than to keep
-LEAST_SAVED = 64  # fewer tokens saved are cheaper to read than a group of prompts of its own
 MOST_TOKENS = 2048  # most tokens kept in total: 0.3 GB for a 4B model with grouped-query attention
 
 
@@ -24,32 +22,6 @@ NOTHING = Prefix([], [])
 def common(sequences: Sequence[list[int]]) -> list[int]:
     """Return the common beginning of one or more sequences."""
     return sequences[0][: common_length(sequences)]
-
-
-def alike(sequences: Sequence[list[int]]) -> Iterator[list[int]]:
-    """Split sequences into groups with longer common beginnings, where that saves tokens.
-
-    Yields:
-        The places of each group's sequences.
-    """
-    order = sorted(range(len(sequences)), key=sequences.__getitem__)
-    shared = [common_length([sequences[a], sequences[b]]) for a, b in pairwise(order)]
-    yield from _split(order, shared)
-
-
-def _split(order: list[int], shared: list[int]) -> Iterator[list[int]]:
-    """Split sorted sequences, of which neighbours share a beginning of some length."""
-    least = min(shared, default=0)
-    cuts = [-1, *(i for i, length in enumerate(shared) if length == least), len(shared)]
-    rest = []
-    for start, end in pairwise(cuts):
-        part, inside = order[start + 1 : end + 1], shared[start + 1 : end]
-        if inside and (len(part) - 1) * (min(inside) - least) >= LEAST_SAVED:
-            yield from _split(part, inside)
-        else:
-            rest += part
-    if rest:
-        yield rest
 
 
 class Prefixes:

@@ -20,10 +20,11 @@ import torch
 from torch.nn.functional import pad
 from transformers.cache_utils import Cache, DynamicCache, DynamicLayer
 
+from harness.backends.beginnings import alike
 from harness.backends.engine import Session, check_logits
 from harness.backends.transformers.eyes import Eyes
 from harness.backends.transformers.memory import PagedLayer, joined
-from harness.backends.transformers.prefixes import LEAST_TOKENS, NOTHING, Prefix, Prefixes, alike, common
+from harness.backends.transformers.prefixes import LEAST_TOKENS, NOTHING, Prefix, Prefixes, common
 from harness.core.arrays import Floats
 
 CPU_TOKENS = 1024  # most tokens that a CPU reads together: what more of them need does not stay in its cache
@@ -42,7 +43,6 @@ class Reader:
         self._failed = False
         self._positions = "position_ids" in signature(model.forward).parameters
         layers = DynamicCache(config=model.config).layers
-        self._layers = len(layers)
         self.together = self._positions and all(type(layer) is DynamicLayer for layer in layers)
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
@@ -85,12 +85,14 @@ class Reader:
         return rows
 
     def _prefix(self, beginnings: list[list[int]]) -> Prefix:
-        """Return what some prompts begin with, read if it was not kept."""
+        """Return what some prompts begin with; what is read of it is kept, unless half of it was."""
         shared = common(beginnings)
         prefix = self._prefixes.longest(shared)
-        if len(beginnings) > 1 and len(shared) - len(prefix.ids) >= LEAST_TOKENS:
+        known = len(prefix.ids)
+        if len(beginnings) > 1 and len(shared) - known >= LEAST_TOKENS:
             prefix = Prefix(shared, Rows.read(self, prefix, [shared], self.positions([shared])).layers())
-            self._prefixes.keep(prefix)
+            if 2 * known < len(shared):
+                self._prefixes.keep(prefix)
         return prefix
 
     def _pieces(self, group: Sequence[int], lengths: Sequence[int]) -> list[list[int]]:
@@ -110,9 +112,10 @@ class Reader:
 
     def cache(self) -> Cache:
         """Return an empty cache of the model's layers."""
+        cache = DynamicCache(config=self._model.config)
         if self.together:
-            return Cache(layers=[PagedLayer() for _ in range(self._layers)])
-        return DynamicCache(config=self._model.config)
+            cache.layers = [PagedLayer() for _ in cache.layers]
+        return cache
 
     def positions(self, prompts: Sequence[Sequence[int]]) -> list[Any] | None:
         """Return the positions of each prompt's tokens, (3, tokens); None if they are consecutive."""
@@ -121,14 +124,15 @@ class Reader:
         places = [self._eyes.positions(prompt) for prompt in prompts]
         return None if places[0] is None else places
 
-    def forward(self, cache: Cache, ids: Any, mask: Any, places: Any = None) -> Any:
-        """Read tokens and return the logits after the last column, (n, vocabulary).
+    def forward(self, cache: Cache, ids: Any, mask: Any, columns: int, places: Any) -> Any:
+        """Read tokens and return the logits after the last columns, (n, columns, vocabulary).
 
         Args:
             cache: keys and values so far, to which the new ones are added.
             ids: tokens, (n, width), on the CPU.
             mask: 1 for a token and 0 for a pad, (n, cached + width), on the CPU.
-            places: positions, (3, n, width), if they are not consecutive.
+            columns: after how many of the last columns.
+            places: positions, (3, n, width); None if they are consecutive.
         """
         device = self._model.device
         options = {"attention_mask": mask.to(device), "past_key_values": cache, "use_cache": True}
@@ -139,7 +143,7 @@ class Reader:
         try:
             with torch.inference_mode():
                 options |= self._eyes.inputs(ids) if self._eyes else {"input_ids": ids.to(device)}
-                return self._model(logits_to_keep=1, **options).logits[:, -1]
+                return self._model(logits_to_keep=columns, **options).logits
         except Exception:
             self._failed = True
             raise
@@ -213,15 +217,36 @@ class Rows:
         return log_p
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
-        width = max(map(len, chunks))
-        if width == 0:
+        if not any(chunks):
             return
+        logits = self._append(chunks, 1)[:, -1]
+        advanced = torch.tensor([[bool(chunk)] for chunk in chunks], device=logits.device)
+        self._logits = logits if self._logits is None else torch.where(advanced, logits, self._logits)
+
+    def follow(self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]) -> list[int]:
+        widest = max(map(len, guesses))
+        both = [[*chunk, *guess] for chunk, guess in zip(chunks, guesses, strict=True)]
+        logits = self._append(both, 1 + widest)
+        counts = []
+        for guess, own in zip(guesses, logits.argmax(-1).tolist(), strict=True):
+            likeliest = zip(guess, own[widest - len(guess) :], strict=False)
+            counts.append(next((i for i, (a, b) in enumerate(likeliest) if a != b), len(guess)))
+        wrong = [len(guess) - count for guess, count in zip(guesses, counts, strict=True)]
+        for row, tokens in enumerate(wrong):
+            self._mask[row, self._mask.shape[1] - tokens :] = 0
+        self._logits = logits[torch.arange(len(wrong)), widest - torch.tensor(wrong)]
+        if cut := min(wrong):
+            self._mask = self._mask[:, :-cut]
+            self._cache.crop(-cut)
+        return counts
+
+    def _append(self, chunks: Sequence[Sequence[int]], columns: int) -> Any:
+        """Read tokens and return the logits after each of the last columns, (n, columns, vocabulary)."""
+        width = max(map(len, chunks))
         ids = torch.tensor([[0] * (width - len(chunk)) + list(chunk) for chunk in chunks])
         new = torch.tensor([[0] * (width - len(chunk)) + [1] * len(chunk) for chunk in chunks])
         self._mask = torch.cat([self._mask, new], dim=1)
-        logits = self._reader.forward(self._cache, ids, self._mask, self._positions(chunks, width))
-        advanced = new[:, -1:].bool().to(logits.device)
-        self._logits = logits if self._logits is None else torch.where(advanced, logits, self._logits)
+        return self._reader.forward(self._cache, ids, self._mask, columns, self._positions(chunks, width))
 
     def _positions(self, chunks: Sequence[Sequence[int]], width: int) -> Any:
         """Return the positions of new tokens, (3, n, width); None if they are consecutive."""
@@ -266,6 +291,10 @@ class Apart:
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
         for session, chunk in zip(self._sessions, chunks, strict=True):
             session.advance([chunk])
+
+    def follow(self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]) -> list[int]:
+        self.advance(chunks)  # what a window or a recurrent state has read cannot be taken back
+        return [0] * len(guesses)
 
     def keep(self, places: Sequence[int]) -> None:
         self._sessions = [self._sessions[place] for place in places]

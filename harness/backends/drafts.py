@@ -1,0 +1,49 @@
+"""Guesses of how an answer goes on, from the answers written beside it.
+
+With a guess, a model reads several tokens at a time in place of one. A guess changes no answer: the model
+checks it, and drops what it would not have written itself (speculative decoding, Leviathan et al., 2023).
+Guesses are a batch's own, so no answer depends on an earlier batch.
+"""
+
+from collections.abc import Hashable, Sequence
+
+from harness.backends.chat import Chat
+
+BEFORE = 8  # tokens that decide what comes next
+MOST = 8  # most tokens of a guess
+
+
+class Drafts:
+    """What came after which tokens so far; numbers count as equal.
+
+    A token is guessed only where all answers went on alike, so next to none is read in vain.
+    """
+
+    def __init__(self, chat: Chat) -> None:
+        self._chat = chat
+        self._next: dict[Hashable, int | None] = {}  # None where answers differ
+        self._numeric: dict[int, bool] = {}
+
+    def learn(self, kind: Hashable, tokens: Sequence[int]) -> None:
+        """Remember what the last token of an answer of some kind came after."""
+        place = self._place(kind, tokens[:-1])
+        if self._next.setdefault(place, tokens[-1]) != tokens[-1]:
+            self._next[place] = None
+
+    def after(self, kind: Hashable, tokens: Sequence[int], most: int) -> list[int]:
+        """Return up to `most` tokens that may follow; none if nothing is known."""
+        guess: list[int] = []
+        while len(guess) < min(most, MOST):
+            token = self._next.get(self._place(kind, [*tokens, *guess]))
+            if token is None:
+                break
+            guess.append(token)
+        return guess
+
+    def _place(self, kind: Hashable, tokens: Sequence[int]) -> Hashable:
+        return kind, *(None if self._is_numeric(token) else token for token in tokens[-BEFORE:])
+
+    def _is_numeric(self, token: int) -> bool:
+        if token not in self._numeric:
+            self._numeric[token] = any(c.isdigit() for c in self._chat.pieces([token])[0])
+        return self._numeric[token]
