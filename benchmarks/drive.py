@@ -71,7 +71,7 @@ def main() -> None:
           f"{1 - frames / frames_lived:.0%}")  # fmt: skip
     for part, seconds in parts.items():
         print(f"  {part:<12}{seconds:8.2f} s {seconds / total:7.1%}")
-    print(f"  {lives / total:.0f} episodes a second of that time")
+    print(f"  {lives / total:.0f} episodes a second of that CPU time")
     for workers, seconds in walls.items():
         print(f"  {workers} workers: {lives / seconds:7.1f} episodes/s")
     print("  one worker, CPU: " + ", ".join(f"{form} {seconds:.2f} s" for form, seconds in cpus.items()))
@@ -92,7 +92,7 @@ def drive(spec: Spec, numbers: range) -> list[Episode]:
 
 
 def shares(spec: Spec, numbers: range) -> tuple[dict[str, float], int, int]:
-    """Seconds of each part in one process, frames simulated, and frames lived through by all episodes."""
+    """CPU seconds of each part in one process, frames simulated, and frames lived through by all episodes."""
     spent = dict.fromkeys(PARTS, 0.0)
     simulated = 0
 
@@ -101,11 +101,11 @@ def shares(spec: Spec, numbers: range) -> tuple[dict[str, float], int, int]:
             nonlocal simulated
             worlds = given[0] if part == "frames" else ()
             simulated -= sum(world.frame for world in worlds)
-            start = perf_counter()
+            start = process_time()
             try:
                 return function(*given, **named)
             finally:
-                spent[part] += perf_counter() - start
+                spent[part] += process_time() - start
                 simulated += sum(world.frame for world in worlds)
 
         return call
@@ -113,9 +113,9 @@ def shares(spec: Spec, numbers: range) -> tuple[dict[str, float], int, int]:
     with ExitStack() as stack:
         for part, (owner, name) in PARTS.items():
             stack.enter_context(patch.object(owner, name, clocked(part, getattr(owner, name))))
-        start = perf_counter()
+        start = process_time()
         episodes = drive(spec, numbers)
-        total = perf_counter() - start
+        total = process_time() - start
     lived_s = sum(episode.time_s or 0.0 for episode in episodes)
     lived = round(lived_s * SCENARIO.parameters.simulation_hz)
     return {**spent, "own": total - sum(spent.values())}, simulated, lived

@@ -5,6 +5,7 @@ lead to the same trajectories; alone, together with NumPy and together compiled 
 The compiled frame needs the extra `fast`. EnvPool is no dependency: name a Python that has it.
 
     python benchmarks/worlds.py [--layouts 500] [--worlds 128] [--envpool PYTHON]
+    python benchmarks/worlds.py --trees     # only what a decision point costs that is frozen, together
 """
 
 import argparse
@@ -61,7 +62,13 @@ def main() -> None:
     arguments.add_argument("--layouts", type=int, default=500)
     arguments.add_argument("--worlds", type=int, default=128)
     arguments.add_argument("--envpool", help="a Python interpreter that has EnvPool")
+    arguments.add_argument("--trees", action="store_true", help="measure only freezing, together")
     given = arguments.parse_args()
+    if given.trees:
+        for name in scenarios.names():
+            trees = ", ".join(f"{form} {tree_ms(scenarios.get(name), form):.1f}" for form in FORMS)
+            print(f"{name:<24}freezing, ms a decision point: {trees}")
+        return
     loading = loading_s() if COMPILED in FORMS else None
     rows = {name: row(scenarios.get(name), given.layouts, given.worlds) for name in scenarios.names()}
     columns = ["plain", "alone", *(f"{form}: {what}" for form in FORMS for what in ("together", "frame"))]

@@ -1,6 +1,7 @@
 """The backend of the reference drivers, so that they run like any model."""
 
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Any
 
 from harness import __version__
@@ -8,7 +9,7 @@ from harness.backends.base import Completion, Request
 from harness.backends.cards import Card
 from harness.core.errors import unknown
 from harness.core.files import canonical_json
-from harness.world.drivers import DRIVERS, choose
+from harness.world.drivers import DRIVERS, choices
 
 
 def open(card: Card, **_: Any) -> "DriverBackend":
@@ -25,12 +26,22 @@ class DriverBackend:
         self.driver = driver
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        return [self._answer(request) for request in requests]
+        # Those of a run are all of one scenario.
+        parts = [list(part) for _, part in groupby(requests, key=lambda request: id(request.scenario))]
+        return [completion for part in parts for completion in self._complete(part)]
 
-    def _answer(self, request: Request) -> Completion:
-        if request.scenario is None:
-            raise ValueError(f"request {request.id} has no scenario; a driver needs its road")
-        action = choose(request.scenario, self.driver, request.view or {}, request.truth)
+    def _complete(self, requests: Sequence[Request]) -> list[Completion]:
+        """Answer requests of one scenario."""
+        scenario = requests[0].scenario
+        if scenario is None:
+            raise ValueError(f"request {requests[0].id} has no scenario; a driver needs its road")
+        asked = [(self.driver, request.view or {}, request.truth) for request in requests]
+        return [
+            self._answer(request, action)
+            for request, action in zip(requests, choices(scenario, asked), strict=True)
+        ]
+
+    def _answer(self, request: Request, action: str) -> Completion:
         text = canonical_json({"action_distribution": {a: float(a == action) for a in request.actions}})
         return Completion(request.id, text, None, None, "stop", None, 1)
 

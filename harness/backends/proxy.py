@@ -7,6 +7,7 @@ something about the harness and nothing about any language model. Its card may m
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from itertools import groupby
 from typing import Any
 
 from harness.backends.base import Completion, FinishReason, Request
@@ -68,26 +69,33 @@ def answer(request: Request) -> str:
 
 def answers(requests: Sequence[Request]) -> list[str]:
     """Return the texts of the answers to some requests."""
-    views: dict[int, tuple[Scenario, list[Mapping[str, Any]]]] = {}
-    for request in requests:  # those of a run are all of one scenario
-        if request.view is None or request.scenario is None:
+    # Those of a run are all of one scenario.
+    parts = [list(part) for _, part in groupby(requests, key=lambda request: id(request.scenario))]
+    return [text for part in parts for text in _answers(part)]
+
+
+def _answers(requests: Sequence[Request]) -> list[str]:
+    """Return the texts of the answers to requests of one scenario."""
+    scenario, views = requests[0].scenario, []
+    for request in requests:
+        if request.view is None or scenario is None:
             raise ValueError(f"request {request.id} has no view of a scenario; the proxy reads nothing else")
-        views.setdefault(id(request.scenario), (request.scenario, []))[1].append(request.view)
-    planned = {key: iter(plans(*of)) for key, of in views.items()}
-    return [_told(request, next(planned[id(request.scenario)])) for request in requests]
+        views.append(request.view)
+    assert scenario is not None
+    return [
+        _told(request, view, _hedged(scenario.actions, planned, view))
+        for request, view, planned in zip(requests, views, plans(scenario, views), strict=True)
+    ]
 
 
-def _told(request: Request, planned: str) -> str:
-    """Return the text of the answer to a request, given the planner's action."""
-    assert request.view is not None
-    assert request.scenario is not None
-    intent = _hedged(request.scenario.actions, planned, request.view)
+def _told(request: Request, view: Mapping[str, Any], intent: dict[str, float]) -> str:
+    """Return the text of an answer."""
     if request.role == "ego":
         body: dict[str, Any] = {"action_distribution": intent}
     else:
-        body = _message(request.view, intent, request.form)
+        body = _message(view, intent, request.form)
     if request.form == "recommendation":
-        return f"{_reason(request.view)} {canonical_json(body)}"  # such a prompt asks for its reasons first
+        return f"{_reason(view)} {canonical_json(body)}"  # such a prompt asks for its reasons first
     return canonical_json(body)
 
 
