@@ -9,6 +9,7 @@ it is done once.
 """
 
 import argparse
+import gc
 import hashlib
 import json
 import statistics
@@ -25,6 +26,7 @@ import copies
 
 from harness.backends import cards
 from harness.backends.proxy import Proxy
+from harness.cli import COLLECT_AFTER
 from harness.coordination.operating_point import POINTS
 from harness.core.files import canonical_json
 from harness.core.resources import DATASET
@@ -64,6 +66,7 @@ def main() -> None:
     arguments.add_argument("--prompt", default="v2")
     given = arguments.parse_args()
 
+    gc.set_threshold(COLLECT_AFTER, 10, 10)  # as a command has it
     load.load(load.find(given.dataset), limit=1)  # pays for imports
     start = process_time()
     dataset = load.load(load.find(given.dataset))
