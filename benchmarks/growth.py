@@ -184,10 +184,10 @@ def drawn(decisions: Sequence[Row], workers: Sequence[Row]) -> Figure:
         axes.yaxis.set_major_formatter(lambda n, _: f"{n:g}")
         axes.yaxis.set_minor_formatter(NullFormatter())
     memory.set_yticks([200, 500, 1000, 2000, 5000, 10000])
-    for axes in (time, memory, hands):
-        axes.legend(fontsize=6, frameon=False)
+    for axes, corner in ((time, "lower right"), (memory, "upper left"), (hands, "lower left")):
+        axes.legend(fontsize=6, frameon=False, loc=corner)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.subplots_adjust(left=0.075, right=0.99, bottom=0.17, top=0.97, wspace=0.3)
+    figure.subplots_adjust(left=0.085, right=0.99, bottom=0.17, top=0.97, wspace=0.34)
     return figure
 
 

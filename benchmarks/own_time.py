@@ -40,7 +40,7 @@ from harness.prompts.versions import Prompt
 from harness.runs import folder as folders
 from harness.runs.folder import read
 
-AIM_MS = 0.3
+AIM_MS = 0.2
 # Functions whose time makes up a part; what the backend and the copies take is no part of the harness.
 PARTS: dict[str, list[tuple[Any, str]]] = {
     "proxy": [(Proxy, "complete")],
