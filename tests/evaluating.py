@@ -29,7 +29,7 @@ from harness.runs import folder
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, Decision, Episode, Latency, Score
-from harness.runs.summary import counted, scores
+from harness.runs.summary import Figures, counted
 from harness.world.drivers import DRIVERS
 
 FILES = ("answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv")
@@ -150,7 +150,9 @@ def walked(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path 
     grid = Grid(tuple(point.name for point in spec.points), spec.seeds, spec.source.dataset.episodes)
     episodes = counted(grid, made, world.episodes())
     answers = folder.ordered(asker.answers.values(), made)
-    return Walked(parts, made, episodes, answers, scores("frozen", grid, made, episodes, answers))
+    return Walked(
+        parts, made, episodes, answers, Figures.of("frozen", grid, made, episodes, answers).scores()
+    )
 
 
 class Scripted:

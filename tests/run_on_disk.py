@@ -14,7 +14,7 @@ from harness.runs import folder
 from harness.runs.decisions import Decisions, schema
 from harness.runs.metrics import Grid, World
 from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Latency, Manifest
-from harness.runs.summary import counted, scores
+from harness.runs.summary import Figures, counted
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 Row = dict[str, Any]
@@ -140,7 +140,7 @@ def _write(
     grid = Grid(tuple(str(c["name"]) for c in manifest.conditions), manifest.seeds, numbers)
     episodes = counted(grid, decisions, _all(ends, Episode))
     world: World = "frozen" if isinstance(manifest.world, FrozenScenes) else "closed-loop"
-    summary = scores(world, grid, decisions, episodes, answers)
+    summary = Figures.of(world, grid, decisions, episodes, answers).scores()
     folder.write(out, manifest, decisions, episodes, [folder.lines(answers)], summary)
     return out
 

@@ -98,17 +98,6 @@ class Figures:
         ]
 
 
-def scores(
-    world: World,
-    grid: Grid,
-    decisions: Decisions,
-    episodes: Sequence[Episode],
-    answers: Sequence[Answer | AnswerFacts],
-) -> list[Score]:
-    """Return every score of a run; `episodes` are in the order of the grid."""
-    return Figures.of(world, grid, decisions, episodes, answers).scores()
-
-
 def of_conditions(conditions: Sequence[str], values: Mapping[str, Floats]) -> Iterator[Score]:
     """Yield each metric's scores in each condition, over seeds and over episodes, from values (C, S, E)."""
     for index, condition in enumerate(conditions):

@@ -15,7 +15,7 @@ from harness.evaluate.walk import table, walk
 from harness.runs import folder
 from harness.runs.metrics import Grid
 from harness.runs.records import Manifest
-from harness.runs.summary import counted, scores
+from harness.runs.summary import Figures, counted
 
 SEEDS = (0, 1, 2)
 
@@ -46,7 +46,7 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
         decisions.rounded(),
         episodes,
         [folder.lines(folder.ordered(answers, decisions))],
-        scores("frozen", grid, decisions, episodes, answers),
+        Figures.of("frozen", grid, decisions, episodes, answers).scores(),
     )
     return out
 
