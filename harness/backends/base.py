@@ -5,6 +5,7 @@ How a backend batches or threads inside is its own matter; the rest of the progr
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from harness.core.image import Image
@@ -75,6 +76,11 @@ class Request:
     def image_sha256(self) -> str | None:
         """Digest of the picture's pixels; None without a picture."""
         return self.image.sha256 if self.image else None
+
+
+def by_scenario(requests: Sequence[Request]) -> list[list[Request]]:
+    """Split requests into parts of one scenario each, in their order; those of a run are one part."""
+    return [list(part) for _, part in groupby(requests, key=lambda request: id(request.scenario))]
 
 
 @dataclass(frozen=True)

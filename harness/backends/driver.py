@@ -1,11 +1,10 @@
 """The backend of the reference drivers, so that they run like any model."""
 
 from collections.abc import Sequence
-from itertools import groupby
 from typing import Any
 
 from harness import __version__
-from harness.backends.base import Completion, Request
+from harness.backends.base import Completion, Request, by_scenario
 from harness.backends.cards import Card
 from harness.core.errors import unknown
 from harness.core.files import canonical_json
@@ -26,9 +25,7 @@ class DriverBackend:
         self.driver = driver
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        # Those of a run are all of one scenario.
-        parts = [list(part) for _, part in groupby(requests, key=lambda request: id(request.scenario))]
-        return [completion for part in parts for completion in self._complete(part)]
+        return [completion for part in by_scenario(requests) for completion in self._complete(part)]
 
     def _complete(self, requests: Sequence[Request]) -> list[Completion]:
         """Answer requests of one scenario."""

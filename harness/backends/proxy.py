@@ -7,10 +7,9 @@ something about the harness and nothing about any language model. Its card may m
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from itertools import groupby
 from typing import Any
 
-from harness.backends.base import Completion, FinishReason, Request
+from harness.backends.base import Completion, FinishReason, Request, by_scenario
 from harness.backends.cards import Card
 from harness.backends.failures import Failures, drawn, spoilt
 from harness.core.files import canonical_json
@@ -69,9 +68,7 @@ def answer(request: Request) -> str:
 
 def answers(requests: Sequence[Request]) -> list[str]:
     """Return the texts of the answers to some requests."""
-    # Those of a run are all of one scenario.
-    parts = [list(part) for _, part in groupby(requests, key=lambda request: id(request.scenario))]
-    return [text for part in parts for text in _answers(part)]
+    return [text for part in by_scenario(requests) for text in _answers(part)]
 
 
 def _answers(requests: Sequence[Request]) -> list[str]:
