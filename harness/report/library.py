@@ -2,8 +2,8 @@
 
 Charts are drawn by Vega-Lite (BSD 3-Clause, University of Washington Interactive Data Lab), which the package
 django-js-lib-vega-embed carries as its authors built it. It is compressed in the page as everything large is;
-scripts are let run by their digest alone. The library's own digest stands here: what another package or release
-puts in its place runs in no page.
+scripts are let run by their digest alone. The library's own digest stands here: what another package or
+release puts in its place runs in no page.
 """
 
 import base64
