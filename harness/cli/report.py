@@ -39,7 +39,9 @@ def write(
     """
     if any((run / SUITE).is_file() for run in runs):
         if isinstance(dataset, Path):
-            raise UserError(f"--dataset {printable(dataset)}: a suite has several; report its runs one by one")
+            raise UserError(
+                f"--dataset {printable(dataset)}: a suite has several; report its runs one by one"
+            )
         return _write_suites(runs, out, quiet)
     from harness.report.page import write_report
     from harness.report.runs import gather

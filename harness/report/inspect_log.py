@@ -42,7 +42,9 @@ def write(run: Run, path: Path, dataset: Path | None = None) -> Path:
         why = lacking(run) or (None if scenes else "its dataset is not here")
         refuse_less(path, {"prompts": why} if why else {}, "--inspect")
     with replacing(path) as part:
-        log.write_eval_log(log_of(run, scenes), str(part), format="json" if path.suffix == ".json" else "eval")
+        log.write_eval_log(
+            log_of(run, scenes), str(part), format="json" if path.suffix == ".json" else "eval"
+        )
     return path
 
 

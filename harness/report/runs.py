@@ -84,7 +84,9 @@ def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs
     world = first.manifest.world
     if not isinstance(world, FrozenScenes):
         if isinstance(dataset, Path):
-            raise UserError(f"--dataset {printable(dataset)}: {printable(first.path)} was driven; leave it out")
+            raise UserError(
+                f"--dataset {printable(dataset)}: {printable(first.path)} was driven; leave it out"
+            )
         found = None
     elif isinstance(dataset, Dataset) and dataset.sha256 == world.sha256:
         found = dataset

@@ -105,9 +105,12 @@ def who(side: Side) -> str:
     return f"{variant.model} · prompt {variant.prompt} · {variant.answer}{variant.mix}"
 
 
-def sides(pair: Pair) -> list[tuple[str, str]]:
-    """`A` and `B`, each with its folder and who answered."""
-    return [(name, f"{side.run.path}: {who(side)}") for name, side in (("A", pair.a), ("B", pair.b))]
+def sides(pair: Pair, whole: bool = False) -> list[tuple[str, str]]:
+    """`A` and `B`, each with the name of its folder, or its `whole` path, and who answered."""
+    return [
+        (name, f"{side.run.path if whole else side.run.path.name}: {who(side)}")
+        for name, side in (("A", pair.a), ("B", pair.b))
+    ]
 
 
 def paces(pair: Pair) -> list[str]:
