@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from harness.core.errors import UserError
 from harness.core.files import digest
+from harness.core.places import text
 from harness.dataset.forest import Forest
 from harness.dataset.load import Scene
 from harness.evaluate.agent import in_mode, shown
@@ -151,6 +152,7 @@ class Details:
                 for key in KEPT
                 if (v := getattr(answer, key)) is not None and v is not False and v != ()
             }
+            shown |= {key: text(shown[key]) for key in ("error", "detail") if key in shown}
             asked = None
             if scene and prompts:
                 shown_to = as_shown(scene, answer)

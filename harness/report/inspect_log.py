@@ -119,13 +119,13 @@ def _sample(
         n = answer.prompt_tokens, answer.completion_tokens
         usage = model.ModelUsage(input_tokens=n[0], output_tokens=n[1], total_tokens=sum(n))
     stop = STOPS.get(answer.finish_reason, "unknown")
-    plain = msgspec.to_builtins(answer)
+    plain = msgspec.to_builtins(answer) | {"detail": text(answer.detail)}
     left_out = ("raw", "prompt_tokens", "completion_tokens", "finish_reason", "error", "seconds")
     intent = "failed" if answer.intent is None else " ".join(
         f"{action} {p:.2f}" for action, p in zip(run.actions, answer.intent, strict=True)
     )  # fmt: skip
     verdict = Score(
-        value=VALUES[answer.verdict], answer=intent, explanation=f"{answer.status}: {answer.detail}"
+        value=VALUES[answer.verdict], answer=intent, explanation=f"{answer.status}: {plain['detail']}"
     )
     return log.EvalSample(
         id=answer.id, epoch=1, input=chat or f"a prompt that is not here, sha256 {answer.prompt_sha256}",

@@ -19,7 +19,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import replacing
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each
-from harness.core.places import nameless
+from harness.core.places import nameless, text
 from harness.parsing.parse import Repair, Status
 from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
@@ -214,7 +214,7 @@ def environment(*more: Path) -> Environment:
     templates.filters |= {
         "number": words.number, "facts": words.facts, "shown": words.shown, "p_value": words.p_value,
         "latency_source": words.latency_source, "answer_times": words.answer_times, "pace": words.pace,
-        "mapping": _mapping, "columns": _table,
+        "mapping": _mapping, "columns": _table, "nameless": text,
     }  # fmt: skip
     return templates
 
