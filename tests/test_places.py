@@ -9,7 +9,6 @@ import pytest
 from evaluating import FILES
 from reading import packed
 
-
 Typed = Callable[..., tuple[int, str, str]]
 CANARY = "canary-in-a-folder"
 SECRET = "letmein"
@@ -76,6 +75,7 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     typed("report", one, two, "--out", here / "both.html")
     typed("compare", one, two, "--html", here / "pair.html", "--junit", here / "gates.xml",
           "--fail-if", "success_rate < -1")  # fmt: skip
+    typed("compare", one, two, "--html", here.parent.parent / "apart.html")
     Path("comment.md").write_text(typed("compare", one, two, "--markdown"))
     typed("history", here / "reports", "--html", here / "history.html")
     typed("fidelity", one, here / "reports/driven", "--out", here / "fidelity")
@@ -85,7 +85,8 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     typed("export", two, "--sft", here / "lessons.jsonl", "--report-seeds-too")
     if find_spec("inspect_ai"):
         typed("export", two, "--inspect", here / "log.json")
-    assert [str(path) for path in found(here)] == []
+    assert [str(path) for path in found(here.parent.parent)] == []
+    assert "reports/one/report.html#" in (here / "pair.html").read_text(), "within a project pages are linked"
 
 
 def test_no_page_of_studies_names_a_folder(typed: Callable[..., str]) -> None:

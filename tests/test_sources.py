@@ -135,6 +135,11 @@ def test_prompts_that_are_gone_are_still_compared(project: Path, harness: Typed)
     assert code == 0
     assert all(word in out for word in ("[-Mind:-]", "{+Beware:+}"))
     assert all(word in Path("page.html").read_text() for word in ("Mind:", "Beware:"))
+    assert "more change" not in out
+    assert (
+        "2 more changes: the page of --html has them"
+        in harness("compare", "reports/run", "reports/other", "--show", "0")[1]
+    )
     shutil.rmtree("reports/run/sources")
     code, out, err = harness("compare", "reports/run", "reports/other", "--html", "page.html")
     assert (code, out) == (2, "")
