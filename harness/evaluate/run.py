@@ -104,8 +104,7 @@ def evaluate(
     begun, chunks = _begin_driving(spec, out, begun, workers)
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, chunks, place, progress, cache, workers)
-        kept_sources.write(place, made_of)
-        return _gather(out, as_finished(spec, begun), chunks, place)
+        return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
 
 def evaluate_shard(
@@ -160,8 +159,7 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
         work.same(out, {**whole.facts(), "shard": ""}, {**stopped.facts(), "shard": stopped.shard})
     with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)
-        kept_sources.write(place, kept_sources.read(folders[0] / WORK))
-        return _gather(out, whole, chunks, place)
+        return _gather(out, whole, chunks, place, kept_sources.read(folders[0] / WORK))
 
 
 def _walk(
@@ -234,8 +232,7 @@ def _frozen(
                 report_kept(chunk)
         walk_chunk = partial(_walk_chunk, spec, begun, None) if in_workers else walk_here
         each(walk_chunk, todo, workers if in_workers else 1, keep, _label)
-        kept_sources.write(place, made_of)
-        return _gather(out, as_finished(spec, begun), chunks, place)
+        return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
 
 def _begin_driving(
@@ -326,8 +323,10 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
     return LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, seeds, spec.ego_alone)
 
 
-def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
-    """Score the chunks in a working folder and write the files of the finished run."""
+def _gather(
+    out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes]
+) -> Evaluated:
+    """Score the chunks in a working folder and write the files of the finished run, with its sources."""
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
 
@@ -357,7 +356,7 @@ def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Pat
             "retries": sum(answer.retries for answer in answers),
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
-        kept_sources.write(out, kept_sources.read(place))
+        kept_sources.write(out, made_of)
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)

@@ -20,7 +20,7 @@ PROMPTS = "prompts"
 
 
 def write(out: Path, files: Mapping[str, bytes]) -> None:
-    """Write files, by their path within `sources`, to a run's folder or to the one it is worked on in."""
+    """Write files, by their path within `sources`, to a run's folder, or a shard's working folder."""
     for name, data in files.items():
         write_whole(out / FOLDER / name, data)
 
