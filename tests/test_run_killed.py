@@ -18,7 +18,7 @@ from harness.evaluate.latency import PAPER
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 
-RESULT = {*FILES, "run.json"}
+RESULT = {*FILES, "run.json", "sources"}
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,8 @@ def test_a_run_that_was_stopped_while_it_tidied_up_asks_and_writes_nothing(
     files = [p for p in (tmp_path / "run").iterdir() if p.is_file()]
     before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in files}
     again = run(spec_of(small), tmp_path / "run")
-    assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "run").iterdir()} == before, "tidy"
+    assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in files} == before
+    assert not (tmp_path / "run" / ".work").exists(), "tidy"
     assert again.manifest == first.manifest
     assert list(again.scores) == list(first.scores)
 

@@ -47,10 +47,12 @@ def command(
     difference = compared(pair(a, b))
     verdicts = [judge(each, difference) for each in gates]
     if html or junit:
-        from harness.report.page import save
+        from harness.report.page import refuse_less, save
     if html:
         from harness.report.compare import page
 
+        why = difference.prompts
+        refuse_less(html, {"prompts": why} if isinstance(why, str) else {}, "--html")
         save([page.render(difference, verdicts, show, page.beside(html))], html, "--html")
     if junit:
         save([text.junit(difference, verdicts)], junit, "--junit")

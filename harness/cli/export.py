@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from harness.cli import options
 from harness.cli.progress import bar
 from harness.core import extras
 from harness.core.errors import UserError, printable
@@ -37,6 +38,7 @@ def command(
             "trees show to be right."
         ),
     ] = None,
+    dataset: options.RunsDataset = None,
     report_seeds_too: Annotated[
         bool,
         typer.Option(
@@ -55,6 +57,8 @@ def command(
         raise UserError(f"{', '.join(asked)}: give exactly one of them")
     if report_seeds_too and not sft:
         raise UserError("--report-seeds-too only goes with --sft; give --sft, or leave it out")
+    if dataset and option not in ("--inspect", "--sft"):
+        raise UserError("--dataset only goes with --inspect and --sft; leave it out")
     if out and option in files:
         raise UserError(
             f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
@@ -76,13 +80,13 @@ def command(
             from harness.training import pairs
 
             with bar("writing chats"):
-                written = [pairs.write(source, sft, report_seeds_too)]
+                written = [pairs.write(source, sft, report_seeds_too, dataset)]
         elif inspect:
             extras.need("--inspect", "inspect_ai")
             from harness.report import inspect_log
 
             with bar("writing a log"):
-                written = [inspect_log.write(source, inspect)]
+                written = [inspect_log.write(source, inspect, dataset)]
     except OSError as error:
         where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"
         other = "name another file" if target else "choose another folder with --out"

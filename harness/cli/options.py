@@ -50,6 +50,13 @@ ScenarioPrompt = Annotated[
     str | None,
     Option(help="Prompt version; `harness prompt list` shows them. Default: the scenario's usual one."),
 ]
+RunsDataset = Annotated[
+    Path | None,
+    Option(
+        "--dataset",
+        help="Folder of the run's dataset, if it has moved. Default: where the run states, or by its name.",
+    ),
+]
 Dataset = Annotated[str, Option(help="Name of a shipped dataset, or a dataset's folder.")]
 Conditions = Annotated[
     list[str] | None,

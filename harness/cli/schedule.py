@@ -90,6 +90,7 @@ def compare(
     answers.
     """
     from harness.coordination.schedules import SCHEDULES
+    from harness.studies.folder import refuse_other
     from harness.studies.learning import layouts
     from harness.studies.schedules import compare as compared_on
     from harness.studies.stored import Stored
@@ -114,6 +115,11 @@ def compare(
         for other in stored[len(runs) :]:
             layouts(other, "tune")
         draws = options.parse_seeds(seeds) if seeds else stored[0].seeds
+        where = out or runs[0] / "schedules"
+        refuse_other(where, "schedule", {
+            "sources": [each.manifest() for each in stored], "condition": condition, "schedules": names,
+            "budget": budget, "seeds": list(draws),
+        })  # fmt: skip
         steps = sum(each.dataset.scenario.parameters.decisions for each in stored)
         progress.more(steps + len(runs) * len(names))
         apart: list[Stored | None] = [*stored[len(runs) :]] if tune else [None] * len(runs)
@@ -123,7 +129,6 @@ def compare(
         ]
     from harness.studies.schedule_page import in_sentences, said, tables, write_schedules
 
-    where = out or runs[0] / "schedules"
     page = write_schedules(found, [each.manifest() for each in stored], draws, where)
     if as_json:
         typer.echo(tables(found)["schedules"].to_json(orient="records"))

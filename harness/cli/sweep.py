@@ -45,6 +45,7 @@ def command(
     proxy: bool = typer.Option(
         False, "--proxy", help="Also draw the calibrated proxy, which plays the paper's study."
     ),
+    dataset: options.RunsDataset = None,
     out: Path | None = typer.Option(
         None, help="Folder to write. Default: RUN/sweep-AXES, in the first run's folder."
     ),
@@ -74,7 +75,7 @@ def command(
     grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]
     conditions, silent = list(dict.fromkeys(condition)), as_json or quiet
     with bar("grid points", quiet=silent) as progress:
-        stored = [Stored(run, latency, progress.more, progress, not no_model) for run in runs]
+        stored = [Stored(run, latency, progress.more, progress, not no_model, dataset) for run in runs]
         panels = {
             axis.name: settings(stored, axis, values, conditions)
             for axis, values in zip(axes, grids, strict=True)

@@ -7,12 +7,14 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 from harness.coordination.attacks import attacks_of, in_text
+from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.coordination.schedules import SCHEDULES
-from harness.coordination.scheduling import ORACLE, PAPER
+from harness.coordination.scheduling import NEVER, ORACLE, PAPER
 from harness.core.config import changed, settable, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Channel, Physical, Unit
+from harness.radio.constant import Radio
 from harness.radio.networks import Network, network
 from harness.radio.profiles import CHANNELS, NO_CHANNEL
 from harness.radio.roadside import Relay
@@ -25,6 +27,8 @@ OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a 
 RELAY, FUSION = "relay", "fusion"
 EDGES = ("none", RELAY, FUSION)
 UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")  # settings of a roadside unit with a place
+ALONE = ("fallback", "round_trip", "round_trip_s", "window_s")  # settings of an ego that asks nobody
+WEIGHING = ("weight_cap", "min_distance_m", "ego_distance_m")  # settings of the weights by distance
 _LARGEST = sys.float_info.max
 
 
@@ -285,6 +289,35 @@ class OperatingPoint:
             return self.tau_nats
         default = SCHEDULES[self.schedule].threshold
         return self.threshold if self.threshold is not None else 0.0 if default is None else default
+
+    def idle(self, setting: str | None) -> str | None:
+        """Return why a setting changes nothing here, whatever its value; None if it may change something.
+
+        Args:
+            setting: a setting of the point or of its channel; None for the number of vehicles.
+        """
+        if self.profile is None and setting not in ALONE:
+            return "it has no channel"
+        if self.schedule == NEVER and setting not in (*ALONE, "schedule"):
+            return f"schedule {NEVER} asks nobody"
+        if self.max_helpers == 0 and setting not in (*ALONE, "max_helpers"):
+            return "max_helpers is 0, so it asks nobody"
+        if setting == "tau_nats" and self.schedule != PAPER and not self.helper_rounds:
+            return f"schedule {self.schedule} has a threshold of its own"
+        if setting in UNIT and self.edge == "none":
+            return "it has no roadside unit (edge is none)"
+        if setting in WEIGHING and (self.consensus == EGO_PROMPT or isinstance(RULES[self.consensus], Heads)):
+            return f"consensus {self.consensus} weighs no distances"
+        counts_rounds = isinstance(self.channel, Radio) and not self.channel.density_coupled
+        if setting == "helper_rounds" and not counts_rounds:
+            return "the load of its channel does not depend on it"
+        channel: Any = self.channel
+        while channel is not None:
+            says = getattr(channel, "idle", None)
+            if says and (why := says(setting)):
+                return str(why)
+            channel = getattr(channel, "channel", None)  # what a wrapper wraps
+        return None
 
     def needs(self, what: str) -> bool:
         """Whether its schedule, its rule or an attack needs `in_time`, `outlook`, `lot` or `claims`."""

@@ -38,9 +38,11 @@ from harness.evaluate.lifecycle import (
     refuse_finished,
     unfinished,
 )
+from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import of_all_seeds, table, walk
 from harness.runs import folder
+from harness.runs import sources as kept_sources
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, ClosedLoop, Episode, Latency, Manifest
@@ -98,10 +100,11 @@ def evaluate(
         return _frozen(
             spec, spec.source, out, begun, progress, cache, more, opens or open_backend, given, workers
         )
+    made_of = sources(spec)
     begun, chunks = _begin_driving(spec, out, begun, workers)
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, chunks, place, progress, cache, workers)
-        return _gather(out, as_finished(spec, begun), chunks, place)
+        return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
 
 def evaluate_shard(
@@ -125,11 +128,13 @@ def evaluate_shard(
         UserError: as in `evaluate`, or the latency is to be measured.
     """
     refuse_finished(out)
+    made_of = sources(spec)
     begun, chunks = _begin_driving(spec, out, unfinished(spec, out, str(shard)), workers, str(shard))
     own_chunks = shard.part(chunks)
     more(sum(map(len, own_chunks)))
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, own_chunks, place, progress, None, workers)
+        kept_sources.write(place, made_of)
     return sum(map(len, own_chunks))
 
 
@@ -154,7 +159,7 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
         work.same(out, {**whole.facts(), "shard": ""}, {**stopped.facts(), "shard": stopped.shard})
     with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)
-        return _gather(out, whole, chunks, place)
+        return _gather(out, whole, chunks, place, kept_sources.read(folders[0] / WORK))
 
 
 def _walk(
@@ -191,6 +196,7 @@ def _frozen(
 ) -> Evaluated:  # fmt: skip
     dataset = source.dataset
     options = {"device": spec.device, "dtype": spec.dtype, "batch_size": spec.batch_size}
+    made_of = sources(spec)
     models = open_each(spec.cards, partial(opens, **options))
     identity = together(spec.cards, models).identity()
     latency = _latency(spec, begun, models, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
@@ -226,7 +232,7 @@ def _frozen(
                 report_kept(chunk)
         walk_chunk = partial(_walk_chunk, spec, begun, None) if in_workers else walk_here
         each(walk_chunk, todo, workers if in_workers else 1, keep, _label)
-        return _gather(out, as_finished(spec, begun), chunks, place)
+        return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
 
 def _begin_driving(
@@ -317,8 +323,10 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
     return LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, seeds, spec.ego_alone)
 
 
-def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
-    """Score the chunks in a working folder and write the files of the finished run."""
+def _gather(
+    out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes]
+) -> Evaluated:
+    """Score the chunks in a working folder and write the files of the finished run, with its sources."""
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
 
@@ -348,6 +356,7 @@ def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Pat
             "retries": sum(answer.retries for answer in answers),
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
+        kept_sources.write(out, made_of)
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)

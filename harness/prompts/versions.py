@@ -7,7 +7,7 @@ versions are pinned by digest in `prompts/released.toml`: a changed text is a ne
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -55,6 +55,7 @@ class Prompt:
         texts: template text by role.
         examples: earlier turns of the chat, from one scenario; None without any.
         image: picture before the user's text: what the viewer's `camera` sees; None if there is none.
+        files: the text of each of its files by name, as they were read.
     """
 
     version: str
@@ -72,6 +73,7 @@ class Prompt:
     max_conflicts: Count | None = None
     examples: Examples | None = None
     image: Literal["camera"] | None = None
+    files: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         least, most = self.token_budget
@@ -253,14 +255,14 @@ def load(version: str, where: Path | None = None) -> Prompt:
     examples = [read_examples(texts[file], f"prompt {version} {file}") for file in optional]
     return convert(
         table, Prompt, what, version=version, sha256=sha256, released=version in released,
-        texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=next(iter(examples), None),
+        texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=next(iter(examples), None), files=texts,
     )  # fmt: skip
 
 
-def as_it_was(version: str, sha256: str) -> Prompt | None:
-    """Load a version if its files have this digest; None if they differ or it is not installed here."""
+def as_it_was(version: str, sha256: str, where: Path | None = None) -> Prompt | None:
+    """Load a version, from a folder if one is given, if its files have this digest; else None."""
     try:
-        prompt = load(version)
+        prompt = load(version, where)
     except UserError:
         return None
     return prompt if prompt.sha256 == sha256 else None

@@ -4,6 +4,7 @@ A file names a model and its parameters, and states their source. A package adds
 in the group `swarmdrive.channels`.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
@@ -68,6 +69,21 @@ class Profiles(FilesAndPlugins[Channel]):
         kind = type(self[name])
         doc = (kind.__doc__ or "").strip().partition("\n")[0]
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
+
+    def files(self, name: str) -> dict[str, Path]:
+        """Return a profile's file and the table that it names, by their paths within `channels/`.
+
+        A table that lies outside is given the profile's name.
+        """
+        file = self.file(name)
+        if file is None:
+            return {}
+        files, table = {file.name: file}, self.profile(name).parameters.get("file")
+        if isinstance(table, str):
+            inside = os.path.normpath(table)
+            outside = os.path.isabs(inside) or inside.split(os.sep)[0] == os.pardir
+            files[f"{name}.csv" if outside else Path(inside).as_posix()] = file.parent / table
+        return files
 
     def record(self, name: str) -> dict[str, Any]:
         """Return all that decides what the channel does, as plain values."""

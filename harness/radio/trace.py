@@ -100,6 +100,19 @@ class Trace:
         delay_s = np.where(links.asked, links.ready_s + latency_s, np.inf)
         return Delivery(link_up(draws.packet, loss), delay_s, loss, np.full_like(loss, np.nan))
 
+    def idle(self, setting: str | None) -> str | None:
+        """Return why a setting changes nothing, whatever its value; None if it may change something."""
+        received = [point for point in self.receptions.points if point.reception > 0]
+        if setting == "latency_s" and all(point.latency_s is not None for point in received):
+            return f"its table {printable(self.receptions.file)} has latencies of its own"
+        if setting == "beyond" and not any(point.reception for point in self._last()):
+            return f"its table {printable(self.receptions.file)} ends where nothing is received"
+        return None
+
+    def _last(self) -> list[Point]:
+        """Return the last row of each curve, the rows of a sight."""
+        return list({point.sight: point for point in self.receptions.points}.values())
+
     def _latency_s(self, point: Point) -> float:
         return self.latency_s if point.latency_s is None else point.latency_s
 

@@ -160,6 +160,8 @@ class Decisions:
     @cached_property
     def scenes(self) -> dict[str, range]:
         """The rows of each decision point, in order. Raises ValueError if they are not adjacent."""
+        if not len(self):
+            return {}
         codes = self.table["scene"].combine_chunks()
         changes = np.flatnonzero(np.diff(_values(codes.indices, -1, np.int32))) + 1
         starts = [0, *changes.tolist(), len(self)]

@@ -11,6 +11,7 @@ import pyarrow.csv as pacsv
 from harness.core.files import replacing, write_whole
 from harness.core.junit import Case
 from harness.core.junit import junit as test_suite
+from harness.core.places import text
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run
 from harness.runs.records import TURNS, Answer, Episode
@@ -55,7 +56,10 @@ def junit(run: Run, path: Path) -> Path:
 
 
 def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -> Path:
-    """Write answers as CSV: one a line, the fields of `answers.jsonl`, a column an action for the intent."""
+    """Write answers as CSV: one a line, the fields of `answers.jsonl`, a column an action for the intent.
+
+    What an engine says of an error has the names of files without their folders.
+    """
     fields = (*Answer.__struct_fields__, *TURNS)
     plain = [name for name in fields if name not in ("intent", "message", "first")]
     unknown = [None] * len(actions)
@@ -66,6 +70,7 @@ def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -
             values = {
                 **{name: getattr(answer, name) for name in plain},
                 "heard": "+".join(answer.heard), "repairs": " ".join(answer.repairs),
+                "detail": text(answer.detail), "error": answer.error and text(answer.error),
             }  # fmt: skip
             message = answer.message and msgspec.json.encode(answer.message).decode()
             writer.writerow([*values.values(), *(answer.intent or unknown), message])

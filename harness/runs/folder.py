@@ -9,6 +9,7 @@ import io
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +27,7 @@ from harness.core.files import replacing, write_whole
 from harness.core.formats import FORMAT, READ_BY, SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
+from harness.dataset.verify import read_manifest
 from harness.runs import attribution
 from harness.runs.answers import Answers
 from harness.runs.attribution import Attribution
@@ -58,6 +60,7 @@ _BROKEN = (
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 _FACTS = msgspec.json.Decoder(AnswerFacts)
 _ENCODER = msgspec.json.Encoder()
+DEEPEST = 8  # folders of a dataset's stated path that are looked for above a run
 
 
 @dataclass(frozen=True)
@@ -335,22 +338,69 @@ def ordered(answers: Iterable[Answer], decisions: Decisions) -> list[Answer]:
     return sorted(reached, key=lambda answer: (order[answer.scene], answer.heard, answer.role == "blind"))
 
 
-def dataset_of(run: Run) -> Dataset:
-    """Return the dataset of a run on frozen scenes.
+def dataset_of(run: Run, given: Path | None = None) -> Dataset:
+    """Return the dataset of a run on frozen scenes, wherever it lies now.
+
+    It is looked for where the run states, at that path seen from each folder above the run's, and by its
+    name; only a dataset with the run's digest is taken.
+
+    Args:
+        run: the run.
+        given: the dataset's folder, if the user names it; it is looked for nowhere else then.
 
     Raises:
-        UserError: the dataset is missing, or its digest is not that of the run.
+        UserError: it is not found, or what is there has another digest or is damaged.
     """
     stated = run.manifest.world
     assert isinstance(stated, FrozenScenes)
-    path = Path(stated.path)
-    dataset = load(path if path.is_dir() else find(stated.name))
-    if dataset.sha256 != stated.sha256:
+    others: list[Path] = []
+    for path in [given] if given else dict.fromkeys(_datasets(run, stated)):
+        if given or _holds(path):
+            if _sha256_of(path) == stated.sha256:
+                return load(path)
+            others.append(path)
+    repair = "restore it, give its folder to a command that has --dataset, or run again"
+    if others:
+        sha256 = _sha256_of(others[0]) or read_manifest(others[0])[1]  # which says what is wrong with it
         raise UserError(
-            f"dataset {printable(dataset.path)} is not the one that {printable(run.path)} was made on "
-            f"(sha256 {dataset.sha256[:12]}…, not {printable(stated.sha256, 13)}); restore it or run again"
+            f"dataset {printable(others[0])} is not the one that {printable(run.path)} was made on "
+            f"(sha256 {sha256[:12]}…, not {printable(stated.sha256, 13)}); {repair}"
         )
-    return dataset
+    raise UserError(
+        f"{printable(run.path)} was made on dataset {printable(stated.name, 40)}, which is neither at "
+        f"{printable(stated.path)}, seen from here or from a folder above the run, nor known by its name; "
+        f"{repair}"
+    )
+
+
+def _datasets(run: Run, stated: FrozenScenes) -> Iterator[Path]:
+    """Yield where a run's dataset may lie."""
+    path = Path(stated.path)
+    yield path
+    with suppress(UserError):
+        yield find(stated.name)
+    # The run may have moved together with its dataset, or be read from another folder.
+    parts = [part for part in path.parts if part not in (path.anchor, "..")][-DEEPEST:]
+    for above in run.path.resolve().parents:
+        yield above / path
+        yield from (above.joinpath(*parts[at:]) for at in range(len(parts)))
+        yield above / "datasets" / stated.name
+
+
+def _sha256_of(path: Path) -> str | None:
+    """Return the digest of the dataset in a folder; None if its manifest is broken."""
+    try:
+        return read_manifest(path)[1]
+    except UserError:
+        return None
+
+
+def _holds(path: Path) -> bool:
+    """Whether there is a dataset in a folder."""
+    try:
+        return (path / "manifest.json").is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        return False
 
 
 def check_scenes(run: Run, dataset: Dataset, some: Iterable[str] | None = None) -> None:

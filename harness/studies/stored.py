@@ -64,7 +64,7 @@ class Stored:
     def __init__(
         self, folder: Path, latency: str | None = None,
         more: Callable[[int], None] = lambda count: None, done: Callable[[int], None] = lambda count: None,
-        asks: bool = True,
+        asks: bool = True, dataset: Path | None = None,
     ) -> None:  # fmt: skip
         """A run.
 
@@ -74,6 +74,7 @@ class Stored:
             more: told how many answers are owed.
             done: told how many have come.
             asks: whether its model is asked what the run has no answer to; else such walks are left out.
+            dataset: folder of its dataset; None where the run states.
         """
         self.run = read(folder)
         if self.run.world != "frozen":
@@ -97,7 +98,7 @@ class Stored:
                         "again"
                     )
         self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
-        self.dataset = dataset_of(self.run).of_episodes(self.run.grid.episodes)
+        self.dataset = dataset_of(self.run, dataset).of_episodes(self.run.grid.episodes)
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
         self._asks = asks
         self.left_out: set[str] = set()

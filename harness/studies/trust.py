@@ -34,6 +34,7 @@ from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.walk import Decided, walk
 from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
+from harness.studies.folder import refuse_other
 from harness.studies.stored import Stored
 from harness.studies.sweep import point_of
 
@@ -286,14 +287,19 @@ def run_bench(
         more: called with the number of cells that are to be played.
 
     Raises:
-        UserError: the point has no channel, or its rule is a fusion call.
+        UserError: the point has no channel, or asks nobody, or its rule is a fusion call; or the folder has
+            the study of another run or condition.
     """
     point = point_of([stored], condition)
+    if why := point.idle("attack"):
+        raise UserError(f"--condition {printable(condition)}: no attack changes anything: {why}")
     if point.attack or EGO_PROMPT in rules:
         raise UserError(
             "harness trust: give a condition without attack, and rules that are arithmetic; a fusion call is "
             f"attacked by `harness eval --condition {condition}:consensus={EGO_PROMPT} --attack injection`"
         )
+    of = {"sources": [{"name": stored.name}], "dataset": stored.run.source, "condition": condition}
+    refuse_other(out, "trust", of)
     every = [
         *((rule, PEACE, 0.0) for rule in dict.fromkeys([BASE, *rules])),
         *((BASE, EXCLUDED, share) for share in shares),
@@ -302,8 +308,8 @@ def run_bench(
     kept = _Kept(out / "cells.jsonl", stored, point, seeds)
     more(len(every))
     cells = {}
-    for of in every:
-        cells[of] = kept.get(of) or kept.add(play(stored, point, seeds, of))
+    for cell in every:
+        cells[cell] = kept.get(cell) or kept.add(play(stored, point, seeds, cell))
         progress(1)
     never = FrozenWorld(stored.dataset, [alone := OperatingPoint("never asks", None)], seeds)
     for _ in walk(never, [alone], stored):

@@ -124,7 +124,9 @@ def ask(
         UserError: the folder holds something else, the model is not available, or no question has a twin.
     """
     if (out / RESULT).exists():
-        raise UserError(f"--out {printable(out)} has finished twins; choose another folder or delete it")
+        raise UserError(
+            f"--out {printable(out)} already holds finished twins; choose another folder or delete it"
+        )
     [identity] = spread(
         _identity, [study.spec], workers, lambda done: None, lambda of: f"the model {of.ego.card.name}", False
     )
