@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from harness.cli.progress import bar
-from harness.core import extras
+from harness.core import extras, work
 from harness.core.errors import UserError, printable
 
 File = Path | None
@@ -59,10 +59,13 @@ def command(
         raise UserError(
             f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
         )
-    source, folder = read(run), out or run
     target = files.get(option)
+    said = work.unanswered(run) if junit else None
+    source, folder = None if said else read(run), out or run
     try:
-        if as_csv:
+        if source is None:
+            written = [export.junit_of_none(run, said, junit)]
+        elif as_csv:
             decisions, answers = source.decisions, source.answers  # both are read before anything is written
             written = [
                 export.decisions_csv(decisions, folder / "decisions.csv"),

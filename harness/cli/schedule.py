@@ -121,6 +121,8 @@ def compare(
             compared_on(run, other, point_of([run], condition), names, draws, budget, progress)
             for run, other in zip(stored, apart, strict=False)
         ]
+        for each in stored:
+            each.settle()
     from harness.studies.schedule_page import in_sentences, said, tables, write_schedules
 
     where = out or runs[0] / "schedules"

@@ -21,6 +21,7 @@ import pyarrow.csv as pacsv
 from msgspec import Struct
 from msgspec.structs import asdict
 
+from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing, write_whole
 from harness.core.formats import FORMAT, READ_BY, SUITE
@@ -235,6 +236,8 @@ def read(path: Path) -> Run:
         raise UserError(
             f"{printable(path)} is a suite; give the folder of one of its runs"
             if (path / SUITE).is_file()
+            else f"{printable(path)} is no finished run, since its model could not be asked: {said}"
+            if (said := work.unanswered(path))
             else f"{printable(path)} is no finished run: it has no run.json; "
             "give a folder made by `harness eval` or `harness drive`"
         )
@@ -300,8 +303,13 @@ def read_part(
     """Read a part that `write_part` wrote. Raises UserError if it is broken."""
     return whole(part, lambda part: (
         Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
-        _FACTS.decode_lines((part / "answers.jsonl").read_bytes()),
+        facts_of(part),
     ))  # fmt: skip
+
+
+def facts_of(part: Path) -> list[AnswerFacts]:
+    """Read a part's answers, without their texts. Raises UserError if it is broken."""
+    return whole(part, lambda part: _FACTS.decode_lines((part / "answers.jsonl").read_bytes()))
 
 
 def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:

@@ -303,11 +303,16 @@ def run_bench(
     more(len(every))
     cells = {}
     for of in every:
-        cells[of] = kept.get(of) or kept.add(play(stored, point, seeds, of))
+        if (cell := kept.get(of)) is None:
+            cell = play(stored, point, seeds, of)
+            stored.settle()
+            kept.add(cell)
+        cells[of] = cell
         progress(1)
     never = FrozenWorld(stored.dataset, [alone := OperatingPoint("never asks", None)], seeds)
     for _ in walk(never, [alone], stored):
         pass
+    stored.settle()
     return Bench(stored.name, stored.run.source, condition, cells, never.ends(alone)["success_rate"])
 
 
@@ -341,13 +346,12 @@ class _Kept:
     def get(self, of: tuple[str, str, float]) -> Cell | None:
         return self._cells.get(of)
 
-    def add(self, cell: Cell) -> Cell:
+    def add(self, cell: Cell) -> None:
         plain = {key: _plain(value) for key, value in vars(cell).items()}
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("ab") as file:
             file.write(b"\n" * self._torn + json.dumps({"of": self._of, **plain}).encode() + b"\n")
         self._torn = False
-        return cell
 
 
 def _plain(value: Any) -> Any:
