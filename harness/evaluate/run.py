@@ -179,10 +179,11 @@ def _walk(
     if isinstance(spec.source, FrozenSource):
         at_once = max(1, WALKS_AT_ONCE // (len(chunk) * len(spec.points)))
     answers: Mapping[str, Answer] = {}
-    tables, episodes = list[Decisions](), list[Episode]()
+    tables, episodes, viewers = list[Decisions](), list[Episode](), dict[str, Sequence[str]]()
     for n, seeds in enumerate(_split(spec.seeds, at_once)):
         world, asker = _world_of(spec, chunk, seeds), asker_of(n, answers)
         decided = list(chain.from_iterable(walk(world, spec.points, asker)))
+        viewers |= {scene.id: scene.viewers for part in decided for scene in part.moments}
         answers, decisions = asker.answers, table(decided, world.columns(), spec.actions)
         if spec.device_profile:
             joules = device.energy(
@@ -191,7 +192,7 @@ def _walk(
             decisions = decisions.replace(**joules)
         tables.append(decisions.rounded())
         episodes += world.episodes()
-    return folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values())
+    return folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values(), viewers)
 
 
 def _frozen(

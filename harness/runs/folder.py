@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
@@ -56,6 +57,7 @@ _BROKEN = (
     OverflowError,
     csv.Error,
 )
+NOBODY: Mapping[str, Sequence[str]] = MappingProxyType({})
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 _FACTS = msgspec.json.Decoder(AnswerFacts)
 _ENCODER = msgspec.json.Encoder()
@@ -278,12 +280,16 @@ def write(
 
 
 def part_files(
-    decisions: Decisions, episodes: Sequence[Episode], answers: Iterable[Answer]
-) -> dict[str, bytes]:
-    """Return the files of a part of a run, by name; the answers may be in any order."""
+    decisions: Decisions, episodes: Sequence[Episode], answers: Iterable[Answer],
+    viewers: Mapping[str, Sequence[str]],
+) -> dict[str, bytes]:  # fmt: skip
+    """Return the files of a part of a run, by name; the answers may be in any order.
+
+    `viewers` has the ids of each decision point's viewers, the ego first.
+    """
     return {
         "decisions.parquet": decisions.encoded(),
-        "answers.jsonl": lines(ordered(answers, decisions)),
+        "answers.jsonl": lines(ordered(answers, decisions, viewers)),
         "episodes.csv": csv_text(Episode, episodes).encode(),
     }
 
@@ -333,14 +339,22 @@ def lines(answers: Sequence[Answer]) -> bytes:
     return _ENCODER.encode_lines(answers)
 
 
-def ordered(answers: Iterable[Answer], decisions: Decisions) -> list[Answer]:
+def ordered(
+    answers: Iterable[Answer], decisions: Decisions, viewers: Mapping[str, Sequence[str]] = NOBODY
+) -> list[Answer]:
     """Sort answers by decision point, and there: the ego's, the helpers', blind helpers', fusion calls'.
 
-    Answers for a decision point without a decision are left out.
+    Those of one kind are in the order of the decision point's `viewers`, where these are known. Answers for a
+    decision point without a decision are left out.
     """
+
+    def place(answer: Answer) -> tuple[Any, ...]:
+        first = viewers[answer.scene].index(answer.viewer) if answer.scene in viewers else 0
+        return order[answer.scene], answer.heard, answer.role == "blind", first
+
     order = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
     reached = (answer for answer in answers if answer.scene in order)
-    return sorted(reached, key=lambda answer: (order[answer.scene], answer.heard, answer.role == "blind"))
+    return sorted(reached, key=place)
 
 
 def dataset_of(run: Run) -> Dataset:

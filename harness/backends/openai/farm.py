@@ -283,7 +283,9 @@ class Farm:
                 place.lost += 1
                 if all(p.aside and p.lost > self._server.retries for p in self._places):
                     self._end(
-                        Unanswered(f"model {self._name!r}: no server is left: {self._faults()}; start one again")
+                        Unanswered(
+                            f"model {self._name!r}: no server is left: {self._faults()}; start one again"
+                        )
                     )
             self._agree(place, model)
         except Exception as error:  # a bug ends the run, too; nothing else awaits this task
