@@ -123,7 +123,7 @@ def test_the_batch_size_changes_no_answer_of_a_language_model(
     data, runs, tables = load(small_path, limit=1), {}, {}
     for batch_size in (1, 3, 64):
         spec = tiny_spec(tiny, data, batch_size=batch_size)
-        done = walked(spec, open_backend(spec.ego.card, "cpu", "float32", batch_size))
+        done = walked(spec, open_backend(spec.ego.card, device="cpu", dtype="float32", batch_size=batch_size))
         runs[batch_size], tables[batch_size] = without_company(list(done.answers)), done.decisions.table
     assert runs[1] == runs[3] == runs[64]
     assert tables[1].equals(tables[3])

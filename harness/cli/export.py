@@ -59,13 +59,16 @@ def command(
         raise UserError(
             f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
         )
+    if junit and (said := work.unanswered(run)):
+        from harness.report.page import save
+
+        save([export.junit_of_none(run, said)], junit, "--junit")
+        typer.echo(printable(junit, 1000))
+        return
+    source, folder = read(run), out or run
     target = files.get(option)
-    said = work.unanswered(run) if junit else None
-    source, folder = None if said else read(run), out or run
     try:
-        if source is None:
-            written = [export.junit_of_none(run, said, junit)]
-        elif as_csv:
+        if as_csv:
             decisions, answers = source.decisions, source.answers  # both are read before anything is written
             written = [
                 export.decisions_csv(decisions, folder / "decisions.csv"),

@@ -283,7 +283,7 @@ def _answered_file(place: Path, chunk: Sequence[int]) -> Path:
     return place / f"{_folder_name(chunk)}.jsonl"
 
 
-def _settle(parts: Sequence[Path], answers: Iterable[AnswerFacts]) -> None:
+def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> None:
     """Raise Unanswered if a run cannot do without the answers that it lacks; its parts lose what lacks them.
 
     Args:

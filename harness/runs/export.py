@@ -75,10 +75,10 @@ def _unanswered(run: Run) -> dict[tuple[str, int], str]:
     return said
 
 
-def junit_of_none(run: Path, said: str, path: Path) -> Path:
-    """Write JUnit's XML of a run that did not finish, since its model could not be asked: one error."""
-    write_whole(path, test_suite(f"harness {run.name}", [Case(run.name, "the model answers", error=said)]))
-    return path
+def junit_of_none(run: Path, said: str) -> str:
+    """Return JUnit's XML of a run that did not finish, since its model could not be asked: one error."""
+    name = run.absolute().name
+    return test_suite(f"harness {name}", [Case(name, "the model answers", error=said)])
 
 
 def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -> Path:

@@ -46,7 +46,7 @@ class Tally:
         return frozenset(r for r, n in self.unanswered.items() if n and (r not in HELPERS or too_many))
 
     def __str__(self) -> str:
-        """In one line: the words of the server or engine, then how many questions got these instead of an answer."""
+        """In one line: the words of the server or engine, then how many questions got no answer."""
         words = [f"{printable(text, 300)} ({n} times)" for text, n in self.words.most_common(WORDS)]
         if len(self.words) > WORDS:
             words.append(f"{len(self.words) - WORDS} other errors")
