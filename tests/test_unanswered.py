@@ -277,7 +277,7 @@ def test_every_study_ends_the_same_way_and_goes_on(
     play.again(some(of_ego, 3, 1))
     code, out, err = ask(command, *options, "--no-cache", "--out", "study")
     assert (code, out) == (3, "")
-    assert err.startswith(f"harness: HTTP 404: {WORDS} (1 times): no answer to questions of ego 1 of ")
+    assert err.startswith(f"harness: HTTP 404: {WORDS}: no answer to questions of ego 1 of ")
     assert not list((tmp_path / "study").glob("*.html"))
     before, refuses = set(play.bodies), play.refuses
     play.again()

@@ -3,9 +3,9 @@
 import math
 import os
 import time
-from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import cache, partial
-from itertools import chain
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any
@@ -190,9 +190,11 @@ class Asker:
         new_answers: dict[str, Answer] = {}
         answering = partial(self._answered, backend)
         calls = 1 + math.ceil(window(backend) / size)
-        for answers in chain.from_iterable(_answer_chunks(answering, wave, calls) for wave in waves):
-            new_answers |= answers
-            self._take(answers.values())
+        for wave in waves:
+            with closing(_answer_chunks(answering, wave, calls)) as chunks_answered:
+                for answers in chunks_answered:
+                    new_answers |= answers
+                    self._take(answers.values())
         self.answers |= {request.id: new_answers[request.id] for chunk in todo for request in chunk}
         found = Tally(new_answers.values())
         if found.missing - set(HELPERS):
@@ -332,7 +334,7 @@ class Asker:
 
 def _answer_chunks(
     work: Callable[[Sequence[Request]], dict[str, Answer]], chunks: Sequence[Sequence[Request]], calls: int
-) -> Iterator[dict[str, Answer]]:
+) -> Generator[dict[str, Answer], None, None]:
     """Yield the answers of each chunk as they come, by request id.
 
     Up to `calls` chunks are asked at the same time, so that no chunk waits for the last answer of another.

@@ -47,7 +47,10 @@ class Tally:
 
     def __str__(self) -> str:
         """In one line: the words of the server or engine, then how many questions got no answer."""
-        words = [f"{printable(text, 300)} ({n} times)" for text, n in self.words.most_common(WORDS)]
+        words = [
+            f"{printable(text, 300)}{f' ({n} times)' if n > 1 else ''}"
+            for text, n in self.words.most_common(WORDS)
+        ]
         if len(self.words) > WORDS:
             words.append(f"{len(self.words) - WORDS} other errors")
         return f"{'; '.join(words)}: no answer to {self.counts()}"
