@@ -586,7 +586,7 @@ def test_a_short_key_is_no_secret_and_changes_no_answer(monkeypatch: pytest.Monk
 def test_after_a_run_the_key_is_nowhere(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, small_path: Path
 ) -> None:
-    """A whole `harness eval` against a server that says the key back in every way, and then in answers only."""
+    """A whole `harness eval` against a server that says the key back in every way, then in answers."""
     monkeypatch.setenv("MY_KEY", KEY)
     monkeypatch.chdir(tmp_path)
     shipped = resources.folder

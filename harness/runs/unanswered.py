@@ -48,7 +48,7 @@ class Tally:
     def __str__(self) -> str:
         """In one line: the words of the server or engine, then how many questions got no answer."""
         words = [
-            f"{printable(text, 300)}{f' ({n} times)' if n > 1 else ''}"
+            printable(text, 300) + (f" ({n} times)" if n > 1 else "")
             for text, n in self.words.most_common(WORDS)
         ]
         if len(self.words) > WORDS:
