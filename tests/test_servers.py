@@ -402,7 +402,7 @@ def test_with_no_server_left_the_run_stops_and_goes_on_at_others(
         evaluated(served_spec(small, one, other), tmp_path / "run")
     said = str(caught.value)
     assert f"model 'mine': no server is left: {one} (" in said
-    assert "start one again, and type the same command to continue" in said
+    assert said.endswith("; start one again")
     assert "\n" not in said
     with served() as url:
         assert same_files(evaluated(served_spec(small, url), tmp_path / "run"), whole)

@@ -76,7 +76,7 @@ def twins_of(name: str, dataset: Dataset) -> Iterator[tuple[dict[str, Any], dict
 def asked(spec: Spec, out: Path, *names: str) -> list[scoring.Row]:
     """The rows of a study."""
     names = names or tuple(TWINS)
-    pairs = asking.ask(Study(spec, names, 0), out, lambda done: None, None, 1)
+    pairs, _ = asking.ask(Study(spec, names, 0), out, lambda done: None, None, 1)
     tidy(out)
     return scoring.rows(pairs, [TWINS[name] for name in names])
 

@@ -14,13 +14,15 @@ from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_file
 from harness.runs.folder import Run, read
 from harness.runs.records import BLIND, Answer, FirstTurn, Latency
+from harness.runs.unanswered import why
 
 
 def open(card: Card, **_: Any) -> "Replay":
     """Open the run folder that a card names.
 
     Raises:
-        UserError: it is not a finished run, or it is a driver's run, which has answers of the ego only.
+        UserError: it is not a finished run, it is a driver's run, which has answers of the ego only, or it
+            lacks answers that no run can do without.
     """
     run = read(Path(card.weights or ""))
     engine = find(str(run.manifest.model.get("engine")))
@@ -29,6 +31,8 @@ def open(card: Card, **_: Any) -> "Replay":
             f"{printable(run.path)} is a run of a driver; "
             f"run it again with --model {printable(run.manifest.model['name'])}"
         )
+    if said := why(run.path):
+        raise UserError(f"{printable(run.path)} lacks answers, so nothing replays it: {said}; run it again")
     return Replay(run)
 
 

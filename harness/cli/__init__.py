@@ -20,7 +20,7 @@ from typer.main import get_command
 from harness import __version__
 from harness.cli import shell
 from harness.core import extras
-from harness.core.errors import UserError, printable
+from harness.core.errors import EXIT_CODES, UserError, printable
 
 PANELS = {
     "Evaluate": (
@@ -47,6 +47,7 @@ app = typer.Typer(
     cls=shell.Map,
     no_args_is_help=True,
     rich_markup_mode=None,
+    epilog=f"Exit codes: {'; '.join(f'{code} {meaning}' for code, meaning in EXIT_CODES.items())}.",
     pretty_exceptions_enable=False,
 )
 
@@ -92,7 +93,7 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 
 
 def main() -> None:
-    """Entry point: what a user can mend is one line on stderr and exit code 2."""
+    """Entry point: what a user can mend is one line on stderr, and one of `EXIT_CODES`."""
     gc.set_threshold(COLLECT_AFTER, 10, 10)
     atexit.register(gc.freeze)  # all memory goes as the process ends; its last collections would walk it all
     out = sys.stdout
@@ -126,7 +127,7 @@ def _typed() -> None:
     try:
         sys.exit(_program()(standalone_mode=False))
     except UserError as error:
-        _fail(_noted(str(error), error))
+        _fail(_noted(str(error), error), error.code)
     except ModuleNotFoundError as error:
         if (lack := extras.OPTIONAL.get((error.name or "").partition(".")[0])) is None:
             raise

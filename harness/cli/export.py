@@ -7,7 +7,7 @@ import typer
 
 from harness.cli import options
 from harness.cli.progress import bar
-from harness.core import extras
+from harness.core import extras, work
 from harness.core.errors import UserError, printable
 
 File = Path | None
@@ -63,6 +63,12 @@ def command(
         raise UserError(
             f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
         )
+    if junit and (said := work.unanswered(run)):
+        from harness.report.page import save
+
+        save([export.junit_of_none(run, said)], junit, "--junit")
+        typer.echo(printable(junit, 1000))
+        return
     source, folder = read(run), out or run
     target = files.get(option)
     try:

@@ -8,7 +8,7 @@ import typer
 
 from harness.cli import options
 from harness.cli.progress import bar
-from harness.core.errors import printable
+from harness.core.errors import Unanswered, printable
 from harness.core.resources import DATASET
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def check(
     """Load a model, show its prompt and time one answer.
 
     It does so in each answer mode. A model that takes pictures is also asked with a picture and with a blank
-    one. Exit code 1 if it answers in no mode, or if it ignores the picture.
+    one. Exit code 1 if no answer can be read, or if it ignores the picture; 3 if it answers in no mode.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities
@@ -106,10 +106,32 @@ def check(
         )
     else:
         _show(spec, seen)
+    every = [*seen.answers.values(), *(seen.looks.answers.values() if seen.looks else ())]
+    errors = [answer.error for answer in every if answer.error is not None]
+    if len(errors) == len(every):
+        who = printable(card.name)
+        raise Unanswered(f"{printable(errors[0], 300)}: no answer of {who} in any answer mode")
     if seen.looks and seen.looks.fault:
         typer.echo(f"harness: {_blind(card, seen.looks.fault)}", err=True)
         raise typer.Exit(1)
-    raise typer.Exit(int(all(answer.error is not None for answer in seen.answers.values())))
+    if not _usable(spec, seen):
+        typer.echo(f"harness: no answer of {printable(card.name)} can be read as a decision", err=True)
+        raise typer.Exit(1)
+
+
+def _usable(spec: "Spec", seen: "Checkup") -> bool:
+    """Whether an answer in any mode says what to do."""
+    from harness.parsing.parse import parse
+
+    ego = spec.ego
+    return any(
+        parse(
+            answer.text, role="ego", actions=spec.actions, thinking=ego.thinking,
+            reasons_first="ego" in ego.prompt.reasons_first, finish_reason=answer.finish_reason,
+            error=answer.error,
+        ).intent
+        for answer in seen.answers.values()
+    )  # fmt: skip
 
 
 def _blind(card: "Card", fault: str) -> str:

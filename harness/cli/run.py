@@ -225,7 +225,11 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: st
     if m.cached_answers:
         yield f"{m.cached_answers} answers came from the cache (--no-cache asks the model again)"
     if m.engine_errors:
-        yield f"{m.engine_errors} answers are engine errors; answers.jsonl has the error messages"
+        asked = sum(s.n for role in ("helper", "blind") if (s := figures.get(("all", f"failed_rate_{role}"))))
+        yield (
+            f"{m.engine_errors} of {asked} questions to helpers got no answer, and count as lost messages; "
+            "answers.jsonl has the errors"
+        )
     if m.retries:
         yield f"{m.retries} attempts failed before an answer came; answers.jsonl counts them as retries"
     for role in ("ego", "helper", "merge", "blind"):

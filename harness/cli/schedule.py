@@ -127,6 +127,8 @@ def compare(
             compared_on(run, other, point_of([run], condition), names, draws, budget, progress)
             for run, other in zip(stored, apart, strict=False)
         ]
+        for each in stored:
+            each.settle()
     from harness.studies.schedule_page import in_sentences, said, tables, write_schedules
 
     page = write_schedules(found, [each.manifest() for each in stored], draws, where)

@@ -17,7 +17,7 @@ import ray
 from ray import exceptions
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import Unanswered, UserError, printable
 from harness.core.parallel import Lost
 from harness.core.versions import differing, of_node
 
@@ -149,5 +149,7 @@ def _on_node(job: tuple[Callable[[Any], Any], dict[str, str], str], item: Any) -
         os.chdir(folder)
     try:
         return node, name, work(item)
+    except Unanswered:  # the words of its server come first
+        raise
     except UserError as error:
         raise UserError(f"node {name}: {error}") from None

@@ -3,7 +3,8 @@
 import math
 import os
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import cache, partial
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -17,7 +18,7 @@ from harness.backends.base import Backend, Completion, Request, Role, window
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Ints
-from harness.core.errors import UserError, printable
+from harness.core.errors import Unanswered, UserError, printable
 from harness.core.files import canonical_bytes, digest
 from harness.dataset.load import Scene
 from harness.evaluate import repair
@@ -29,9 +30,12 @@ from harness.evaluate.walk import Fuses
 from harness.parsing.parse import parse
 from harness.runs.records import BLIND, REWRITTEN, Answer, Latency
 from harness.runs.records import Role as RecordedRole
+from harness.runs.unanswered import HELPERS, Tally
 from harness.world.perception.graph import blinded, truth_graph
 
 CHUNK = 64  # fewest requests that are asked, and kept, together
+FIRST = 8  # fewest questions that a server is asked before it has answered any
+IN_A_ROW = CHUNK  # questions without an answer, one after the other, after which nothing more is asked
 SYNC_S = 1.0  # kept answers reach the disk this often; if power fails, those since are asked again
 
 
@@ -119,10 +123,13 @@ def answer_of(request: Request, completion: Completion) -> Answer:
 class Asker:
     """Asks for the answers that are missing, and turns answers into arrays of intents.
 
+    A question that gets no answer is never kept, so that it is asked again when the work goes on.
+
     Attributes:
         spec: the evaluation.
         answers: answers by request id, in the order of the requests.
         latency: how long inference takes.
+        tally: what became of the questions that were asked here.
     """
 
     def __init__(
@@ -151,31 +158,72 @@ class Asker:
         self.latency, self._on_disk_s = latency, -math.inf
         self._given = frozenset(answers or {})
         self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
+        self.tally, self._in_a_row = Tally(), 0
 
     def ask(self, asked: Sequence[Request]) -> None:
-        """Ask for the missing answers, and keep each chunk as soon as it is answered."""
+        """Ask for the missing answers, and keep each chunk as soon as it is answered.
+
+        Raises:
+            Unanswered: a question of the ego or a fusion call got no answer, and all others of these were
+                asked; or none of the first questions was answered, or none of the last `IN_A_ROW`.
+        """
         if all(request.id in self.answers for request in asked):
             self._progress(len(asked))
             return
-        # An answer may depend on the other requests in its batch. So the chunks of a resumed run begin at the
-        # same places, and a chunk with an answer missing is asked again as a whole.
         backend, batch = self._backend(), self.spec.batch_size
         size = batch * math.ceil(CHUNK / batch)
         chunks = [asked[start : start + size] for start in range(0, len(asked), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
             chunks[-2:] = [asked[size * (len(chunks) - 2) :]]  # a short last chunk would not fill a batch
-        incomplete = [chunk for chunk in chunks if any(request.id not in self.answers for request in chunk)]
-        if len(incomplete) < len(chunks):
-            self._progress(len(asked) - sum(map(len, incomplete)))
+        todo = [[request for request in chunk if request.id not in self.answers] for chunk in chunks]
+        if not window(backend):
+            # An answer may depend on the other requests in its batch. So the chunks of a resumed run begin at
+            # the same places, and a chunk with an answer missing is asked again as a whole.
+            todo = [[*chunk] if missing else [] for chunk, missing in zip(chunks, todo, strict=True)]
+        todo = [chunk for chunk in todo if chunk]
+        if due := len(asked) - sum(map(len, todo)):
+            self._progress(due)
+        waves, first = [todo], self._first()
+        if window(backend) and self._refused_so_far() and len(todo[0]) >= first + batch:
+            todo[:1] = [todo[0][:first], todo[0][first:]]
+            waves = [todo[:1], todo[1:]]
         new_answers: dict[str, Answer] = {}
-        for answers in _answer_chunks(
-            partial(self._answered, backend), incomplete, 1 + math.ceil(window(backend) / size)
-        ):
-            new_answers |= answers
-            if self._kept:
-                _keep(self._kept, answers.values(), self._to_disk())
-            self._progress(len(answers))
-        self.answers |= {request.id: new_answers[request.id] for chunk in incomplete for request in chunk}
+        answering = partial(self._answered, backend)
+        calls = 1 + math.ceil(window(backend) / size)
+        for wave in waves:
+            with closing(_answer_chunks(answering, wave, calls)) as chunks_answered:
+                for answers in chunks_answered:
+                    new_answers |= answers
+                    self._take(answers.values())
+        self.answers |= {request.id: new_answers[request.id] for chunk in todo for request in chunk}
+        found = Tally(new_answers.values())
+        if found.missing - set(HELPERS):
+            raise Unanswered(str(found))
+
+    def settle(self) -> None:
+        """Raise Unanswered if too many of the questions that were asked here got no answer."""
+        if self.tally.missing:
+            raise Unanswered(str(self.tally))
+
+    def _take(self, answers: Collection[Answer]) -> None:
+        """Count and keep what came; stop if nothing is answered any more."""
+        answered = [answer for answer in answers if answer.error is None]
+        if self._kept and answered:
+            _keep(self._kept, answered, self._to_disk())
+        refused_so_far = self._refused_so_far()
+        self.tally.add(answers)
+        self._in_a_row = 0 if answered else self._in_a_row + len(answers)
+        if self._in_a_row >= (self._first() if refused_so_far else IN_A_ROW):
+            raise Unanswered(str(self.tally))
+        self._progress(len(answers))
+
+    def _first(self) -> int:
+        """How many questions are asked before anything was answered: whole batches."""
+        return self.spec.batch_size * math.ceil(FIRST / self.spec.batch_size)
+
+    def _refused_so_far(self) -> bool:
+        """Whether no question that was asked here got an answer."""
+        return self.tally.asked == self.tally.unanswered
 
     def _to_disk(self) -> bool:
         """Whether the last answers reached the disk long enough ago."""
@@ -286,7 +334,7 @@ class Asker:
 
 def _answer_chunks(
     work: Callable[[Sequence[Request]], dict[str, Answer]], chunks: Sequence[Sequence[Request]], calls: int
-) -> Iterator[dict[str, Answer]]:
+) -> Generator[dict[str, Answer], None, None]:
     """Yield the answers of each chunk as they come, by request id.
 
     Up to `calls` chunks are asked at the same time, so that no chunk waits for the last answer of another.
@@ -324,7 +372,10 @@ def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
 
 
 def read_kept(kept: Path) -> dict[str, Answer]:
-    """Read the answers kept so far, by request id, and cut a torn last line from the file."""
+    """Read the answers kept so far, by request id, and cut a torn last line from the file.
+
+    A question without an answer is left out, wherever the file comes from.
+    """
     if not kept.is_file():
         return {}
     data = kept.read_bytes()
@@ -338,7 +389,7 @@ def read_kept(kept: Path) -> dict[str, Answer]:
         raise UserError(
             f"{printable(kept)} is damaged ({printable(error)}); delete its folder and start again"
         ) from None
-    return {answer.id: answer for answer in answers}
+    return {answer.id: answer for answer in answers if answer.error is None}
 
 
 _DECODER, _ENCODER = msgspec.json.Decoder(Answer), msgspec.json.Encoder()

@@ -98,7 +98,7 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> Begun | None:
 def resumable(spec: Spec, out: Path) -> bool:
     """Whether this run was stopped in a folder and no process is working there."""
     try:
-        return unfinished(spec, out) is not None and not work.held(out)
+        return (work.idle(out) or unfinished(spec, out) is not None) and not work.held(out)
     except UserError:
         return False
 

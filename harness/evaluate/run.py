@@ -1,8 +1,10 @@
 """Run an evaluation, for `harness eval` and `harness drive`: walk its chunks, score them, write the run."""
 
 import math
+import os
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -15,8 +17,8 @@ from harness.backends.base import Backend
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
-from harness.core.errors import UserError
-from harness.core.files import digest
+from harness.core.errors import Unanswered, UserError
+from harness.core.files import digest, write_whole
 from harness.core.formats import FORMAT, WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
@@ -25,7 +27,7 @@ from harness.dataset.load import Scene
 from harness.dataset.select import drawn
 from harness.evaluate import device, timing
 from harness.evaluate import latency as latencies
-from harness.evaluate.asking import Asker
+from harness.evaluate.asking import Asker, read_kept
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.lifecycle import (
     Begun,
@@ -45,8 +47,9 @@ from harness.runs import folder
 from harness.runs import sources as kept_sources
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
-from harness.runs.records import Answer, ClosedLoop, Episode, Latency, Manifest
+from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Manifest
 from harness.runs.summary import Figures, counted
+from harness.runs.unanswered import Tally
 
 if TYPE_CHECKING:  # only driving loads the simulator
     from harness.evaluate.live_world import LiveSource, LiveWorld
@@ -89,6 +92,8 @@ def evaluate(
     Raises:
         UserError: the folder holds another run or something else, or the model is not available. Nothing is
             written then.
+        Unanswered: a question of the ego or a fusion call, or too many of the helpers', got no answer. The
+            folder keeps all answers, and the same call asks the others again.
     """
     if (out / "run.json").exists() and (out / WORK).is_dir():
         return finished(spec, out)
@@ -135,6 +140,8 @@ def evaluate_shard(
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, own_chunks, place, progress, None, workers)
         kept_sources.write(place, made_of)
+        parts = [place / _folder_name(chunk) for chunk in own_chunks]
+        _settle(parts, chain.from_iterable(map(folder.facts_of, parts)))
     return sum(map(len, own_chunks))
 
 
@@ -159,7 +166,10 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
         work.same(out, {**whole.facts(), "shard": ""}, {**stopped.facts(), "shard": stopped.shard})
     with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)
-        return _gather(out, whole, chunks, place, kept_sources.read(folders[0] / WORK))
+        try:
+            return _gather(out, whole, chunks, place, kept_sources.read(folders[0] / WORK))
+        except Unanswered as error:
+            raise UserError(f"{error}; type the commands of the shards again, and merge then") from None
 
 
 def _walk(
@@ -174,10 +184,11 @@ def _walk(
     if isinstance(spec.source, FrozenSource):
         at_once = max(1, WALKS_AT_ONCE // (len(chunk) * len(spec.points)))
     answers: Mapping[str, Answer] = {}
-    tables, episodes = list[Decisions](), list[Episode]()
+    tables, episodes, viewers = list[Decisions](), list[Episode](), dict[str, Sequence[str]]()
     for n, seeds in enumerate(_split(spec.seeds, at_once)):
         world, asker = _world_of(spec, chunk, seeds), asker_of(n, answers)
         decided = list(chain.from_iterable(walk(world, spec.points, asker)))
+        viewers |= {scene.id: scene.viewers for part in decided for scene in part.moments}
         answers, decisions = asker.answers, table(decided, world.columns(), spec.actions)
         if spec.device_profile:
             joules = device.energy(
@@ -186,7 +197,7 @@ def _walk(
             decisions = decisions.replace(**joules)
         tables.append(decisions.rounded())
         episodes += world.episodes()
-    return folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values())
+    return folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values(), viewers)
 
 
 def _frozen(
@@ -207,12 +218,15 @@ def _frozen(
         todo = [chunk for chunk in chunks if not (place / _folder_name(chunk)).is_dir()]
         in_workers = len(todo) > 1 and workers != 1 and _reproducible(spec) and not given
 
-        def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
-            # Each has a file of its own, so that a resumed run asks in the same chunks.
-            kept = place / (f"answers-{n + 1}.jsonl" if n else "answers.jsonl")
-            return Asker(spec, lambda: backend, latency, kept, {**given, **so_far}, progress, more)
-
         def walk_here(chunk: Sequence[int]) -> dict[str, bytes]:
+            before = read_kept(_answered_file(place, chunk))
+
+            def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
+                # Each has a file of its own, so that a resumed run asks in the same chunks.
+                kept = place / (f"answers-{n + 1}.jsonl" if n else "answers.jsonl")
+                there = {**given, **before, **so_far}
+                return Asker(spec, lambda: backend, latency, kept, there, progress, more)
+
             return _walk(spec, chunk, asker_of)
 
         def report_kept(chunk: Sequence[int]) -> None:
@@ -222,15 +236,15 @@ def _frozen(
 
         def keep(index: int, files: dict[str, bytes]) -> None:
             folder.write_part(place / _folder_name(todo[index]), files)
-            for kept in place.glob("answers*.jsonl"):
-                kept.unlink()
+            for kept in (*place.glob("answers*.jsonl"), _answered_file(place, todo[index])):
+                kept.unlink(missing_ok=True)
             if in_workers:
                 report_kept(todo[index])
 
         for chunk in chunks:
             if chunk not in todo:
                 report_kept(chunk)
-        walk_chunk = partial(_walk_chunk, spec, begun, None) if in_workers else walk_here
+        walk_chunk = partial(_walk_chunk, spec, begun, None, None) if in_workers else walk_here
         each(walk_chunk, todo, workers if in_workers else 1, keep, _label)
         return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
@@ -270,6 +284,31 @@ def _folder_name(chunk: Sequence[int]) -> str:
     return f"episodes-{chunk[0]:06d}-{chunk[-1]:06d}"
 
 
+def _answered_file(place: Path, chunk: Sequence[int]) -> Path:
+    """Return the file of the answers that a chunk has before it is walked to its end."""
+    return place / f"{_folder_name(chunk)}.jsonl"
+
+
+def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> None:
+    """Raise Unanswered if a run cannot do without the answers that it lacks; its parts lose what lacks them.
+
+    Args:
+        parts: folders of the chunks.
+        answers: all that is in them.
+    """
+    found = Tally(answers)
+    if not found.missing:
+        return
+    for part in parts:
+        answered = read_kept(part / "answers.jsonl")
+        if len(answered) < folder.answers_in(part):
+            write_whole(part.with_suffix(".jsonl"), folder.lines(list(answered.values())))
+            gone = part.with_name(f".{part.name}.{os.getpid()}.part")
+            os.replace(part, gone)  # so that no part is ever half there
+            shutil.rmtree(gone)
+    raise Unanswered(str(found))
+
+
 def _label(chunk: Sequence[int]) -> str:
     """Return a chunk's name for people."""
     whole = chunk == range(chunk[0], chunk[-1] + 1)
@@ -286,10 +325,12 @@ def _drive(
 
     def keep(index: int, files: dict[str, bytes]) -> None:
         folder.write_part(place / _folder_name(todo[index]), files)
+        _answered_file(place, todo[index]).unlink(missing_ok=True)
         progress(len(todo[index]))
 
-    # The cache is a file of this machine, which the nodes of a cluster cannot share.
-    walk_chunk = partial(_walk_chunk, spec, begun, cache if isinstance(workers, int) else None)
+    # These are files of this machine, which the nodes of a cluster cannot share.
+    files = (cache, None if _reproducible(spec) else place) if isinstance(workers, int) else (None, None)
+    walk_chunk = partial(_walk_chunk, spec, begun, *files)
     each(walk_chunk, todo, workers, keep, _label, _reproducible(spec))
 
 
@@ -298,8 +339,11 @@ def _reproducible(spec: Spec) -> bool:
     return not any(agent.can.language_model for agent in spec.agents)
 
 
-def _walk_chunk(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[int]) -> dict[str, bytes]:
-    """Walk a chunk in a worker process and return its files by name."""
+def _walk_chunk(
+    spec: Spec, begun: Begun, cache: Path | None, place: Path | None, chunk: Sequence[int]
+) -> dict[str, bytes]:  # fmt: skip
+    """Walk a chunk in a worker process and return its files by name; `place` keeps its answers until then."""
+    kept = place and _answered_file(place, chunk)
 
     def backend() -> Backend:
         combined = together(spec.cards, _open_all(spec), cache)
@@ -309,7 +353,7 @@ def _walk_chunk(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[in
             )
         return combined
 
-    return _walk(spec, chunk, lambda n, so_far: Asker(spec, backend, begun.latency, answers=so_far))
+    return _walk(spec, chunk, lambda n, so_far: Asker(spec, backend, begun.latency, kept, so_far))
 
 
 def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "FrozenWorld | LiveWorld":
@@ -340,7 +384,9 @@ def _gather(
         # One part after the other: the decisions of all would not fit into memory.
         by_part, figures = zip(*map(scored, chunks, parts), strict=True)
         whole = Figures.joined(figures)
-        answers, summary = [answer for answer, _ in whole.answers], whole.scores()
+        answers = [answer for answer, _ in whole.answers]
+        _settle(parts, answers)
+        summary = whole.scores()
         cells = len(names) * len(settings["seeds"])
         episodes = [
             episode for cell in range(cells) for chunk, of_part in zip(chunks, by_part, strict=True)

@@ -10,6 +10,7 @@ from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
 from harness.runs.metrics import ALL
 from harness.runs.records import Manifest, Score
+from harness.runs.unanswered import tally
 
 FEW = 100  # episodes; with fewer a page warns of wide intervals
 OFF_LAG = 0.5  # least share of decisions that act in another frame of which a page warns
@@ -51,6 +52,12 @@ def unread(scores: Sequence[Score]) -> Iterator[str]:
             yield f"{share} of {whose} {score.n} answers could be read: {instead}."
 
 
+def unanswered(run: Run) -> Iterator[str]:
+    """What the questions said that got no answer, where a run cannot do without."""
+    if (found := tally(run)).missing:
+        yield f"{found}: the model could not be asked, so that this is no result."
+
+
 def of_run(run: Run) -> Iterator[str]:
     """What else a reader of a run's page has to know first: few episodes, a stumbling engine, another lag."""
     n = len(run.grid.episodes)
@@ -62,9 +69,10 @@ def of_run(run: Run) -> Iterator[str]:
             f"{run.manifest.sampling_seed}: another seed gives other answers."
         )
     retries = sum(answer.retries for answer in run.answers)
-    if run.manifest.engine_errors or retries:
-        errors = run.manifest.engine_errors
-        yield f"The engine had errors: {errors} requests ended in one, {retries} attempts were repeated."
+    if (found := tally(run)).words and not found.missing:
+        yield f"{found}: each counts as a lost message."
+    if retries:
+        yield f"The engine had errors: {retries} attempts were repeated."
     for control, heard in _CONTROLS.items():
         if names := [c["name"] for c in run.manifest.conditions if c.get("messages") == control]:
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."

@@ -114,7 +114,10 @@ def _pieces(
     charts = list(panels(runs))
     alone = len(runs.names) == 1
     by_name = dict(zip(runs.names, runs.runs, strict=True))
-    unread = caveats.said(by_name, lambda run: caveats.unread(run.scores))
+    unread = [
+        *caveats.said(by_name, caveats.unanswered),
+        *caveats.said(by_name, lambda run: caveats.unread(run.scores)),
+    ]
     others = caveats.said(by_name, caveats.of_run)
     return environment().get_template("page.html.j2").generate(
         runs=runs,

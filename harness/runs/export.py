@@ -15,6 +15,7 @@ from harness.core.places import text
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run
 from harness.runs.records import TURNS, Answer, Episode
+from harness.runs.unanswered import lacking
 
 AT_ONCE = 10_000  # decisions in a piece
 
@@ -41,7 +42,11 @@ def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
 
 
 def junit(run: Run, path: Path) -> Path:
-    """Write JUnit's XML: a test case for each episode and condition, which fails if any seed fails."""
+    """Write JUnit's XML: a test case for each episode and condition, which fails if any seed fails.
+
+    An episode with a question that got no answer is an error, unless it was a message that may be lost.
+    """
+    said = _unanswered(run)
     episodes: dict[tuple[str, int], list[Episode]] = {}
     for outcome in run.episodes:
         episodes.setdefault((outcome.condition, outcome.episode), []).append(outcome)
@@ -50,9 +55,31 @@ def junit(run: Run, path: Path) -> Path:
         failed = [f"{outcome.failure} with seed {outcome.seed}" for outcome in by_seed if not outcome.success]
         group = f"{run.source} · {run.manifest.variant} · {condition}"
         failure = f"{len(failed)} of {len(by_seed)} seeds: {', '.join(failed)}"
-        cases.append(Case(group, f"episode {episode}", failure if failed else None))
+        words = said.get((condition, episode))
+        error = f"{words}: the model could not be asked" if words else None
+        cases.append(Case(group, f"episode {episode}", failure if failed else None, error))
     write_whole(path, test_suite(f"harness {run.manifest.name}", cases))
     return path
+
+
+def _unanswered(run: Run) -> dict[tuple[str, int], str]:
+    """Return by condition and episode what a question said that got no answer."""
+    answers, said = list(lacking(run)), dict[tuple[str, int], str]()
+    if not answers:
+        return said
+    decisions = run.decisions
+    numbers, conditions = decisions.whole("episode"), decisions.codes("condition", run.conditions)
+    for answer in answers:
+        for row in decisions.scenes.get(answer.scene, ()):
+            if answer.role != "merge" or decisions["fusion_failed"][row] == 1.0:
+                said.setdefault((run.conditions[conditions[row]], int(numbers[row])), answer.error or "")
+    return said
+
+
+def junit_of_none(run: Path, said: str) -> str:
+    """Return JUnit's XML of a run that did not finish, since its model could not be asked: one error."""
+    name = run.absolute().name
+    return test_suite(f"harness {name}", [Case(name, "the model answers", error=said)])
 
 
 def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -> Path:

@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
@@ -22,6 +23,7 @@ import pyarrow.csv as pacsv
 from msgspec import Struct
 from msgspec.structs import asdict
 
+from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing, write_whole
 from harness.core.formats import FORMAT, READ_BY, SUITE
@@ -57,6 +59,7 @@ _BROKEN = (
     OverflowError,
     csv.Error,
 )
+NOBODY: Mapping[str, Sequence[str]] = MappingProxyType({})
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 _FACTS = msgspec.json.Decoder(AnswerFacts)
 _ENCODER = msgspec.json.Encoder()
@@ -238,6 +241,8 @@ def read(path: Path) -> Run:
         raise UserError(
             f"{printable(path)} is a suite; give the folder of one of its runs"
             if (path / SUITE).is_file()
+            else f"{printable(path)} is no finished run, since its model could not be asked: {said}"
+            if (said := work.unanswered(path))
             else f"{printable(path)} is no finished run: it has no run.json; "
             "give a folder made by `harness eval` or `harness drive`"
         )
@@ -278,12 +283,16 @@ def write(
 
 
 def part_files(
-    decisions: Decisions, episodes: Sequence[Episode], answers: Iterable[Answer]
-) -> dict[str, bytes]:
-    """Return the files of a part of a run, by name; the answers may be in any order."""
+    decisions: Decisions, episodes: Sequence[Episode], answers: Iterable[Answer],
+    viewers: Mapping[str, Sequence[str]],
+) -> dict[str, bytes]:  # fmt: skip
+    """Return the files of a part of a run, by name; the answers may be in any order.
+
+    `viewers` has the ids of each decision point's viewers, the ego first.
+    """
     return {
         "decisions.parquet": decisions.encoded(),
-        "answers.jsonl": lines(ordered(answers, decisions)),
+        "answers.jsonl": lines(ordered(answers, decisions, viewers)),
         "episodes.csv": csv_text(Episode, episodes).encode(),
     }
 
@@ -303,8 +312,13 @@ def read_part(
     """Read a part that `write_part` wrote. Raises UserError if it is broken."""
     return whole(part, lambda part: (
         Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
-        _FACTS.decode_lines((part / "answers.jsonl").read_bytes()),
+        facts_of(part),
     ))  # fmt: skip
+
+
+def facts_of(part: Path) -> list[AnswerFacts]:
+    """Read a part's answers, without their texts. Raises UserError if it is broken."""
+    return whole(part, lambda part: _FACTS.decode_lines((part / "answers.jsonl").read_bytes()))
 
 
 def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:
@@ -328,14 +342,22 @@ def lines(answers: Sequence[Answer]) -> bytes:
     return _ENCODER.encode_lines(answers)
 
 
-def ordered(answers: Iterable[Answer], decisions: Decisions) -> list[Answer]:
+def ordered(
+    answers: Iterable[Answer], decisions: Decisions, viewers: Mapping[str, Sequence[str]] = NOBODY
+) -> list[Answer]:
     """Sort answers by decision point, and there: the ego's, the helpers', blind helpers', fusion calls'.
 
-    Answers for a decision point without a decision are left out.
+    Those of one kind are in the order of the decision point's `viewers`, where these are known. Answers for a
+    decision point without a decision are left out.
     """
+
+    def place(answer: Answer) -> tuple[Any, ...]:
+        first = viewers[answer.scene].index(answer.viewer) if answer.scene in viewers else 0
+        return order[answer.scene], answer.heard, answer.role == "blind", first
+
     order = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
     reached = (answer for answer in answers if answer.scene in order)
-    return sorted(reached, key=lambda answer: (order[answer.scene], answer.heard, answer.role == "blind"))
+    return sorted(reached, key=place)
 
 
 def dataset_of(run: Run, given: Path | None = None) -> Dataset:

@@ -38,6 +38,7 @@ from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 from harness.runs.folder import dataset_of, read
 from harness.runs.records import Answer
+from harness.runs.unanswered import tally
 from harness.studies.axes import Setting
 from harness.studies.play import Walked, walk_through
 
@@ -105,9 +106,11 @@ class Stored:
         self._opened: dict[int, Backend] = {}
         self._laid_out: Intents | None = None  # at every decision point that was asked for
         self._row: dict[str, int] = {}  # of each of them, by id
+        missing = tally(self.run).missing  # a lost message is a part of the run; what it lacks is asked again
+        answers = {a.id: a for a in self.run.answers if a.error is None or a.role not in missing}
         self._asker = Asker(
             self._spec(), self._open, PAPER if latency == "paper" else manifest.latency, folder / MORE,
-            {answer.id: answer for answer in self.run.answers}, done, more,
+            answers, done, more,
         )  # fmt: skip
 
     def _roots(self) -> list[str]:
@@ -172,6 +175,15 @@ class Stored:
         with self._writing():
             self._asker.answer(requests)
         return self._asker.answers
+
+    @property
+    def lost(self) -> str:
+        """How many questions that were asked here got no answer, for people; empty if all did."""
+        return self._asker.tally.counts()
+
+    def settle(self) -> None:
+        """Raise Unanswered if too many of the questions that were asked here got no answer."""
+        self._asker.settle()
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
         """What every vehicle intends. Where the run has no answer its model is asked."""

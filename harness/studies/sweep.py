@@ -114,6 +114,9 @@ def run_sweep(
         ]
         for panel, points in panels.items()
     }
+    for source in sources:
+        if isinstance(source, Stored):
+            source.settle()
     whole = joined([part for parts in played.values() for part in parts])
     along = [whole.summary[whole.summary.panel == panel] for panel in panels if panel != CORE]
     drawn = {"sweep": figures.along(along)}

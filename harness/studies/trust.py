@@ -308,12 +308,17 @@ def run_bench(
     kept = _Kept(out / "cells.jsonl", stored, point, seeds)
     more(len(every))
     cells = {}
-    for cell in every:
-        cells[cell] = kept.get(cell) or kept.add(play(stored, point, seeds, cell))
+    for place in every:
+        if (cell := kept.get(place)) is None:
+            cell = play(stored, point, seeds, place)
+            stored.settle()
+            kept.add(cell)
+        cells[place] = cell
         progress(1)
     never = FrozenWorld(stored.dataset, [alone := OperatingPoint("never asks", None)], seeds)
     for _ in walk(never, [alone], stored):
         pass
+    stored.settle()
     return Bench(stored.name, stored.run.source, condition, cells, never.ends(alone)["success_rate"])
 
 
@@ -347,13 +352,12 @@ class _Kept:
     def get(self, of: tuple[str, str, float]) -> Cell | None:
         return self._cells.get(of)
 
-    def add(self, cell: Cell) -> Cell:
+    def add(self, cell: Cell) -> None:
         plain = {key: _plain(value) for key, value in vars(cell).items()}
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("ab") as file:
             file.write(b"\n" * self._torn + json.dumps({"of": self._of, **plain}).encode() + b"\n")
         self._torn = False
-        return cell
 
 
 def _plain(value: Any) -> Any:

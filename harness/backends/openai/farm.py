@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from harness.backends.openai.http import Client, Reply
 from harness.backends.servers import Kind, Server
-from harness.core.errors import UserError, printable
+from harness.core.errors import Unanswered, UserError, printable
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0  # wait before the first retry, doubled with each; and its limit
 BROKEN = 3  # failures in a row after which a server is set aside
@@ -120,12 +120,13 @@ class Farm:
         """Ask every server for its model. One that does not answer is set aside if another does.
 
         Raises:
-            UserError: none answers, one refuses the key, or two have different models.
+            UserError: two have different models.
+            Unanswered: none answers, or one refuses the key.
         """
         models = await asyncio.gather(*(self._look(place) for place in self._places))
         answering = {place: model for place, model in zip(self._places, models, strict=True) if model}
         if not answering:
-            raise UserError(
+            raise Unanswered(
                 f"nobody answers at {self._faults()}; start the server, or fix base_url in the model's card"
             )
         self._first, self.model = next(iter(answering.items()))
@@ -143,7 +144,8 @@ class Farm:
         doubling one.
 
         Raises:
-            UserError: no server is left, or one has come back with another model.
+            UserError: one has come back with another model.
+            Unanswered: no server is left.
         """
         if self._refused:
             raise self._refused
@@ -281,9 +283,8 @@ class Farm:
                 place.lost += 1
                 if all(p.aside and p.lost > self._server.retries for p in self._places):
                     self._end(
-                        UserError(
-                            f"model {self._name!r}: no server is left: {self._faults()}; start one again, "
-                            "and type the same command to continue"
+                        Unanswered(
+                            f"model {self._name!r}: no server is left: {self._faults()}; start one again"
                         )
                     )
             self._agree(place, model)
@@ -314,14 +315,14 @@ class Farm:
         """Ask a server for its statement about the model; None if it does not answer.
 
         Raises:
-            UserError: it refuses the key.
+            Unanswered: it refuses the key.
         """
         reply = await self._client.get(place.url, place.url + "/models")
         place.fault = reply.fault or ""
         if reply.unreached or (reply.again and self._server.any_may_answer):
             return None
         if reply.status == 401:
-            raise UserError(
+            raise Unanswered(
                 f"model {self._name!r}: its server refuses the key ({reply.fault}); "
                 f"set {self._server.key_env} in the environment"
             )

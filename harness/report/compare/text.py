@@ -102,6 +102,11 @@ def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
     return test_suite("harness compare", cases)
 
 
+def junit_of_none(gates: Sequence[str], said: str) -> str:
+    """The gates as test cases where they cannot be judged, since a model could not be asked."""
+    return test_suite("harness compare", [Case("harness compare", gate, error=said) for gate in gates])
+
+
 def code(text: str) -> str:
     """Text as Markdown's code, whatever backticks it has."""
     text = printable(text, WHOLE)

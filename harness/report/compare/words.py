@@ -8,7 +8,7 @@ from harness.core.errors import printable
 from harness.core.multiplicity import LEVEL
 from harness.prompts.difference import marked
 from harness.prompts.versions import as_it_was
-from harness.report.caveats import no_prompt, unread
+from harness.report.caveats import no_prompt, unanswered, unread
 from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.flips import LOST_BY, DecisionFlip
 from harness.report.compare.gate import Verdict
@@ -124,7 +124,7 @@ def caveats(pair: Pair) -> list[str]:
     """What must be said of the runs before their numbers, with the run's letter where it is of one."""
     sides = (("A", pair.a.run), ("B", pair.b.run))
     return [
-        *(f"{name}: {said}" for name, run in sides for said in unread(run.scores)),
+        *(f"{name}: {said}" for name, run in sides for said in (*unanswered(run), *unread(run.scores))),
         *no_prompt(run.manifest for _, run in sides),
     ]
 
