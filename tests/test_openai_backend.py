@@ -393,8 +393,24 @@ def shares(*likeliest: tuple[str, float]) -> tuple[list[float], float | None]:
 
 
 def test_a_read_out_is_the_letters_probabilities_among_themselves() -> None:
-    """A 1/2, B 1/4, C 1/8: 4/7, 2/7, 1/7 of a mass of 7/8. ` A` is another token than `A`."""
-    p, mass = shares(("A", HALF), ("B", QUARTER), ("C", EIGHTH), (" A", SIXTEENTH), ("the", SIXTEENTH))
+    """A 1/2, B 1/4, C 1/8: 4/7, 2/7, 1/7 of a mass of 7/8."""
+    p, mass = shares(("A", HALF), ("B", QUARTER), ("C", EIGHTH), ("a", SIXTEENTH), ("the", SIXTEENTH))
+    assert p == pytest.approx([4 / 7, 2 / 7, 1 / 7], abs=1e-6)
+    assert mass == pytest.approx(7 / 8)
+
+
+@pytest.mark.parametrize("blank", [" ", "\u2581", "\u0120", "\n"])
+def test_a_letter_counts_in_both_of_its_spellings(blank: str) -> None:
+    """A 1/4 + 1/4, B 1/8 + 1/8, C 1/16: 8, 4 and 1 parts of 13/16; then each in the second spelling alone."""
+    p, mass = shares(
+        ("A", QUARTER), (f"{blank}A", QUARTER), ("B", EIGHTH), (f"{blank}B", EIGHTH),
+        (f"{blank}C", SIXTEENTH), ("the", SIXTEENTH),
+    )  # fmt: skip
+    assert p == pytest.approx([8 / 13, 4 / 13, 1 / 13], abs=1e-6)
+    assert mass == pytest.approx(13 / 16)
+    p, mass = shares(
+        *((f"{blank}{x}", logprob) for x, logprob in zip("ABC", (HALF, QUARTER, EIGHTH), strict=True))
+    )
     assert p == pytest.approx([4 / 7, 2 / 7, 1 / 7], abs=1e-6)
     assert mass == pytest.approx(7 / 8)
 

@@ -13,14 +13,14 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from harness.backends.base import Backend, Completion, Request, Role, window
+from harness.backends.base import Backend, Completion, Request, Role, Served, served, window
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes, digest
 from harness.dataset.load import Scene
-from harness.evaluate import repair
+from harness.evaluate import repair, servers
 from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
@@ -123,6 +123,7 @@ class Asker:
         spec: the evaluation.
         answers: answers by request id, in the order of the requests.
         latency: how long inference takes.
+        served: which server gave each answer that is not kept in a file.
     """
 
     def __init__(
@@ -149,7 +150,7 @@ class Asker:
         self.spec, self._backend, self._kept = spec, backend, kept
         self._progress, self._more = progress, more
         self.latency, self._on_disk_s = latency, -math.inf
-        self._given = frozenset(answers or {})
+        self._given, self.served = frozenset(answers or {}), list[Served]()
         self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
 
     def ask(self, asked: Sequence[Request]) -> None:
@@ -174,6 +175,9 @@ class Asker:
             new_answers |= answers
             if self._kept:
                 _keep(self._kept, answers.values(), self._to_disk())
+                servers.keep(self._kept.parent, served(backend))
+            else:
+                self.served += served(backend)
             self._progress(len(answers))
         self.answers |= {request.id: new_answers[request.id] for chunk in incomplete for request in chunk}
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from harness.backends.base import Backend
+from harness.backends.base import Backend, Served
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
@@ -23,7 +23,7 @@ from harness.core.parallel import Workers, each, spread
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
-from harness.evaluate import device, timing
+from harness.evaluate import device, servers, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
@@ -154,13 +154,15 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
         work.same(out, {**whole.facts(), "shard": ""}, {**stopped.facts(), "shard": stopped.shard})
     with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)
-        return _gather(out, whole, chunks, place)
+        return _gather(out, whole, chunks, place, folders)
 
 
 def _walk(
     spec: Spec, chunk: Sequence[int], asker_of: Callable[[int, Mapping[str, Answer]], Asker]
 ) -> dict[str, bytes]:
     """Walk a chunk's episodes to their ends and return the files of this part of the run, by name.
+
+    Which servers gave answers that are not kept yet is one of them; it is no part of the run's tables.
 
     Frozen scenes are walked for some seeds at a time: the decisions of all would not fit into memory.
     `asker_of` returns the asker of the n-th of these walks, which is given the answers so far.
@@ -169,10 +171,11 @@ def _walk(
     if isinstance(spec.source, FrozenSource):
         at_once = max(1, WALKS_AT_ONCE // (len(chunk) * len(spec.points)))
     answers: Mapping[str, Answer] = {}
-    tables, episodes = list[Decisions](), list[Episode]()
+    tables, episodes, served = list[Decisions](), list[Episode](), list[Served]()
     for n, seeds in enumerate(_split(spec.seeds, at_once)):
         world, asker = _world_of(spec, chunk, seeds), asker_of(n, answers)
         decided = list(chain.from_iterable(walk(world, spec.points, asker)))
+        served += asker.served
         answers, decisions = asker.answers, table(decided, world.columns(), spec.actions)
         if spec.device_profile:
             joules = device.energy(
@@ -181,7 +184,8 @@ def _walk(
             decisions = decisions.replace(**joules)
         tables.append(decisions.rounded())
         episodes += world.episodes()
-    return folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values())
+    files = folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values())
+    return {**files, servers.FILE: servers.lines(served)} if served else files
 
 
 def _frozen(
@@ -279,6 +283,7 @@ def _drive(
     progress(sum(map(len, chunks)) - sum(map(len, todo)))
 
     def keep(index: int, files: dict[str, bytes]) -> None:
+        servers.keep(place, files.pop(servers.FILE, b""))
         folder.write_part(place / _folder_name(todo[index]), files)
         progress(len(todo[index]))
 
@@ -317,8 +322,10 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
     return LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, seeds, spec.ego_alone)
 
 
-def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
-    """Score the chunks in a working folder and write the files of the finished run."""
+def _gather(
+    out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path, others: Sequence[Path] = ()
+) -> Evaluated:  # fmt: skip
+    """Score the chunks in a working folder and write the files of the finished run, merged from `others`."""
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
 
@@ -348,6 +355,7 @@ def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Pat
             "retries": sum(answer.retries for answer in answers),
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
+        servers.write(out, [place, *(other / WORK for other in others)])
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)
