@@ -29,6 +29,7 @@ class Words:
     template: str
     specials: dict[str, str] = field(default_factory=lambda: {"eos_token": "<|im_end|>"})
     bos: int | None = None
+    vocabulary: int = 256
 
     def encode(self, text: str) -> list[int]:
         return list(text.encode())
