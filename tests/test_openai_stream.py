@@ -191,7 +191,7 @@ def test_a_thought_beside_an_empty_field_of_a_thought_is_one() -> None:
             {"choices": [{"delta": {"reasoning_content": old, "reasoning": text}, "finish_reason": None}]}
             for text in ("The gap ", "is short.")
         ]
-        [done], _ = ask(lambda asked, sent=sent: asked.stream(*sent, *pieces("{}")))  # type: ignore[misc]
+        [done], _ = ask(lambda asked, sent=sent: asked.stream(*sent, *pieces("{}")))
         assert done.text == "<think>\nThe gap is short.\n</think>\n\n{}"
 
 

@@ -91,7 +91,7 @@ def changed(paths: Paths, path: str, *steps: Any, to: Any) -> Paths:
     for step in steps[:-1]:
         at = at[step]
     at[steps[-1]] = to
-    return made  # type: ignore[no-any-return]
+    return made
 
 
 def opened(url: str, kind: Kind) -> openai_backend.OpenAIBackend:
