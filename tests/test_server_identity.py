@@ -255,6 +255,14 @@ def test_whatever_is_stated_is_a_short_identity(facts: dict[str, Any], kind: Kin
     assert json.loads(text) == [model.listed, model.version, dict(model.states)]
 
 
+def test_a_length_beyond_any_number_is_text() -> None:
+    listed = identity(
+        "vllm", {"/v1/models": {"data": [{"id": "m", "max_model_len": 10**300, "root": {"a": 1}}]}}
+    )
+    assert listed["listed"]["max_model_len"].startswith("1000")
+    assert listed["listed"]["root"] == "{'a': 1}"
+
+
 def test_a_thousand_facts_are_few_and_none_is_lost() -> None:
     facts = {f"k{n}": n for n in range(1000)}
     assert len(_flat(facts)) == 64

@@ -108,7 +108,11 @@ class OpenAIBackend:
 
     def served(self) -> list[Served]:
         """Return which server gave each answer since the last call."""
-        return [self._served.popleft() for _ in range(len(self._served))]
+        taken: list[Served] = []
+        with suppress(IndexError):  # the loop's thread may add some, and another may take some
+            while True:
+                taken.append(self._served.popleft())
+        return taken
 
     async def _all(self, requests: Sequence[Request]) -> list[Completion]:
         together = min(self._batch_size, len(requests))

@@ -68,7 +68,9 @@ async def stated(kind: Kind, weights: str, models: Any, ask: Ask) -> Model:
     """
     if (entry := _entry(models, "data", weights)) is None:
         return Model()
-    listed = {k: v if type(v) is int else printable(v) for k in _LISTED if (v := entry.get(k))}
+    listed = {
+        k: v if type(v) is int and abs(v) <= _EXACT else printable(v) for k in _LISTED if (v := entry.get(k))
+    }
     facts = {name: value for name, value in entry.items() if name not in _LISTED}
     version = None
     if kind in _MORE:
