@@ -29,6 +29,7 @@ class Words:
     template: str
     specials: dict[str, str] = field(default_factory=lambda: {"eos_token": "<|im_end|>"})
     bos: int | None = None
+    vocabulary: int = 256
 
     def encode(self, text: str) -> list[int]:
         return list(text.encode())
@@ -97,4 +98,5 @@ def test_a_template_that_is_no_jinja_is_known_at_once() -> None:
 def test_tokens_and_bos_are_the_files(tmp_path: Path) -> None:
     chat = GgufChat("words", Words("{{ bos_token }}", {"bos_token": "<s>"}, bos=1))
     assert (chat.bos, chat.encode("ab"), chat.decode([97, 98])) == (1, [97, 98], "ab")
+    assert chat.spellings("Ba") == {"B": [66], "a": [97]}
     assert chat.render(MESSAGES, thinking=False) == "<s>"

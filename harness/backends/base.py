@@ -3,10 +3,10 @@
 How a backend batches or threads inside is its own matter; the rest of the program does not depend on it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from harness.core.image import Image
 
@@ -164,6 +164,34 @@ def window(backend: Backend) -> int:
     0 for a backend that takes one call at a time; it has no attribute `window`.
     """
     return getattr(backend, "window", 0)
+
+
+class Served(NamedTuple):
+    """Which server gave an answer.
+
+    Attributes:
+        id: the request's id.
+        server: base URL of the server.
+        model: the model that the server says has answered; None if it says none.
+    """
+
+    id: str
+    server: str
+    model: str | None
+
+
+def served(backend: Backend) -> list[Served]:
+    """Return which server gave each answer since the last call; empty for a backend without servers."""
+    taken: Callable[[], list[Served]] | None = getattr(backend, "served", None)
+    return taken() if taken else []
+
+
+def doubt(backend: Backend) -> str | None:
+    """Return why a backend's cached answers may be of other weights, in one line; None if it can tell.
+
+    A backend whose identity does not show that its weights have changed has an attribute `doubt`.
+    """
+    return getattr(backend, "doubt", None)
 
 
 class Timed(Backend, Protocol):

@@ -1,6 +1,6 @@
 """The model card: a record of a model, its engine, its weights and its latency, read from a TOML file."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -98,6 +98,20 @@ class Card:
             ValueError: one is not a base URL, or is named twice.
         """
         return replace(self, server=replace(self.server, base_url=urls)) if self.server and urls else self
+
+    def record(self) -> dict[str, Any]:
+        """Return the card as plain values, from which `convert` makes it again.
+
+        A server's keys that later versions added stand in it only where they are set: a run that an earlier
+        version began has the same settings.
+        """
+        record = asdict(self)
+        if self.server:
+            server = {key: value for key, value in record["server"].items() if value is not None}
+            if self.server.fields:
+                server["fields"] = dict(self.server.fields.changed)
+            record["server"] = server
+        return record
 
 
 @dataclass(frozen=True)

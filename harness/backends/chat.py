@@ -5,6 +5,9 @@ from typing import Any
 
 from harness.backends.cards import Thinking
 from harness.core.errors import UserError, printable
+from harness.prompts.readout import spelt
+
+_LONGEST = 8  # characters of a letter's longest token: `<0x41>`, or a letter with blanks
 
 
 class Chat:
@@ -89,6 +92,22 @@ class Chat:
             self.tokenizer.decode([i], skip_special_tokens=False, clean_up_tokenization_spaces=False)
             for i in ids
         ]
+
+    def spellings(self, letters: str) -> dict[str, list[int]]:
+        """Return the ids of all tokens that are each letter: alone, with blanks around it, or as a byte."""
+        found: dict[str, list[int]] = {letter: [] for letter in letters}
+        candidates = self._candidates(letters)
+        for token, piece in zip(candidates, self.pieces(candidates), strict=True):
+            if (letter := spelt(piece)) in found:
+                found[letter].append(token)
+        return found
+
+    def _candidates(self, letters: str) -> Sequence[int]:
+        """Return the ids of the tokens whose texts may be one of the letters."""
+        return [
+            token for text, token in self.tokenizer.get_vocab().items()
+            if len(text) <= _LONGEST and (text.startswith("<0x") or any(x in text for x in letters))
+        ]  # fmt: skip
 
 
 def in_parts(messages: Sequence[Mapping[str, str]], picture: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -14,14 +14,14 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from harness.backends.base import Backend, Completion, Request, Role, window
+from harness.backends.base import Backend, Completion, Request, Role, Served, served, window
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Ints
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.files import canonical_bytes, digest
 from harness.dataset.load import Scene
-from harness.evaluate import repair
+from harness.evaluate import repair, servers
 from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
@@ -130,6 +130,7 @@ class Asker:
         answers: answers by request id, in the order of the requests.
         latency: how long inference takes.
         tally: what became of the questions that were asked here.
+        served: which server gave each answer that is not kept in a file.
     """
 
     def __init__(
@@ -156,7 +157,7 @@ class Asker:
         self.spec, self._backend, self._kept = spec, backend, kept
         self._progress, self._more = progress, more
         self.latency, self._on_disk_s = latency, -math.inf
-        self._given = frozenset(answers or {})
+        self._given, self.served = frozenset(answers or {}), list[Served]()
         self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
         self.tally, self._in_a_row = Tally(), 0
 
@@ -194,6 +195,7 @@ class Asker:
             with closing(_answer_chunks(answering, wave, calls)) as chunks_answered:
                 for answers in chunks_answered:
                     new_answers |= answers
+                    self._keep_servers(served(backend))
                     self._take(answers.values())
         self.answers |= {request.id: new_answers[request.id] for chunk in todo for request in chunk}
         found = Tally(new_answers.values())
@@ -216,6 +218,13 @@ class Asker:
         if self._in_a_row >= (self._first() if refused_so_far else IN_A_ROW):
             raise Unanswered(str(self.tally))
         self._progress(len(answers))
+
+    def _keep_servers(self, these: Sequence[Served]) -> None:
+        """Keep which server gave each answer."""
+        if self._kept:
+            servers.keep(self._kept.parent, these)
+        else:
+            self.served += these
 
     def _first(self) -> int:
         """How many questions are asked before anything was answered: whole batches."""

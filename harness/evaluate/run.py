@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from harness.backends.base import Backend
+from harness.backends.base import Backend, Served
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
@@ -25,7 +25,7 @@ from harness.core.parallel import Workers, each, spread
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
-from harness.evaluate import device, timing
+from harness.evaluate import device, servers, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker, read_kept
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
@@ -167,7 +167,7 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)
         try:
-            return _gather(out, whole, chunks, place, kept_sources.read(folders[0] / WORK))
+            return _gather(out, whole, chunks, place, kept_sources.read(folders[0] / WORK), folders)
         except Unanswered as error:
             raise UserError(f"{error}; type the commands of the shards again, and merge then") from None
 
@@ -177,6 +177,8 @@ def _walk(
 ) -> dict[str, bytes]:
     """Walk a chunk's episodes to their ends and return the files of this part of the run, by name.
 
+    Which servers gave answers that are not kept yet is one of them; it is no part of the run's tables.
+
     Frozen scenes are walked for some seeds at a time: the decisions of all would not fit into memory.
     `asker_of` returns the asker of the n-th of these walks, which is given the answers so far.
     """
@@ -185,10 +187,12 @@ def _walk(
         at_once = max(1, WALKS_AT_ONCE // (len(chunk) * len(spec.points)))
     answers: Mapping[str, Answer] = {}
     tables, episodes, viewers = list[Decisions](), list[Episode](), dict[str, Sequence[str]]()
+    served = list[Served]()
     for n, seeds in enumerate(_split(spec.seeds, at_once)):
         world, asker = _world_of(spec, chunk, seeds), asker_of(n, answers)
         decided = list(chain.from_iterable(walk(world, spec.points, asker)))
         viewers |= {scene.id: scene.viewers for part in decided for scene in part.moments}
+        served += asker.served
         answers, decisions = asker.answers, table(decided, world.columns(), spec.actions)
         if spec.device_profile:
             joules = device.energy(
@@ -197,7 +201,8 @@ def _walk(
             decisions = decisions.replace(**joules)
         tables.append(decisions.rounded())
         episodes += world.episodes()
-    return folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values(), viewers)
+    files = folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values(), viewers)
+    return {**files, servers.FILE: servers.lines(served)} if served else files
 
 
 def _frozen(
@@ -324,6 +329,7 @@ def _drive(
     progress(sum(map(len, chunks)) - sum(map(len, todo)))
 
     def keep(index: int, files: dict[str, bytes]) -> None:
+        servers.keep(place, files.pop(servers.FILE, b""))
         folder.write_part(place / _folder_name(todo[index]), files)
         _answered_file(place, todo[index]).unlink(missing_ok=True)
         progress(len(todo[index]))
@@ -368,9 +374,19 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
 
 
 def _gather(
-    out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes]
-) -> Evaluated:
-    """Score the chunks in a working folder and write the files of the finished run, with its sources."""
+    out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes],
+    others: Sequence[Path] = (),
+) -> Evaluated:  # fmt: skip
+    """Score the chunks in a working folder and write the files of the finished run, with its sources.
+
+    Args:
+        out: the run's folder.
+        begun: what the work began with.
+        chunks: the episodes of each part.
+        place: the working folder.
+        made_of: the run's sources, by name.
+        others: folders that the run is merged from.
+    """
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
 
@@ -403,6 +419,7 @@ def _gather(
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
         kept_sources.write(out, made_of)
+        servers.write(out, [place, *(other / WORK for other in others)])
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)

@@ -20,6 +20,7 @@ class Vocabulary(Protocol):
     template: str
     specials: dict[str, str]
     bos: int | None
+    vocabulary: int
 
     def encode(self, text: str) -> list[int]: ...
     def decode(self, ids: Sequence[int]) -> str: ...
@@ -53,6 +54,9 @@ class GgufChat(Chat):
 
     def pieces(self, ids: Sequence[int]) -> list[str]:
         return self._vocabulary.pieces(ids)
+
+    def _candidates(self, letters: str) -> Sequence[int]:
+        return range(self._vocabulary.vocabulary)
 
     def _apply(self, messages: list[dict[str, str]], switch: Mapping[str, bool]) -> str:
         return self._compiled.render(
