@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harness.backends.base import AnswerMode
+    from harness.backends.cards import Card
     from harness.coordination.operating_point import OperatingPoint
     from harness.core import parallel, shards
     from harness.evaluate.agent import ImageMode
@@ -27,6 +28,14 @@ Model = Annotated[
     Option(
         help="Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file or "
         "a hub id."
+    ),
+]
+RunModel = Annotated[
+    list[str] | None,
+    Option(
+        "--model",
+        help="The run's model, where it is none of your cards: a checkpoint directory, a .gguf file or a hub "
+        "id. Nothing that only a run names is opened or asked. Repeatable, for several models.",
     ),
 ]
 Scenario = Annotated[str, Argument(help="Scenario name; `harness scenario list` shows them.")]
@@ -222,6 +231,13 @@ def points(
             if point.profile and setting.partition("=")[0] not in point.name:
                 found.append(named_point(point.name + ("," if ":" in point.name else ":") + setting))
     return tuple(dict.fromkeys(found))
+
+
+def cards(models: "Sequence[str] | None") -> "list[Card]":
+    """Cards of the models that a user names. Raises UserError if there is no such model."""
+    from harness.backends.cards import resolve
+
+    return [resolve(model) for model in models or ()]
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
