@@ -271,8 +271,9 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     if name is not None:
         if env_config is not None:
             raise UserError("--env-config changes an environment; give --env as well")
-        return name
+        return typed(name)
     assert env is not None
+    typed(f"{environment.PREFIX}{env}")
     if env_config is None:
         return f"{environment.PREFIX}{env}"
     try:
@@ -282,6 +283,15 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
             f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a JSON file"
         ) from None
     return environment.named(env, changes)
+
+
+def typed(scenario: str) -> str:
+    """Return a scenario's name that the user typed, which may thus import an environment's module."""
+    from harness.world.environments import environment
+
+    if scenario.startswith(environment.PREFIX):
+        environment.allow(scenario)
+    return scenario
 
 
 def workers_of(text: str) -> "parallel.Workers":
