@@ -673,10 +673,38 @@ def test_a_server_with_one_model_answers_to_any_name() -> None:
 
 
 def test_the_key_is_read_from_the_variable_that_the_card_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SWARMDRIVE_KEYS", "OTHER_SECRET, MY_KEY")
     monkeypatch.setenv("MY_KEY", f" {KEY}\n")
     monkeypatch.setenv("OPENAI_API_KEY", "not-this-one")
     with serving(lambda asked: asked.reply(completion())) as there:
         openai_backend.open(card(there.url, key_env="MY_KEY"), batch_size=1).complete([request()])
+    assert there.asked[0].headers["Authorization"] == f"Bearer {KEY}"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["AWS_SECRET_ACCESS_KEY", "GITHUB_TOKEN", "HF_TOKEN", "MY_CLOUD_SECRET", "STRIPE_API_KEY", "HOME", "KEY",
+     "OPENAI", "OPENAI_SECRET"],
+)  # fmt: skip
+def test_a_card_may_not_have_any_variable_sent(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(name, KEY)
+    with serving(lambda asked: asked.reply(completion())) as there:
+        with pytest.raises(UserError, match=f"key_env {name} is no name of a key of models") as caught:
+            openai_backend.open(card(there.url, key_env=name), batch_size=1)
+        assert there.asked == []
+        assert "5ecret" not in str(caught.value)
+        monkeypatch.delenv(name)
+        openai_backend.open(card(there.url, key_env=name), batch_size=1).complete([request()])
+    assert "Authorization" not in there.asked[0].headers
+
+
+@pytest.mark.parametrize("name", ["OPENAI_API_KEY", "AZURE_OPENAI_API_KEY", "VLLM_KEY", "LAB_LLM_TOKEN"])
+def test_a_variable_named_for_a_key_of_models_needs_no_listing(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, KEY)
+    with serving(lambda asked: asked.reply(completion())) as there:
+        openai_backend.open(card(there.url, key_env=name), batch_size=1).complete([request()])
     assert there.asked[0].headers["Authorization"] == f"Bearer {KEY}"
 
 
@@ -753,6 +781,7 @@ def test_after_a_run_the_key_is_nowhere(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, small_path: Path
 ) -> None:
     """A whole `harness eval` against a server that says the key back in every way, then in answers."""
+    monkeypatch.setenv("SWARMDRIVE_KEYS", "MY_KEY")
     monkeypatch.setenv("MY_KEY", KEY)
     monkeypatch.chdir(tmp_path)
     shipped = resources.folder
@@ -792,7 +821,7 @@ def test_the_papers_cloud_comparator_is_a_card_with_its_round_trip_declared(
     [text] = re.findall(r"```toml\n(.+?)```", page, re.DOTALL)
     (tmp_path / resources.MARKER).touch()
     (tmp_path / "models").mkdir()
-    monkeypatch.setenv("CLOUD_KEY", KEY)
+    monkeypatch.setenv("CLOUD_LLM_KEY", KEY)
     with serving(lambda asked: asked.reply(completion(GOOD))) as there:
         (tmp_path / "models/cloud.toml").write_text(text.replace("https://api.example.com/v1", there.url))
         options = ("--dataset", small_path, "--limit", "2", "--condition", "single-local", "--out", "run")

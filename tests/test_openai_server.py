@@ -84,9 +84,9 @@ def url(gguf: Path) -> Iterator[str]:
 
 @pytest.fixture
 def card(url: str, monkeypatch: pytest.MonkeyPatch) -> Card:
-    monkeypatch.setenv("TINY_KEY", KEY)
+    monkeypatch.setenv("TINY_LLAMA_KEY", KEY)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    server = Server(url, "llama-cpp-python", key_env="TINY_KEY", retries=0)
+    server = Server(url, "llama-cpp-python", key_env="TINY_LLAMA_KEY", retries=0)
     return Card("served", "openai", "d", Latency("paper", None, "b"), "tiny", server=server)
 
 
@@ -177,8 +177,8 @@ def test_a_whole_run_holds_the_answers_and_not_the_key(card: Card, data: Dataset
 
 def test_a_wrong_key_is_one_line_at_opening(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
     for wrong in ("sk-of-somebody-else", ""):
-        monkeypatch.setenv("TINY_KEY", wrong)
-        with pytest.raises(UserError, match=r"refuses the key \(HTTP 401: .*\); set TINY_KEY"):
+        monkeypatch.setenv("TINY_LLAMA_KEY", wrong)
+        with pytest.raises(UserError, match=r"refuses the key \(HTTP 401: .*\); set TINY_LLAMA_KEY"):
             openai_backend.open(card, batch_size=1)
 
 

@@ -7,8 +7,9 @@ lists. For a directory, a GGUF file, a hub id or `replay:RUN_DIR`, a card is mad
 import json
 import os.path
 import re
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 from harness.backends.card import Card, Dtype, Latency, LatencySource, Thinking, read
@@ -19,10 +20,14 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 
 __all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", "each_engine", "load",
-           "load_all", "names", "resolve"]  # fmt: skip
+           "load_all", "names", "own", "resolve"]  # fmt: skip
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
+# Keys that decide no answer, or whose effect is in the identity of the opened model.
+_PLACE = ("description", "latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
+          "licence", "projector")  # fmt: skip
+_SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 PROJECTOR = "mmproj-"  # prefix of a projector's GGUF file
 _SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
 _GGUF_HEAD = 1 << 25  # the first bytes of a GGUF file, with its vocabulary and its template
@@ -85,6 +90,47 @@ def argument(card: Card) -> str:
     if card.name.partition(":")[0] in names() and load(card.name) == card:
         return card.name
     return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
+
+
+def own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card:
+    """Return the user's own card of the model that a run names. What the run says of it opens nothing.
+
+    Args:
+        stated: the card that the run states. Only its name is looked up; the rest is compared.
+        given: cards that the user gave, which come before the card files.
+        where: name of the run, in messages.
+        hint: what the user can do if there is no such card.
+
+    Raises:
+        UserError: the user has no card of that name, or it asks otherwise than the run did.
+    """
+    name = printable(stated.name)
+    card = next((card for card in given if card.name == stated.name), None)
+    if card is None:
+        if stated.name.partition(":")[0] not in names():
+            raise UserError(f"{where}: its model {name} is none of your cards; {hint}")
+        card = load(stated.name)
+    if differing := _differing(card, stated):
+        raise UserError(
+            f"{where}: its model {name} is not what it was ({', '.join(differing)} of your card differs); "
+            "restore the card, or run again"
+        )
+    return card
+
+
+def _differing(card: Card, stated: Card) -> list[str]:
+    """Return the keys in which two cards of a model differ so that answers may differ.
+
+    Where it lies and what people read may change: the identity of the opened model says what answers.
+    """
+    for part in ("server", "vision"):
+        if bool(getattr(card, part)) != bool(getattr(stated, part)):
+            return [f"[{part}]"]
+    same = {key: getattr(stated, key) for key in _PLACE}
+    if card.server and stated.server:
+        same["server"] = replace(card.server, **{key: getattr(stated.server, key) for key in _SERVER_PLACE})
+    card = replace(card, **same)
+    return [f.name for f in fields(Card) if getattr(card, f.name) != getattr(stated, f.name)]
 
 
 def _on_the_spot(text: str, engine: str | None) -> Card:

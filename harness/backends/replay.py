@@ -7,7 +7,7 @@ from typing import Any
 
 from harness.backends.base import AGAIN, Backend, Completion, Request
 from harness.backends.cache import cached, default_file
-from harness.backends.cards import Card
+from harness.backends.cards import Card, own
 from harness.backends.registry import find, open_backend
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
@@ -86,7 +86,11 @@ class Replay:
                 )
             self._check(request, agent)
         if role not in self._models:
-            card = convert(agent["model"], Card, f"{shown}: its model")
+            stated = convert(agent["model"], Card, f"{shown}: its model")
+            card = own(
+                stated, (), f"{shown} holds no answer for {requests[0].id}",
+                "write one of that name, or make the run again",
+            )  # fmt: skip
             model = open_backend(card, dtype=manifest.dtype, batch_size=manifest.batch_size)
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":

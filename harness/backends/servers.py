@@ -3,6 +3,7 @@
 A card is a public file: it names the environment variable of the key and holds no secret.
 """
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ from typing import Annotated, Any, Literal, get_args
 from urllib.parse import urlsplit
 
 from msgspec import Meta
+
+from harness.core.errors import UserError
 
 Kind = Literal["generic", "vllm", "llama-server", "ollama", "lm-studio", "llama-cpp-python"]
 KINDS = get_args(Kind)
@@ -74,6 +77,15 @@ class Fields:
         }
 
 
+KEYS = "SWARMDRIVE_KEYS"  # environment variable: names of further variables, with commas, that cards may use
+# Words of which one is in the name of a variable that holds a key of models, such as AZURE_OPENAI_API_KEY.
+_OF_MODELS = {
+    "ANTHROPIC", "CEREBRAS", "COHERE", "DASHSCOPE", "DEEPINFRA", "DEEPSEEK", "FIREWORKS", "GEMINI", "GROQ",
+    "LITELLM", "LLAMA", "LLM", "LMSTUDIO", "MISTRAL", "MOONSHOT", "NVIDIA", "OLLAMA", "OPENAI", "OPENROUTER",
+    "SAMBANOVA", "SGLANG", "TGI", "TOGETHER", "TOGETHERAI", "VLLM", "XAI", "ZAI",
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Server:
     """A server that speaks OpenAI's chat completions.
@@ -82,7 +94,8 @@ class Server:
         base_url: URL up to and with `/v1`; http or https, without credentials, query or fragment. With a list
             of servers, any of them may answer, and each must list the model.
         kind: decides how a constrained answer is asked for; `generic` is OpenAI's own way.
-        key_env: environment variable with the key; it need not be set for a server without one.
+        key_env: environment variable with the key; it need not be set for a server without one. Its name
+            tells that it is a key of models (`readable`), or the user lists it in SWARMDRIVE_KEYS.
         timeout_s: longest time of one attempt, from connecting to the last byte, in seconds.
         retries: attempts after the first, if a server was busy, broke down or was not reached; of several
             servers, each is tried at least once.
@@ -110,6 +123,23 @@ class Server:
                 "set the key in the environment, never in a card"
             )
 
+    def key(self) -> str | None:
+        """Return the server's key; None if its variable is not set.
+
+        A card may come from others, so it may not have any variable sent to its server.
+
+        Raises:
+            UserError: the variable holds no key of models, by its name, and the user does not list it.
+        """
+        if not self.key_env or not (key := os.environ.get(self.key_env, "").strip()):
+            return None
+        if not readable(self.key_env):
+            raise UserError(
+                f"key_env {self.key_env} is no name of a key of models, such as OPENAI_API_KEY or VLLM_KEY, "
+                f"so it is not sent; if it holds one, set {KEYS}={self.key_env} in your environment"
+            )
+        return key
+
     @property
     def urls(self) -> tuple[str, ...]:
         """The base URL of each server, without a trailing slash."""
@@ -125,6 +155,16 @@ class Server:
     def tells_thinking(self) -> bool:
         """Whether a request can turn thinking on and off."""
         return self.kind in ("vllm", "llama-server")
+
+
+def readable(variable: str) -> bool:
+    """Whether a card may have this environment variable sent to its server.
+
+    It ends in KEY or TOKEN and has the word of a service or a server of models, or the user lists it.
+    """
+    *words, last = variable.split("_")
+    listed = {name.strip() for name in os.environ.get(KEYS, "").split(",")}
+    return variable in listed or (last in ("KEY", "TOKEN") and not _OF_MODELS.isdisjoint(words))
 
 
 def _fault(url: str) -> str | None:

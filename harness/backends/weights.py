@@ -16,7 +16,7 @@ from harness.core.resources import find
 
 # Without one of these AutoTokenizer silently builds an empty tokenizer.
 _TOKENIZERS = ("tokenizer.json", "tokenizer.model", "vocab.json")
-_WEIGHTS = ("*.safetensors", "*.bin")
+_WEIGHTS = ("*.safetensors",)  # a pickle, such as pytorch_model.bin, may hold code and is never read
 _SHARDS = "model.safetensors.index.json"
 # The files that transformers loads; a repository may hold the same weights in other formats as well.
 _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]

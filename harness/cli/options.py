@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harness.backends.base import AnswerMode
+    from harness.backends.cards import Card
     from harness.coordination.operating_point import OperatingPoint
     from harness.core import parallel, shards
     from harness.evaluate.agent import ImageMode
@@ -27,6 +28,14 @@ Model = Annotated[
     Option(
         help="Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file or "
         "a hub id."
+    ),
+]
+RunModel = Annotated[
+    list[str] | None,
+    Option(
+        "--model",
+        help="The run's model, where it is none of your cards: a checkpoint directory, a .gguf file or a hub "
+        "id. Nothing that only a run names is opened or asked. Repeatable, for several models.",
     ),
 ]
 Scenario = Annotated[str, Argument(help="Scenario name; `harness scenario list` shows them.")]
@@ -231,6 +240,13 @@ def points(
     return tuple(dict.fromkeys(found))
 
 
+def cards(models: "Sequence[str] | None") -> "list[Card]":
+    """Cards of the models that a user names. Raises UserError if there is no such model."""
+    from harness.backends.cards import resolve
+
+    return [resolve(model) for model in models or ()]
+
+
 def parse_seeds(text: str) -> tuple[int, ...]:
     """Seeds from `0:5` (0 to 4) or `3,7,9`."""
     start, colon, stop = text.partition(":")
@@ -262,8 +278,9 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     if name is not None:
         if env_config is not None:
             raise UserError("--env-config changes an environment; give --env as well")
-        return name
+        return typed(name)
     assert env is not None
+    typed(f"{environment.PREFIX}{env}")
     if env_config is None:
         return f"{environment.PREFIX}{env}"
     try:
@@ -273,6 +290,15 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
             f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a JSON file"
         ) from None
     return environment.named(env, changes)
+
+
+def typed(scenario: str) -> str:
+    """Return a scenario's name that the user typed, which may thus import an environment's module."""
+    from harness.world.environments import environment
+
+    if scenario.startswith(environment.PREFIX):
+        environment.allow(scenario)
+    return scenario
 
 
 def workers_of(text: str) -> "parallel.Workers":

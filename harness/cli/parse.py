@@ -35,7 +35,7 @@ def command(
 
     if finish_reason not in FINISH_REASONS:
         raise errors.unknown("finish reason", finish_reason, FINISH_REASONS)
-    actions = scenarios.get(scenario).actions
+    actions = scenarios.get(options.typed(scenario)).actions
     text = _read(file)
     parsed = parse(
         text, role=role, actions=actions, thinking=thinking, reasons_first=reasons_first,

@@ -37,6 +37,7 @@ def command(
     latency: str = typer.Option(
         "run", help="Inference time of one answer: run (as in the run) or paper (145 ms)."
     ),
+    model: options.RunModel = None,
     no_model: bool = typer.Option(
         False,
         "--no-model",
@@ -75,7 +76,8 @@ def command(
     grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]
     conditions, silent = list(dict.fromkeys(condition)), as_json or quiet
     with bar("grid points", quiet=silent) as progress:
-        stored = [Stored(run, latency, progress.more, progress, not no_model, dataset) for run in runs]
+        own = options.cards(model)
+        stored = [Stored(run, latency, progress.more, progress, not no_model, dataset, own) for run in runs]
         panels = {
             axis.name: settings(stored, axis, values, conditions)
             for axis, values in zip(axes, grids, strict=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from harness.backends.base import AnswerMode, Backend, Request
 from harness.backends.cache import default_file
-from harness.backends.cards import Card
+from harness.backends.cards import Card, own
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
 from harness.coordination.intents import Intents
@@ -43,6 +43,7 @@ from harness.studies.axes import Setting
 from harness.studies.play import Walked, walk_through
 
 WALKS = 1 << 17  # most that are walked together, unless one grid point has more: some 120 MB
+_GIVE_IT = "to ask it, give --model with its folder, .gguf file or hub id, or write a card models/NAME.toml"
 MORE = "more-answers.jsonl"  # answers at decision points that the run did not come to, and its fusion calls
 
 
@@ -65,7 +66,7 @@ class Stored:
     def __init__(
         self, folder: Path, latency: str | None = None,
         more: Callable[[int], None] = lambda count: None, done: Callable[[int], None] = lambda count: None,
-        asks: bool = True, dataset: Path | None = None,
+        asks: bool = True, dataset: Path | None = None, models: Sequence[Card] = (),
     ) -> None:  # fmt: skip
         """A run.
 
@@ -76,6 +77,8 @@ class Stored:
             done: told how many have come.
             asks: whether its model is asked what the run has no answer to; else such walks are left out.
             dataset: folder of its dataset; None where the run states.
+            models: cards that the user gave; a model of another name is asked only if the user has a card
+                file of it. What a run says of a model's place is never used.
         """
         self.run = read(folder)
         if self.run.world != "frozen":
@@ -101,7 +104,7 @@ class Stored:
         self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
         self.dataset = dataset_of(self.run, dataset).of_episodes(self.run.grid.episodes)
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
-        self._asks = asks
+        self._asks, self._models = asks, models
         self.left_out: set[str] = set()
         self._opened: dict[int, Backend] = {}
         self._laid_out: Intents | None = None  # at every decision point that was asked for
@@ -268,16 +271,17 @@ class Stored:
                     f"{shown}: prompt {printable(agent.prompt.version)} has changed since; restore it or run "
                     "again"
                 )
+        cards = [own(card, self._models, shown, _GIVE_IT) for card in spec.cards]
         opens = partial(open_backend, dtype=spec.dtype, batch_size=spec.batch_size)
-        models = open_each(spec.cards, opens)
-        identity = together(spec.cards, models).identity()
+        models = open_each(cards, opens)
+        identity = together(cards, models).identity()
         stored, now = manifest.identity, msgspec.json.decode(canonical_json(identity))
         if now != stored:
             other = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
             raise UserError(
                 f"{shown}: the model is not what it was ({printable(', '.join(other))}); run again"
             )
-        return together(spec.cards, models, default_file())
+        return together(cards, models, default_file())
 
 
 class _Nearest:

@@ -39,6 +39,14 @@ def places(env):
     return [(*v.position.tolist(), float(v.heading), float(v.speed)) for v in env.road.vehicles]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _imports():
+    """The module of this user's own environment, which names may have imported."""
+    with pytest.MonkeyPatch.context() as changed:
+        changed.setenv("SWARMDRIVE_IMPORTS", "my_roads")
+        yield
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("built") / "breakdown"

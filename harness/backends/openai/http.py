@@ -6,7 +6,6 @@ Nothing that a server does raises an exception: answers and failures are both da
 import asyncio
 import json
 import math
-import os
 import time
 from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
@@ -182,7 +181,7 @@ class Client:
 
 
 def _key(server: Server) -> str | None:
-    key = os.environ.get(server.key_env, "").strip()
+    key = server.key() or ""
     if not (key.isascii() and key.isprintable()) or " " in key:
         raise UserError(f"the key in {server.key_env} holds characters that no key has; set it again")
     return key or None
