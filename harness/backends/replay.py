@@ -135,7 +135,7 @@ class Replay:
     def identity(self) -> dict[str, Any]:
         """Return the digest of the run's answers, with its model and identity."""
         return {
-            "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl"),
+            "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl", "rows"),
             "of": {"model": self._run.manifest.model, "identity": self._run.manifest.identity},
         }  # fmt: skip
 

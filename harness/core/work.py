@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from harness.core.errors import Unfinished, UserError, printable
-from harness.core.files import alone, forget_halves, write_whole
+from harness.core.files import alone, forget_halves, text_of, write_whole
 from harness.core.formats import CONFIG, WORK
 
 LOCK = "lock"
@@ -49,7 +49,7 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
     shown, file = printable(out), out / WORK / CONFIG
     try:
         if file.is_file():
-            return msgspec.json.decode(file.read_bytes(), type=kind)
+            return msgspec.json.decode(text_of(file, "record"), type=kind)
         others = out.is_dir() and any(path.name != WORK for path in out.iterdir())
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(

@@ -15,10 +15,11 @@ import csv
 import math
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
+from pathlib import Path
 from typing import ClassVar, Literal
 
 from harness.core.errors import UserError
+from harness.core.files import text_of
 from harness.radio.block_error import BlockError, block_error, threshold
 from harness.radio.propagation import Environment, noise_dbm
 from harness.radio.sidelink import Sidelink
@@ -114,6 +115,6 @@ class NrMode2(Sidelink):
 
 @cache
 def _bits_per_s_per_hz() -> list[float]:
-    text = (resources.files(__package__) / "nr_mcs.csv").read_text(encoding="utf-8")
+    text = text_of(Path(__file__).with_name("nr_mcs.csv"))
     rows = csv.DictReader(text.splitlines())
     return [int(row["bits_per_symbol"]) * int(row["rate_1024"]) / 1024 for row in rows]

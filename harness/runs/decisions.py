@@ -1,6 +1,5 @@
 """The table of decisions, `decisions.parquet`: one row for each decision point, condition and seed."""
 
-import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,7 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.files import replacing
+from harness.core.files import bytes_of, replacing
 from harness.runs.records import Decision, Message
 
 if TYPE_CHECKING:
@@ -275,7 +274,7 @@ class DecisionFiles:
 
     def write(self, path: Path) -> None:
         """Write one Parquet file. Raises what `Decisions.read` raises."""
-        columns = [set(pq.read_schema(file).names) for file in self.files]
+        columns = [set(pq.read_schema(arrow_file(file)).names) for file in self.files]
         helpers = max(_helpers(names) for names in columns)
         unknown = set(OPTIONAL).difference(*columns)
         with replacing(path) as part:
@@ -314,13 +313,12 @@ def _row_group(tables: Sequence[pa.Table]) -> pa.Table:
     return pa.table(columns, schema=kinds)
 
 
-def arrow_file(path: Path) -> pa.OSFile:
+def arrow_file(path: Path) -> pa.BufferReader:
     """Open a file for Arrow.
 
-    Arrow's threads can abort the process when they release a file object of Python; this is Arrow's own.
+    Arrow's threads can abort the process when they release a file object of Python, so it gets the content.
     """
-    with path.open("rb"):  # its error says in few words why a file cannot be opened
-        return pa.OSFile(os.fsencode(path))
+    return pa.BufferReader(bytes_of(path, "rows"))
 
 
 # pyarrow loads pandas when it converts a foreign array to its own or back; going by buffers avoids that.

@@ -22,7 +22,7 @@ from msgspec import Struct
 from msgspec.structs import asdict
 
 from harness.core.errors import UserError, printable
-from harness.core.files import replacing, write_whole
+from harness.core.files import bytes_of, replacing, text_of, write_whole
 from harness.core.formats import FORMAT, READ_BY, SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
@@ -124,7 +124,7 @@ class Run:
     @cached_property
     def answers(self) -> Answers:
         """The lines of `answers.jsonl`."""
-        return self._read("answers.jsonl", lambda file: Answers(file.read_bytes(), len(self.actions)))
+        return self._read("answers.jsonl", lambda file: Answers(bytes_of(file, "rows"), len(self.actions)))
 
     @cached_property
     def answers_by_scene(self) -> Mapping[str, list[Answer]]:
@@ -238,7 +238,7 @@ def read(path: Path) -> Run:
             else f"{printable(path)} is no finished run: it has no run.json; "
             "give a folder made by `harness eval` or `harness drive`"
         )
-    stated: Any = whole(file, lambda file: msgspec.json.decode(file.read_bytes()))
+    stated: Any = whole(file, lambda file: msgspec.json.decode(text_of(file, "record")))
     version = stated.get("format") if isinstance(stated, dict) else None
     if version != FORMAT:
         old = READ_BY.get(version) if isinstance(version, str) else None
@@ -300,7 +300,7 @@ def read_part(
     """Read a part that `write_part` wrote. Raises UserError if it is broken."""
     return whole(part, lambda part: (
         Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
-        _FACTS.decode_lines((part / "answers.jsonl").read_bytes()),
+        _FACTS.decode_lines(bytes_of(part / "answers.jsonl", "rows")),
     ))  # fmt: skip
 
 
@@ -311,13 +311,13 @@ def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles
 
 def answers_in(part: Path) -> int:
     """Return the number of answers in a part."""
-    return (part / "answers.jsonl").read_bytes().count(b"\n")
+    return bytes_of(part / "answers.jsonl", "rows").count(b"\n")
 
 
 def lines_of(parts: Iterable[Path]) -> Iterator[bytes]:
     """Yield the content of a run's `answers.jsonl` from its parts, one part at a time."""
     for part in parts:
-        yield (part / "answers.jsonl").read_bytes()
+        yield bytes_of(part / "answers.jsonl", "rows")
 
 
 def lines(answers: Sequence[Answer]) -> bytes:

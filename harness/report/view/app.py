@@ -33,6 +33,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from harness.core.errors import UserError, printable
+from harness.core.files import bytes_of
 from harness.report.view import pages
 from harness.report.view.folder import PICTURES, own_file, pictures, whole
 from harness.runs.listing import Listed, runs
@@ -210,7 +211,7 @@ class View:
 
 
 def _shown(page: Path) -> Response:
-    return _with_way_back(page.read_text(encoding="utf-8", errors="replace"))
+    return _with_way_back(bytes_of(page, "rows").decode("utf-8", "replace"))
 
 
 def _with_way_back(page: str) -> Response:
