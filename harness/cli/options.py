@@ -261,12 +261,11 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     if env_config is None:
         return f"{environment.PREFIX}{env}"
     try:
-        changes = json.loads(text_of(env_config, "settings"))
+        return environment.named(env, json.loads(text_of(env_config, "settings")))
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a JSON file"
         ) from None
-    return environment.named(env, changes)
 
 
 def workers_of(text: str) -> "parallel.Workers":

@@ -38,6 +38,13 @@ LONGEST_S = 3600.0  # the longest time that a model may be declared to take for 
 Seconds = Annotated[
     float, msgspec.Meta(ge=0, le=LONGEST_S, description=f"seconds, 0 or more, at most {LONGEST_S:g}")
 ]
+
+
+def between(least: float, most: float) -> msgspec.Meta:
+    """Return the bounds of an annotated number, with words for them."""
+    return msgspec.Meta(ge=least, le=most, description=f"a number from {least:g} to {most:g}")
+
+
 _type_info = cache(type_info)
 _MISSING = re.compile(r"Object missing required field `(.+)`")
 _STEPS = re.compile(r"\.([^.\[`]+)|\[(\d+)\]|(\[\.{3}\])")  # the steps of a path such as `$.points[1].loss`

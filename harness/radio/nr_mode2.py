@@ -16,8 +16,9 @@ import math
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
+from harness.core.config import between
 from harness.core.errors import UserError
 from harness.core.files import text_of
 from harness.radio.block_error import BlockError, block_error, threshold
@@ -49,14 +50,14 @@ class NrMode2(Sidelink):
     """
 
     environment: Environment = "tr37885-highway"
-    frequency_ghz: float = 5.89
-    t1_slots: int = 2
-    t2_slots: int = 33
+    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89
+    t1_slots: Annotated[int, between(0, 10000)] = 2
+    t2_slots: Annotated[int, between(0, 10000)] = 33
     bandwidth_mhz: Literal[10, 20, 30, 40] = 40
     numerology: Literal[0, 1, 2] = 0
-    subchannel_blocks: int = 50
-    mcs: int = 14
-    packet_bytes: int = 200
+    subchannel_blocks: Annotated[int, between(1, 1000)] = 50
+    mcs: Annotated[int, between(0, 28)] = 14
+    packet_bytes: Annotated[int, between(1, 10000)] = 200
     ranks: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
