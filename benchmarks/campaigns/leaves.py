@@ -232,14 +232,15 @@ def _runs(here: Path) -> Iterator[Subject]:
     every = (("ls", "all"), ("history", "all"))
     grid = ("--over", "tau", "--grid", "0.3", "--no-model", "--out", "out")
     reads = (
-        ("report", "all/it", "--out", "out.html"), ("compare", "all/it", "sound/it", "--html", "out.html"),
+        *(("report", "all/it", "--out", "out.html"),) * 3,
+        ("compare", "all/it", "sound/it", "--html", "out.html"),
         ("export", "all/it", "--csv", "--out", "out"), ("export", "all/it", "--junit", "out.html"),
         ("sweep", "all/it", *grid), ("trust", "all/it", "--no-model", "--share", "1/3", "--attacks", "liar",
                                      "--rules", "linear", "--out", "out"),
         ("fidelity", "all/it", "sound/driven", "--out", "out"), ("schedule", "compare", "all/it", "--out", "out"),
         ("eval", "--model", "replay:all/it", "--dataset", "small", *seeds, "--condition", "6g", "--out", "out"),
     )  # fmt: skip
-    files = ("run.json", "run.json", "answers.jsonl", "episodes.csv", "summary.csv", "decisions.parquet",
+    files = ("run.json", "run.json", "run.json", "answers.jsonl", "episodes.csv", "summary.csv", "decisions.parquet",
              "attribution.json")  # fmt: skip
     for name in files:
         yield Subject("run", where / "all/it" / name, (*every, *reads), where)

@@ -86,7 +86,8 @@ class Replay:
             model = open_backend(card, dtype=manifest.dtype, batch_size=manifest.batch_size)
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":
-                stored = manifest.identity["helpers"][0]
+                helpers = manifest.identity.get("helpers")
+                stored = helpers[0] if isinstance(helpers, list) and helpers else {}
             if digest(model.identity()) != digest(stored):
                 raise UserError(
                     f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} has "

@@ -42,6 +42,7 @@ from harness.runs.records import (
     Speed,
     Variant,
 )
+from harness.world.scenario import MOST_DECISIONS
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
@@ -206,7 +207,7 @@ class Run:
         return grid, tuple(grid.ordered(episodes))
 
     def _decisions(self, file: Path) -> Decisions:
-        decisions = Decisions.read(file, self.actions)
+        decisions = Decisions.read(file, self.actions, _most_rows(self.episodes))
         decisions.codes("action", self.actions)
         if infinite := decisions.infinite():
             raise ValueError(f"{infinite} is infinite")
@@ -299,9 +300,18 @@ def read_part(
 ) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:  # fmt: skip
     """Read a part that `write_part` wrote. Raises UserError if it is broken."""
     return whole(part, lambda part: (
-        Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
-        _FACTS.decode_lines(bytes_of(part / "answers.jsonl", "rows")),
+        *_read_tables(part, actions), _FACTS.decode_lines(bytes_of(part / "answers.jsonl", "rows")),
     ))  # fmt: skip
+
+
+def _read_tables(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...]]:
+    episodes = _records(part / "episodes.csv", Episode)
+    return Decisions.read(part / "decisions.parquet", actions, _most_rows(episodes)), episodes
+
+
+def _most_rows(episodes: Sequence[Episode]) -> int:
+    """Return how many decisions a file may hold, so that one with a few too many is still read and named."""
+    return 2 * MOST_DECISIONS * len(episodes)
 
 
 def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:

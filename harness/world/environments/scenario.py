@@ -171,7 +171,7 @@ def _parameters(name: str, env: Any, actions: int) -> Parameters:
     for kind, value in (("simulation", hz), ("policy", decisions_hz)):
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= MOST_HZ:
             raise UserError(
-                f"{environment.shown(name)}: {kind}_frequency is {printable(repr(value))}; set it to a number "
+                f"{environment.shown(name)}: {kind}_frequency is {printable(repr(value))}; set a number "
                 f"above 0, at most {MOST_HZ}, in its config"
             )
     if hz % decisions_hz:
