@@ -28,7 +28,7 @@ TESTS = Path(__file__).parents[2] / "tests"
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: its exit code, or the negative signal, what it said, and the most bytes it took."""
+    """How a command ended: its exit code or negative signal, what it said, and the most memory, in bytes."""
 
     command: Sequence[str]
     code: int

@@ -1,12 +1,12 @@
-"""Single changed leaves in everything that the program reads: one line, never a traceback, a hang or a gigabyte.
+"""Single changed leaves in all that the program reads: one line, never a traceback, a hang or a gigabyte.
 
     python benchmarks/campaigns/leaves.py [--count 5000] [--seed 0] [--kind run] [--memory 1]
 
-A leaf is a value in a JSON, TOML, CSV or Parquet file: of a dataset, its trees and scenes; of a run, frozen or
-driven, and of unfinished work; of a suite; of a project's prompts, cards, channels, devices, networks, schedules and
-suites. It becomes another type, sign, size or name, is removed or stands twice. Then a command is typed that reads
-it; files are drawn with equal odds, and so are the leaves of a file and its commands. A dataset's digests are made
-anew, so that what is read is the leaf and not the digest.
+A leaf is a value in a JSON, TOML, CSV or Parquet file: of a dataset, its trees and scenes; of a run, frozen
+or driven; of a project's prompts, cards, channels, devices, networks, schedules and suites. It becomes another
+type, sign, size or name, is removed or stands twice. Then a command is typed that reads it. Files are drawn
+with equal odds, and so are the leaves of a file and its commands. A dataset's digests are made anew, so that
+what is read is the leaf and not the digest.
 """
 
 import argparse
@@ -41,8 +41,9 @@ LIMIT_S = 120.0
 SKIPPED = ("training", "llama_cpp", "transformers", "__main__")  # what takes long to import, or runs
 GONE, TWICE = object(), object()
 VALUES: tuple[Any, ...] = (
-    None, True, False, 0, 1, -1, -0.5, 2, 10**9, 2**31, 2**63, 10**30, 10**400, 1e9, 1e18, 1e308, -1e308, 5e-324,
-    1e-12, math.nan, math.inf, -math.inf, "", " ", "x", "nan", "nobody-of-this-name", "x" * 300, "x" * 2_000_000,
+    None, True, False, 0, 1, -1, -0.5, 2, 10**9, 2**31, 2**63, 10**30, 10**400, 1e9, 1e18, 1e308, -1e308,
+    5e-324, 1e-12, math.nan, math.inf, -math.inf, "", " ", "x", "nan", "nobody-of-this-name", "x" * 300,
+    "x" * 2_000_000,
     "\x1b[31m\u202e", "../../..", "/dev/zero", "a\x00b", "\ud800", "9" * 5000, [], {}, [None], [[]], {"a": 1},
     ["x"] * 1000,
 )  # fmt: skip
@@ -81,8 +82,8 @@ def main() -> None:
         subjects = made(here, given.kind)
         for n in range(given.count):
             subject = rng.choice(subjects)
-            original = {path: path.read_bytes() for path in (subject.file, subject.file.with_name("manifest.json"))
-                        if path.is_file()}  # fmt: skip
+            files = [subject.file, *subject.file.parent.glob("manifest.json")]
+            original = {path: path.read_bytes() for path in files}
             shown = changed(rng, subject)
             command = rng.choice(subject.commands)
             os.chdir(subject.where)
@@ -97,11 +98,16 @@ def main() -> None:
             os.chdir(here)
             for path, data in original.items():
                 path.write_bytes(data)
-            for path in (subject.where / "out", subject.where / "out.html"):
-                shutil.rmtree(path, ignore_errors=True)
-                path.unlink(missing_ok=True)
+            cleared(subject.where)
         print(f"\nlargest: {most / 1e9:.2f} GB", end="")
         tally.end()
+
+
+def cleared(where: Path) -> None:
+    """Delete what a command wrote."""
+    for path in (where / "out", where / "out.html"):
+        shutil.rmtree(path, ignore_errors=True)
+        path.unlink(missing_ok=True)
 
 
 def load_all() -> None:
@@ -127,20 +133,19 @@ def made(here: Path, kinds: list[str] | None) -> list[Subject]:
     if not kinds or {"run", "driven"} & set(kinds):
         subjects += _runs(here)
     found = [subject for subject in subjects if not kinds or subject.kind in kinds]
-    for subject in found:  # a sound one ends well, or a fault could hide another
-        for command in subject.commands:
-            os.chdir(subject.where)
-            ended = typed(*command)
-            assert ended.code in (0, 1), (command, ended.err)
-            for path in (subject.where / "out", subject.where / "out.html"):
-                shutil.rmtree(path, ignore_errors=True)
-                path.unlink(missing_ok=True)
+    typed_in = {(subject.where, command) for subject in found for command in subject.commands}
+    for where, command in sorted(typed_in, key=str):  # a sound one ends well, or a fault could hide another
+        os.chdir(where)
+        ended = typed(*command)
+        assert ended.code in (0, 1), (command, ended.err)
+        cleared(where)
     os.chdir(here)
     return found
 
 
 CHANNELS = {
-    "my-6g": "6g", "my-mode4": "mode4", "my-mode2": "mode2", "my-its": "its-g5", "my-coupled": "density-coupled",
+    "my-6g": "6g", "my-mode4": "mode4", "my-mode2": "mode2", "my-its": "its-g5", 
+    "my-coupled": "density-coupled",
 }  # fmt: skip
 TRACE = "distance_m,reception,sight,latency_ms\n" + "".join(
     f"{d},{1 - d / 1000},{sight},5\n" for d in (10, 200, 400) for sight in ("clear", "vehicle", "building")
@@ -157,10 +162,23 @@ def _project(project: Path) -> Iterator[Subject]:
     (project / "swarmdrive.toml").write_text("")
     for name, shipped in CHANNELS.items():
         shutil.copy(folder("channels") / f"{shipped}.toml", project / f"channels/{name}.toml")
-        drive = ("eval", "--limit", 1, "--seeds", "0", "--model", "cruise", "--condition", name, "--out", "out")
+        drive = (
+            "eval",
+            "--limit",
+            1,
+            "--seeds",
+            "0",
+            "--model",
+            "cruise",
+            "--condition",
+            name,
+            "--out",
+            "out",
+        )
         yield of("channel", f"channels/{name}.toml", ("channel", "list"), ("channel", "show", name), drive)
     (project / "channels/trace.toml").write_text(
-        'model = "trace"\ndescription = "d"\nsource = "s"\nstatus = "measured"\n[parameters]\nfile = "trace.csv"\n'
+        'model = "trace"\ndescription = "d"\nsource = "s"\nstatus = "measured"\n'
+        '[parameters]\nfile = "trace.csv"\n'
         'latency_s = 0.01\nbeyond = "held"\n'
     )
     (project / "channels/trace.csv").write_text(TRACE)
@@ -176,7 +194,7 @@ def _project(project: Path) -> Iterator[Subject]:
     shutil.copy(folder("schedules") / "learnt.toml", project / "schedules/mine.toml")
     yield of(
         "schedule", "schedules/mine.toml", (*quick, "--condition", "6g:schedule=mine"),
-        ("eval", "--limit", 1, "--seeds", "0", "--model", "proxy", "--condition", "6g:schedule=mine", "--out", "out"),
+        ("eval", "--limit", 1, "--seeds", "0", "--condition", "6g:schedule=mine", "--out", "out"),
     )  # fmt: skip
     for name, shipped in {"faulty": "proxy-faulty", "weights": "qwen3-8b", "served": "openai-example",
                           "eyes": "qwen3-vl-2b"}.items():  # fmt: skip
@@ -195,9 +213,30 @@ def _project(project: Path) -> Iterator[Subject]:
         '[mine]\ndescription = "d"\ndatasets = ["occluded-intersection-v2"]\n'
     )
     yield of("suite", "datasets/suites.toml", (*quick, "--dataset", "suite:mine"))
-    (project / "config.json").write_text('{"policy_frequency": 1, "simulation_frequency": 15, "screen_width": 600}')
-    yield of("env-config", "config.json", ("drive", "--env", "merge-v0", "--env-config", "config.json", "--episodes", 1, "--seeds", "0", "--model", "cruise",
-        "--condition", "6g", "--out", "out"))
+    (project / "config.json").write_text(
+        '{"policy_frequency": 1, "simulation_frequency": 15, "screen_width": 600}'
+    )
+    yield of(
+        "env-config",
+        "config.json",
+        (
+            "drive",
+            "--env",
+            "merge-v0",
+            "--env-config",
+            "config.json",
+            "--episodes",
+            1,
+            "--seeds",
+            "0",
+            "--model",
+            "cruise",
+            "--condition",
+            "6g",
+            "--out",
+            "out",
+        ),
+    )
 
 
 def _dataset(where: Path) -> Iterator[Subject]:
@@ -237,11 +276,13 @@ def _runs(here: Path) -> Iterator[Subject]:
         ("export", "all/it", "--csv", "--out", "out"), ("export", "all/it", "--junit", "out.html"),
         ("sweep", "all/it", *grid), ("trust", "all/it", "--no-model", "--share", "1/3", "--attacks", "liar",
                                      "--rules", "linear", "--out", "out"),
-        ("fidelity", "all/it", "sound/driven", "--out", "out"), ("schedule", "compare", "all/it", "--out", "out"),
-        ("eval", "--model", "replay:all/it", "--dataset", "small", *seeds, "--condition", "6g", "--out", "out"),
+        ("fidelity", "all/it", "sound/driven", "--out", "out"),
+        ("schedule", "compare", "all/it", "--out", "out"),
+        ("eval", "--model", "replay:all/it", "--dataset", "small", *seeds, "--condition", "6g",
+         "--out", "out"),
     )  # fmt: skip
-    files = ("run.json", "run.json", "run.json", "answers.jsonl", "episodes.csv", "summary.csv", "decisions.parquet",
-             "attribution.json")  # fmt: skip
+    files = ("run.json", "run.json", "run.json", "answers.jsonl", "episodes.csv", "summary.csv",
+             "decisions.parquet",             "attribution.json")  # fmt: skip
     for name in files:
         yield Subject("run", where / "all/it" / name, (*every, *reads), where)
     drives = (
@@ -395,13 +436,18 @@ def _column(rng: random.Random, file: Path) -> str:
     elif how == "twice":
         table = table.append_column(name, table[name])
     elif how == "rows":
-        table = rng.choice((table.slice(0, 0), pa.concat_tables([table] * 2), table.slice(1), table.slice(0, 1)))
+        table = rng.choice(
+            (table.slice(0, 0), pa.concat_tables([table] * 2), table.slice(1), table.slice(0, 1))
+        )
     else:
         one = rng.randrange(len(values))
         kind = table.schema.field(at).type
         with suppress(pa.ArrowException, OverflowError, TypeError, ValueError):
             if how == "one":
-                column = pa.array([*values[:one], value, *values[one + 1 :]], type=pa.string() if pa.types.is_dictionary(kind) else kind)
+                column = pa.array(
+                    [*values[:one], value, *values[one + 1 :]],
+                    type=pa.string() if pa.types.is_dictionary(kind) else kind,
+                )
             else:
                 column = pa.array([value] * len(values))
             table = table.set_column(at, name, column)

@@ -70,7 +70,7 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
         elif any(
             isinstance(value, a) != isinstance(expected[name], b) for a, b in ((list, tuple), (str, str))
         ):
-            yield f"[parameters]: {name} = {value}; wanted is a value such as {expected[name]}"
+            yield f"[parameters]: {name} = {printable(value)}; wanted is a value such as {expected[name]}"
     if missing := scenario.parameters.stated().keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"
     if scenario.start and manifest.environment != (here := environment.config(scenario.name)):

@@ -241,8 +241,8 @@ class Decisions:
     def read(cls, path: Path, actions: Sequence[str], most: int | None = None) -> "Decisions":
         """Read a Parquet file.
 
-        Raises OSError or ValueError if it is none, lacks a run's columns, or has more than `most` rows or more
-        bytes than its rows can need: a file of a few bytes may hold a thousand million rows.
+        Raises OSError or ValueError if it is none, lacks a run's columns, or has more than `most` rows or
+        more bytes than its rows can need: a file of a few bytes may hold a thousand million rows.
         """
         with arrow_file(path) as file:  # read_table would make columns of folder names
             source = pq.ParquetFile(file)
