@@ -28,12 +28,13 @@ TESTS = Path(__file__).parents[2] / "tests"
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: its exit code, or the negative signal, and what it said."""
+    """How a command ended: its exit code or negative signal, what it said, and the most memory, in bytes."""
 
     command: Sequence[str]
     code: int
     out: str
     err: str
+    peak: int
 
     @property
     def faults(self) -> list[str]:
@@ -83,7 +84,7 @@ class Running:
     def ended(self, within_s: float = LIMIT_S) -> Ended:
         """Wait for it; it is killed when it takes longer."""
         until_s = time.monotonic() + within_s
-        while (done := os.waitpid(self.pid, os.WNOHANG))[0] == 0:
+        while (done := os.wait4(self.pid, os.WNOHANG))[0] == 0:
             if time.monotonic() > until_s:
                 os.killpg(self.pid, signal.SIGKILL)
             time.sleep(0.01)
@@ -91,7 +92,7 @@ class Running:
         for file in self._said:
             file.seek(0)
             said.append(file.read().decode("utf-8", "replace"))
-        return Ended(self.command, os.waitstatus_to_exitcode(done[1]), *said)
+        return Ended(self.command, os.waitstatus_to_exitcode(done[1]), *said, done[2].ru_maxrss << 10)
 
     def left(self, within_s: float = 5.0) -> list[int]:
         """Processes of its session that are still there so long after it ended; they are then killed."""

@@ -18,6 +18,7 @@ from harness.backends.vision import Vision, of_checkpoint
 from harness.core import resources
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import bytes_of, opened, text_of
 
 __all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", "each_engine", "load",
            "load_all", "names", "own", "resolve"]  # fmt: skip
@@ -201,13 +202,13 @@ def _new_card(name: str, engine: str, weights: str, description: str, thinking: 
 def _thinking(checkpoint: Path) -> Thinking:
     """Return `switch` if a checkpoint's chat template has the thinking switch; reads the file's text only."""
     files = (checkpoint / name for name in _TEMPLATE_FILES)
-    return "switch" if any(_SWITCH in f.read_bytes() for f in files if f.is_file()) else "none"
+    return "switch" if any(_SWITCH in bytes_of(f, "record") for f in files if f.is_file()) else "none"
 
 
 def _run_vision(run: Path) -> Vision | None:
     """Return how a run's model took pictures; None also for an unreadable run, which fails on opening."""
     with suppress(OSError, ValueError, TypeError, KeyError, UserError):
-        stated = json.loads((run / "run.json").read_bytes())["model"]["vision"]
+        stated = json.loads(text_of(run / "run.json", "record"))["model"]["vision"]
         return stated and convert(stated, Vision, "vision")
     return None
 
@@ -216,7 +217,7 @@ def _vision(text: str, checkpoint: Path) -> Vision | None:
     """Return how a checkpoint takes pictures, from its config files. Raises UserError if they do not say."""
     try:
         config, processor = (
-            json.loads(file.read_bytes()) if file.is_file() else {}
+            json.loads(text_of(file, "record")) if file.is_file() else {}
             for file in (checkpoint / "config.json", checkpoint / "preprocessor_config.json")
         )
         return of_checkpoint(config, processor)
@@ -229,5 +230,5 @@ def _vision(text: str, checkpoint: Path) -> Vision | None:
 
 def _gguf_thinking(file: Path) -> Thinking:
     """Return `switch` if the chat template in a GGUF file has the thinking switch; the file is not parsed."""
-    with file.open("rb") as data:
+    with opened(file, "weights") as data:
         return "switch" if _SWITCH in data.read(_GGUF_HEAD) else "none"

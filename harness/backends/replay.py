@@ -94,7 +94,8 @@ class Replay:
             model = open_backend(card, dtype=manifest.dtype, batch_size=manifest.batch_size)
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":
-                stored = manifest.identity["helpers"][0]
+                helpers = manifest.identity.get("helpers")
+                stored = helpers[0] if isinstance(helpers, list) and helpers else {}
             if digest(model.identity()) != digest(stored):
                 raise UserError(
                     f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} has "
@@ -143,7 +144,7 @@ class Replay:
     def identity(self) -> dict[str, Any]:
         """Return the digest of the run's answers, with its model and identity."""
         return {
-            "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl"),
+            "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl", "rows"),
             "of": {"model": self._run.manifest.model, "identity": self._run.manifest.identity},
         }  # fmt: skip
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from harness.backends.cards import Card
 from harness.core.errors import UserError, printable
+from harness.core.files import text_of
 from harness.core.resources import find
 
 # Qwen2's pre-tokeniser, for `tokenizer.ggml.pre = qwen2`: every digit is a piece of its own.
@@ -31,7 +32,7 @@ def tokenizer(source: Path) -> Any:
             f"no tokenizer at {printable(file)}; give a tokenizer.json, its folder, or a GGUF file"
         )
     try:
-        return _from_gguf(file) if file.suffix == ".gguf" else Tokenizer.from_file(str(file))
+        return _from_gguf(file) if file.suffix == ".gguf" else Tokenizer.from_str(text_of(file, "record"))
     except UserError:
         raise
     except Exception as error:  # tokenizers and gguf raise bare Exceptions on a broken file

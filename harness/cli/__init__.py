@@ -107,7 +107,9 @@ def main() -> None:
     except BrokenPipeError:  # as SIGPIPE ends a program: `| head` has left
         sys.exit(141)
     except OSError as error:
-        if error.errno not in MACHINE:
+        from harness.core.files import Refused
+
+        if error.errno not in MACHINE and not isinstance(error, Refused):
             raise
         where = f"{printable(error.filename)}: " if error.filename else ""
         _fail(f"{where}{error.strerror}; fix that, and type the same command again")

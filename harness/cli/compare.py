@@ -56,8 +56,8 @@ def command(
     if html:
         from harness.report.compare import page
 
-        why = difference.prompts
-        refuse_less(html, {"prompts": why} if isinstance(why, str) else {}, "--html")
+        lacking = difference.prompts
+        refuse_less(html, {"prompts": lacking} if isinstance(lacking, str) else {}, "--html")
         save([page.render(difference, verdicts, show, page.beside(html))], html, "--html")
     if junit:
         save([text.junit(difference, verdicts)], junit, "--junit")

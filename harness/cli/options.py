@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option, echo
 
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import text_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -284,12 +285,11 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     if env_config is None:
         return f"{environment.PREFIX}{env}"
     try:
-        changes = json.loads(env_config.read_bytes())
+        return environment.named(env, json.loads(text_of(env_config, "settings")))
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a JSON file"
         ) from None
-    return environment.named(env, changes)
 
 
 def typed(scenario: str) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 
 from harness.core.arrays import Bools
 from harness.core.errors import UserError, unknown
+from harness.core.files import text_of
 from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
 from harness.core.resources import find as beside
@@ -274,7 +275,7 @@ def argument(path: Path) -> str:
 def released_digests() -> set[str]:
     """Return the manifests' digests of released datasets, from `datasets/released.toml`."""
     pins = folder("datasets") / "released.toml"
-    return set(tomllib.loads(pins.read_text()).values()) if pins.is_file() else set()
+    return set(tomllib.loads(text_of(pins)).values()) if pins.is_file() else set()
 
 
 @uncollected()

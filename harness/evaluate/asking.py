@@ -19,7 +19,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Ints
 from harness.core.errors import Unanswered, UserError, printable
-from harness.core.files import canonical_bytes, digest
+from harness.core.files import bytes_of, canonical_bytes, digest
 from harness.dataset.load import Scene
 from harness.evaluate import repair, servers
 from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of
@@ -387,7 +387,7 @@ def read_kept(kept: Path) -> dict[str, Answer]:
     """
     if not kept.is_file():
         return {}
-    data = kept.read_bytes()
+    data = bytes_of(kept, "rows")
     whole = data[: data.rfind(b"\n") + 1]
     if len(whole) < len(data):
         with kept.open("r+b") as file:

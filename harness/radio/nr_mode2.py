@@ -15,10 +15,12 @@ import csv
 import math
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
-from typing import ClassVar, Literal
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
 
+from harness.core.config import between
 from harness.core.errors import UserError
+from harness.core.files import text_of
 from harness.radio.block_error import BlockError, block_error, threshold
 from harness.radio.propagation import Environment, noise_dbm
 from harness.radio.sidelink import Sidelink
@@ -48,14 +50,14 @@ class NrMode2(Sidelink):
     """
 
     environment: Environment = "tr37885-highway"
-    frequency_ghz: float = 5.89
-    t1_slots: int = 2
-    t2_slots: int = 33
+    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89
+    t1_slots: Annotated[int, between(0, 10000)] = 2
+    t2_slots: Annotated[int, between(0, 10000)] = 33
     bandwidth_mhz: Literal[10, 20, 30, 40] = 40
     numerology: Literal[0, 1, 2] = 0
-    subchannel_blocks: int = 50
-    mcs: int = 14
-    packet_bytes: int = 200
+    subchannel_blocks: Annotated[int, between(1, 1000)] = 50
+    mcs: Annotated[int, between(0, 28)] = 14
+    packet_bytes: Annotated[int, between(1, 10000)] = 200
     ranks: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -114,6 +116,6 @@ class NrMode2(Sidelink):
 
 @cache
 def _bits_per_s_per_hz() -> list[float]:
-    text = (resources.files(__package__) / "nr_mcs.csv").read_text(encoding="utf-8")
+    text = text_of(Path(__file__).with_name("nr_mcs.csv"))
     rows = csv.DictReader(text.splitlines())
     return [int(row["bits_per_symbol"]) * int(row["rate_1024"]) / 1024 for row in rows]

@@ -17,6 +17,7 @@ import numpy as np
 
 from harness.core.config import convert, settable, toml
 from harness.core.errors import printable, unknown
+from harness.core.files import written_ns
 from harness.core.plugins import FilesAndPlugins
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
@@ -60,12 +61,12 @@ class Profiles(FilesAndPlugins[Channel]):
 
     def read(self, file: Path) -> Channel:
         """Read the channel of a file."""
-        return _read(file, file.stat().st_mtime_ns)[1]
+        return _read(file, written_ns(file))[1]
 
     def profile(self, name: str) -> Profile:
         """Return the profile in the channel's file, or one made up for a package's channel."""
         if file := self.file(name):
-            return _read(file, file.stat().st_mtime_ns)[0]
+            return _read(file, written_ns(file))[0]
         kind = type(self[name])
         doc = (kind.__doc__ or "").strip().partition("\n")[0]
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")

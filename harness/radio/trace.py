@@ -9,6 +9,7 @@ import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import StringIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -18,7 +19,7 @@ import numpy as np
 from harness.core.arrays import Floats, Ints
 from harness.core.config import Seconds, convert
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import sha256_file
+from harness.core.files import sha256_file, text_of
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Broadcast, Delivery, Draws, Links, Site
 from harness.radio.constant import link_up
 
@@ -134,7 +135,7 @@ def of_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace
         raise UserError(f"{where} has no file; add it, a CSV with distance_m and reception")
     path = folder / parameters["file"]
     points = read(path)
-    table = Table(parameters["file"], sha256_file(path), points)
+    table = Table(parameters["file"], sha256_file(path, "text"), points)
     rest = {key: value for key, value in parameters.items() if key != "file"}
     return convert(rest, Trace, where, receptions=table)
 
@@ -143,14 +144,13 @@ def read(path: Path) -> tuple[Point, ...]:
     """Read the rows of a table, sorted by sight and distance. Raises UserError if the table is wrong."""
     shown = printable(path)
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.DictReader(file)
-            if missing := {"distance_m", "reception"} - {*(rows.fieldnames or ())}:
-                raise UserError(f"{shown}: has no column {' or '.join(sorted(missing))}")
-            for name in rows.fieldnames or ():
-                if name not in COLUMNS:
-                    raise unknown(f"column of {shown}", name, COLUMNS)
-            points = [_point(f"{shown}, line {rows.line_num}", row) for row in rows]
+        rows = csv.DictReader(StringIO(text_of(path), newline=""))
+        if missing := {"distance_m", "reception"} - {*(rows.fieldnames or ())}:
+            raise UserError(f"{shown}: has no column {' or '.join(sorted(missing))}")
+        for name in rows.fieldnames or ():
+            if name not in COLUMNS:
+                raise unknown(f"column of {shown}", name, COLUMNS)
+        points = [_point(f"{shown}, line {rows.line_num}", row) for row in rows]
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
         raise UserError(f"{shown}: cannot be read as a table ({printable(problem)})") from None
     if not points:

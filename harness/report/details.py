@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.core.places import text
 from harness.dataset.forest import Forest
@@ -147,6 +147,11 @@ class Details:
         answers = []
         by_viewer = {answer.key: answer for answer in run.answers_by_scene.get(name, ())}
         for answer in by_viewer.values():
+            if scene and answer.viewer not in scene.viewers:
+                raise UserError(
+                    f"{printable(run.path / 'answers.jsonl')} has an answer of {printable(answer.viewer)} in "
+                    f"scene {printable(name)}, where nobody of that name answers; make the run again"
+                )
             shown = {
                 key: v
                 for key in KEPT

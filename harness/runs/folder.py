@@ -25,7 +25,7 @@ from msgspec.structs import asdict
 
 from harness.core import work
 from harness.core.errors import UserError, printable
-from harness.core.files import replacing, write_whole
+from harness.core.files import bytes_of, replacing, text_of, write_whole
 from harness.core.formats import FORMAT, READ_BY, SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
@@ -46,6 +46,7 @@ from harness.runs.records import (
     Speed,
     Variant,
 )
+from harness.world.scenario import MOST_DECISIONS
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
@@ -130,7 +131,7 @@ class Run:
     @cached_property
     def answers(self) -> Answers:
         """The lines of `answers.jsonl`."""
-        return self._read("answers.jsonl", lambda file: Answers(file.read_bytes(), len(self.actions)))
+        return self._read("answers.jsonl", lambda file: Answers(bytes_of(file, "rows"), len(self.actions)))
 
     @cached_property
     def answers_by_scene(self) -> Mapping[str, list[Answer]]:
@@ -212,7 +213,7 @@ class Run:
         return grid, tuple(grid.ordered(episodes))
 
     def _decisions(self, file: Path) -> Decisions:
-        decisions = Decisions.read(file, self.actions)
+        decisions = Decisions.read(file, self.actions, _most_rows(self.episodes))
         decisions.codes("action", self.actions)
         if infinite := decisions.infinite():
             raise ValueError(f"{infinite} is infinite")
@@ -246,7 +247,7 @@ def read(path: Path) -> Run:
             else f"{printable(path)} is no finished run: it has no run.json; "
             "give a folder made by `harness eval` or `harness drive`"
         )
-    stated: Any = whole(file, lambda file: msgspec.json.decode(file.read_bytes()))
+    stated: Any = whole(file, lambda file: msgspec.json.decode(text_of(file, "record")))
     version = stated.get("format") if isinstance(stated, dict) else None
     if version != FORMAT:
         old = READ_BY.get(version) if isinstance(version, str) else None
@@ -311,14 +312,23 @@ def read_part(
 ) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:  # fmt: skip
     """Read a part that `write_part` wrote. Raises UserError if it is broken."""
     return whole(part, lambda part: (
-        Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
-        facts_of(part),
+        *_read_tables(part, actions), facts_of(part),
     ))  # fmt: skip
 
 
 def facts_of(part: Path) -> list[AnswerFacts]:
     """Read a part's answers, without their texts. Raises UserError if it is broken."""
-    return whole(part, lambda part: _FACTS.decode_lines((part / "answers.jsonl").read_bytes()))
+    return whole(part, lambda part: _FACTS.decode_lines(bytes_of(part / "answers.jsonl", "rows")))
+
+
+def _read_tables(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...]]:
+    episodes = _records(part / "episodes.csv", Episode)
+    return Decisions.read(part / "decisions.parquet", actions, _most_rows(episodes)), episodes
+
+
+def _most_rows(episodes: Sequence[Episode]) -> int:
+    """Return how many decisions a file may hold, so that one with a few too many is still read and named."""
+    return 2 * MOST_DECISIONS * len(episodes)
 
 
 def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:
@@ -328,13 +338,13 @@ def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles
 
 def answers_in(part: Path) -> int:
     """Return the number of answers in a part."""
-    return (part / "answers.jsonl").read_bytes().count(b"\n")
+    return bytes_of(part / "answers.jsonl", "rows").count(b"\n")
 
 
 def lines_of(parts: Iterable[Path]) -> Iterator[bytes]:
     """Yield the content of a run's `answers.jsonl` from its parts, one part at a time."""
     for part in parts:
-        yield (part / "answers.jsonl").read_bytes()
+        yield bytes_of(part / "answers.jsonl", "rows")
 
 
 def lines(answers: Sequence[Answer]) -> bytes:

@@ -16,6 +16,7 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.config import changed
 from harness.core.errors import UserError, printable
+from harness.core.files import text_of
 from harness.core.statistics import Estimate, episode_interval, rate_interval, resampled
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Physical, Site
 from harness.radio.fading import Trips
@@ -161,7 +162,7 @@ def curves_of(path: Path) -> list[Curve]:
     """
     shown = printable(path)
     try:
-        rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
+        rows = list(csv.DictReader(text_of(path).splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{shown} cannot be read as a table: {printable(error)}") from None
     curves: dict[tuple[str, str], list[tuple[float, float]]] = {}

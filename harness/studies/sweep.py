@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
 from harness.core.figures import interval
-from harness.core.files import write_whole
+from harness.core.files import bytes_of, write_whole
 from harness.core.versions import versions
 from harness.report.library import picture
 from harness.report.page import environment
@@ -127,7 +127,7 @@ def run_sweep(
     write_manifest(out, "sweep", {**stated, "sources": asked, "versions": versions()})
     found = tables(whole.summary)
     page = environment(TEMPLATES).get_template("sweep.html.j2").render(
-        pictures={name: picture((out / f"{name}.svg").read_bytes()) for name in drawn},
+        pictures={name: picture(bytes_of(out / f"{name}.svg", "picture")) for name in drawn},
         tables=found, sentences=[f"{name}: {in_a_sentence(rows)}." for name, rows in found.items()],
         seeds=seeds, axes=len(along),
         title=f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",

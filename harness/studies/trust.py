@@ -20,7 +20,7 @@ from harness.coordination.rules import EGO_PROMPT
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import digest
+from harness.core.files import bytes_of, digest
 from harness.core.kept import code_sha256
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import (
@@ -332,7 +332,7 @@ class _Kept:
             versions(), code_sha256("**/*.py"),
         ])  # fmt: skip
         self._cells: dict[tuple[str, str, float], Cell] = {}
-        data = path.read_bytes() if path.is_file() else b""
+        data = bytes_of(path, "rows") if path.is_file() else b""
         for line in data.splitlines():
             self._read(line)
         self._torn = not data.endswith(b"\n") and bool(data)

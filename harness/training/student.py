@@ -10,6 +10,7 @@ import torch
 
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
+from harness.core.files import text_of
 from harness.prompts import readout
 from harness.training.answers import answer, evidence, sights
 from harness.training.cells import CLASSES
@@ -213,7 +214,7 @@ class Student:
             texts = [m["content"] for q in some for m in q.read_out]
             texts += [answer(q.prompt, q.graph, q.label, q.actions) for q in some]
             train_tokenizer(texts, sees).save(str(file))
-        return Tokenizer.from_file(str(file))
+        return Tokenizer.from_str(text_of(file, "record"))
 
 
 def _place(question: Question) -> str:
