@@ -32,6 +32,7 @@ from harness.runs.records import Role as RecordedRole
 from harness.world.perception.graph import blinded, truth_graph
 
 CHUNK = 64  # fewest requests that are asked, and kept, together
+MORE_FOLLOWS = b" \n"  # ends every kept line but the last of its chunk, so that a torn chunk can be told
 SYNC_S = 1.0  # kept answers reach the disk this often; if power fails, those since are asked again
 
 
@@ -141,7 +142,8 @@ class Asker:
             spec: the evaluation.
             backend: opens the backend, at the first request.
             latency: how long inference takes.
-            kept: JSON Lines file of the answers so far; its last line may be torn if a run was killed.
+            kept: JSON Lines file of the answers so far; its last chunk may be torn if a run was killed. Only
+                one process at a time may ask.
             answers: further answers that need not be asked for, by request id.
             progress: called with the number of new answers, those kept by a stopped run included.
             more: called with the number of requests before they are made.
@@ -150,32 +152,46 @@ class Asker:
         self._progress, self._more = progress, more
         self.latency, self._on_disk_s = latency, -math.inf
         self._given = frozenset(answers or {})
-        self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
+        self.answers: dict[str, Answer] = {}
+        self._read_b = 0  # bytes of the file whose answers are among these
+        self._recall()
+        self.answers |= answers or {}
 
     def ask(self, asked: Sequence[Request]) -> None:
-        """Ask for the missing answers, and keep each chunk as soon as it is answered."""
-        if all(request.id in self.answers for request in asked):
-            self._progress(len(asked))
+        """Ask for the missing answers, each once, and keep each chunk as soon as it is answered."""
+        self._recall(cut=True)  # another process may have asked, too
+        missing = [request for request in asked if request.id not in self.answers]
+        if len(missing) < len(asked):
+            self._progress(len(asked) - len(missing))
+        if not missing:
             return
-        # An answer may depend on the other requests in its batch. So the chunks of a resumed run begin at the
-        # same places, and a chunk with an answer missing is asked again as a whole.
+        # An answer may depend on the other requests in its batch. Chunks are kept whole or not at all, and all
+        # but the last are equally long. So what is missing in a resumed run falls into the same chunks.
         backend, batch = self._backend(), self.spec.batch_size
         size = batch * math.ceil(CHUNK / batch)
-        chunks = [asked[start : start + size] for start in range(0, len(asked), size)]
+        chunks = [missing[start : start + size] for start in range(0, len(missing), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
-            chunks[-2:] = [asked[size * (len(chunks) - 2) :]]  # a short last chunk would not fill a batch
-        incomplete = [chunk for chunk in chunks if any(request.id not in self.answers for request in chunk)]
-        if len(incomplete) < len(chunks):
-            self._progress(len(asked) - sum(map(len, incomplete)))
+            chunks[-2:] = [missing[size * (len(chunks) - 2) :]]  # a short last chunk would not fill a batch
         new_answers: dict[str, Answer] = {}
-        for answers in _answer_chunks(
-            partial(self._answered, backend), incomplete, 1 + math.ceil(window(backend) / size)
-        ):
-            new_answers |= answers
-            if self._kept:
-                _keep(self._kept, answers.values(), self._to_disk())
-            self._progress(len(answers))
-        self.answers |= {request.id: new_answers[request.id] for chunk in incomplete for request in chunk}
+        try:
+            for answers in _answer_chunks(
+                partial(self._answered, backend), chunks, 1 + math.ceil(window(backend) / size)
+            ):
+                new_answers |= answers
+                if self._kept:
+                    self._read_b += _keep(self._kept, answers.values(), self._to_disk())
+                self._progress(len(answers))
+        finally:
+            there = (request.id for request in missing if request.id in new_answers)
+            self.answers |= {name: new_answers[name] for name in there}
+
+    def _recall(self, cut: bool = False) -> None:
+        """Read what the file has that is not known yet; with `cut`, a torn chunk is cut from it."""
+        if self._kept and self._kept.is_file() and (size_b := self._kept.stat().st_size) != self._read_b:
+            whole = _whole(self._kept.read_bytes())
+            self.answers, self._read_b = {**_answers_in(self._kept, whole), **self.answers}, len(whole)
+            if cut and self._read_b < size_b:
+                os.truncate(self._kept, self._read_b)
 
     def _to_disk(self) -> bool:
         """Whether the last answers reached the disk long enough ago."""
@@ -324,16 +340,13 @@ def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
 
 
 def read_kept(kept: Path) -> dict[str, Answer]:
-    """Read the answers kept so far, by request id, and cut a torn last line from the file."""
-    if not kept.is_file():
-        return {}
-    data = kept.read_bytes()
-    whole = data[: data.rfind(b"\n") + 1]
-    if len(whole) < len(data):
-        with kept.open("r+b") as file:
-            file.truncate(len(whole))
+    """Read the answers kept so far, by request id; those of a torn chunk do not count."""
+    return _answers_in(kept, _whole(kept.read_bytes())) if kept.is_file() else {}
+
+
+def _answers_in(kept: Path, lines: bytes) -> dict[str, Answer]:
     try:
-        answers = [_DECODER.decode(line) for line in whole.splitlines()]
+        answers = [_DECODER.decode(line) for line in lines.splitlines()]
     except (ValueError, RecursionError) as error:
         raise UserError(
             f"{printable(kept)} is damaged ({printable(error)}); delete its folder and start again"
@@ -341,13 +354,24 @@ def read_kept(kept: Path) -> dict[str, Answer]:
     return {answer.id: answer for answer in answers}
 
 
+def _whole(data: bytes) -> bytes:
+    """Return the chunks of a file that were kept to their ends."""
+    lines = data.splitlines(keepends=True)
+    while lines and (lines[-1].endswith(MORE_FOLLOWS) or not lines[-1].endswith(b"\n")):
+        lines.pop()
+    return b"".join(lines)
+
+
 _DECODER, _ENCODER = msgspec.json.Decoder(Answer), msgspec.json.Encoder()
 
 
-def _keep(kept: Path, answers: Iterable[Answer], to_disk: bool) -> None:
-    """Append answers to a file; with `to_disk`, return once it is on the disk."""
+def _keep(kept: Path, answers: Iterable[Answer], to_disk: bool) -> int:
+    """Append a chunk of answers to a file, and return its bytes; with `to_disk`, once it is on the disk."""
+    lines = _ENCODER.encode_lines(answers)
+    chunk = lines[:-1].replace(b"\n", MORE_FOLLOWS) + lines[-1:]
     with kept.open("ab") as file:
-        file.write(_ENCODER.encode_lines(answers))
+        file.write(chunk)
         file.flush()
         if to_disk:
             os.fsync(file.fileno())
+    return len(chunk)
