@@ -165,8 +165,8 @@ class Asker:
             self._progress(len(asked) - len(missing))
         if not missing:
             return
-        # An answer may depend on the other requests in its batch. Chunks are kept whole or not at all, and all
-        # but the last are equally long. So what is missing in a resumed run falls into the same chunks.
+        # An answer may depend on the other requests in its batch. Chunks are kept whole or not at all, and
+        # all but the last are equally long. So what a resumed run lacks falls into the same chunks.
         backend, batch = self._backend(), self.spec.batch_size
         size = batch * math.ceil(CHUNK / batch)
         chunks = [missing[start : start + size] for start in range(0, len(missing), size)]
@@ -189,7 +189,7 @@ class Asker:
         """Read what the file has that is not known yet; with `cut`, a torn chunk is cut from it."""
         if self._kept and self._kept.is_file() and (size_b := self._kept.stat().st_size) != self._read_b:
             whole = _whole(self._kept.read_bytes())
-            self.answers, self._read_b = {**_answers_in(self._kept, whole), **self.answers}, len(whole)
+            self.answers, self._read_b = _answers_in(self._kept, whole) | self.answers, len(whole)
             if cut and self._read_b < size_b:
                 os.truncate(self._kept, self._read_b)
 

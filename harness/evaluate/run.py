@@ -169,11 +169,13 @@ def _walk(
     if isinstance(spec.source, FrozenSource):
         at_once = max(1, WALKS_AT_ONCE // (len(chunk) * len(spec.points)))
     answers: Mapping[str, Answer] = {}
+    viewers: dict[str, Sequence[str]] = {}
     tables, episodes = list[Decisions](), list[Episode]()
     for n, seeds in enumerate(_split(spec.seeds, at_once)):
         world, asker = _world_of(spec, chunk, seeds), asker_of(n, answers)
         decided = list(chain.from_iterable(walk(world, spec.points, asker)))
         answers, decisions = asker.answers, table(decided, world.columns(), spec.actions)
+        viewers |= {scene.id: scene.viewers for part in decided for scene in part.moments}
         if spec.device_profile:
             joules = device.energy(
                 spec.device_profile, asker.latency, spec.points, decisions, answers.values()
@@ -181,7 +183,10 @@ def _walk(
             decisions = decisions.replace(**joules)
         tables.append(decisions.rounded())
         episodes += world.episodes()
-    return folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values())
+    # They came in any order: some were given, some kept by a stopped run, and several are asked at a time.
+    reached = (answer for answer in answers.values() if answer.scene in viewers)
+    in_order = sorted(reached, key=lambda answer: viewers[answer.scene].index(answer.viewer))
+    return folder.part_files(of_all_seeds(tables, spec.points), episodes, in_order)
 
 
 def _frozen(
