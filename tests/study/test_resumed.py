@@ -35,7 +35,7 @@ def test_a_resumed_study_has_the_files_of_one_that_ran_through(name: str, studie
 @pytest.mark.slow
 def test_no_study_keeps_an_answer_twice(studies: Path) -> None:
     kept = list(studies.glob(f"*/*/run/{MORE}"))
-    assert {path.parts[-3] for path in kept} >= {"trust", "sweep", "schedule", "attribute"}
+    assert {path.parts[-3] for path in kept} >= {"trust", "schedule", "attribute"}
     for path in kept:
         asked = Counter(
             (a["scene"], a["viewer"], a["role"], tuple(a.get("heard", ())))
