@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
 from types import NoneType
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -19,6 +19,8 @@ _QUICK = msgspec.json.Encoder(order="sorted")
 _EXACT = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False, check_circular=False
 )
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a formula begins with, and what spreadsheets skip before it
+T = TypeVar("T")
 _PLAIN = frozenset({str, int, bool, NoneType})
 
 
@@ -79,6 +81,20 @@ def text_of(path: Path, most: int = 1 << 24) -> str:
     if path.stat().st_size > most:
         raise OSError(errno.EFBIG, f"it is larger than {most >> 20} MB")
     return path.read_bytes().decode("utf-8")
+
+
+def neutral(cell: T) -> T | str:
+    """Return a cell of a CSV file for spreadsheets: a text that they would take for a formula as text.
+
+    It gets an apostrophe before it. Numbers, also those that are texts, stay as they are.
+    """
+    if not isinstance(cell, str) or not cell.startswith(FORMULA):
+        return cell
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}"
+    return cell
 
 
 def sha256_bytes(data: bytes) -> str:
