@@ -18,7 +18,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from harness import cli
+import harness.cli  # noqa: F401 (loaded before it is forked)
+from harness import __main__ as entry
 
 SCENARIO = "occluded-intersection"
 LIMIT_S = 120.0
@@ -68,7 +69,7 @@ class Running:
             resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
             sys.argv = ["harness", *self.command]
             prepare()
-            cli.main()
+            entry.main()
             code = 0
         except SystemExit as ended:
             code = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
@@ -96,17 +97,22 @@ class Running:
 
     def left(self, within_s: float = 5.0) -> list[int]:
         """Processes of its session that are still there so long after it ended; they are then killed."""
-        until_s = time.monotonic() + within_s
-        while (alive := list(_session(self.pid))) and time.monotonic() < until_s:
-            time.sleep(0.05)
-        for pid in alive:
-            os.kill(pid, signal.SIGKILL)
-        return alive
+        return of_session(self.pid, within_s)
 
 
 def typed(*command: object, prepare: Callable[[], object] = lambda: None) -> Ended:
     """Run a command to its end."""
     return Running(command, prepare).ended()
+
+
+def of_session(leader: int, within_s: float = 5.0) -> list[int]:
+    """Processes of a session that are still there after so many seconds; they are then killed."""
+    until_s = time.monotonic() + within_s
+    while (alive := list(_session(leader))) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    for pid in alive:
+        os.kill(pid, signal.SIGKILL)
+    return alive
 
 
 def _session(leader: int) -> Iterator[int]:

@@ -17,7 +17,11 @@ def command(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
     as_csv: Annotated[
         bool,
-        typer.Option("--csv", help="Write decisions.csv and answers.csv, one row per decision and answer."),
+        typer.Option(
+            "--csv",
+            help="Write decisions.csv and answers.csv, one row per decision and answer. A text that a "
+            "spreadsheet would take for a formula gets an apostrophe before it.",
+        ),
     ] = False,
     as_jsonl: Annotated[
         bool, typer.Option("--jsonl", help="Write decisions.jsonl, one object per decision.")

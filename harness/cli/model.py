@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any, cast, get_args
 import typer
 
 from harness.cli import options
+from harness.cli.estimates import echo_json, echo_wrong
 from harness.cli.progress import bar
-from harness.core.errors import Unanswered, printable
+from harness.core import resources
+from harness.core.errors import Unanswered, UserError, printable
 from harness.core.resources import DATASET
 
 if TYPE_CHECKING:
@@ -34,19 +36,31 @@ def list_models(as_json: options.Json = False) -> None:
     from harness.backends import cards
     from harness.backends.registry import missing
 
-    rows = [(card, missing(card)) for card in cards.load_all()]
+    rows: list[tuple[str, Card | UserError, str | None]] = []
+    for name, found in resources.each(cards.names(), cards.each_engine).items():
+        if isinstance(found, UserError):
+            rows.append((name, found, None))
+        else:
+            rows += [(card.name, card, missing(card)) for card in found]
     if as_json:
-        typer.echo(json.dumps([{**asdict(card), "missing": lack} for card, lack in rows], indent=2))
+        echo_json([
+            {"name": name, "error": str(card)} if isinstance(card, UserError)
+            else {**asdict(card), "missing": lack}
+            for name, card, lack in rows
+        ], indent=2)  # fmt: skip
         return
     line = "{:<22}{:<14}{:<10}{:<13}{}"
     typer.echo(line.format("name", "engine", "thinking", "latency", "runs here"))
-    for card, lack in rows:
+    for name, card, lack in rows:
+        if isinstance(card, UserError):
+            echo_wrong(name, card)
+            continue
         seconds = card.latency.inference_s
         latency = "paper" if seconds is None else f"card {seconds * 1000:g} ms"
         here = f"no: {lack}" if lack else "yes"
-        name, _, other = card.name.partition(":")
+        stem, _, other = name.partition(":")
         # A card's other engines stand below it.
-        typer.echo(line.format("" if other else printable(name), card.engine, card.thinking, latency, here))
+        typer.echo(line.format("" if other else printable(stem), card.engine, card.thinking, latency, here))
         if not other:
             typer.echo(f"  {printable(card.description, 78)}")
 

@@ -193,7 +193,8 @@ def as_mapping(done: "Evaluated") -> dict[str, Any]:
 
 def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str]) -> None:
     """Print a run's table, a row a condition, with what it was run on and what to know about it."""
-    from harness.report.caveats import caveats
+    from harness.report.caveats import caveats, lost_at_once
+    from harness.runs.folder import read
 
     m = done.manifest
     figures = {(s.condition, s.metric): s for s in done.scores if s.interval != "seed means"}
@@ -202,7 +203,7 @@ def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Seque
     text.print(f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · {scenes}")
     if m.helpers:
         text.print(f"helpers: {printable(m.variant.helpers)}")
-    for caveat in caveats(m, done.scores):
+    for caveat in (*caveats(m, done.scores), *lost_at_once(read(done.out))):
         text.print(caveat)
     table(
         ("condition", *(column.head for column in columns)),

@@ -101,7 +101,7 @@ def compare(
     from harness.studies.sweep import point_of
 
     extras.need("harness schedule compare", "matplotlib")
-    names = list(dict.fromkeys(schedule or SCHEDULES))
+    names = list(dict.fromkeys(schedule or SCHEDULES.usable()))
     for name in names:
         if name not in SCHEDULES:
             raise unknown("--schedule", name, SCHEDULES)

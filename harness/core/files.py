@@ -16,11 +16,13 @@ from functools import cache
 from glob import escape
 from pathlib import Path
 from types import NoneType
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO, Literal, TypeVar
 
 _EXACT = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False, check_circular=False
 )
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a formula begins with, and what spreadsheets skip before it
+T = TypeVar("T")
 _PLAIN = frozenset({str, int, bool, NoneType})
 
 
@@ -145,6 +147,20 @@ def written_ns(path: Path) -> int:
         return path.stat().st_mtime_ns
     except OSError:
         return 0
+
+
+def neutral(cell: T) -> T | str:
+    """Return a cell of a CSV file for spreadsheets: a text that they would take for a formula as text.
+
+    It gets an apostrophe before it. Numbers, also those that are texts, stay as they are.
+    """
+    if not isinstance(cell, str) or not cell.startswith(FORMULA):
+        return cell
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}"
+    return cell
 
 
 def sha256_bytes(data: bytes) -> str:

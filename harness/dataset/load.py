@@ -168,6 +168,15 @@ class Dataset:
         """The trees as arrays."""
         return Forest.of(tuple(self.trees), self.actions, self.scenario.parameters.delay_allowance_s)
 
+    @property
+    def lost(self) -> int:
+        """In how many episodes the ego collides before its first action, whatever that is."""
+        lag_s = self.scenario.parameters.decision_lag_s
+        firsts = [[self.forest.edges[n].end for n in edges] for edges in self.forest.edge[self.forest.root]]
+        return sum(
+            all(end and end.result == "collision" and end.time_s <= lag_s for end in ends) for ends in firsts
+        )
+
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
         """Return the dataset with only these episodes."""
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)

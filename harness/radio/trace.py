@@ -1,13 +1,14 @@
 """A channel from a user's table of packet reception by distance, such as a run of ns-3 or Veins gives.
 
 The table is a CSV file with the columns `distance_m` and `reception` (share of packets received), and
-optionally `sight` (`clear`, `vehicle` or `building`, with a curve for each) and `latency_ms`. Values are
-interpolated linearly between distances; below the first distance its values hold.
+optionally `sight` (`clear`, `vehicle` or `building`, with a curve for each) and `latency_ms`, which may be
+blank or `nan` where nothing is received. Values are interpolated linearly between distances; below the first
+distance its values hold.
 """
 
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from itertools import pairwise
@@ -150,7 +151,7 @@ def read(path: Path) -> tuple[Point, ...]:
         for name in rows.fieldnames or ():
             if name not in COLUMNS:
                 raise unknown(f"column of {shown}", name, COLUMNS)
-        points = [_point(f"{shown}, line {rows.line_num}", row) for row in rows]
+        points = _with_latencies([_point(f"{shown}, line {rows.line_num}", row) for row in rows])
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
         raise UserError(f"{shown}: cannot be read as a table ({printable(problem)})") from None
     if not points:
@@ -164,6 +165,25 @@ def read(path: Path) -> tuple[Point, ...]:
         if (a.sight, a.distance_m) == (b.sight, b.distance_m):
             raise UserError(f"{shown}: distance_m {a.distance_m:g} stands there twice; give each once")
     return tuple(points)
+
+
+def _with_latencies(points: Sequence[Point]) -> list[Point]:
+    """Give points where nothing is received, which have no latency of their own, that of points beside them.
+
+    Reception is interpolated, so that something is received next to them.
+    """
+    known = [p for p in points if p.latency_s is not None and not math.isnan(p.latency_s)]
+    longest_s = max((p.latency_s for p in known if p.latency_s is not None), default=None)
+    full = []
+    for point in points:
+        if point.latency_s is not None and math.isnan(point.latency_s):
+            beside = sorted((p.distance_m, p.latency_s) for p in known if p.sight == point.sight)
+            latency_s = longest_s
+            if beside:
+                latency_s = float(np.interp(point.distance_m, *np.array(beside, dtype=float).T))
+            point = point._replace(latency_s=latency_s)
+        full.append(point)
+    return full
 
 
 def _point(where: str, row: dict[str, str]) -> Point:
@@ -183,5 +203,11 @@ def _point(where: str, row: dict[str, str]) -> Point:
         raise UserError(f"{where}: sight is {printable(sight)!r}; it must be {', '.join(SIGHTS)}")
     distance_m = number("distance_m", 1e6, "metres, 0 or more")
     reception = number("reception", 1.0, "a share from 0 to 1")
-    latency_s = number("latency_ms", 1e6, "milliseconds, 0 or more") / 1000 if "latency_ms" in row else None
+    latency_s = None
+    if "latency_ms" in row:
+        if reception == 0 and row["latency_ms"].strip().lower() in ("", "nan"):
+            latency_s = math.nan
+        else:
+            allowed = "milliseconds, 0 or more; it may be blank where reception is 0"
+            latency_s = number("latency_ms", 1e6, allowed) / 1000
     return Point(distance_m, reception, sight, latency_s)

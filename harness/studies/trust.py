@@ -362,5 +362,7 @@ class _Kept:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        return [[None if np.isnan(x) else round(float(x), 6) for x in row] for row in value]
+        return [
+            [None if np.isnan(x) else float(x) for x in row] for row in value
+        ]  # exact: cells are read back
     return list(value) if isinstance(value, tuple) else value
