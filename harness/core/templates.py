@@ -322,7 +322,8 @@ def _cost(body: Iterable[nodes.Node]) -> int:
     steps, unread = 1, list(body)
     while unread:
         node = unread.pop()
-        steps += 1 + (len(node.data) >> 3 if isinstance(node, nodes.TemplateData) else 0)
+        text = getattr(node, "data", None) or getattr(node, "value", None)  # of a template's text, of a constant
+        steps += 1 + (len(text) >> 3 if isinstance(text, str) else 0)
         unread += node.iter_child_nodes()
     return steps
 
@@ -347,13 +348,16 @@ class Sandbox(ImmutableSandboxedEnvironment):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(finalize=read, **options)
-        free = {f"{FREE}{name}": made for name, made in self.filters.items()}
-        paid = self.filters | {"format": _format, "join": _join, "replace": _replace, "sum": _sum}
-        self.filters = free | {
-            name: made if name in _FREE else _filter(name, made) for name, made in paid.items()
-        }
+        own = {"format": _format, "join": _join, "replace": _replace, "sum": _sum}
+        for name, function in list(self.filters.items()):
+            self.filters[f"{FREE}{name}"] = function
+            self.add_filter(name, own.get(name, function))
         self.tests = {name: _test(made) if name in _READING else made for name, made in self.tests.items()}
         self.globals |= {"lipsum": _lorem_ipsum, "namespace": _Namespace}
+
+    def add_filter(self, name: str, function: Callable[..., Any]) -> None:
+        """Add a filter, which pays."""
+        self.filters[name] = function if name in _FREE else _filter(name, function)
 
     def _parse(self, source: str, name: str | None, filename: str | None) -> nodes.Template:
         if len(source) > MOST_TEXT:
@@ -366,7 +370,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
     def _generate(
         self, source: nodes.Template, name: str | None, filename: str | None, defer_init: bool = False
     ) -> str:
-        begin()  # constant parts are worked out here
+        _account.left = 0  # so that no filter is applied to a constant here, where nothing pays for the result
         try:
             self._put_steps_into(source)
             code = super()._generate(source, name, filename, defer_init)
