@@ -1,6 +1,6 @@
 """The model card: a record of a model, its engine, its weights and its latency, read from a TOML file."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -94,6 +94,11 @@ class Card:
     vision: Vision | None = None
     projector: str | None = None
     system: System | None = None
+
+    def record(self) -> dict[str, Any]:
+        """Return the card as plain values; without `system` unless it is set, as older runs hold it."""
+        values = asdict(self)
+        return values if self.system else {key: v for key, v in values.items() if key != "system"}
 
     def at(self, urls: tuple[str, ...]) -> "Card":
         """Return the card of a served model with other servers; the card itself if `urls` is empty.

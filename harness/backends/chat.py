@@ -101,7 +101,9 @@ class Chat:
         with suppress(UserError):
             if len(joined) < len(messages) and not self.system:
                 if unsaid(joined, self._apply(joined, thinking=thinking)) is None:
-                    return f'a card with system = "{FIRST_USER}" puts the system text into the first user turn'
+                    return (
+                        f'a card with system = "{FIRST_USER}" puts the system text into the first user turn'
+                    )
         return "use a prompt with roles that it knows, or a model with another template"
 
     def _shown(self, messages: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:

@@ -106,7 +106,7 @@ class Agent:
     def settings(self) -> dict[str, Any]:
         """Return everything that decides its answers, as plain values."""
         return {
-            "model": asdict(self.card),
+            "model": self.card.record(),
             "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
             "thinking": self.thinking,
             "answer": self.answer,

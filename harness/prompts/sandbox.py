@@ -138,7 +138,11 @@ def _keeps_small(node: nodes.Filter) -> bool:
         return False
     given = [value.as_const() for value in constants]
     if name == "replace":
-        return len(given) == 2 and all(isinstance(x, str) and x for x in given) and len(given[0]) >= len(given[1])
+        return (
+            len(given) == 2
+            and all(isinstance(x, str) and x for x in given)
+            and len(given[0]) >= len(given[1])
+        )
     if name == "join":
         return len(given) <= 1 and all(isinstance(x, str) and len(x) < 8 for x in given)
     return name in SHORTENING and all(not isinstance(x, int) or 0 <= x < 1000 for x in given)

@@ -27,7 +27,8 @@ _CONTROLS = {
 
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
     """Sentences for a run's headline; none for a language model whose answers could be read."""
-    return [*unread(scores), *no_prompt([manifest]), *beyond_sources(manifest), *on_device(manifest)]
+    first = [*unread(scores), *no_prompt([manifest]), *moved_system(manifest)]
+    return [*first, *beyond_sources(manifest), *on_device(manifest)]
 
 
 def said(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
@@ -68,6 +69,7 @@ def of_run(run: Run) -> Iterator[str]:
     for control, heard in _CONTROLS.items():
         if names := [c["name"] for c in run.manifest.conditions if c.get("messages") == control]:
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
+    yield from moved_system(run.manifest)
     yield from beyond_sources(run.manifest)
     yield from on_device(run.manifest)
     off = [c for c in run.conditions if (s := run.score(c, "off_lag_rate")) and (s.value or 0.0) >= OFF_LAG]
@@ -75,6 +77,16 @@ def of_run(run: Run) -> Iterator[str]:
         yield (
             f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
             "closed-loop success may differ. harness fidelity compares the two."
+        )
+
+
+def moved_system(manifest: Manifest) -> Iterator[str]:
+    """Whose system text stands in the first user turn, since the model's chat template has no place for it."""
+    agents = (manifest.agent(0), *manifest.helpers)
+    for name in dict.fromkeys(str(a["model"]["name"]) for a in agents if a["model"].get("system")):
+        yield (
+            f"{printable(name, 30)} reads the system text at the beginning of the first user turn: its chat "
+            "template has no place for a system message."
         )
 
 

@@ -138,7 +138,11 @@ class TransformersEngine:
         )
         listed = self.model.generation_config.eos_token_id or []
         # A chat model's turn may end with a token that its generation config does not list: the template's.
-        ends = {*(listed if isinstance(listed, list) else [listed]), tokenizer.eos_token_id, self.chat.turn_end}
+        ends = {
+            *(listed if isinstance(listed, list) else [listed]),
+            tokenizer.eos_token_id,
+            self.chat.turn_end,
+        }
         self.stops: Sequence[int] = sorted(ends - {None})
         self._reader = Reader(self.model, self.eyes)
 
