@@ -23,7 +23,7 @@ from jinja2.runtime import Context, LoopContext
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 from jinja2.utils import Cycler, Joiner, Namespace, generate_lorem_ipsum, pass_environment, pass_eval_context
 
-MOST_STEPS = 2_000_000  # of one rendering; a prompt that ships takes 2 000 at most
+MOST_STEPS = 1_000_000  # of one rendering; a prompt that ships takes 2 000 at most
 MOST_TEXT = 200_000  # characters of a template
 _MOST_BITS = 4096  # of a whole number
 _SHORT = 64  # characters of a text that is not counted
@@ -153,7 +153,7 @@ def _made(value: Any) -> Any:
 
 def _one_by_one(items: Iterable[Any]) -> Iterator[Any]:
     for item in items:
-        spend(_size(item))
+        spend(1 + _size(item))
         yield item
 
 
@@ -225,7 +225,7 @@ def _join(context: EvalContext, value: Any, d: Any = "", attribute: Any = None) 
 
 
 @pass_environment
-def _sum(environment: "Limited", iterable: Any, attribute: Any = None, start: Any = 0) -> Any:
+def _sum(environment: "Sandbox", iterable: Any, attribute: Any = None, start: Any = 0) -> Any:
     if isinstance(start, str):
         raise TypeError("sum() adds numbers and lists; use join for texts")
     total = start
@@ -244,7 +244,7 @@ def _format(text: Any, *values: Any, **named: Any) -> Any:
     return do_format(text, *values, **named)
 
 
-def _lorem_ipsum(n: int = 5, html: bool = True, min: int = 20, max: int = 100) -> Any:  # noqa: A002
+def _lorem_ipsum(n: int = 5, html: bool = True, min: int = 20, max: int = 100) -> Any:
     spend((1 + _extent(n)) * (1 + _extent(max)))
     return generate_lorem_ipsum(n, html, min, max)
 
