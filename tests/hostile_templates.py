@@ -12,9 +12,7 @@ def _built(first: str, step: str, use: str = "{{ ns.t | length }}") -> str:
 
 def _long(use: str, times: int = 18, unit: str = "'ab c-d, '") -> str:
     """A template that uses a text of some megabytes."""
-    return (
-        f"{{% set ns = namespace(t={unit}) %}}{{% for i in range({times}) %}}{{% set ns.t = ns.t ~ ns.t %}}{{% endfor %}}{use}"
-    )
+    return f"{{% set ns = namespace(t={unit}) %}}{{% for i in range({times}) %}}{{% set ns.t = ns.t ~ ns.t %}}{{% endfor %}}{use}"
 
 
 _FOREVER = "{% for a in range(99999) %}{% for b in range(99999) %}%s{% endfor %}{% endfor %}"

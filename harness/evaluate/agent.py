@@ -1,7 +1,7 @@
 """Describe an agent: the model that answers for a vehicle, and how it is asked."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from harness.backends.base import AnswerMode, Role

@@ -90,7 +90,9 @@ def around(text: str, at: int, end: int, fields: Sequence[str], cut: bool) -> tu
     repeated = any(len(re.findall(rf'"{re.escape(field)}"\s*:', source)) > 1 for field in fields)
     if repeated or not set(members) <= set(fields) or not all(member in source for member in texts):
         raise unreadable()
-    if _numbers(list(others.values())) != [float(number) for number in _NUMBER.findall(source[:at] + source[end:])]:
+    if _numbers(list(others.values())) != [
+        float(number) for number in _NUMBER.findall(source[:at] + source[end:])
+    ]:
         raise unreadable()
     return others, name, text[len(source) :]
 
