@@ -1,3 +1,4 @@
+# ruff: noqa: E501 a template is one line
 """Templates that would fill memory or never end, by the kind of thing they do.
 
 Those that build a text do so in a namespace, `TWICE` and `TIMES` times.

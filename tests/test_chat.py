@@ -4,8 +4,10 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from test_gguf_chat import Words
@@ -54,8 +56,8 @@ def test_a_thought_of_an_earlier_turn_may_be_left_out() -> None:
 
 @pytest.mark.parametrize(
     ("template", "said"),
-    [(DROPS, "message 1 of 4, the system's"), (CUTS, "message 1 of 4, the system's"),
-     (LAST, "message 2 of 4, the user's"), (TURNS.replace("in messages", "in messages[:3]"), "message 4 of 4"),
+    [(DROPS, "message 1 of 4, the system's"), (CUTS, "message 1 of 4"),
+     (LAST, "message 2 of 4, the user's"), (TURNS.replace("messages", "messages[:3]"), "message 4 of 4"),
      (TURNS.replace("| trim", "| upper"), "message 1 of 4"), ("", "message 1 of 4")],
 )  # fmt: skip
 def test_a_template_that_leaves_out_changes_or_moves_a_text_is_refused(template: str, said: str) -> None:
@@ -87,7 +89,7 @@ def test_a_server_is_sent_it_the_same_way(tmp_path: Path) -> None:
     card = cards.load("openai-example")
     assert card.server
     request = Request("0/v1", "ego", CHAT[:2], ("A",), 9)
-    asked = body(cards.replace(card, system="first-user"), card.server, request)["messages"]
+    asked = body(replace(card, system="first-user"), card.server, request)["messages"]
     assert [m["role"] for m in asked] == ["user"]
     assert asked[0]["content"].startswith("  You drive car v1.")
     assert [m["role"] for m in body(card, card.server, request)["messages"]] == ["system", "user"]
@@ -102,8 +104,8 @@ def test_only_a_template_that_refuses_is_given_it_unasked() -> None:
 
 @pytest.mark.parametrize(
     ("template", "end"),
-    [(TURNS, "<|im_end|>"), (TURNS.replace("<|im_end|>", "</s>"), "</s>"), (TURNS.replace("<|im_end|>", ""), None),
-     ("{{ messages[0].content }}", None), ("{{ raise_exception('x') }}", None)],
+    [(TURNS, "<|im_end|>"), (TURNS.replace("<|im_end|>", "</s>"), "</s>"), ("{{ raise_exception('x') }}", None),
+     (TURNS.replace("<|im_end|>", ""), None), ("{{ messages[0].content }}", None)],
 )  # fmt: skip
 def test_an_answer_ends_at_the_token_that_the_template_writes_after_it(
     template: str, end: str | None
@@ -113,13 +115,13 @@ def test_an_answer_ends_at_the_token_that_the_template_writes_after_it(
             marks = [mark for mark in ("<|im_end|>", "</s>") if text.startswith(mark)]
             return [7] if marks else list(text.encode())
 
-        def pieces(self, ids: list[int]) -> list[str]:  # type: ignore[override]
+        def pieces(self, ids: Sequence[int]) -> list[str]:
             return [end or "?" if i == 7 else chr(i) for i in ids]
 
     assert GgufChat("m", Marked(template)).turn_end == (7 if end else None)
 
 
-# -- real weights ----------------------------------------------------------------------------------------------
+# -- real weights --------------------------------------------------------------------------------------------
 
 
 def with_template(folder: Path, template: str) -> Path:
@@ -161,9 +163,8 @@ def test_a_gguf_file_that_drops_the_system_text_is_refused(
 ) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     model = with_template(tmp_path, DROPS + OPENING)
-    code, out, err = harness(
-        "eval", "--model", model, "--dataset", small_path, "--limit", "1", "--out", "RUN"
-    )
+    args = ("--model", model, "--dataset", small_path, "--limit", "1", "--out", "RUN")
+    code, _, err = harness("eval", *args)
     assert (code, err.count("\n")) == (2, 1)
     assert "message 1 of 2, the system's" in err
 
@@ -175,10 +176,11 @@ def test_a_checkpoint_whose_end_is_another_token_ends_where_its_template_says(
     pytest.importorskip("transformers", reason="needs the transformers extra")
     copy = tmp_path / "copy"
     shutil.copytree(find("models", "swarm-tiny"), copy, ignore=shutil.ignore_patterns("*.gguf"))
-    for name, change in {
+    changes: dict[str, dict[str, Any]] = {
         "config.json": {"eos_token_id": 765}, "generation_config.json": {"eos_token_id": 765},
         "tokenizer_config.json": {"eos_token": "<|endoftext|>"},
-    }.items():  # fmt: skip
+    }  # fmt: skip
+    for name, change in changes.items():
         file = copy / name
         file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
     code, out, err = harness("model", "check", copy, "--json")

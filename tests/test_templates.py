@@ -1,3 +1,4 @@
+# ruff: noqa: E501 a template is one line
 """Templates of strangers: none runs for ever or fills memory, and what they may do is as in Jinja."""
 
 import resource
@@ -36,7 +37,7 @@ def narrow(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.usefixtures("narrow")
 @pytest.mark.parametrize("text", [*TEMPLATES.values(), *PADDING.values()], ids=[*TEMPLATES, *PADDING])
 def test_no_prompt_template_runs_for_ever_or_fills_memory(text: str) -> None:
-    with pytest.raises(Exception, match=".") as refused:
+    with pytest.raises(Exception, match=r".") as refused:
         Template(f"{{% block user %}}{text}{{% endblock %}}").render({"actions": ("A",)}, ("user",))
     assert not isinstance(refused.value, MemoryError)
 
@@ -44,7 +45,7 @@ def test_no_prompt_template_runs_for_ever_or_fills_memory(text: str) -> None:
 @pytest.mark.usefixtures("narrow")
 @pytest.mark.parametrize("text", [*TEMPLATES.values(), *PADDING.values()], ids=[*TEMPLATES, *PADDING])
 def test_no_chat_template_runs_for_ever_or_fills_memory(text: str) -> None:
-    with pytest.raises(UserError, match="model 'sly': its chat template ") as refused:
+    with pytest.raises(UserError, match=r"^model 'sly': its chat template ") as refused:
         ChatTemplate("sly", text).render([{"role": "user", "content": "x"}])
     assert str(refused.value).isprintable()
 
@@ -52,7 +53,7 @@ def test_no_chat_template_runs_for_ever_or_fills_memory(text: str) -> None:
 def test_the_limit_is_named_with_the_template() -> None:
     with pytest.raises(UserError, match=r"'sly': its chat template takes more than 1,000,000 steps"):
         ChatTemplate("sly", TEMPLATES["loops"]).render([])
-    with pytest.raises(UserError, match="no Jinja .it has 300,000 characters; allowed: 200,000"):
+    with pytest.raises(UserError, match=r"no Jinja .it has 300,000 characters; allowed: 200,000"):
         ChatTemplate("sly", TEMPLATES["a long template"])
 
 

@@ -190,9 +190,9 @@ def _vision(text: str, checkpoint: Path) -> Vision | None:
 
 def _system(template: str | None) -> System | None:
     """Return how a card made on the spot gives the system text, so that its chat template takes it."""
-    from harness.backends.chat_template import FIRST_USER, needs_first_user  # imports Jinja, as few cards do
+    from harness.backends.chat_template import needs_first_user  # imports Jinja, as few cards do
 
-    return FIRST_USER if template and needs_first_user(template) else None
+    return "first-user" if template and needs_first_user(template) else None
 
 
 def _template(checkpoint: Path) -> str | None:

@@ -75,6 +75,11 @@ class Chat:
                 return tokens[0]
         return None
 
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Ids of the tokens that end a turn by the template: one at most."""
+        return () if self.turn_end is None else (self.turn_end,)
+
     def render(self, messages: Sequence[Mapping[str, str]], *, thinking: bool) -> str:
         """Render messages to the prompt that the model reads, with `image_token` for a picture.
 
@@ -87,19 +92,19 @@ class Chat:
         except Refused as error:
             raise UserError(f"{error}; {self._way_out(messages, thinking)}") from None
         if (lacking := unsaid(shown, prompt)) is not None:
-            turn = shown.index(lacking) + 1
+            turn = next(n for n, message in enumerate(shown, 1) if message is lacking)
             raise UserError(
-                f"model {printable(self.name)!r}: its chat template leaves out or changes the text of message "
-                f"{turn} of {len(shown)}, the {printable(lacking['role'])}'s, or moves it; the model would not "
-                f"read what it is asked; {self._way_out(messages, thinking)}"
+                f"model {printable(self.name)!r}: its chat template leaves out or changes the text of "
+                f"message {turn} of {len(shown)}, the {printable(lacking['role'])}'s, or moves it; the model would "
+                f"not read what it is asked; {self._way_out(messages, thinking)}"
             )
         return prompt
 
     def _way_out(self, messages: Sequence[Mapping[str, str]], thinking: bool) -> str:
         """Return what helps where a template has no place for one of the messages."""
         joined = self._shown(with_system(messages, FIRST_USER))
-        with suppress(UserError):
-            if len(joined) < len(messages) and not self.system:
+        if len(joined) < len(messages) and not self.system:
+            with suppress(UserError):
                 if unsaid(joined, self._apply(joined, thinking=thinking)) is None:
                     return (
                         f'a card with system = "{FIRST_USER}" puts the system text into the first user turn'

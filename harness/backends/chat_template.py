@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from typing import Any
+from typing import Any, Literal
 
 from jinja2 import TemplateError, nodes
 from jinja2.ext import Extension
@@ -13,7 +13,9 @@ from harness.core.errors import UserError, printable
 from harness.core.templates import Sandbox, TooMuch
 
 Messages = Sequence[Mapping[str, Any]]
-FIRST_USER = "first-user"  # a card's `system`: the system text begins the first user turn
+FIRST_USER: Literal["first-user"] = (
+    "first-user"  # a card's `system`: the system text begins the first user turn
+)
 _THOUGHT_ENDS = "</think>"
 _LONGEST_FORM = 100  # characters of a form of dates
 
@@ -45,8 +47,8 @@ class ChatTemplate:
             self._compiled = _environment().from_string(text)
         except TemplateError as error:
             raise UserError(
-                f"model {printable(name)!r}: its chat template is no Jinja ({printable(error)}); give another "
-                "model, or mend the template"
+                f"model {printable(name)!r}: its chat template is no Jinja ({printable(error)}); give "
+                "another model, or mend the template"
             ) from None
 
     def render(self, messages: Messages, **values: Any) -> str:
@@ -61,8 +63,8 @@ class ChatTemplate:
             return self._compiled.render(messages=messages, **given)
         except TooMuch as error:
             raise UserError(
-                f"model {printable(self._name)!r}: its chat template takes {printable(error)} to render; give "
-                "another model, or mend the template"
+                f"model {printable(self._name)!r}: its chat template takes {printable(error)} to render; "
+                "give another model, or mend the template"
             ) from None
         except Exception as error:  # a template is a program and may fail in any way
             raise Refused(

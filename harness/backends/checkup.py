@@ -57,10 +57,10 @@ class Checkup:
     Attributes:
         prompt: the first question as the model reads it, or as a server is sent it.
         tokens: its token ids, each with its text; None if only a server knows them.
-        bos_tokens: number of BOS tokens that it begins with; more than one harms most models. Further on, BOS may
-            be the mark of a turn.
-        turn_end: text of the token with which its chat template ends an answer; None if there is no such token,
-            and for a server's.
+        bos_tokens: number of BOS tokens that it begins with; more than one harms most models. Further on,
+            BOS may be the mark of a turn.
+        turn_end: text of the token with which its chat template ends an answer; None if there is no such
+            token, and for a server's.
         thinking: what the model's own template can do, whatever its card says; None for a server's.
         answers: one answer in each answer mode, asked alone after a warm-up; the seconds are of batch size 1.
         identity: identity of the backend, as in a run's manifest.

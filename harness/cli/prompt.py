@@ -89,8 +89,8 @@ def show(
 ) -> None:
     """Print exactly what a model is sent about a scene.
 
-    Its chat template is not applied yet; the system text stands in the first user turn if the card of `--model`
-    says so. Pictures are drawn if the terminal has colours.
+    Its chat template is not applied yet; the system text stands in the first user turn if the card of
+    `--model` says so. Pictures are drawn if the terminal has colours.
     """
     from harness.backends.cards import resolve
     from harness.backends.chat_template import with_system

@@ -33,7 +33,16 @@ _NAMED_WIDE = re.compile(r"\d{3}|\*")  # in one with `%(name)`, whose name may h
 FREE = "free "  # prefix of the name of a filter that pays nothing
 _STEP = "spent step"  # name of the node that pays; as those with the prefix, no template can write it
 
-_LISTS = (list, tuple, set, frozenset, range, type({}.keys()), type({}.values()), type({}.items()))
+_LISTS: tuple[type[Any], ...] = (
+    list,
+    tuple,
+    set,
+    frozenset,
+    range,
+    type({}.keys()),
+    type({}.values()),
+    type({}.items()),
+)
 _MAPPINGS = (dict, MappingProxyType)
 _SMALL = frozenset({float, bool, type(None)})
 # Filters that read one thing of a value, whatever its size.
@@ -259,10 +268,12 @@ class _Namespace(Namespace):
 class Code(CodeGenerator):
     """Jinja's compiler, whose code pays for what it reads, joins and repeats."""
 
+    environment: "Sandbox"
+
     @optimizeconst
     def visit_Filter(self, node: nodes.Filter, frame: Frame) -> None:
         if node.name == _STEP:
-            self.write(f"spend({node.args[0].value})")
+            self.write(f"spend({node.args[0].as_const()})")
         else:
             super().visit_Filter(node, frame)
 
@@ -389,7 +400,9 @@ class Sandbox(ImmutableSandboxedEnvironment):
 
     def _put_steps_into(self, source: nodes.Template) -> None:
         """Let each body pay whenever it runs."""
-        for node in list(source.find_all((nodes.For, nodes.Macro, nodes.CallBlock, nodes.Block))):
+        kinds = (nodes.For, nodes.Macro, nodes.CallBlock, nodes.Block)
+        bodies: list[Any] = list(source.find_all(kinds))
+        for node in bodies:
             if isinstance(node, nodes.For) and node.test is not None:
                 node.test = nodes.And(self._step([node.test]), node.test, lineno=node.lineno)
             node.body.insert(0, nodes.ExprStmt(self._step(node.body), lineno=node.lineno))

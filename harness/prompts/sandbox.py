@@ -17,8 +17,8 @@ WIDE = re.compile(r"\d{3}|\*")  # in a format: a width of 100 characters or more
 PADDING = frozenset({"center", "ljust", "rjust", "zfill", "expandtabs", "format", "format_map", "translate"})
 # What binds a name to something that a template works out, or works out more than a loop over given things.
 BINDING = (
-    nodes.Assign, nodes.AssignBlock, nodes.Call, nodes.CallBlock, nodes.Concat, nodes.FilterBlock, nodes.Macro,
-    nodes.With,
+    nodes.Assign, nodes.AssignBlock, nodes.Call, nodes.CallBlock, nodes.Concat, nodes.FilterBlock,
+    nodes.Macro, nodes.With,
 )  # fmt: skip
 # Filters whose result is no larger than their value, whatever small constants they are given.
 SHORTENING = frozenset({

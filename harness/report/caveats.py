@@ -81,7 +81,7 @@ def of_run(run: Run) -> Iterator[str]:
 
 
 def moved_system(manifest: Manifest) -> Iterator[str]:
-    """Whose system text stands in the first user turn, since the model's chat template has no place for it."""
+    """Whose system text stands in the first user turn, since the chat template has no place for it."""
     agents = (manifest.agent(0), *manifest.helpers)
     for name in dict.fromkeys(str(a["model"]["name"]) for a in agents if a["model"].get("system")):
         yield (

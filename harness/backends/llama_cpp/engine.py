@@ -82,7 +82,7 @@ class LlamaEngine:
             raise UserError(f"model {card.name!r}: its chat template has none of {_PICTURES} for a picture")
         self.chat: Chat = GgufChat(card.name, model, shown[0] if shown else None, card.system)
         self.context_tokens = card.context_tokens or model.trained_tokens
-        self.stops: Sequence[int] = sorted({*model.stops, self.chat.turn_end} - {None})
+        self.stops: Sequence[int] = sorted({*model.stops, *self.chat.ends})
         self._card, self._file, self._model = card, file, model
         self._projector = projector
         self._context = LlamaContext(model, batch_size + BEGINNINGS, projector)
