@@ -95,8 +95,8 @@ class Chat:
             turn = next(n for n, message in enumerate(shown, 1) if message is lacking)
             raise UserError(
                 f"model {printable(self.name)!r}: its chat template leaves out or changes the text of "
-                f"message {turn} of {len(shown)}, the {printable(lacking['role'])}'s, or moves it; the model would "
-                f"not read what it is asked; {self._way_out(messages, thinking)}"
+                f"message {turn} of {len(shown)}, the {printable(lacking['role'])}'s, or moves it; the model "
+                f"would not read what it is asked; {self._way_out(messages, thinking)}"
             )
         return prompt
 

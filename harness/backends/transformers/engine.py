@@ -141,7 +141,7 @@ class TransformersEngine:
         ends = {
             *(listed if isinstance(listed, list) else [listed]),
             tokenizer.eos_token_id,
-            self.chat.turn_end,
+            *self.chat.ends,
         }
         self.stops: Sequence[int] = sorted(ends - {None})
         self._reader = Reader(self.model, self.eyes)
