@@ -195,7 +195,15 @@ def _show(spec: "Spec", seen: "Checkup") -> None:
     if seen.tokens is None:
         typer.echo("tokens       not known here: the server renders the prompt and counts them")
     else:
-        typer.echo(f"tokens       {len(seen.tokens)} in the prompt, {seen.bos_tokens} of them BOS")
+        typer.echo(
+            f"tokens       {len(seen.tokens)} in the prompt, {seen.bos_tokens} of them BOS at its beginning"
+        )
+        if seen.turn_end:
+            typer.echo(f"answer ends  at {printable(seen.turn_end)}, as its chat template ends a turn")
+        else:
+            typer.echo("answer ends  at no token of its chat template: it may write on after its answer")
+    if card.system:
+        typer.echo("system       at the beginning of the first user turn: its template has no place for it")
     typer.echo(f"thinking     {seen.thinking or 'as the server is set'}; "
                f"{'asked' if spec.ego.thinking else 'not asked'} here; card: {card.thinking}")  # fmt: skip
     typer.echo(f"prompt       {PROMPT}, the ego of {DATASET}'s first scene")

@@ -20,6 +20,7 @@ from harness.core.config import Count, convert, loads
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, sha256_bytes, text_of, write_whole
 from harness.core.resources import entries, find
+from harness.core.templates import TooMuch
 from harness.prompts.examples import EXAMPLES, Examples
 from harness.prompts.examples import read as read_examples
 from harness.prompts.template import Template
@@ -188,6 +189,11 @@ class Prompt:
         """Render blocks of a role's template. Raises UserError, whose message ends with `needs`."""
         try:
             return self._templates[role].render(variables, blocks)
+        except TooMuch as error:
+            raise UserError(
+                f"prompt {self.version} {role}.j2 does not render: it takes {printable(error)}; "
+                "let it loop less, or write less"
+            ) from None
         except Exception as error:  # a template is a program and may fail in any way
             raise UserError(
                 f"prompt {self.version} {role}.j2 does not render: {printable(error)}; {needs}"

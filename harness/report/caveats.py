@@ -30,7 +30,8 @@ _CONTROLS = {
 
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
     """Sentences for a run's headline; none for a language model whose answers could be read."""
-    return [*unread(scores), *no_prompt([manifest]), *beyond_sources(manifest), *on_device(manifest)]
+    first = [*unread(scores), *no_prompt([manifest]), *moved_system(manifest)]
+    return [*first, *beyond_sources(manifest), *on_device(manifest)]
 
 
 def said(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
@@ -79,6 +80,7 @@ def of_run(run: Run) -> Iterator[str]:
         if names := [c["name"] for c in run.manifest.conditions if c.get("messages") == control]:
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
     yield from lost_at_once(run)
+    yield from moved_system(run.manifest)
     yield from beyond_sources(run.manifest)
     yield from on_device(run.manifest)
     off = [c for c in run.conditions if (s := run.score(c, "off_lag_rate")) and (s.value or 0.0) >= OFF_LAG]
@@ -103,6 +105,16 @@ def lost_at_once(run: Run) -> Iterator[str]:
         yield (
             f"{len(lost)} of {len(run.grid.episodes)} episodes are lost before the ego's first action, in a "
             "collision that no answer could prevent."
+        )
+
+
+def moved_system(manifest: Manifest) -> Iterator[str]:
+    """Whose system text stands in the first user turn, since the chat template has no place for it."""
+    agents = (manifest.agent(0), *manifest.helpers)
+    for name in dict.fromkeys(str(a["model"]["name"]) for a in agents if a["model"].get("system")):
+        yield (
+            f"{printable(name, 30)} reads the system text at the beginning of the first user turn: its chat "
+            "template has no place for a system message."
         )
 
 

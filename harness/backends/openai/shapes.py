@@ -12,6 +12,7 @@ from typing import Any
 from harness.backends.base import FinishReason, Request
 from harness.backends.cards import Card
 from harness.backends.chat import in_parts
+from harness.backends.chat_template import with_system
 from harness.backends.openai.constraint import broken, constraint
 from harness.backends.servers import MOST_LOGPROBS, Kind, Server
 from harness.core.errors import UserError, printable
@@ -76,7 +77,7 @@ def body(
         # Plain text is not sent as parts, since not every server and chat template takes them.
         "messages": [
             in_parts([message], picture)[0] if picture and "image" in message else dict(message)
-            for message in request.messages
+            for message in with_system(request.messages, card.system)
         ],
         "max_tokens": request.max_tokens,
         "temperature": request.temperature or 0,
