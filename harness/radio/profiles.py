@@ -5,7 +5,7 @@ in the group `swarmdrive.channels`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
@@ -68,6 +68,15 @@ class Profiles(FilesAndPlugins[Channel]):
         kind = type(self[name])
         doc = (kind.__doc__ or "").strip().partition("\n")[0]
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
+
+    def unchanged(self, name: str, recorded: Any) -> bool:
+        """Return whether the channel does what a record of it said; a newer parameter had its default."""
+        if name not in self:
+            return False
+        now, then = self.record(name), msgspec.to_builtins(recorded)
+        defaults = {f.name: f.default for f in fields(self[name]) if f.default is not MISSING}  # type: ignore[arg-type]
+        before = {**msgspec.to_builtins(defaults), **then["parameters"]}
+        return bool((now["model"], now["parameters"]) == (then["model"], before))
 
     def record(self, name: str) -> dict[str, Any]:
         """Return all that decides what the channel does, as plain values."""

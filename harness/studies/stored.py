@@ -84,14 +84,18 @@ class Stored:
         manifest = self.run.manifest
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
-        stated: dict[str, tuple[Mapping[str, Any], Callable[[str], Any]]] = {
-            "channel profile": (manifest.channels, lambda name: name in CHANNELS and CHANNELS.record(name)),
-            "network": (manifest.networks, lambda name: asdict(network(name))),
-            "schedule": (manifest.schedules, SCHEDULES.file_sha256),
+
+        def same(now: Any, recorded: Any) -> bool:
+            return bool(now == msgspec.json.decode(msgspec.json.encode(recorded)))
+
+        stated: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
+            "channel profile": (manifest.channels, CHANNELS.unchanged),
+            "network": (manifest.networks, lambda name, then: same(asdict(network(name)), then)),
+            "schedule": (manifest.schedules, lambda name, then: same(SCHEDULES.file_sha256(name), then)),
         }
-        for what, (of_run, now) in stated.items():
+        for what, (of_run, unchanged) in stated.items():
             for name, recorded in of_run.items():
-                if now(name) != msgspec.json.decode(msgspec.json.encode(recorded)):
+                if not unchanged(name, recorded):
                     raise UserError(
                         f"{printable(folder)}: {what} {printable(name)} has changed since; restore it or run "
                         "again"
