@@ -49,6 +49,8 @@ class Exchange:
         triggered: whether the ego asks at least one helper, `(...)`. By default it asks those in the radius
             if the entropy is above tau. Without a channel, or with nobody in the radius, it asks nobody.
         asked: which helpers are asked; each has a scheduled reply, `(..., H)`.
+        infers: which helpers' computers infer for this decision, `(..., H)`: those in the radius, asked or
+            not, or on demand those that are asked. None without a channel.
         requests: number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of a unit
             that asks for the ego; 0 if nobody is asked.
         request_bits: size of the requests, `(...)`; 0 if nobody is asked.
@@ -69,6 +71,7 @@ class Exchange:
     entropy_nats: Floats
     triggered: Bools
     asked: Bools
+    infers: Bools
     requests: Ints
     request_bits: Floats
     reply_bits: Floats
@@ -130,6 +133,7 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         entropy_nats=known.entropy_nats,
         triggered=any_of(asked),
         asked=outcome.asked,
+        infers=_infers(point, intents, outcome.asked),
         requests=outcome.requests,
         request_bits=outcome.request_bits,
         reply_bits=np.sum(np.where(outcome.asked, intents.payload_bits, 0.0), axis=-1) + outcome.policy_bits,
@@ -140,6 +144,12 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         on_time=outcome.fused & (arrival_s <= point.window_s),
         exchange_s=np.minimum(request_s[..., 0] + outcome.acts_s, waits_until_s),
     )
+
+
+def _infers(point: OperatingPoint, intents: Intents, asked: Bools) -> Bools:
+    if point.profile is None or point.on_demand:
+        return asked
+    return np.asarray(intents.range_m <= point.radius_m)  # before they know who is asked
 
 
 def _ask_helpers(

@@ -17,6 +17,7 @@ from harness.backends.cache import default_file
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
+from harness.coordination.exchange import Exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.schedules import SCHEDULES
@@ -155,15 +156,22 @@ class Stored:
         for point in points:
             yield [Walked(world.numbers, world.ends(point), *walked[point])]
 
-    def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> tuple[Floats, float]:
-        """Joules of each vehicle's answer, (n, 1+H), and watts of a radio that sends; NaN where unknown."""
+    def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> Floats:
+        """Joules of each vehicle's answer, (n, 1+H); NaN where unknown."""
         manifest = self.run.manifest
         if manifest.device_profile is None:
-            return np.full((len(moments), self.vehicles), np.nan), np.nan
+            return np.full((len(moments), self.vehicles), np.nan)
         taken = device.vehicles_j(manifest.latency, moments, self._asker.answers)
         if point.round_trip_s is not None or point.round_trip:
             taken[:, 0] = np.nan  # the ego's model is in a cloud
-        return taken, device.transmit_watts(manifest.device_profile, point)
+        return taken
+
+    def radio_j(self, point: OperatingPoint, heard: Exchange) -> Floats:
+        """Joules that radios take to send the messages of each decision, (n,); NaN where unknown."""
+        profile = self.run.manifest.device_profile
+        if profile is None:
+            return np.full(heard.messages.shape, np.nan)
+        return device.radio_j(profile, point, heard.airtime_s, heard.requests + heard.messages)
 
     @property
     def spec(self) -> Spec:
