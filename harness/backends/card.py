@@ -106,8 +106,8 @@ class Card:
     def record(self) -> dict[str, Any]:
         """Return the card as plain values, from which `convert` makes it again.
 
-        Keys that later versions added stand in it only where they are set: a run that an earlier version began
-        has the same settings.
+        Keys that later versions added stand in it only where they are set: a run that an earlier version
+        began has the same settings.
         """
         record = asdict(self)
         if self.system is None:

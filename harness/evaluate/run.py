@@ -193,11 +193,12 @@ def _walk(
         decided = list(chain.from_iterable(walk(world, spec.points, asker)))
         viewers |= {scene.id: scene.viewers for part in decided for scene in part.moments}
         served += asker.served
-        answers, decisions = asker.answers, table(decided, world.columns(), spec.actions)
+        answers, more = asker.answers, world.columns()
         if spec.device_profile:
-            joules = device.energy(
-                spec.device_profile, asker.latency, spec.points, decisions, answers.values()
-            )
+            more = {**more, "helpers_j": device.decided_helpers_j(asker.latency, decided, answers)}
+        decisions = table(decided, more, spec.actions)
+        if spec.device_profile:
+            joules = device.energy(spec.device_profile, asker.latency, spec.points, decisions, answers)
             decisions = decisions.replace(**joules)
         tables.append(decisions.rounded())
         episodes += world.episodes()

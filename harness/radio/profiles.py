@@ -6,7 +6,7 @@ in the group `swarmdrive.channels`.
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
@@ -85,6 +85,15 @@ class Profiles(FilesAndPlugins[Channel]):
             outside = os.path.isabs(inside) or inside.split(os.sep)[0] == os.pardir
             files[f"{name}.csv" if outside else Path(inside).as_posix()] = file.parent / table
         return files
+
+    def unchanged(self, name: str, recorded: Any) -> bool:
+        """Return whether the channel does what a record of it said; a newer parameter had its default."""
+        if name not in self:
+            return False
+        now, then = self.record(name), msgspec.to_builtins(recorded)
+        defaults = {f.name: f.default for f in fields(self[name]) if f.default is not MISSING}  # type: ignore[arg-type]
+        before = {**msgspec.to_builtins(defaults), **then["parameters"]}
+        return bool((now["model"], now["parameters"]) == (then["model"], before))
 
     def record(self, name: str) -> dict[str, Any]:
         """Return all that decides what the channel does, as plain values."""

@@ -504,6 +504,8 @@ class Device(Struct, frozen=True, kw_only=True):
         idle_watts: its draw while it waits.
         transmit_dbm: radiated power of its radio, if the channel states none.
         amplifier_efficiency: the share of the radio amplifier's draw that is radiated.
+        frame_ms: least time on air of a message under a channel that states bits and bandwidth alone; None
+            counts only these.
     """
 
     name: str
@@ -515,6 +517,7 @@ class Device(Struct, frozen=True, kw_only=True):
     idle_watts: Constant | None = None
     transmit_dbm: Constant | None = None
     amplifier_efficiency: Constant | None = None
+    frame_ms: Constant | None = None
 
     def __post_init__(self) -> None:
         names = [row.model for row in self.rows]

@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -168,7 +168,7 @@ def curves_of(path: Path) -> list[Curve]:
     curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for line, row in enumerate(rows, 2):
         try:
-            point = msgspec.convert(row, _Row, strict=False, str_keys=True)
+            point = msgspec.convert({k: _plain(v) for k, v in row.items()}, _Row, strict=False, str_keys=True)
         except msgspec.ValidationError as error:
             raise UserError(f"{shown}, line {line}: {printable(error)}") from None
         key = point.configuration, point.source or path.name
@@ -176,6 +176,14 @@ def curves_of(path: Path) -> list[Curve]:
     if not curves:
         raise UserError(f"{shown} has no rows; give distance_m and reception at one distance at least")
     return [Curve(*key, *np.array(points).T) for key, points in curves.items()]
+
+
+def _plain(cell: Any) -> Any:
+    """A number as JSON writes it: `.9` is none there."""
+    try:
+        return repr(float(cell))
+    except (TypeError, ValueError):
+        return cell
 
 
 @dataclass(frozen=True)

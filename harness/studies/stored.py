@@ -17,6 +17,7 @@ from harness.backends.cache import default_file
 from harness.backends.cards import Card, own
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
+from harness.coordination.exchange import Exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.schedules import SCHEDULES
@@ -89,14 +90,18 @@ class Stored:
         manifest = self.run.manifest
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
-        stated: dict[str, tuple[Mapping[str, Any], Callable[[str], Any]]] = {
-            "channel profile": (manifest.channels, lambda name: name in CHANNELS and CHANNELS.record(name)),
-            "network": (manifest.networks, lambda name: asdict(network(name))),
-            "schedule": (manifest.schedules, SCHEDULES.file_sha256),
+
+        def same(now: Any, recorded: Any) -> bool:
+            return bool(now == msgspec.json.decode(msgspec.json.encode(recorded)))
+
+        stated: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
+            "channel profile": (manifest.channels, CHANNELS.unchanged),
+            "network": (manifest.networks, lambda name, then: same(asdict(network(name)), then)),
+            "schedule": (manifest.schedules, lambda name, then: same(SCHEDULES.file_sha256(name), then)),
         }
-        for what, (of_run, now) in stated.items():
+        for what, (of_run, unchanged) in stated.items():
             for name, recorded in of_run.items():
-                if now(name) != msgspec.json.decode(msgspec.json.encode(recorded)):
+                if not unchanged(name, recorded):
                     raise UserError(
                         f"{printable(folder)}: {what} {printable(name)} has changed since; restore it or run "
                         "again"
@@ -158,15 +163,22 @@ class Stored:
         for point in points:
             yield [Walked(world.numbers, world.ends(point), *walked[point])]
 
-    def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> tuple[Floats, float]:
-        """Joules of each vehicle's answer, (n, 1+H), and watts of a radio that sends; NaN where unknown."""
+    def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> Floats:
+        """Joules of each vehicle's answer, (n, 1+H); NaN where unknown."""
         manifest = self.run.manifest
         if manifest.device_profile is None:
-            return np.full((len(moments), self.vehicles), np.nan), np.nan
+            return np.full((len(moments), self.vehicles), np.nan)
         taken = device.vehicles_j(manifest.latency, moments, self._asker.answers)
         if point.round_trip_s is not None or point.round_trip:
             taken[:, 0] = np.nan  # the ego's model is in a cloud
-        return taken, device.transmit_watts(manifest.device_profile, point)
+        return taken
+
+    def radio_j(self, point: OperatingPoint, heard: Exchange) -> Floats:
+        """Joules that radios take to send the messages of each decision, (n,); NaN where unknown."""
+        profile = self.run.manifest.device_profile
+        if profile is None:
+            return np.full(heard.messages.shape, np.nan)
+        return device.radio_j(profile, point, heard.airtime_s, heard.requests + heard.messages)
 
     @property
     def spec(self) -> Spec:
