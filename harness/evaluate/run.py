@@ -134,7 +134,7 @@ def evaluate_shard(
     more(sum(map(len, own_chunks)))
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, own_chunks, place, progress, None, workers)
-        kept_sources.write(place, made_of)
+        kept_sources.write(place, made_of, place)
     return sum(map(len, own_chunks))
 
 
@@ -356,7 +356,7 @@ def _gather(
             "retries": sum(answer.retries for answer in answers),
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
-        kept_sources.write(out, made_of)
+        kept_sources.write(out, made_of, place)
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)
