@@ -29,8 +29,9 @@ def write(out: Path, files: Mapping[str, bytes], work: Path) -> None:
     part = work / f".{SOURCES}.{os.getpid()}.part"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
+    for folder in dict.fromkeys((part / name).parent for name in files):
+        folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
-        (part / name).parent.mkdir(parents=True, exist_ok=True)
         (part / name).write_bytes(data)
     shutil.rmtree(out / SOURCES, ignore_errors=True)
     os.replace(part, out / SOURCES)
