@@ -9,6 +9,9 @@ import pytest
 from evaluating import FILES
 from reading import packed
 
+from harness.report.compare.page import beside
+from harness.runs.folder import read
+
 Typed = Callable[..., tuple[int, str, str]]
 CANARY = "canary-in-a-folder"
 SECRET = "letmein"
@@ -86,7 +89,8 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     if find_spec("inspect_ai"):
         typed("export", two, "--inspect", here / "log.json")
     assert [str(path) for path in found(here.parent.parent)] == []
-    assert "reports/one/report.html#" in (here / "pair.html").read_text(), "within a project pages are linked"
+    places = [beside(page)(read(one)) for page in (here / "pair.html", here.parent / "apart.html", one / "x")]
+    assert places == ["reports/one/report.html", None, "report.html"], "pages of one project are linked"
 
 
 def test_no_page_of_studies_names_a_folder(typed: Callable[..., str]) -> None:

@@ -139,7 +139,7 @@ def evaluate_shard(
     more(sum(map(len, own_chunks)))
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, own_chunks, place, progress, None, workers)
-        kept_sources.write(place, made_of)
+        kept_sources.write(place, made_of, place)
         parts = [place / _folder_name(chunk) for chunk in own_chunks]
         _settle(parts, chain.from_iterable(map(folder.facts_of, parts)))
     return sum(map(len, own_chunks))
@@ -419,7 +419,7 @@ def _gather(
             "retries": sum(answer.retries for answer in answers),
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
-        kept_sources.write(out, made_of)
+        kept_sources.write(out, made_of, place)
         servers.write(out, [place, *(other / WORK for other in others)])
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)

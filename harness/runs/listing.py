@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, text_of
-from harness.core.formats import CONFIG, FORMAT, READ_BY, SUITE, WORK
+from harness.core.formats import CONFIG, FORMAT, READ_BY, SOURCES, SUITE, WORK
 
 DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
@@ -101,7 +101,12 @@ def _entries(path: str, root: str, depth: int) -> Iterator[Listed]:
     if depth < DEPTH:
         for name in sorted(os.listdir(path)) if os.access(path, os.R_OK | os.X_OK) else ():
             subfolder = os.path.join(path, name)
-            if not name.startswith(".") and os.path.isdir(subfolder) and _within(subfolder, root):
+            if (
+                not name.startswith(".")
+                and name != SOURCES
+                and os.path.isdir(subfolder)
+                and _within(subfolder, root)
+            ):
                 yield from _entries(subfolder, root, depth + 1)
 
 

@@ -5,29 +5,41 @@ its answers. `run.json` has the digests of the prompts, so that a kept prompt ca
 """
 
 import os
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from harness.core.errors import printable
-from harness.core.files import write_whole
+from harness.core.formats import SOURCES
 from harness.prompts import versions
 from harness.prompts.versions import Prompt
 from harness.runs.folder import Run
 
-FOLDER = "sources"
 PROMPTS = "prompts"
 
 
-def write(out: Path, files: Mapping[str, bytes]) -> None:
-    """Write files, by their path within `sources`, to a run's folder, or a shard's working folder."""
+def write(out: Path, files: Mapping[str, bytes], work: Path) -> None:
+    """Write files, by their path within `sources`, to a run's folder in one step.
+
+    They are first written to its folder of unfinished work, with which goes what a killed process left there.
+    """
+    if read(out) == files:
+        return
+    part = work / f".{SOURCES}.{os.getpid()}.part"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    for folder in dict.fromkeys((part / name).parent for name in files):
+        folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
-        write_whole(out / FOLDER / name, data)
+        (part / name).write_bytes(data)
+    shutil.rmtree(out / SOURCES, ignore_errors=True)
+    os.replace(part, out / SOURCES)
 
 
-def read(work: Path) -> dict[str, bytes]:
+def read(out: Path) -> dict[str, bytes]:
     """Return what `write` wrote to a folder, by path; links are left out."""
-    kept = work / FOLDER
+    kept = out / SOURCES
     files = sorted(path for path in kept.rglob("*") if path.is_file() and not path.is_symlink())
     return {file.relative_to(kept).as_posix(): file.read_bytes() for file in files}
 
@@ -40,8 +52,8 @@ def prompt_of(run: Run, stated: Mapping[str, Any]) -> Prompt | None:
     version, sha256 = stated["version"], stated["sha256"]
     if prompt := versions.as_it_was(version, sha256):
         return prompt
-    kept = run.path / FOLDER / PROMPTS
-    here = os.path.join(os.path.realpath(run.path), FOLDER, PROMPTS)
+    kept = run.path / SOURCES / PROMPTS
+    here = os.path.join(os.path.realpath(run.path), SOURCES, PROMPTS)
     files = [path for folder in kept.glob("*") for path in (folder, *folder.glob("*"))]
     if any(os.path.realpath(path) != os.path.join(here, path.relative_to(kept)) for path in files):
         return None  # a link, which no command makes

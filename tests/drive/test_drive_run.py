@@ -84,7 +84,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
     expected = folder_of(cruise, tmp_path / "whole")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(HERE.parent)])}
     # Before the settings are kept, in chunks, before a table, tidying up.
-    places = ("6", "20", "38", "60", "90")
+    places = ("6", "20", "38", "75", "100")
     command = [sys.executable, str(HERE / "killed_drive.py"), str(tmp_path), *places]
     subprocess.run(command, env=environment, check=True)
     resumed = 0
