@@ -204,7 +204,8 @@ def test_a_few_helpers_without_an_answer_are_lost_messages_that_are_counted_and_
     ask: Typed, harness: Typed, play: Play, tmp_path: Path
 ) -> None:
     play.again(some(of_helper, 40))
-    code, out, err = ask("eval", *EVAL, "--out", "run")
+    device = ("--device-profile", "agx-orin", "--device-model", "qwen3-4b")
+    code, out, err = ask("eval", *EVAL, *device, "--out", "run")
     assert (code, err) == (0, "")
     errors = [answer for answer in answers_of(tmp_path / "run") if answer.error]
     helpers = [answer for answer in answers_of(tmp_path / "run") if answer.role == "helper"]
