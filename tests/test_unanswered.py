@@ -402,3 +402,4 @@ def test_the_codes_are_in_the_help_and_on_a_page(harness: Typed) -> None:
     assert code == 0
     for number, meaning in EXIT_CODES.items():
         assert f"{number} {meaning}" in " ".join(out.split())
+        assert f"| {number} | {meaning}" in (resources.root() / "docs/answers.md").read_text()
