@@ -204,7 +204,8 @@ def test_a_few_helpers_without_an_answer_are_lost_messages_that_are_counted_and_
     ask: Typed, harness: Typed, play: Play, tmp_path: Path
 ) -> None:
     play.again(some(of_helper, 40))
-    code, out, err = ask("eval", *EVAL, "--out", "run")
+    device = ("--device-profile", "agx-orin", "--device-model", "qwen3-4b")
+    code, out, err = ask("eval", *EVAL, *device, "--out", "run")
     assert (code, err) == (0, "")
     errors = [answer for answer in answers_of(tmp_path / "run") if answer.error]
     helpers = [answer for answer in answers_of(tmp_path / "run") if answer.role == "helper"]
@@ -401,3 +402,4 @@ def test_the_codes_are_in_the_help_and_on_a_page(harness: Typed) -> None:
     assert code == 0
     for number, meaning in EXIT_CODES.items():
         assert f"{number} {meaning}" in " ".join(out.split())
+        assert f"| {number} | {meaning}" in (resources.root() / "docs/answers.md").read_text()

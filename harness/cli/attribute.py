@@ -70,6 +70,8 @@ def command(
             for r in made
         )
         table(HEADS, cells)
+        if stored.lost:
+            typer.echo(fill(stored.lost, WIDTH))
         typer.echo(fill(f"{rule(found)}; intervals over episodes", WIDTH))
         typer.echo(
             "of: the prompt it is left out of; fusion: a message that came in time; shift:\n"

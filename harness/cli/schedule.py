@@ -158,6 +158,9 @@ def compare(
         )  # fmt: skip
         for sentence in in_sentences(run):
             text.print(printable(sentence, 400))
+    for source in stored:
+        if source.lost:
+            text.print(source.lost)
     text.print(
         "after a schedule's name: the most helpers it asks, and its threshold; 95 % intervals over episodes, "
         "paired; the page also has costs, p, areas, and random with as many messages"

@@ -92,6 +92,8 @@ def command(
     if not silent:
         show_tables(summary)
         for source in stored:
+            if source.lost:
+                typer.echo(source.lost)
             if left := source.left_out:
                 typer.echo(
                     f"{printable(source.name)}: left out episodes that reach one of {len(left)} decision "

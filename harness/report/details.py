@@ -174,7 +174,7 @@ class Details:
                     (agent["model"]["name"], agent["prompt"]["version"], agent["answer"])
                 )
             if run.manifest.latency.speeds:
-                shown["took_s"] = answer_s(run.speed(answer), answer)
+                shown["took_s"] = None if answer.error else answer_s(run.speed(answer), answer)
             spans_read = _read_in(answer, run) if answer.repairs else []
             answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
         decisions: dict[str, dict[str, Any]] = {}  # seeds with the same decision share an entry

@@ -193,8 +193,11 @@ class Stored:
 
     @property
     def lost(self) -> str:
-        """How many questions that were asked here got no answer, for people; empty if all did."""
-        return self._asker.tally.counts()
+        """What was asked here and got no answer, in a sentence; empty if everything did."""
+        counts = self._asker.tally.counts()
+        return (
+            f"{printable(self.name)}: no answer to {counts}; left out, as lost messages are" if counts else ""
+        )
 
     def settle(self) -> None:
         """Raise Unanswered if too many of the questions that were asked here got no answer."""
