@@ -65,7 +65,7 @@ def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
     return None
 
 
-def plain_text(data: bytes) -> str | None:
+def plain_text(data: bytes | bytearray) -> str | None:
     """Return a body that is words of a server; None if it is empty, markup, broken JSON or no text."""
     with suppress(UnicodeDecodeError):
         text = " ".join(data.decode().split())
