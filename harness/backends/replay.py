@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import AGAIN, Backend, Completion, Request
+from harness.backends.base import AGAIN, Backend, Completion, Request, same_model
 from harness.backends.cache import cached, default_file
 from harness.backends.cards import Card
 from harness.backends.registry import find, open_backend
@@ -87,7 +87,7 @@ class Replay:
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":
                 stored = manifest.identity["helpers"][0]
-            if digest(model.identity()) != digest(stored):
+            if not same_model(stored, model.identity()):
                 raise UserError(
                     f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} has "
                     "changed since that run; make the run again"
