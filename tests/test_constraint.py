@@ -2,6 +2,8 @@
 
 import json
 import re
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, get_args
 
 import jsonschema
@@ -15,6 +17,7 @@ from harness.backends.cards import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai.constraint import broken, constraint
 from harness.backends.servers import KINDS, Kind, Server
+from harness.core import resources
 
 ACTIONS = ("SLOWER", "SLOW", "IDLE")  # one name begins another
 FORMS = (("ego", "distribution"), ("helper", "distribution"), ("helper", "recommendation"))
@@ -196,3 +199,23 @@ def test_an_answer_that_nobody_constrained_is_free(monkeypatch: pytest.MonkeyPat
                     server=Server(there.url, "vllm", key_env="NO_KEY"))  # fmt: skip
         [done] = openai_backend.open(card, batch_size=1).complete([request().alike(answer="json")])
     assert (done.text, done.error) == ("I would rather wait.", None)
+
+
+def test_model_check_says_so_in_its_table(
+    harness: Callable[..., tuple[int, str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    (tmp_path / resources.MARKER).touch()
+    (tmp_path / "models").mkdir()
+    with serving(lambda asked: asked.reply(completion(FREE))) as there:
+        (tmp_path / "models/mine.toml").write_text(
+            'engine = "openai"\ndescription = "d"\nweights = "m"\n'
+            f'[server]\nbase_url = "{there.url}"\nkind = "vllm"\nkey_env = "NO_KEY"\n'
+            '[latency]\nsource = "paper"\nbasis = "b"\n'
+        )
+        code, out, _ = harness("model", "check", "mine")
+    lines = {line.split(" ")[0]: line for line in out.splitlines()}
+    assert code == 0, "it answers in json"
+    assert FREE in lines["json"]
+    assert "no answer: the server did not keep to the constraint that was sent: ' {" in lines["constrained"]
+    assert "no answer: the server gives no log-probabilities" in lines["readout"]

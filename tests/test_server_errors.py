@@ -55,6 +55,7 @@ ERRORS = [
     {"choices": [{"error": {"message": WORDS, "code": 403}, "message": {"content": "a"}}]},
     {"error": {"message": "Provider returned error", "metadata": {"raw": WORDS}}},
     WORDS,
+    f"{WORDS}\n".encode(),
 ]  # fmt: skip
 
 

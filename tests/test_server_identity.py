@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import Asked, completion, serving
 
-from harness.backends.base import Request
+from harness.backends.base import Request, same_model
 from harness.backends.cache import cached
 from harness.backends.cards import Card, Latency
 from harness.backends.openai import backend as openai_backend
@@ -187,6 +187,22 @@ def test_two_servers_with_other_templates_are_one_line_that_says_in_what_they_di
             UserError, match=r"chat_template=sha256:\w+…?, and server .* chat_template=short; serve"
         ):
             openai_backend.open(card)
+
+
+def test_a_run_of_an_earlier_version_is_of_the_same_model_as_far_as_it_says() -> None:
+    """It did not store what a server states, which is no other model; what it stored must be the same."""
+    now = identity("llama-server", LLAMA)
+    before = {key: value for key, value in now.items() if key != "states"}
+    other = {**now, "states": {**now["states"], "meta.size": 1}}
+    assert same_model(before, now)
+    assert same_model(now, now)
+    assert not same_model(now, other)
+    assert not same_model(now, before)
+    assert not same_model(before, {**now, "version": "b1"})
+    assert same_model({**before, "helpers": [before]}, {**now, "helpers": [now]})
+    assert not same_model({**now, "helpers": [now]}, {**now, "helpers": [other]})
+    assert not same_model({**before, "helpers": [before]}, now)
+    assert not same_model({**before, "helpers": 3}, {**now, "helpers": [now]})
 
 
 # -- the cache follows --------------------------------------------------------------------------------------

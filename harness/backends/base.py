@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
+from harness.core.files import canonical_json
 from harness.core.image import Image
 
 if TYPE_CHECKING:
@@ -144,6 +145,21 @@ class Backend(Protocol):
     def identity(self) -> dict[str, Any]:
         """Return what decides the answers, as JSON for the manifest: engine, versions, weights, settings."""
         ...
+
+
+def same_model(stored: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Whether an identity is that of a stored one; what an earlier version did not store is not compared."""
+    return canonical_json(_as_stored(now, stored)) == canonical_json(stored)
+
+
+def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an identity without what servers state, if the stored one lacks that; the helpers' as well."""
+    made = {key: value for key, value in now.items() if key != "states" or key in stored}
+    helpers, others = made.get("helpers"), stored.get("helpers")
+    if isinstance(helpers, list | tuple) and isinstance(others, list | tuple) and len(helpers) == len(others):
+        pairs = zip(helpers, others, strict=True)
+        made["helpers"] = [_as_stored(h, o) if isinstance(o, Mapping) else h for h, o in pairs]
+    return made
 
 
 class Rendering(Backend, Protocol):

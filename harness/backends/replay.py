@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import AGAIN, Backend, Completion, Request
+from harness.backends.base import AGAIN, Backend, Completion, Request, same_model
 from harness.backends.cache import cached, default_file
 from harness.backends.cards import Card, own
 from harness.backends.registry import find, open_backend
@@ -96,7 +96,7 @@ class Replay:
             if manifest.helpers and role == "helper":
                 helpers = manifest.identity.get("helpers")
                 stored = helpers[0] if isinstance(helpers, list) and helpers else {}
-            if digest(model.identity()) != digest(stored):
+            if not same_model(stored, model.identity()):
                 raise UserError(
                     f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} has "
                     "changed since that run; make the run again"

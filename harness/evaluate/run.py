@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from harness.backends.base import Backend, Served
+from harness.backends.base import Backend, Served, same_model
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
 from harness.core.errors import Unanswered, UserError
-from harness.core.files import digest, write_whole
+from harness.core.files import write_whole
 from harness.core.formats import FORMAT, WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
@@ -354,7 +354,7 @@ def _walk_chunk(
 
     def backend() -> Backend:
         combined = together(spec.cards, _open_all(spec), cache)
-        if digest(combined.identity()) != digest(begun.identity):
+        if not same_model(begun.identity, combined.identity()):
             raise UserError(
                 f"a worker opens {another_model(spec)} than this run began with; give it the same"
             )

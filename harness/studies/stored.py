@@ -12,7 +12,7 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
-from harness.backends.base import AnswerMode, Backend, Request
+from harness.backends.base import AnswerMode, Backend, Request, same_model
 from harness.backends.cache import default_file
 from harness.backends.cards import Card, own
 from harness.backends.registry import open_backend
@@ -291,7 +291,7 @@ class Stored:
         models = open_each(cards, opens)
         identity = together(cards, models).identity()
         stored, now = manifest.identity, msgspec.json.decode(canonical_json(identity))
-        if now != stored:
+        if not same_model(stored, now):
             other = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
             raise UserError(
                 f"{shown}: the model is not what it was ({printable(', '.join(other))}); run again"

@@ -155,15 +155,15 @@ class OpenAIBackend:
 
     def _note(self, request: Request, reply: Reply, answer: Said) -> None:
         """Keep which server gave an answer; say once if it names another model than it was asked for."""
-        model = None if answer.model is None else printable(answer.model)
+        model, asked = answer.model, self._card.weights
+        if model not in (None, asked, f"{asked}:latest", (self._farm.model.listed or {}).get("id")):
+            model = printable(model)
+            if not self._told:
+                self._told, url = True, printable(reply.url)
+                self._farm.say(
+                    f"server {url} was asked for {printable(asked)}, and says that {model} answers"
+                )
         self._served.append(Served(request.id, reply.url, model))
-        asked = printable(self._card.weights or "")
-        known = (None, asked, f"{asked}:latest", (self._farm.model.listed or {}).get("id"))
-        if model not in known and not self._told:
-            self._told = True
-            self._farm.say(
-                f"server {printable(reply.url)} was asked for {asked}, and says that {model} answers"
-            )
 
     def _hinted(self, reply: Reply) -> str:
         """Return a reply's fault; if it names a field that a card can change, say so."""

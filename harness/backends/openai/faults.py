@@ -4,6 +4,7 @@ Some servers and most routers answer HTTP 200 before they know that they cannot 
 """
 
 import json
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 _WORDS = ("error", "message", "detail")  # where an error or its words stand
@@ -61,6 +62,14 @@ def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
             return Fault(words_of({"error": error}), _code(error) or _code(payload))
     if of_chat and not choices and any(isinstance(payload.get(name), str | list) for name in _WORDS[1:]):
         return Fault(words_of(payload), _code(payload))
+    return None
+
+
+def plain_text(data: bytes | bytearray) -> str | None:
+    """Return a body that is words of a server; None if it is empty, markup, broken JSON or no text."""
+    with suppress(UnicodeDecodeError):
+        text = " ".join(data.decode().split())
+        return text if text and text.isprintable() and text[0] not in "<{[" else None
     return None
 
 

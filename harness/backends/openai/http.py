@@ -16,7 +16,7 @@ from urllib.request import getproxies, proxy_bypass
 import aiohttp
 from yarl import URL
 
-from harness.backends.openai.faults import fault_in, may_pass, words_of
+from harness.backends.openai.faults import fault_in, may_pass, plain_text, words_of
 from harness.backends.openai.stream import Stream
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable
@@ -137,10 +137,9 @@ class Client:
             return Reply(payload, status=status, first_at_s=stream.first_at_s)
         payload, readable = self._payload(bytes(data))
         if status == 200:
-            if not readable:
-                return Reply(fault="the answer is no JSON", status=status)
-            if (fault := fault_in(payload, of_chat=url.endswith(COMPLETIONS))) is None:
-                return Reply(payload, status=status)
+            fault = fault_in(payload if readable else plain_text(data), of_chat=url.endswith(COMPLETIONS))
+            if fault is None:
+                return Reply(payload, fault=None if readable else "the answer is no JSON", status=status)
             words = self._shown(fault.words)
             if fault.code is None:
                 return Reply(fault=f"an error with HTTP 200: {words}", status=status)
