@@ -4,6 +4,7 @@ import os
 import sys
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path
+from types import GenericAlias
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -152,11 +153,11 @@ def kinds(draw: st.DrawFn, depth: int = 3) -> tuple[Any, Any]:
         return record, {name: value for name, (_, value) in fields.items()}
     kind, value = draw(kinds(depth - 1))
     if shape == "list":
-        return list[kind], [value] * draw(st.integers(1, 3))
+        return GenericAlias(list, (kind,)), [value] * draw(st.integers(1, 3))
     if shape == "pair":
-        return tuple[str, kind], ["x", value]
+        return GenericAlias(tuple, (str, kind)), ["x", value]
     if shape == "table":
-        return dict[str, kind], dict.fromkeys(draw(st.sets(KEYS, min_size=1)), value)
+        return GenericAlias(dict, (str, kind)), dict.fromkeys(draw(st.sets(KEYS, min_size=1)), value)
     return kind | None, value
 
 
