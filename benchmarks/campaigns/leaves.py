@@ -3,10 +3,10 @@
     python benchmarks/campaigns/leaves.py [--count 5000] [--seed 0] [--kind run] [--memory 1]
 
 A leaf is a value in a JSON, TOML, CSV or Parquet file: of a dataset, its trees and scenes; of a run, frozen
-or driven; of a project's prompts, cards, channels, devices, networks, schedules and suites. It becomes another
-type, sign, size or name, is removed or stands twice. Then a command is typed that reads it. Files are drawn
-with equal odds, and so are the leaves of a file and its commands. A dataset's digests are made anew, so that
-what is read is the leaf and not the digest.
+or driven; of a project's prompts, cards, channels, devices, networks, schedules and suites. It becomes
+another type, sign, size or name, is removed or stands twice. Then a command is typed that reads it. Files are
+drawn with equal odds, and so are the leaves of a file and its commands. A dataset's digests are made anew, so
+that what is read is the leaf and not the digest.
 """
 
 import argparse
@@ -259,9 +259,11 @@ def _runs(here: Path) -> Iterator[Subject]:
     conditions = ("--condition", "single-local", "--condition", "6g:attack=liar", "--condition",
                   "mode4:density_per_km=90", "--condition", "cloud:round_trip=5g-city",
                   "--condition", "v2x:schedule=learnt")  # fmt: skip
+    fused = ("sweep", "all/it", "--over", "consensus", "--grid", "ego-prompt")
     for command in (
         ("eval", "--dataset", small, *seeds, *conditions, "--out", "all/it"),
         ("attribute", "all/it", "--sample", 2),
+        (*fused, "--out", "all/it/fused"),
         ("drive", "--episodes", 1, "--first-seed", 0, *conditions[:6], *seeds, "--out", "all/driven"),
     ):
         ended = typed(*command)
@@ -285,6 +287,8 @@ def _runs(here: Path) -> Iterator[Subject]:
              "decisions.parquet",             "attribution.json")  # fmt: skip
     for name in files:
         yield Subject("run", where / "all/it" / name, (*every, *reads), where)
+    for name in ("more-answers.jsonl", "fused/sweep.json"):
+        yield Subject("run", where / "all/it" / name, (*every, reads[0], (*fused, "--out", "out")), where)
     drives = (
         ("report", "all/driven", "--out", "out.html"), ("compare", "all/driven", "sound/driven"),
         ("fidelity", "sound/it", "all/driven", "--out", "out"),

@@ -285,7 +285,9 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     if env_config is None:
         return f"{environment.PREFIX}{env}"
     try:
-        return environment.named(env, json.loads(text_of(env_config, "settings")))
+        named = environment.named(env, json.loads(text_of(env_config, "settings")))
+        named.encode()  # JSON can write half a character, which no file can hold
+        return named
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a JSON file"

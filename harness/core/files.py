@@ -14,9 +14,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from glob import escape
+from io import BufferedReader
 from pathlib import Path
 from types import NoneType
-from typing import Any, BinaryIO, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 _EXACT = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False, check_circular=False
@@ -95,14 +96,14 @@ LARGEST: dict[Kind, int] = {
 """The largest file of each kind, bytes."""
 
 
-def opened(path: str | Path, kind: Kind) -> BinaryIO:
+def opened(path: str | Path, kind: Kind) -> BufferedReader:
     """Open a file for reading; it is checked after it is opened, so nothing can take its place in between.
 
     Raises:
         OSError: the file cannot be opened.
         Refused: it is not a regular file, or is larger than `LARGEST` of its kind.
     """
-    file: BinaryIO = open(path, "rb", opener=_at_once)  # noqa: SIM115
+    file = open(path, "rb", opener=_at_once)  # noqa: SIM115
     try:
         state = os.fstat(file.fileno())
         if not stat.S_ISREG(state.st_mode):

@@ -157,7 +157,13 @@ def collect(parts: Mapping[str, Path], folder: Path) -> None:
         copy = folder / f".{name}.{os.getpid()}.part"
         if not (folder / name).exists():
             shutil.rmtree(copy, ignore_errors=True)
-            (shutil.copytree if part.is_dir() else shutil.copyfile)(part, copy)
+            content = _content(part)
+            if part.is_dir():
+                copy.mkdir()
+                for file, data in content.items():
+                    (copy / file).write_bytes(data)
+            else:
+                copy.write_bytes(content[part.name])
             os.replace(copy, folder / name)
 
 

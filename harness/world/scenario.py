@@ -113,12 +113,13 @@ class Parameters:
         }
         for field in fields(self):
             value = getattr(self, field.name)
-            unit = next((unit for unit in BOUNDS if field.name.endswith(unit)), None)
-            if unit and not all(
-                BOUNDS[unit][0] <= each <= BOUNDS[unit][1]
-                for each in (value if isinstance(value, tuple) else (value,))
-            ):
-                bounds[field.name] = (False, f"from {BOUNDS[unit][0]:g} to {BOUNDS[unit][1]:g}")
+            least, most = next((BOUNDS[unit] for unit in BOUNDS if field.name.endswith(unit)), (None, None))
+            if least is not None and bounds.get(field.name, (True, ""))[0]:
+                each = value if isinstance(value, tuple) else (value,)
+                bounds[field.name] = (
+                    all(least <= one <= most for one in each),
+                    f"from {least:g} to {most:g}",
+                )
         for name, (fits, allowed) in bounds.items():
             if not fits:
                 raise UserError(f"scenario: {name} is {printable(getattr(self, name))}; it must be {allowed}")
