@@ -8,11 +8,12 @@ from typer import Argument, Option, echo
 from harness.core.errors import UserError, printable, unknown
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from harness.backends.base import AnswerMode
     from harness.coordination.operating_point import OperatingPoint
     from harness.core import parallel, shards
+    from harness.dataset.load import Dataset as Frozen  # Dataset is an option here
     from harness.evaluate.agent import ImageMode
 else:  # typer takes any text; what is evaluated says which are allowed
     AnswerMode = ImageMode = str
@@ -222,6 +223,16 @@ def points(
             if point.profile and setting.partition("=")[0] not in point.name:
                 found.append(named_point(point.name + ("," if ":" in point.name else ":") + setting))
     return tuple(dict.fromkeys(found))
+
+
+def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
+    """Say on stderr which of these have fewer episodes than --limit."""
+    for dataset in datasets:
+        if limit is not None and limit > (n := dataset.manifest.episodes):
+            echo(
+                f"--limit {limit}: {printable(dataset.name)} has {n} episodes, all of which are used",
+                err=True,
+            )
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
