@@ -12,14 +12,16 @@ import traceback
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from evaluating import Scripted, sure
 
 from harness import cli
 from harness.backends.base import Completion, Request
+from harness.backends.card import Card
 from harness.evaluate import lifecycle
 from harness.studies import folder as study_folder
-from harness.studies import grid, repeats
+from harness.studies import repeats
 
 RUN, DRIVEN, SEEDS = "run", "driven", ("--seeds", "0:4")
 POINTS = ("--condition", "single-local", "--condition", "6g")
@@ -115,14 +117,17 @@ def typed(words: Sequence[str], here: Path, last: int | None = None) -> int:
 
 
 def main(dataset: Path, folder: Path, names: Sequence[str]) -> None:
-    lifecycle.datetime = Then
     os.environ["SWARMDRIVE_CACHE"] = os.fspath(folder / "cache")
-    study_folder.FORMATS = ("svg",)  # the pictures of a study take longer than all else
-    grid.open_backend = lambda card, **options: backend(card, **options)
-    backend = repeats_backend = repeats.open_backend
-    repeats.open_backend = lambda card, **options: (
-        Wanderer() if card.name == "swarm-tiny" else repeats_backend(card, **options)
-    )
+    backend = repeats.open_backend  # type: ignore[attr-defined]
+
+    def opens(card: Card, **options: Any) -> Any:
+        return Wanderer() if card.name == "swarm-tiny" else backend(card, **options)
+
+    for module, name, instead in (
+        (lifecycle, "datetime", Then), (repeats, "open_backend", opens),
+        (study_folder, "FORMATS", ("svg",)),  # the pictures of a study take longer than all else
+    ):  # fmt: skip
+        setattr(module, name, instead)
     base, here = folder / "base", folder / "here"
     shutil.copytree(dataset, base / "data")
     typed(("eval", "--dataset", "data", "--seeds", "0:1", *POINTS, "--out", RUN), base)

@@ -100,3 +100,9 @@ def test_the_command_in_the_manifest_runs_it_again(
     code, _, _ = harness(*shlex.split(manifest["command"])[1:])
     assert code == 0
     assert same_files(tmp_path / "a b", tmp_path / "first")
+
+
+def test_a_limit_beyond_the_dataset_is_said(harness: Callable[..., Said], small_path: Path) -> None:
+    code, out, err = harness("eval", "--dataset", small_path, "--limit", "9999", "--seeds", "0:1")
+    assert (code, err) == (0, "--limit 9999: small has 4 episodes, all of which are used\n")
+    assert "n = 4 episodes" in out

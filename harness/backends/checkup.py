@@ -1,6 +1,6 @@
 """Check a language model before a run: the prompt it reads, token by token, its answers and their time."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,14 +77,24 @@ class Checkup:
     looks: Looks | None = None
 
 
-def check(backend: Rendering, asked: Sequence[Request], shown: Sequence[Pictured] = ()) -> Checkup:
+def check(
+    backend: Rendering, asked: Sequence[Request], shown: Sequence[Pictured] = (),
+    progress: Callable[[int], None] = lambda done: None,
+) -> Checkup:  # fmt: skip
     """Check a model with some questions, one in each answer mode.
 
     Args:
         backend: the model's backend.
         asked: the questions.
         shown: questions of an image prompt; empty for a model without vision.
+        progress: called with 1 as soon as a question is answered.
     """
+
+    def answer(request: Request, warm: bool = False) -> Completion:
+        completion = _answer(backend, request, warm)
+        progress(1)
+        return completion
+
     [prompt] = backend.rendered(asked[:1])
     chat: Chat | None = getattr(backend, "chat", None)
     ids = chat.encode(prompt) if chat else []
@@ -94,9 +104,9 @@ def check(backend: Rendering, asked: Sequence[Request], shown: Sequence[Pictured
         bos_tokens=_leading(ids, chat.bos) if chat else None,
         turn_end=chat.pieces([end])[0] if chat and (end := chat.turn_end) is not None else None,
         thinking=chat.thinking if chat else None,
-        answers={request.answer: _answer(backend, request) for request in asked},
+        answers={request.answer: answer(request) for request in asked},
         identity=backend.identity(),
-        looks=_looks(backend, shown) if shown else None,
+        looks=_looks(answer, shown) if shown else None,
     )
 
 
@@ -105,11 +115,11 @@ def _leading(ids: Sequence[int], token: int | None) -> int:
     return next((n for n, other in enumerate(ids) if other != token), len(ids))
 
 
-def _looks(backend: Rendering, shown: Sequence[Pictured]) -> Looks:
-    answers = {own.answer: _answer(backend, own) for own, _, _ in shown}
-    others = {blank.answer: _answer(backend, blank, warm=True) for _, blank, _ in shown}
+def _looks(answer: Callable[..., Completion], shown: Sequence[Pictured]) -> Looks:
+    answers = {own.answer: answer(own) for own, _, _ in shown}
+    others = {blank.answer: answer(blank, warm=True) for _, blank, _ in shown}
     answered = [text for _, _, text in shown if not (answers[text.answer].error or others[text.answer].error)]
-    return Looks(answers, others, _answer(backend, answered[-1], warm=True) if answered else None)
+    return Looks(answers, others, answer(answered[-1], warm=True) if answered else None)
 
 
 def _answer(backend: Rendering, request: Request, warm: bool = False) -> Completion:

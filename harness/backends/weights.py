@@ -136,7 +136,8 @@ def _download(card: Card) -> None:
             f"{shown}: there is no {at}{revision}, or it is private; see `hf auth login`"
         ) from None
     except Exception as error:  # the hub, the network and the disk fail in any of a dozen types
-        reason = printable(" ".join(str(error).split()), 160)
+        # Its first sentence, as long as it may be: those after it give advice of the library's own.
+        reason = printable(" ".join(str(error).split()).partition(". ")[0].rstrip("."), 400)
         raise UserError(
             f"{shown}: cannot fetch {at}: {reason}; try again, or copy the weights here and give their path"
         ) from None

@@ -184,7 +184,8 @@ def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -
         for way in ways if sees
     ]  # fmt: skip
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
-    return spec, look(cast("Rendering", backend), asked, shown)
+    with bar(f"asking {printable(card.name, 30)}", len(asked) + 2 * len(shown)) as progress:
+        return spec, look(cast("Rendering", backend), asked, shown, progress)
 
 
 def _show(spec: "Spec", seen: "Checkup") -> None:

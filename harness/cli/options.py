@@ -9,12 +9,13 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import text_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from harness.backends.base import AnswerMode
     from harness.backends.cards import Card
     from harness.coordination.operating_point import OperatingPoint
     from harness.core import parallel, shards
+    from harness.dataset.load import Dataset as Frozen  # Dataset is an option here
     from harness.evaluate.agent import ImageMode
 else:  # typer takes any text; what is evaluated says which are allowed
     AnswerMode = ImageMode = str
@@ -246,6 +247,16 @@ def cards(models: "Sequence[str] | None") -> "list[Card]":
     from harness.backends.cards import resolve
 
     return [resolve(model) for model in models or ()]
+
+
+def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
+    """Say on stderr which of these have fewer episodes than --limit."""
+    for dataset in datasets:
+        if limit is not None and limit > (n := dataset.manifest.episodes):
+            echo(
+                f"--limit {limit}: {printable(dataset.name)} has {n} episodes, all of which are used",
+                err=True,
+            )
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

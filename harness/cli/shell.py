@@ -44,7 +44,8 @@ class Map(TyperGroup):
 
 def keep_encoding() -> None:
     """Have typer write in the terminal's encoding: where that is ASCII, it would write UTF-8."""
-    import_module(echo.__module__.replace("utils", "_compat"))._stream_is_misconfigured = _never
+    streams: Any = import_module(echo.__module__.replace("utils", "_compat"))
+    streams._stream_is_misconfigured = _never
 
 
 def _never(stream: object) -> bool:

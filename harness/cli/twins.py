@@ -79,6 +79,7 @@ def command(
     example = "mirrored:invariance_rate < 0.9"
     gates = [gate(typed, scoring.METRICS, "TWIN", example) for typed in fail_if or ()]
     whole = load.load(load.find(dataset), None if sample else limit)
+    options.say_all(limit, [whole])
     if limit is None and sample is None:
         sample = min(EPISODES, len(whole.episodes))
     selection = Selection(limit, sample=sample, sample_seed=sample_seed)

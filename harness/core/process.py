@@ -5,6 +5,7 @@ import signal
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from io import TextIOWrapper
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -140,7 +141,7 @@ def _open_streams() -> None:
             if null == number:
                 os.set_inheritable(null, True)
     for stream in (sys.stdout, sys.stderr):
-        if stream.errors == "strict":
+        if isinstance(stream, TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")
 
 

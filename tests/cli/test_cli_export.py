@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree
 
 import pyarrow as pa
@@ -49,8 +50,8 @@ def test_a_spreadsheet_finds_no_formula(tmp_path: Path, harness: Callable[..., S
     written = [row["raw"] for row in rows[: len(texts)]]
     assert written == [f"'{text}" if n < 6 else text for n, text in enumerate(texts)]
     assert (run / "answers.jsonl").read_bytes() == before
-    table = pa.table({"a": ["=1", "1", None], "b": [-1.5, 2.0, None]})
-    exported = export.decisions_csv(SimpleNamespace(table=table), tmp_path / "decisions.csv")
+    made: Any = SimpleNamespace(table=pa.table({"a": ["=1", "1", None], "b": [-1.5, 2.0, None]}))
+    exported = export.decisions_csv(made, tmp_path / "decisions.csv")
     assert exported.read_text().splitlines()[1:] == ['"\'=1",-1.5', '"1",2', ","]
 
 

@@ -91,10 +91,10 @@ def test_a_run_without_streams_is_whole(closed: tuple[int, ...], tmp_path: Path)
         for number in closed:
             os.close(number)
 
-    streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     done = ended(
-        "eval", "--limit", "1", "--seeds", "0", "--out", "run", cwd=tmp_path, prepare=close, **streams
-    )
+        "eval", "--limit", "1", "--seeds", "0", "--out", "run", cwd=tmp_path, prepare=close,
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
     assert done.returncode == 0
     assert {path.name for path in (tmp_path / "run").iterdir()} == {
         "answers.jsonl", "decisions.parquet", "episodes.csv", "report.html", "run.json", "summary.csv",
