@@ -14,6 +14,7 @@ from harness.backends.base import Completion, Request, per_token_s
 from harness.backends.cards import Card
 from harness.backends.openai.farm import Farm
 from harness.backends.openai.http import Client, Reply
+from harness.backends.openai.read import Reading
 from harness.backends.openai.shapes import Said, body, digest_url, read
 from harness.backends.openai.stream import ASKED
 from harness.backends.servers import Server
@@ -52,6 +53,7 @@ class OpenAIBackend:
         self._streams = True  # until a server refuses to stream
         client = Client(server)
         self._farm = Farm(client, server, card.name, card.weights or "", batch_size)
+        self._reading = Reading(client, card, server)
         self._loop = _Loop(client)
         weakref.finalize(self, self._loop.end)
         self._loop.run(self._farm.open())
@@ -91,6 +93,7 @@ class OpenAIBackend:
         }
 
     async def _all(self, requests: Sequence[Request]) -> list[Completion]:
+        await self._reading.check(requests)
         together = min(self._batch_size, len(requests))
         # One at a time: if a server refuses to stream, the next request must know.
         if together == 1 and any(request.timed for request in requests):

@@ -85,9 +85,10 @@ class Client:
     async def __aexit__(self, *_: object) -> None:
         await self._session.close()
 
-    async def get(self, base: str, url: str) -> Reply:
-        """Request a URL of a server."""
-        return await self._once("GET", base, url, None, min(CONNECT_S, self._server.timeout_s))
+    async def get(self, base: str, url: str, content: bytes | None = None) -> Reply:
+        """Request what a server states at a URL; with JSON as `content` it is sent that."""
+        method = "GET" if content is None else "POST"
+        return await self._once(method, base, url, content, min(CONNECT_S, self._server.timeout_s))
 
     async def post(self, base: str, path: str, content: bytes) -> Reply:
         """Send JSON to a server."""
