@@ -104,9 +104,8 @@ def test_only_a_template_that_refuses_is_given_it_unasked() -> None:
 
 @pytest.mark.parametrize(
     ("template", "end"),
-    [(TURNS, "<|im_end|>"), (TURNS.replace("<|im_end|>", "</s>"), "</s>"),
-     ("{{ raise_exception('x') }}", None), (TURNS.replace("<|im_end|>", ""), None),
-     ("{{ messages[0].content }}", None)],
+    [(TURNS, "<|im_end|>"), (TURNS.replace("<|im_end|>", "</s>"), "</s>"), (OPENING, None),
+     (TURNS.replace("<|im_end|>", ""), None), ("{{ raise_exception('x') }}", None)],
 )  # fmt: skip
 def test_an_answer_ends_at_the_token_that_the_template_writes_after_it(
     template: str, end: str | None

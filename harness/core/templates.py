@@ -365,7 +365,8 @@ class Sandbox(ImmutableSandboxedEnvironment):
         for name, function in list(self.filters.items()):
             self.filters[f"{FREE}{name}"] = function
             self.add_filter(name, own.get(name, function))
-        self.tests = {name: _test(made) if name in _READING else made for name, made in self.tests.items()}
+        tests: dict[str, Any] = {**self.tests}
+        self.tests = {name: _test(test) if name in _READING else test for name, test in tests.items()}
         self.globals |= {"lipsum": _lorem_ipsum, "namespace": _Namespace}
 
     def add_filter(self, name: str, function: Callable[..., Any]) -> None:

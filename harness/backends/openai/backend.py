@@ -15,6 +15,7 @@ from harness.backends.base import Completion, Request, Served, per_token_s
 from harness.backends.cards import Card
 from harness.backends.openai.farm import Farm
 from harness.backends.openai.http import Client, Reply
+from harness.backends.openai.read import Reading
 from harness.backends.openai.shapes import Said, body, digest_url, read
 from harness.backends.openai.stream import ASKED, BROKE_OFF
 from harness.backends.servers import Fields, Server
@@ -57,6 +58,7 @@ class OpenAIBackend:
         self._told = False  # that a server names another model
         client = Client(server)
         self._farm = Farm(client, server, card.name, card.weights or "", batch_size)
+        self._reading = Reading(client, card, server)
         self._loop = _Loop(client)
         weakref.finalize(self, self._loop.end)
         self._loop.run(self._farm.open())
@@ -115,6 +117,7 @@ class OpenAIBackend:
         return taken
 
     async def _all(self, requests: Sequence[Request]) -> list[Completion]:
+        await self._reading.check(requests)
         together = min(self._batch_size, len(requests))
         # One at a time: if a server refuses to stream, the next request must know.
         if together == 1 and any(request.timed for request in requests):
