@@ -22,16 +22,17 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     subprocess.run(build, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
     bare = folder / "bare"
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(bare)], check=True)
-    install = [
-        *(sys.executable, "-m", "pip", "--python", str(bare / "bin/python"), "install"),
-        *("--quiet", "--no-compile", "--constraint", str(ROOT / "requirements.lock"), str(wheel)),
-    ]
-    done = subprocess.run(install, capture_output=True, text=True, check=False)
-    offline = re.search(r"NewConnectionError|NameResolutionError|ConnectTimeout", done.stderr)
-    if offline and "CI" not in os.environ:
-        pytest.skip("no package index is reached")
-    assert done.returncode == 0, done.stderr
+    subprocess.run([sys.executable, "-m", "venv", str(bare)], check=True)
+    python = str(bare / "bin/python")
+    for command in (
+        [sys.executable, str(ROOT / "requirements.py"), "packages", "base", python, "--no-compile"],
+        [python, "-m", "pip", "install", "--quiet", "--no-compile", "--no-index", str(wheel)],
+    ):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        offline = re.search(r"NewConnectionError|NameResolutionError|ConnectTimeout", done.stderr)
+        if offline and "CI" not in os.environ:
+            pytest.skip("no package index is reached")
+        assert done.returncode == 0, done.stderr
     yield bare
     shutil.rmtree(bare)  # half a gigabyte
 
