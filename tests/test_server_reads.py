@@ -25,7 +25,7 @@ def users(messages: list[Any]) -> list[Any]:
     return [m for m in messages if m["role"] == "user"]
 
 
-def asked_of(kind: str, tell: Tell, system: str | None = None) -> tuple[list[str], list[str]]:
+def asked_of(kind: Any, tell: Tell, system: Any = None) -> tuple[list[str], list[str]]:
     """Paths that a server of a kind was asked, and its answers; `tell` says what its model reads."""
     paths: list[str] = []
 
