@@ -91,8 +91,11 @@ def harness(
     def typed(*args: str | Path) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["harness", *map(str, args)])
         capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
+        with pytest.MonkeyPatch.context() as own:
+            # A command adds the module of its --env, for its own process.
+            own.setenv("SWARMDRIVE_IMPORTS", os.environ.get("SWARMDRIVE_IMPORTS", ""))
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
         return int(ended.value.code or 0), *capsys.readouterr()
 
     return typed

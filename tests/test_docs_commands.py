@@ -118,6 +118,8 @@ def test_a_page_can_be_followed(
             command = shlex.join([program, *args])
             if program == "cd":
                 monkeypatch.chdir(args[0])
+            elif program == "export":
+                monkeypatch.setenv(*args[0].split("=", 1))
             elif command in NOT_RUN:
                 path, rest = parsed(args)
                 COMMANDS[path].make_context(path, rest)

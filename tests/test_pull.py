@@ -100,7 +100,7 @@ def test_a_file_that_is_not_what_its_card_says_is_refused(tmp_path: Path) -> Non
     [
         ({}, "there is no {url}/some/model, or it is private; see `hf auth login`"),
         ({"some/model": {}}, "{url}/some/model asks for its licence to be accepted; do so on that page"),
-        ({"some/model": {"config.json": b"{}"}}, "has no weights (*.safetensors or *.bin)"),
+        ({"some/model": {"config.json": b"{}"}}, "has no weights (*.safetensors)"),
         (
             {"some/model": {**CHECKPOINT, "model.safetensors": None}},
             "cannot fetch {url}/some/model: peer closed",

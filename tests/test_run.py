@@ -259,7 +259,7 @@ def test_a_folder_in_use_is_refused_and_left_as_it_is(
         (file, "is no folder; choose an empty or a new one"),
         (in_file, "cannot be made (Not a directory); choose another folder"),
     ):
-        before = {p: p.read_bytes() for p in (*proxy_run.iterdir(), other / "thesis.tex", file)}
+        before = {p: p.read_bytes() for p in (*proxy_run.glob("*.*"), other / "thesis.tex", file)}
         with pytest.raises(UserError) as caught:
             run(spec_of(small), out)
         assert str(caught.value).endswith(said)
@@ -269,7 +269,7 @@ def test_a_folder_in_use_is_refused_and_left_as_it_is(
 def test_an_empty_folder_is_a_fine_place(small: Dataset, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     run(spec_of(small, "cruise"), tmp_path / "empty")
-    assert {p.name for p in (tmp_path / "empty").iterdir()} == {*FILES, "run.json"}
+    assert {p.name for p in (tmp_path / "empty").iterdir()} == {*FILES, "run.json", "sources"}
 
 
 def test_a_model_that_cannot_be_had_leaves_nothing(small: Dataset, tmp_path: Path) -> None:

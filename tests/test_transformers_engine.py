@@ -1,5 +1,6 @@
 """The transformers engine, played on a real tiny Qwen3 with random weights."""
 
+import json
 import os
 import pickle
 import shutil
@@ -131,10 +132,11 @@ def test_the_thinking_switch_alters_the_prompt(backend: LanguageModel) -> None:
 
 
 def test_a_template_without_the_switch_is_rendered_as_it_is(tmp_path: Path) -> None:
-    bare = tiny_qwen3.build(tmp_path / "bare", template="{{ messages[0].content }}>")
+    bare = tiny_qwen3.build(tmp_path / "bare", template="{{ messages | map(attribute='content') | join }}>")
     opened = open_tiny(bare)
     assert opened.chat.thinking == "none"
-    assert opened.chat.render(ask(0).messages, thinking=True) == "You drive.>"
+    said = "".join(message["content"] for message in ask(0).messages)
+    assert opened.chat.render(ask(0).messages, thinking=True) == f"{said}>"
     always = tiny_qwen3.build(tmp_path / "always", template="{{ messages[0].content }}<think>\n")
     assert open_tiny(always).chat.thinking == "always"
 
@@ -250,8 +252,60 @@ def test_a_pickle_is_refused_in_one_line_and_runs_no_code(
     (folder / "pytorch_model.bin").write_bytes(pickle.dumps(Trap()))
     code, out, err = harness("eval", "--model", folder, "--limit", 1, "--seeds", "0")
     assert (code, out, err.count("\n")) == (2, "", 1), err
-    assert "does not load: Weights only load failed" in err
+    assert "has no weights (*.safetensors)" in err
+    (folder / "adapter.safetensors").write_bytes(b"")  # which is no reason to read the pickle
+    code, out, err = harness("eval", "--model", folder, "--limit", 1, "--seeds", "0")
+    assert (code, out, err.count("\n")) == (2, "", 1), err
+    assert "does not load" in err
     assert not list(tmp_path.rglob("caught"))
+
+
+def own_config(folder: Path) -> None:
+    """A configuration and a model of the checkpoint's own code."""
+    change(folder / "config.json", auto_map={"AutoConfig": "own.Own"}, model_type="own")
+
+
+def own_model(folder: Path) -> None:
+    change(folder / "config.json", auto_map={"AutoModelForCausalLM": "own.Own"}, architectures=["Own"])
+
+
+def own_tokenizer(folder: Path) -> None:
+    owned = {"AutoTokenizer": ["own.Own", "own.Own"]}
+    change(folder / "tokenizer_config.json", auto_map=owned, tokenizer_class="Own")
+
+
+def kernel_of_the_hub(folder: Path) -> None:
+    change(folder / "config.json", attn_implementation="kernels-community/flash-attn")
+
+
+def change(file: Path, **values: object) -> None:
+    file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (own_config, "does not load"),
+        (own_model, ""),  # loaded by transformers' own class
+        (own_tokenizer, ""),
+        (
+            kernel_of_the_hub,
+            "names code of the hub, which is never run",
+        ),
+    ],
+)
+def test_no_code_of_a_checkpoint_is_run(
+    tiny: Path, tmp_path: Path, changed: Callable[[Path], None], said: str
+) -> None:
+    folder = shutil.copytree(tiny, tmp_path / "with-code")
+    changed(folder)
+    (folder / "own.py").write_text(f"import os\nos.mkdir({str(tmp_path / 'caught')!r})\nclass Own: pass\n")
+    if said:
+        with pytest.raises(UserError, match=said):
+            open_tiny(folder)
+    else:
+        open_tiny(folder)
+    assert not (tmp_path / "caught").exists()
 
 
 @pytest.mark.parametrize(

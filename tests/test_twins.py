@@ -504,7 +504,7 @@ def test_the_command_prints_writes_and_gates(
     assert links.targets <= links.ids
     code, _, err = harness("twins", "--model", "proxy-faulty", "--sample", "3", "--out", "faulty")
     assert code == 2
-    assert "has finished twins" in err
+    assert "already holds finished twins" in err
 
 
 def test_workers_change_nothing(harness: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:

@@ -5,9 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import AGAIN, Backend, Completion, Request
+from harness.backends.base import AGAIN, Backend, Completion, Request, same_model
 from harness.backends.cache import cached, default_file
-from harness.backends.cards import Card
+from harness.backends.cards import Card, own
 from harness.backends.registry import find, open_backend
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
@@ -86,12 +86,17 @@ class Replay:
                 )
             self._check(request, agent)
         if role not in self._models:
-            card = convert(agent["model"], Card, f"{shown}: its model")
+            stated = convert(agent["model"], Card, f"{shown}: its model")
+            card = own(
+                stated, (), f"{shown} holds no answer for {requests[0].id}",
+                "write one of that name, or make the run again",
+            )  # fmt: skip
             model = open_backend(card, dtype=manifest.dtype, batch_size=manifest.batch_size)
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":
-                stored = manifest.identity["helpers"][0]
-            if digest(model.identity()) != digest(stored):
+                helpers = manifest.identity.get("helpers")
+                stored = helpers[0] if isinstance(helpers, list) and helpers else {}
+            if not same_model(stored, model.identity()):
                 raise UserError(
                     f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} has "
                     "changed since that run; make the run again"
@@ -139,7 +144,7 @@ class Replay:
     def identity(self) -> dict[str, Any]:
         """Return the digest of the run's answers, with its model and identity."""
         return {
-            "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl"),
+            "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl", "rows"),
             "of": {"model": self._run.manifest.model, "identity": self._run.manifest.identity},
         }  # fmt: skip
 

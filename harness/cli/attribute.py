@@ -23,6 +23,8 @@ def command(
     condition: str | None = typer.Option(
         None, help="Condition to draw decision points from. Default: 6g, or the run's last if it has no 6g."
     ),
+    dataset: options.RunsDataset = None,
+    model: options.RunModel = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -38,7 +40,8 @@ def command(
 
     options.in_range("--sample", sample, 1, MOST)
     with bar("asking without", quiet=as_json or quiet) as progress:
-        stored = Stored(run, more=progress.more, done=progress)
+        own = options.cards(model)
+        stored = Stored(run, more=progress.more, done=progress, dataset=dataset, models=own)
         chosen = condition or (USUAL if USUAL in stored.points else stored.run.conditions[-1])
         found = attribute(stored, chosen, sample, sample_seed)
     made, file = rows(found), write(found, run)

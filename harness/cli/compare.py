@@ -34,7 +34,7 @@ def command(
     from harness.report.compare.difference import compare as compared
     from harness.report.compare.gate import gate, judge
     from harness.report.compare.pair import pair
-    from harness.report.page import save
+    from harness.report.page import refuse_less, save
     from harness.runs.unanswered import why
 
     if as_markdown and as_json:
@@ -56,6 +56,8 @@ def command(
     if html:
         from harness.report.compare import page
 
+        lacking = difference.prompts
+        refuse_less(html, {"prompts": lacking} if isinstance(lacking, str) else {}, "--html")
         save([page.render(difference, verdicts, show, page.beside(html))], html, "--html")
     if junit:
         save([text.junit(difference, verdicts)], junit, "--junit")

@@ -6,13 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option, echo
 
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import text_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from harness.backends.base import AnswerMode
+    from harness.backends.cards import Card
     from harness.coordination.operating_point import OperatingPoint
     from harness.core import parallel, shards
+    from harness.dataset.load import Dataset as Frozen  # Dataset is an option here
     from harness.evaluate.agent import ImageMode
 else:  # typer takes any text; what is evaluated says which are allowed
     AnswerMode = ImageMode = str
@@ -27,6 +30,14 @@ Model = Annotated[
     Option(
         help="Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file or "
         "a hub id."
+    ),
+]
+RunModel = Annotated[
+    list[str] | None,
+    Option(
+        "--model",
+        help="The run's model, where it is none of your cards: a checkpoint directory, a .gguf file or a hub "
+        "id. Nothing that only a run names is opened or asked. Repeatable, for several models.",
     ),
 ]
 Scenario = Annotated[str, Argument(help="Scenario name; `harness scenario list` shows them.")]
@@ -49,6 +60,13 @@ Prompt = Annotated[str, Option(help="Prompt version; `harness prompt list` shows
 ScenarioPrompt = Annotated[
     str | None,
     Option(help="Prompt version; `harness prompt list` shows them. Default: the scenario's usual one."),
+]
+RunsDataset = Annotated[
+    Path | None,
+    Option(
+        "--dataset",
+        help="Folder of the run's dataset, if it has moved. Default: where the run states, or by its name.",
+    ),
 ]
 Dataset = Annotated[str, Option(help="Name of a shipped dataset, or a dataset's folder.")]
 Conditions = Annotated[
@@ -224,6 +242,23 @@ def points(
     return tuple(dict.fromkeys(found))
 
 
+def cards(models: "Sequence[str] | None") -> "list[Card]":
+    """Cards of the models that a user names. Raises UserError if there is no such model."""
+    from harness.backends.cards import resolve
+
+    return [resolve(model) for model in models or ()]
+
+
+def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
+    """Say on stderr which of these have fewer episodes than --limit."""
+    for dataset in datasets:
+        if limit is not None and limit > (n := dataset.manifest.episodes):
+            echo(
+                f"--limit {limit}: {printable(dataset.name)} has {n} episodes, all of which are used",
+                err=True,
+            )
+
+
 def parse_seeds(text: str) -> tuple[int, ...]:
     """Seeds from `0:5` (0 to 4) or `3,7,9`."""
     start, colon, stop = text.partition(":")
@@ -255,17 +290,28 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     if name is not None:
         if env_config is not None:
             raise UserError("--env-config changes an environment; give --env as well")
-        return name
+        return typed(name)
     assert env is not None
+    typed(f"{environment.PREFIX}{env}")
     if env_config is None:
         return f"{environment.PREFIX}{env}"
     try:
-        changes = json.loads(env_config.read_bytes())
+        named = environment.named(env, json.loads(text_of(env_config, "settings")))
+        named.encode()  # JSON can write half a character, which no file can hold
+        return named
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a JSON file"
         ) from None
-    return environment.named(env, changes)
+
+
+def typed(scenario: str) -> str:
+    """Return a scenario's name that the user typed, which may thus import an environment's module."""
+    from harness.world.environments import environment
+
+    if scenario.startswith(environment.PREFIX):
+        environment.allow(scenario)
+    return scenario
 
 
 def workers_of(text: str) -> "parallel.Workers":

@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import console, echo_json, table
+from harness.cli.estimates import console, echo_json, echo_wrong, table
 from harness.cli.progress import bar
+from harness.core import resources
 from harness.core.errors import UserError, printable
 from harness.core.figures import as_mapping, interval, shown
 from harness.core.seeds import FIRST, purpose, stated
@@ -23,12 +24,19 @@ def list_scenarios(as_json: options.Json = False) -> None:
     """List the scenarios, each with a summary."""
     from harness.world import scenarios
 
-    rows = [{"name": name, "summary": scenarios.get(name).summary} for name in scenarios.names()]
+    found = resources.each(scenarios.names(), scenarios.get)
     if as_json:
-        echo_json(rows)
+        echo_json([
+            {"name": name, "error": str(each)} if isinstance(each, UserError)
+            else {"name": name, "summary": each.summary}
+            for name, each in found.items()
+        ])  # fmt: skip
         return
-    for row in rows:
-        typer.echo(f"{row['name']}: {row['summary']}")
+    for name, each in found.items():
+        if isinstance(each, UserError):
+            echo_wrong(name, each)
+        else:
+            typer.echo(f"{name}: {each.summary}")
 
 
 @app.command()
@@ -37,7 +45,7 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
     from harness.cli.docstrings import echo_fields
     from harness.world import scenarios
 
-    scenario = scenarios.get(name)
+    scenario = scenarios.get(options.typed(name))
     description, actions = scenario.description, scenario.actions
     if as_json:
         from harness.prompts.answer_schema import ROLES, answer_schema
@@ -112,7 +120,7 @@ def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episod
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios
 
-    scenario = scenarios.get(name)
+    scenario = scenarios.get(options.typed(name))
     options.in_range(counted, episodes, 1, LAST_EPISODE + 1)
     options.in_range("--seed", seed, 0, LAST_SEED)
     purpose(seed, episodes)

@@ -30,6 +30,7 @@ def learn(
     out: Path = typer.Option(
         ..., help="File to write; schedules/NAME.toml makes it usable as schedule NAME."
     ),
+    model: options.RunModel = None,
     quiet: options.Quiet = False,
 ) -> None:
     """Learn a schedule: what asking a helper is worth.
@@ -46,10 +47,12 @@ def learn(
         raise UserError(
             f"--out {printable(out)} is there already; give a new name, since runs name schedules"
         )
-    point = named_point(condition)
+    point, own = named_point(condition), options.cards(model)
     command = shlex.join(["harness", *sys.argv[1:]])
     with bar("learning", ROUNDS, quiet=quiet) as progress:
-        train, others = ([Stored(run, None, progress.more, progress) for run in of] for of in (runs, tune))
+        train, others = (
+            [Stored(run, None, progress.more, progress, models=own) for run in of] for of in (runs, tune)
+        )
         progress.more(sum(each.dataset.scenario.parameters.decisions for each in (*train, *others)))
         made = run_learn(train, others, point, out, command, progress)
     if not quiet:
@@ -76,6 +79,7 @@ def compare(
     latency: str = typer.Option(
         "run", help="Inference time of one answer: run (as in the run) or paper (145 ms)."
     ),
+    model: options.RunModel = None,
     out: Path | None = typer.Option(
         None, help="Folder to write. Default: RUN/schedules, in the first run's folder."
     ),
@@ -90,13 +94,14 @@ def compare(
     answers.
     """
     from harness.coordination.schedules import SCHEDULES
+    from harness.studies.folder import refuse_other
     from harness.studies.learning import layouts
     from harness.studies.schedules import compare as compared_on
     from harness.studies.stored import Stored
     from harness.studies.sweep import point_of
 
     extras.need("harness schedule compare", "matplotlib")
-    names = list(dict.fromkeys(schedule or SCHEDULES))
+    names = list(dict.fromkeys(schedule or SCHEDULES.usable()))
     for name in names:
         if name not in SCHEDULES:
             raise unknown("--schedule", name, SCHEDULES)
@@ -110,10 +115,16 @@ def compare(
         )
     silent = as_json or quiet
     with bar("schedules", quiet=silent) as progress:
-        stored = [Stored(run, latency, progress.more, progress) for run in (*runs, *tune)]
+        own = options.cards(model)
+        stored = [Stored(run, latency, progress.more, progress, models=own) for run in (*runs, *tune)]
         for other in stored[len(runs) :]:
             layouts(other, "tune")
         draws = options.parse_seeds(seeds) if seeds else stored[0].seeds
+        where = out or runs[0] / "schedules"
+        refuse_other(where, "schedule", {
+            "sources": [each.manifest() for each in stored], "condition": condition, "schedules": names,
+            "budget": budget, "seeds": list(draws),
+        })  # fmt: skip
         steps = sum(each.dataset.scenario.parameters.decisions for each in stored)
         progress.more(steps + len(runs) * len(names))
         apart: list[Stored | None] = [*stored[len(runs) :]] if tune else [None] * len(runs)
@@ -125,7 +136,6 @@ def compare(
             each.settle()
     from harness.studies.schedule_page import in_sentences, said, tables, write_schedules
 
-    where = out or runs[0] / "schedules"
     page = write_schedules(found, [each.manifest() for each in stored], draws, where)
     if as_json:
         typer.echo(tables(found)["schedules"].to_json(orient="records"))

@@ -37,6 +37,7 @@ def command(
     latency: str = typer.Option(
         "run", help="Inference time of one answer: run (as in the run) or paper (145 ms)."
     ),
+    model: options.RunModel = None,
     no_model: bool = typer.Option(
         False,
         "--no-model",
@@ -45,6 +46,7 @@ def command(
     proxy: bool = typer.Option(
         False, "--proxy", help="Also draw the calibrated proxy, which plays the paper's study."
     ),
+    dataset: options.RunsDataset = None,
     out: Path | None = typer.Option(
         None, help="Folder to write. Default: RUN/sweep-AXES, in the first run's folder."
     ),
@@ -74,7 +76,8 @@ def command(
     grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]
     conditions, silent = list(dict.fromkeys(condition)), as_json or quiet
     with bar("grid points", quiet=silent) as progress:
-        stored = [Stored(run, latency, progress.more, progress, not no_model) for run in runs]
+        own = options.cards(model)
+        stored = [Stored(run, latency, progress.more, progress, not no_model, dataset, own) for run in runs]
         panels = {
             axis.name: settings(stored, axis, values, conditions)
             for axis, values in zip(axes, grids, strict=True)

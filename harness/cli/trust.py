@@ -22,10 +22,14 @@ HEADS = ("rule", "price in peace", "mean of attacks %", "worst attack", "there %
 
 def command(
     run: Path | None = typer.Argument(
-        None, help="Folder of a finished run of `harness eval`. Give this or --model.", metavar="[RUN]"
+        None,
+        help="Folder of a finished run of `harness eval`. Give this or --model.",
+        metavar="[RUN]",
     ),
     model: str | None = typer.Option(
-        None, help="Model to evaluate first, on the default dataset, instead of RUN."
+        None,
+        help="Model to evaluate first, on the default dataset, instead of RUN. With RUN: the run's model, "
+        "where it is none of your cards.",
     ),
     prompt: options.ScenarioPrompt = None,
     attacks: str = typer.Option(
@@ -76,17 +80,18 @@ def command(
 
     chosen = names_of("--attacks", attacks, USUAL, tuple(ATTACKS))
     ways, parts = names_of("--rules", rules, (*RULES, CAPPED), tuple(RULES)), shares_of(share)
-    if (run is None) == (model is None) or (run and prompt):
+    if (run is None and model is None) or (run and prompt):
         raise UserError("give either RUN, the folder of a finished run, or --model, with its --prompt")
     with bar("rules under attack", quiet=as_json or quiet) as progress:
-        if model is not None:
+        if run is None:
+            assert model is not None
             spec = _spec(model, prompt, condition, seeds)
             name = f"trust-{file_name(model)}-{spec.ego.prompt.version}-{spec.source.name}"
             out = out or Path("reports") / name
             cache = default_file()
             run = read_or_evaluate(spec, out / "run", progress, cache, progress.more, open_backend).path
-        assert run is not None
-        stored = Stored(run, more=progress.more, done=progress, asks=not no_model)
+        own = options.cards([model] if model else None)
+        stored = Stored(run, more=progress.more, done=progress, asks=not no_model, models=own)
         draws = options.parse_seeds(seeds) if seeds else stored.seeds
         where = out or run / "trust"
         bench = run_bench(stored, condition, ways, chosen, parts, draws, where, progress, progress.more)

@@ -17,7 +17,7 @@ from harness.core.figures import shown
 if TYPE_CHECKING:
     from harness.studies.twins.scoring import Row
 
-EPISODES = 12  # that are drawn where nothing is said
+EPISODES = 40  # that are drawn where nothing is said; with fewer, intervals near 90 % are too narrow
 HEADS = ("twin", "role", "holds", "invariant % [95 %]", "TV distance", "fail%", "n")
 
 
@@ -79,6 +79,7 @@ def command(
     example = "mirrored:invariance_rate < 0.9"
     gates = [gate(typed, scoring.METRICS, "TWIN", example) for typed in fail_if or ()]
     whole = load.load(load.find(dataset), None if sample else limit)
+    options.say_all(limit, [whole])
     if limit is None and sample is None:
         sample = min(EPISODES, len(whole.episodes))
     selection = Selection(limit, sample=sample, sample_seed=sample_seed)

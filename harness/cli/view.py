@@ -1,6 +1,7 @@
 """`harness view`: the runs in a folder, in a browser."""
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Thread
 
 import typer
@@ -13,7 +14,10 @@ def command(
     port: int = typer.Option(7654, help="Port on 127.0.0.1; 0 picks a free one."),
     open_browser: bool = typer.Option(False, "--open", help="Also open the page in the browser."),
 ) -> None:
-    """List, open and compare runs and studies in a browser. Only this machine is served, until Ctrl-C."""
+    """List, open and compare runs and studies in a browser.
+
+    Only this machine is served, and only whoever has the token in the printed address, until Ctrl-C.
+    """
     from harness.report.view.serve import serve
     from harness.runs.listing import runs
 
@@ -22,11 +26,22 @@ def command(
         if open_browser:
             import webbrowser
 
-            Thread(target=webbrowser.open, args=[url], daemon=True).start()
+            Thread(target=webbrowser.open, args=[_leading_to(url, Path(private))], daemon=True).start()
 
     options.in_range("--port", port, 0, 65535)
     runs(folder)  # says what is wrong with the folder
-    try:
-        serve(folder, port, listening)
-    except KeyboardInterrupt:
-        return
+    with TemporaryDirectory(prefix="harness-view-") as private:  # which only this user can read
+        try:
+            serve(folder, port, listening)
+        except KeyboardInterrupt:
+            return
+
+
+def _leading_to(url: str, folder: Path) -> str:
+    """Write a page that leads to a URL, and return its address.
+
+    A browser is given its address as an argument, which every user of the machine can see.
+    """
+    page = folder / "open.html"
+    page.write_text(f'<!doctype html><title>Runs</title><meta http-equiv="refresh" content="0; url={url}">')
+    return page.as_uri()

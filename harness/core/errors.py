@@ -52,5 +52,8 @@ def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserE
     names = sorted(known)
     nearest = get_close_matches(name, names, n=1)
     suggestion = f"; did you mean {nearest[0]!r}?" if nearest else ";"
+    # Of several names that begin so, the nearest is only the shortest.
+    if len(begin := [known for known in names if name and known.startswith(name)]) > 1:
+        suggestion = f"; did you mean one of {', '.join(begin)}?"
     listed = ", ".join(names) or "(none)"
     return UserError(f"unknown {kind} {printable(name)!r}{suggestion} known: {listed}{hint}")

@@ -51,7 +51,7 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
     shown, file = printable(out), out / WORK / CONFIG
     try:
         if file.is_file() and not idle(out):
-            return msgspec.json.decode(file.read_bytes(), type=kind)
+            return msgspec.json.decode(text_of(file, "record"), type=kind)
         others = out.is_dir() and any(path.name != WORK for path in out.iterdir())
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(

@@ -13,19 +13,19 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from harness.backends.base import Backend
+from harness.backends.base import Backend, Served, same_model
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
 from harness.core.errors import Unanswered, UserError
-from harness.core.files import digest, write_whole
+from harness.core.files import write_whole
 from harness.core.formats import FORMAT, WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
-from harness.evaluate import device, timing
+from harness.evaluate import device, servers, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker, read_kept
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
@@ -40,9 +40,11 @@ from harness.evaluate.lifecycle import (
     refuse_finished,
     unfinished,
 )
+from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import of_all_seeds, table, walk
 from harness.runs import folder
+from harness.runs import sources as kept_sources
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Manifest
@@ -103,10 +105,11 @@ def evaluate(
         return _frozen(
             spec, spec.source, out, begun, progress, cache, more, opens or open_backend, given, workers
         )
+    made_of = sources(spec)
     begun, chunks = _begin_driving(spec, out, begun, workers)
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, chunks, place, progress, cache, workers)
-        return _gather(out, as_finished(spec, begun), chunks, place)
+        return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
 
 def evaluate_shard(
@@ -130,11 +133,13 @@ def evaluate_shard(
         UserError: as in `evaluate`, or the latency is to be measured.
     """
     refuse_finished(out)
+    made_of = sources(spec)
     begun, chunks = _begin_driving(spec, out, unfinished(spec, out, str(shard)), workers, str(shard))
     own_chunks = shard.part(chunks)
     more(sum(map(len, own_chunks)))
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, own_chunks, place, progress, None, workers)
+        kept_sources.write(place, made_of, place)
         parts = [place / _folder_name(chunk) for chunk in own_chunks]
         _settle(parts, chain.from_iterable(map(folder.facts_of, parts)))
     return sum(map(len, own_chunks))
@@ -162,7 +167,7 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)
         try:
-            return _gather(out, whole, chunks, place)
+            return _gather(out, whole, chunks, place, kept_sources.read(folders[0] / WORK), folders)
         except Unanswered as error:
             raise UserError(f"{error}; type the commands of the shards again, and merge then") from None
 
@@ -172,6 +177,8 @@ def _walk(
 ) -> dict[str, bytes]:
     """Walk a chunk's episodes to their ends and return the files of this part of the run, by name.
 
+    Which servers gave answers that are not kept yet is one of them; it is no part of the run's tables.
+
     Frozen scenes are walked for some seeds at a time: the decisions of all would not fit into memory.
     `asker_of` returns the asker of the n-th of these walks, which is given the answers so far.
     """
@@ -180,19 +187,23 @@ def _walk(
         at_once = max(1, WALKS_AT_ONCE // (len(chunk) * len(spec.points)))
     answers: Mapping[str, Answer] = {}
     tables, episodes, viewers = list[Decisions](), list[Episode](), dict[str, Sequence[str]]()
+    served = list[Served]()
     for n, seeds in enumerate(_split(spec.seeds, at_once)):
         world, asker = _world_of(spec, chunk, seeds), asker_of(n, answers)
         decided = list(chain.from_iterable(walk(world, spec.points, asker)))
         viewers |= {scene.id: scene.viewers for part in decided for scene in part.moments}
-        answers, decisions = asker.answers, table(decided, world.columns(), spec.actions)
+        served += asker.served
+        answers, more = asker.answers, world.columns()
         if spec.device_profile:
-            joules = device.energy(
-                spec.device_profile, asker.latency, spec.points, decisions, answers.values()
-            )
+            more = {**more, "helpers_j": device.decided_helpers_j(asker.latency, decided, answers)}
+        decisions = table(decided, more, spec.actions)
+        if spec.device_profile:
+            joules = device.energy(spec.device_profile, asker.latency, spec.points, decisions, answers)
             decisions = decisions.replace(**joules)
         tables.append(decisions.rounded())
         episodes += world.episodes()
-    return folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values(), viewers)
+    files = folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values(), viewers)
+    return {**files, servers.FILE: servers.lines(served)} if served else files
 
 
 def _frozen(
@@ -202,6 +213,7 @@ def _frozen(
 ) -> Evaluated:  # fmt: skip
     dataset = source.dataset
     options = {"device": spec.device, "dtype": spec.dtype, "batch_size": spec.batch_size}
+    made_of = sources(spec)
     models = open_each(spec.cards, partial(opens, **options))
     identity = together(spec.cards, models).identity()
     latency = _latency(spec, begun, models, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
@@ -240,7 +252,7 @@ def _frozen(
                 report_kept(chunk)
         walk_chunk = partial(_walk_chunk, spec, begun, None, None) if in_workers else walk_here
         each(walk_chunk, todo, workers if in_workers else 1, keep, _label)
-        return _gather(out, as_finished(spec, begun), chunks, place)
+        return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
 
 def _begin_driving(
@@ -318,6 +330,7 @@ def _drive(
     progress(sum(map(len, chunks)) - sum(map(len, todo)))
 
     def keep(index: int, files: dict[str, bytes]) -> None:
+        servers.keep(place, files.pop(servers.FILE, b""))
         folder.write_part(place / _folder_name(todo[index]), files)
         _answered_file(place, todo[index]).unlink(missing_ok=True)
         progress(len(todo[index]))
@@ -341,7 +354,7 @@ def _walk_chunk(
 
     def backend() -> Backend:
         combined = together(spec.cards, _open_all(spec), cache)
-        if digest(combined.identity()) != digest(begun.identity):
+        if not same_model(begun.identity, combined.identity()):
             raise UserError(
                 f"a worker opens {another_model(spec)} than this run began with; give it the same"
             )
@@ -361,8 +374,20 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
     return LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, seeds, spec.ego_alone)
 
 
-def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
-    """Score the chunks in a working folder and write the files of the finished run."""
+def _gather(
+    out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes],
+    others: Sequence[Path] = (),
+) -> Evaluated:  # fmt: skip
+    """Score the chunks in a working folder and write the files of the finished run, with its sources.
+
+    Args:
+        out: the run's folder.
+        begun: what the work began with.
+        chunks: the episodes of each part.
+        place: the working folder.
+        made_of: the run's sources, by name.
+        others: folders that the run is merged from.
+    """
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
 
@@ -394,6 +419,8 @@ def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Pat
             "retries": sum(answer.retries for answer in answers),
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
+        kept_sources.write(out, made_of, place)
+        servers.write(out, [place, *(other / WORK for other in others)])
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)

@@ -20,7 +20,7 @@ from typing import Any
 from markupsafe import Markup
 
 from harness.core.errors import UserError
-from harness.core.files import sha256_bytes
+from harness.core.files import sha256_bytes, text_of
 
 # In the order in which they need each other.
 SCRIPTS = (
@@ -52,7 +52,7 @@ def vega() -> str:
 @cache
 def script() -> Markup:
     """The page's own script."""
-    parts = "\n".join((FOLDER / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS)
+    parts = "\n".join(text_of(FOLDER / f"{name}.js") for name in SCRIPTS)
     return Markup(f'"use strict";\n(() => {{\n{parts}}})();\n')
 
 

@@ -23,6 +23,7 @@ from harness.backends.transformers import engine as transformers_engine
 from harness.backends.weights import find_checkpoint
 from harness.core.arrays import Floats
 from harness.core.errors import Unanswered, printable
+from harness.core.files import text_of
 from harness.parsing.parse import parse
 from harness.training.gguf_export import export, projector_of
 
@@ -91,7 +92,7 @@ def compare(
         UserError: weights that are not there or do not load; a checkpoint that no GGUF can hold.
     """
     where = find_checkpoint(reference)
-    config = json.loads((where / "config.json").read_bytes())
+    config = json.loads(text_of(where / "config.json", "record"))
     rows = int(config.get("text_config", config)["vocab_size"])  # padding included
     most_logit = SEEN if reference.vision else MOST_LOGIT
     plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")

@@ -35,7 +35,7 @@ def address(small, tmp_path_factory):
     command = [sys.executable, "-m", "harness", "view", str(folder), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
-            yield process.stdout.readline().split()[0]
+            yield process.stdout.readline().split()[0]  # with its token, as whoever ran it copies it
         finally:
             process.kill()
 
@@ -83,7 +83,8 @@ def test_the_list_fits_a_telephone_and_is_read_aloud(page, address, scheme):
 
 
 def test_a_report_works_in_its_sandbox(page, address):
-    page.goto(f"{address}run?path=first")
+    page.goto(address)
+    page.get_by_role("link", name="first").click()
     wait(page)
     assert page.evaluate("self.origin") == "null"
     with page.expect_download() as saved:
@@ -97,9 +98,44 @@ def test_a_report_works_in_its_sandbox(page, address):
     expect(said).to_have_text(re.compile(r"^[1-9]\d* of "))
 
 
+def test_links_lead_out_of_a_sandbox_and_the_token_stays_out_of_addresses(page, address):
+    """A page in a sandbox is another site to its own server."""
+    page.goto(address)
+    list_of_runs = address.partition("?")[0]
+    assert page.url == list_of_runs
+    page.get_by_role("link", name="first").click()
+    wait(page)
+    page.get_by_role("link", name="All runs").focus()
+    page.keyboard.press("Enter")
+    page.wait_for_url(list_of_runs)
+    assert page.locator("tbody th").count() == 3
+    page.reload()
+    assert page.locator("tbody th").count() == 3
+    page.goto(f"{list_of_runs}compare?path=first&path=second")
+    link = page.locator("a[href*='#scene=']").first
+    link.click()
+    page.wait_for_url("**/run?path=*#scene=*")
+    page.go_back()
+    assert page.locator("h1").inner_text() == "B compared with A"
+
+
+def test_the_token_is_needed_and_a_file_may_lead_to_it(browser, address, tmp_path):
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(address.partition("?")[0])
+    assert "with its token" in page.locator("main").inner_text()
+    # The page that --open leads a browser to, from a file.
+    (tmp_path / "open.html").write_text(f'<meta http-equiv="refresh" content="0; url={address}">')
+    page.goto((tmp_path / "open.html").as_uri())
+    page.wait_for_url(address.partition("?")[0])
+    assert page.locator("tbody th").count() == 3
+    context.close()
+
+
 def test_a_page_that_spies_reads_nothing_else(browser, address):
     page = browser.new_page()
-    page.goto(f"{address}run?path=spy")
+    page.goto(address)
+    page.get_by_role("link", name="spy").click()
     page.wait_for_function("document.title != 'not told'")
     assert page.title() == "refused at null"
     page.close()

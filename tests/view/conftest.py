@@ -5,12 +5,13 @@ import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
 from starlette.testclient import TestClient
-from viewing import SECRET, configure
+from viewing import SECRET, TOKEN, configure
 
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
 from harness.report.page import write_report
 from harness.report.runs import gather
+from harness.report.view.access import cookie
 from harness.report.view.app import app
 
 
@@ -42,4 +43,8 @@ def reports(made: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def browser(reports: Path) -> TestClient:
-    return TestClient(app(reports), base_url="http://127.0.0.1:7654", raise_server_exceptions=False)
+    """Who has opened the address that `harness view` printed."""
+    return TestClient(
+        app(reports, TOKEN), base_url="http://127.0.0.1:7654", raise_server_exceptions=False,
+        cookies={cookie(7654): TOKEN},
+    )  # fmt: skip

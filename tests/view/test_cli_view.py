@@ -3,6 +3,7 @@
 import re
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import threading
@@ -14,6 +15,8 @@ from pathlib import Path
 import httpx
 import pytest
 import uvicorn
+
+from harness.report.view.access import cookie
 
 Said = tuple[int, str, str]
 LISTENS = "0A"  # of /proc/net/tcp
@@ -42,27 +45,30 @@ def test_the_command_serves_on_loopback_alone_until_it_is_interrupted(
     served: tuple["subprocess.Popen[str]", str],
 ) -> None:
     process, line = served
-    found = re.fullmatch(r"(http://127\.0\.0\.1:(\d+)/) shows them until Ctrl-C\n", line)
+    found = re.fullmatch(r"(http://127\.0\.0\.1:(\d+)/\?token=([\w-]{43})) shows them until Ctrl-C\n", line)
     assert found, line
-    port = int(found[2])
-    page = httpx.get(found[1], timeout=60)
+    port, owner = int(found[2]), f"Cookie: {cookie(int(found[2]))}={found[3]}\r\n"
+    page = httpx.get(found[1], timeout=60, follow_redirects=True)
     assert page.status_code == 200
+    assert str(page.url) == f"http://127.0.0.1:{port}/"
     assert "tag of first" in page.text
     assert "server" not in page.headers
+    assert httpx.get(page.url, timeout=60).status_code == 403
     for path in (
         "/../secret/secret.txt",
         "/%2e%2e/secret/secret.txt",
         "/run?path=../secret",
         "/run?path=%00",
     ):
-        answer = raw(port, f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+        answer = raw(port, f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n{owner}")
         assert answer.startswith(b"HTTP/1.1 404")
+        assert raw(port, f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n").startswith(b"HTTP/1.1 403")
     assert raw(port, "GET / HTTP/1.1\r\nHost: evil.example\r\n").startswith(b"HTTP/1.1 400")
     # 4 MiB of path, a request cut short and no HTTP at all end no server.
     for sent in (b"GET /" + b"x" * (1 << 22), b"GET / HTT", b"\x16\x03\x01\x00"):
         with socket.create_connection(("127.0.0.1", port)) as cut, suppress(ConnectionError):
             cut.sendall(sent)
-    assert httpx.get(found[1], timeout=60).status_code == 200
+    assert httpx.get(found[1], timeout=60, follow_redirects=True).status_code == 200
     if Path("/proc/net/tcp").is_file():
         assert listeners(port) == [f"0100007F:{port:04X}"]
     process.send_signal(signal.SIGINT)
@@ -110,18 +116,31 @@ def test_it_opens_the_browser_when_asked_to(
 ) -> None:
     Path("reports").mkdir()
     opened: list[str] = []
+    modes: list[int] = []
+    asks_to_open: list[bool] = []
     shown = threading.Event()
 
     def interrupted(self: uvicorn.Server, sockets: list[socket.socket]) -> None:
         [listener] = sockets
         assert listener.getsockname()[0] == "127.0.0.1"
+        if asks_to_open:
+            assert shown.wait(10)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(uvicorn.Server, "run", interrupted)
-    monkeypatch.setattr(webbrowser, "open", lambda url: (opened.append(url), shown.set()))
+
+    def opens(url: str) -> None:
+        page = Path(url.removeprefix("file://"))
+        modes.append(stat.S_IMODE(page.parent.stat().st_mode))
+        opened.append(page.read_text())
+        shown.set()
+
+    monkeypatch.setattr(webbrowser, "open", opens)
     code, out, err = harness("view", "--port", "0")
     assert (code, err, opened) == (0, "", [])
+    asks_to_open.append(True)
     code, out, err = harness("view", "--port", "0", "--open")
-    assert shown.wait(10)
     assert (code, err) == (0, "")
-    assert out.startswith(opened[0])
+    # The address of a page, whose folder no other user can read: all users see a browser's arguments.
+    assert f'content="0; url={out.split()[0]}"' in opened[0]
+    assert modes == [0o700]

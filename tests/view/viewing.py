@@ -9,6 +9,7 @@ from pathlib import Path
 
 from httpx import Response
 
+TOKEN = "a-token-of-these-tests"
 SECRET = "what lies outside, or is hidden"
 
 

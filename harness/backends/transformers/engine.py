@@ -1,5 +1,6 @@
 """The Hugging Face transformers engine: any causal language model, on CPU or CUDA."""
 
+import json
 from collections.abc import Sequence
 from functools import cached_property
 from importlib.metadata import version
@@ -47,15 +48,16 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
     held_to_digest(card, where / "model.safetensors")
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
+    _refuse_kernels(card, where)
     # trust_remote_code=False: otherwise a checkpoint with its own code asks at the terminal.
     options = {"local_files_only": True, "trust_remote_code": False}
     try:
         with catch_warnings():
-            simplefilter("ignore")  # torch warns about a pickle, whose errors are reported below
+            simplefilter("ignore")  # what is wrong is reported below
             tokenizer = transformers.AutoTokenizer.from_pretrained(where, **options)
             kind = "AutoModelForImageTextToText" if card.vision else "AutoModelForCausalLM"
             model, report = getattr(transformers, kind).from_pretrained(
-                where, dtype=dtype, output_loading_info=True, **options
+                where, dtype=dtype, output_loading_info=True, use_safetensors=True, **options
             )
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
         reason = printable(" ".join(str(error).split()), 200)
@@ -88,6 +90,29 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
             "or put a chat_template.jinja beside its config.json"
         )
     return tokenizer, model
+
+
+def _refuse_kernels(card: Card, where: Path) -> None:
+    """Raise UserError if a checkpoint's config names a repository for its attention.
+
+    Where the package `kernels` is installed, transformers fetches that repository and runs its code.
+    """
+    try:
+        rest: list[Any] = [json.loads((where / "config.json").read_bytes())]
+    except (OSError, ValueError, RecursionError):
+        return  # transformers says what is wrong
+    while rest:
+        value = rest.pop()
+        if isinstance(value, list):
+            rest += value
+        elif isinstance(value, dict):
+            rest += value.values()
+            for key in ("attn_implementation", "_attn_implementation"):
+                if "/" in str(value.get(key, "")):
+                    raise UserError(
+                        f"model {printable(card.name)!r} in {printable(where)}: {key} in its config.json "
+                        "names code of the hub, which is never run; take it out of the file"
+                    )
 
 
 def device_of(asked: str | None) -> str:
@@ -131,14 +156,18 @@ class TransformersEngine:
         self.card = card
         self.where = where
         self.eyes = Eyes(card.name, where, card.vision, tokenizer, model) if card.vision else None
-        self.chat = Chat(card.name, tokenizer, self.eyes.image_token if self.eyes else None)
+        self.chat = Chat(card.name, tokenizer, self.eyes.image_token if self.eyes else None, card.system)
         self.model = model
         self.context_tokens: int = (
             card.context_tokens or self.model.config.get_text_config().max_position_embeddings
         )
         listed = self.model.generation_config.eos_token_id or []
-        # A chat model's turn may end with a token that its generation config does not list.
-        ends = {*(listed if isinstance(listed, list) else [listed]), tokenizer.eos_token_id}
+        # A chat model's turn may end with a token that its generation config does not list: the template's.
+        ends = {
+            *(listed if isinstance(listed, list) else [listed]),
+            tokenizer.eos_token_id,
+            *self.chat.ends,
+        }
         self.stops: Sequence[int] = sorted(ends - {None})
         self._reader = Reader(self.model, self.eyes)
 
@@ -165,6 +194,7 @@ class TransformersEngine:
             "dtype": str(self.model.dtype).removeprefix("torch."),
             "device": str(self.model.device),
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
+            **({"system": self.chat.system} if self.chat.system else {}),
         }
 
     @cached_property

@@ -33,7 +33,7 @@ def terminal(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
 
 def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterator[str]:
     pair = comparison.pair
-    yield from (f"{name}: {side}" for name, side in words.sides(pair))
+    yield from (f"{name}: {side}" for name, side in words.sides(pair, whole=True))
     yield from words.caveats(pair)
     yield f"paired: {words.paired(pair)}"
     yield words.differing(comparison)

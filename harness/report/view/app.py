@@ -5,12 +5,13 @@ the files of its study; both are compared as text, so `..`, absolute and encoded
 then opened must lie in the folder itself (`folder.py`). What a run says it was made of, its
 prompt and its dataset, is read as by `harness report`: shown only if it has the digest that the run noted.
 
-Other sites get nothing: names other than this machine's are refused, which ends DNS rebinding, and no page
-may be framed, embedded or posted to. The list runs no script. A run's page is as untrusted as the run's
-author, so pages are kept apart from the list and from each other: `sandbox` gives them an origin of their
-own, from which they can read nothing here, and they may load nothing. Their inline scripts may run as far as
-their own policy lets them, and save files if they are clicked. Browsers show no page that is both in a
-sandbox and `same-origin` with its opener, so these are not.
+Nobody without the token gets anything (`access.py`), and other sites get nothing: names other than this
+machine's are refused, which ends DNS rebinding, and no page may be framed, embedded or posted to. The list
+runs no script. A run's page is as untrusted as the run's author, so pages are kept apart from the list and
+from each other: `sandbox` gives them an origin of their own, from which they can read nothing here, and they
+may load nothing. Their inline scripts may run as far as their own policy lets them, and save files if they
+are clicked. Browsers show no page that is both in a sandbox and `same-origin` with its opener, so these are
+not.
 """
 
 import asyncio
@@ -33,7 +34,9 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from harness.core.errors import UserError, printable
+from harness.core.files import bytes_of
 from harness.report.view import pages
+from harness.report.view.access import Access
 from harness.report.view.folder import PICTURES, own_file, pictures, whole
 from harness.runs.listing import Listed, runs
 from harness.runs.suite import contents_of
@@ -58,8 +61,8 @@ OF_RUNS = {  # in the place of those above, for what a run's folder holds
 WAY_BACK = '<p class="way-back"><a href="/">← All runs</a></p>'
 
 
-def app(folder: Path) -> ASGIApp:
-    """The application for one folder of runs."""
+def app(folder: Path, token: str) -> ASGIApp:
+    """The application for one folder of runs, for whoever has the token."""
     view = View(folder)
     routes = {
         "/": view.index, "/style.css": view.style, "/run": view.run, "/picture": view.picture,
@@ -68,7 +71,10 @@ def app(folder: Path) -> ASGIApp:
     return _Guarded(
         Starlette(
             routes=[Route(path, page, methods=["GET"]) for path, page in routes.items()],
-            middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False)],
+            middleware=[
+                Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False),
+                Middleware(Access, token=token),
+            ],
             exception_handlers={UserError: view.wrong, HTTPException: view.wrong, Exception: view.bug},
         )
     )
@@ -210,7 +216,7 @@ class View:
 
 
 def _shown(page: Path) -> Response:
-    return _with_way_back(page.read_text(encoding="utf-8", errors="replace"))
+    return _with_way_back(bytes_of(page, "rows").decode("utf-8", "replace"))
 
 
 def _with_way_back(page: str) -> Response:

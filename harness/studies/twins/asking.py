@@ -134,7 +134,9 @@ def ask(
             others.
     """
     if (out / RESULT).exists():
-        raise UserError(f"--out {printable(out)} has finished twins; choose another folder or delete it")
+        raise UserError(
+            f"--out {printable(out)} already holds finished twins; choose another folder or delete it"
+        )
     [identity] = spread(
         _identity, [study.spec], workers, lambda done: None, lambda of: f"the model {of.ego.card.name}", False
     )

@@ -5,8 +5,9 @@ changes as JSON. So the name alone is enough to create the same environment agai
 """
 
 import json
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -16,6 +17,8 @@ from harness.core.files import canonical_json
 from harness.world.road import Lane
 
 PREFIX, CHANGES = "env:", ":config="
+IMPORTS = "SWARMDRIVE_IMPORTS"  # environment variable: modules, with commas, that names may have imported
+OWN_PACKAGE = "highway_env"
 KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers and the planner use
 
 
@@ -42,6 +45,51 @@ def shown(name: str) -> str:
     return printable(name, 80)
 
 
+def allow(name: str) -> None:
+    """Let a name that the user typed import its module, in this process and in those that it starts.
+
+    A name from a file, such as a dataset's manifest or a run's, is never given to this function.
+    """
+    if module := _id_and_changes(name)[0].rpartition(":")[0]:
+        os.environ[IMPORTS] = ",".join([*_allowed(), module])
+
+
+def _allowed() -> list[str]:
+    return [module for text in os.environ.get(IMPORTS, "").split(",") if (module := text.strip())]
+
+
+def _id_and_changes(name: str) -> tuple[str, str]:
+    env_id, _, changes = split(name)[0].removeprefix(PREFIX).partition(CHANGES)
+    return env_id, changes
+
+
+def _only_allowed(name: str, env_id: str, changed: Mapping[str, Any]) -> None:
+    """Raise UserError if a name would import a module that is neither highway-env's nor allowed.
+
+    gymnasium imports what stands before the colon of an id; highway-env imports classes that its
+    configuration names by their path.
+    """
+    of_id = env_id.rpartition(":")[0]
+    paths = (text.rpartition(".")[0] for text in _texts(changed) if "." in text)
+    for module in filter(None, (of_id, *paths)):
+        if not any(f"{module}.".startswith(f"{known}.") for known in (OWN_PACKAGE, *_allowed())):
+            raise UserError(
+                f"{shown(name)} would import the module {printable(module, 40)}; if you trust it, set "
+                f"{IMPORTS}={printable(module.partition('.')[0], 40)} in your environment"
+            )
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Yield all texts among the values of a JSON value."""
+    rest = [value]
+    while rest:
+        value = rest.pop()
+        if isinstance(value, str):
+            yield value
+        elif isinstance(value, dict | list):
+            rest += value.values() if isinstance(value, dict) else value
+
+
 def reset(name: str, seed: int) -> Any:
     """Return an environment at the start of a seed's episode. Raises UserError if there is none."""
     env = _made(name)
@@ -62,6 +110,8 @@ def _made(name: str) -> Any:
     gymnasium.logger.min_level = gymnasium.logger.ERROR  # no warning of an old version: the user named it
     highway_env._register_highway_envs()
     env_id, _, changes = name.removeprefix(PREFIX).partition(CHANGES)
+    changed = _changed(name, changes or "{}")
+    _only_allowed(name, env_id, changed)
     if not re.search(r"-v\d+$", env_id):
         raise UserError(f"{shown(name)}: give its version too, as in merge-v0")
     _constants().restore()
@@ -81,7 +131,7 @@ def _made(name: str) -> Any:
             f"{shown(name)} is a {type(env).__name__}, no environment of highway-env; its class must be a "
             "subclass of highway_env's AbstractEnv"
         )
-    for key, value in _changed(name, changes or "{}").items():
+    for key, value in changed.items():
         if key not in env.config:
             raise unknown(f"config key of {shown(name)}", key, env.config)
         env.config[key] = _merged(env.config[key], value)
@@ -144,8 +194,20 @@ def numbered(env: Any, kind: Any, action: str) -> Any:
 
 
 def lane_of(v: Any) -> Lane:
-    """Return the lane that a vehicle steers for, in plain types (highway-env may use NumPy's)."""
-    begin, end, number = getattr(v, "target_lane_index", v.lane_index)
+    """Return the lane that a vehicle steers for, in plain types (highway-env may use NumPy's).
+
+    Raises:
+        UserError: it has none.
+    """
+    try:
+        begin, end, number = getattr(v, "target_lane_index", v.lane_index)
+    except TypeError:  # made without a road, its index is NaN
+        x_m, y_m = v.position
+        who = v.spawn.id if hasattr(v, "spawn") else "the ego"
+        raise UserError(
+            f"environment: {who}, a {type(v).__name__} at {x_m:.1f}, {y_m:.1f} m, has no lane; make every "
+            "vehicle with the road, and on one of its lanes"
+        ) from None
     return str(begin), str(end), int(number or 0)
 
 

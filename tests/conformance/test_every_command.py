@@ -1,0 +1,313 @@
+"""Every command on hostile copies of all that it takes: no server asked, no module imported, no secret told.
+
+Each command is run in a stranger's project, once as it is, and once for each hostile value of each of its
+parameters: runs, datasets, models, prompts, cards, traces, weights, answers of a server. A new command is
+covered if its parameters have names that other commands have; else `PLAIN` asks for one line.
+"""
+
+import importlib
+import json
+import pickle
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from evaluating import live_spec_of, spec_of
+from evaluating import run as evaluate
+from misbehaving import Asked, Server, completion, serving
+from starlette.testclient import TestClient
+
+from harness import cli
+from harness.coordination.operating_point import POINTS
+from harness.dataset.load import Dataset
+from harness.report.view import serve
+from harness.world.environments.environment import IMPORTS
+
+Said = tuple[int, str, str]
+SECRET = "sk-canary-0123456789"
+MODULE = "canary_module"
+ENV = f"env:{MODULE}:canary-v0"
+TRAFFIC = f'env:merge-v0:config={{"other_vehicles_type":"{MODULE}.Car"}}'
+IMPORTED = """
+import os, gymnasium
+from highway_env.envs import MergeEnv
+from highway_env.vehicle.behavior import IDMVehicle
+open(os.environ["CANARY_FILE"], "a").write("imported\\n")
+class Car(IDMVehicle): pass
+class Canary(MergeEnv): pass
+gymnasium.register("canary-v0", entry_point=Canary)
+"""
+CARD = """
+engine = "openai"
+description = "d"
+weights = "m"
+[server]
+base_url = "{url}"
+key_env = "{key}"
+retries = 0
+[latency]
+source = "paper"
+basis = "b"
+"""
+TEMPLATE = """{% include "../../secret.txt" ignore missing %}{{ self.__init__.__globals__ }}{{ environ }}
+{{ cycler.__init__.__globals__.os.environ }}{{ task }}"""
+TRACE = """description = "d"
+source = "s"
+status = "assumed"
+model = "trace"
+[parameters]
+file = "../../secret.txt"
+latency_s = 0.01
+"""
+
+
+def commands() -> Iterator[tuple[str, Any]]:
+    """Every command of the program with its words."""
+
+    def within(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
+        if subcommands := getattr(command, "commands", None):
+            for name, each in subcommands.items():
+                yield from within(each, (*words, name))
+        else:
+            yield " ".join(words), command
+
+    yield from within(cli._program(), ())
+
+
+class Trap:
+    """Code in a pickle."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return importlib.import_module, (MODULE,)
+
+
+class Strangers:
+    """A stranger's project, in the current folder, with something hostile of each kind in it."""
+
+    def __init__(self, asked: Server, mine: Server, base: Path) -> None:
+        shutil.copytree(base, ".", dirs_exist_ok=True)
+        Path("swarmdrive.toml").touch()
+        for kind in ("models", "channels", "prompts", "reports", "datasets"):
+            Path(kind).mkdir(exist_ok=True)
+        self._cards(asked.url, mine.url)
+        self._weights()
+        shutil.copytree(Path(__file__).parents[2] / "prompts/v2", "prompts/evil")
+        for file in Path("prompts/evil").glob("*.j2"):
+            file.write_text(TEMPLATE)
+        Path("channels/evil.toml").write_text(TRACE)
+        Path("evil.json").write_text(json.dumps({"other_vehicles_type": f"{MODULE}.Car"}))
+        Path("evil.csv").write_text("distance_m,reception\n1,0.5\n9,0.1\n")
+        Path("evil.txt").write_text(f'{{"import": "{MODULE}"}} {{{{ environ }}}} {asked.url}')
+        self._datasets()
+        self._runs(asked.url)
+
+    def _cards(self, theirs: str, mine: str) -> None:
+        Path("models/evil.toml").write_text(CARD.format(url=theirs, key="CANARY_SECRET"))
+        # A server that the user trusts with a key, and which sends every request elsewhere.
+        Path("models/mine.toml").write_text(CARD.format(url=mine, key="OPENAI_API_KEY"))
+
+    def _weights(self) -> None:
+        folder = Path("models/evil-weights")
+        folder.mkdir()
+        own = {"auto_map": {"AutoConfig": f"{MODULE}.C", "AutoModelForCausalLM": f"{MODULE}.M"}}
+        for name in ("config.json", "tokenizer.json", "tokenizer_config.json"):
+            (folder / name).write_text(json.dumps({"model_type": "own", **own}))
+        (folder / "pytorch_model.bin").write_bytes(pickle.dumps(Trap()))
+
+    def _datasets(self) -> None:
+        for name, scenario in (("module", ENV), ("traffic", TRAFFIC)):
+            shutil.copytree("base/dataset", f"datasets/{name}")
+            change(Path(f"datasets/{name}/manifest.json"), scenario=scenario)
+
+    def _runs(self, url: str) -> None:
+        run, driven = Path("base/run"), Path("base/driven")
+        stated = json.loads((run / "run.json").read_text())
+        served = {
+            "base_url": url,
+            "kind": "generic",
+            "key_env": "CANARY_SECRET",
+            "timeout_s": 9.0,
+            "retries": 0,
+        }
+        # The identity is what the canary server would state of itself.
+        identity = {"engine": "openai", "server": "generic", "base_url": url, "model": "m", "listed": {}}
+        asks = {**stated["model"], "engine": "openai", "weights": "m", "server": served}
+        loads = {
+            **stated["model"],
+            "engine": "transformers",
+            "weights": str(Path("models/evil-weights").absolute()),
+        }
+        folders = {
+            "served": {"model": {**asks, "name": "theirs"}, "identity": identity},
+            "posing": {"model": {**asks, "name": "proxy"}, "identity": identity},
+            "weights": {"model": {**loads, "name": "theirs"}},
+            "moved": {"world": {**stated["world"], "path": str(Path("datasets/module").absolute())}},
+            "named": {"world": {**stated["world"], "path": "nowhere", "name": "traffic"}},
+        }
+        for name, changes in folders.items():
+            shutil.copytree(run, f"reports/{name}")
+            change(Path(f"reports/{name}/run.json"), **changes)
+        world = json.loads((driven / "run.json").read_text())["world"]
+        for name, scenario in (("driven", ENV), ("traffic", TRAFFIC)):
+            shutil.copytree(driven, f"reports/{name}")
+            stated_world = {**world, "scenario": {**world["scenario"], "name": scenario}}
+            change(Path(f"reports/{name}/run.json"), world=stated_world)
+
+
+RUNS = [f"reports/{name}" for name in ("served", "posing", "weights", "moved", "named", "driven", "traffic")]
+DATASETS = ["module", "datasets/traffic"]
+MODELS = ["evil", "mine", "models/evil-weights", "replay:reports/served", "replay:reports/weights"]
+# Hostile values of parameters by name, or by command and name.
+HOSTILE: dict[str, Sequence[str]] = {
+    "run": RUNS, "runs": RUNS, "a": RUNS, "b": RUNS, "folders": RUNS, "tune": RUNS, "folder": ["reports"],
+    "dataset": DATASETS, "model": MODELS, "helper_model": ["evil", "mine"], "prompt": ["evil"],
+    "helper_prompt": ["evil"], "version": ["evil"], "condition": ["evil"], "env_config": ["evil.json"],
+    "against": ["evil.csv"], "tokenizer": ["models/evil-weights"], "base": ["models/evil-weights"],
+    "file": ["evil.txt"], "names": ["evil"],
+    "channel show name": ["evil"], "channel check name": ["evil"], "model check name": ["evil", "mine"],
+    "model pull name": ["evil"], "prompt diff a": ["evil"], "prompt diff b": ["evil"],
+}  # fmt: skip
+# What a command needs, and what keeps it short; a folder that it writes is its own each time.
+PLAIN: dict[str, str] = {
+    "run": "reports/served", "runs": "reports/served", "a": "reports/served", "b": "base/run",
+    "folders": "reports/served", "tune": "reports/served", "folder": "reports", "dataset": "base/dataset",
+    "version": "v2", "file": "evil.txt", "episode": "0", "scenario": "occluded-intersection",
+    "names": "evil", "scene": "00000-0",
+    "prompt diff a": "v2", "prompt diff b": "v4", "init folder": "new", "dataset build name": "do-not-pass",
+    "scenario show name": "do-not-pass", "scenario check name": "do-not-pass",
+    "scenario audit name": "do-not-pass", "channel show name": "6g", "channel check name": "mode4",
+    "model check name": "proxy", "model pull name": "proxy", "device show name": "laptop-cpu",
+    "device check name": "laptop-cpu", "parity model": "models/evil-weights", "view port": "0",
+    "limit": "1", "episodes": "1", "sweep_episodes": "1", "seeds": "0,1", "workers": "1", "layouts": "100",
+    "sample": "2", "count": "1", "over": "consensus", "grid": "ego-prompt", "attacks": "jump",
+    "rules": "linear", "share": "1/3", "trust condition": "6g", "eval condition": "6g",
+    "drive condition": "6g", "twin": "mirrored", "schedule": "entropy", "samples": "1,1,1,1",
+    "prompts": "1", "window_s": "1",
+}  # fmt: skip
+FLAGS = {"env_config": ["--env", "merge-v0"], "dataset build env_config": ["--env", "merge-v0"]}
+
+
+def change(file: Path, **values: Any) -> None:
+    file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
+
+
+def typed(words: str, command: Any) -> Iterator[list[str]]:
+    """What is typed: the command as it is, then once for each hostile value of each parameter."""
+    parameters = [p for p in command.params if p.name not in ("help", "as_json", "quiet")]
+
+    def value(table: Mapping[str, Any], name: str) -> Any:
+        return table.get(f"{words} {name}", table.get(name))
+
+    def line(changed: str = "", to: str = "") -> list[str]:
+        arguments, options = [], []
+        for p in parameters:
+            given = to if p.name == changed else value(PLAIN, p.name)
+            if p.name == "out":
+                given = "written" + (".toml" if words == "schedule learn" else "")
+            needed = p.required or p.name == changed or p.name not in HOSTILE
+            if given is None or not needed:
+                if p.required:
+                    pytest.fail(
+                        f"`harness {words}` needs {p.name}: say in PLAIN what, in HOSTILE what is hostile"
+                    )
+                continue
+            if p.param_type_name == "argument":
+                arguments.append(given)
+            else:
+                options += [p.opts[0], given]
+        if changed == "env_config":
+            options += ["--env", "merge-v0"]
+            arguments = []
+        return [*words.split(), *arguments, *options]
+
+    yield line()
+    for p in parameters:
+        for hostile in value(HOSTILE, p.name) or ():
+            yield line(p.name, hostile)
+
+
+@pytest.fixture(scope="module")
+def base(small: Dataset, small_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset, a frozen run and a driven one, from which the hostile ones are made."""
+    folder = tmp_path_factory.mktemp("strangers")
+    shutil.copytree(small_path, folder / "base/dataset")
+    points = (POINTS["single-local"], POINTS["6g"])
+    evaluate(spec_of(small, "proxy", limit=1, points=points), folder / "base/run")
+    evaluate(live_spec_of(episodes=1, points=points), folder / "base/driven")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def theirs() -> Iterator[Server]:
+    """The stranger's server, which nobody may ask: it would answer."""
+    with serving(lambda asked: asked.reply(completion("{}")), listed) as server:
+        yield server
+
+
+def listed(asked: Asked) -> None:
+    asked.handler.server.asked.append(asked)  # type: ignore[attr-defined]
+    asked.reply({"data": [{"id": "m"}]})
+
+
+@pytest.fixture(scope="module")
+def mine(theirs: Server) -> Iterator[Server]:
+    """A server of the user's own, which sends every question to the stranger's."""
+
+    def elsewhere(asked: Asked) -> None:
+        asked.reply({"next": theirs.url}, 307, location=f"{theirs.url}/chat/completions")
+
+    with serving(elsewhere, lambda asked: asked.reply({"data": [{"id": "m"}], "next": theirs.url})) as server:
+        yield server
+
+
+@pytest.mark.parametrize(("words", "command"), commands(), ids=[words for words, _ in commands()])
+def test_a_hostile_copy_causes_nothing(
+    words: str, command: Any, harness: Callable[..., Said], base: Path, theirs: Server, mine: Server,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    canary = tmp_path / "canary"
+    canary.mkdir()
+    (canary / f"{MODULE}.py").write_text(IMPORTED)
+    (tmp_path / "secret.txt").write_text(f"{SECRET},reception\n1,1\n")
+    project = tmp_path / "theirs" / "project"
+    project.mkdir(parents=True)
+    monkeypatch.chdir(project)
+    monkeypatch.syspath_prepend(canary)
+    monkeypatch.setenv("CANARY_FILE", str(canary / "imported"))
+    monkeypatch.setenv("CANARY_SECRET", SECRET)
+    monkeypatch.setenv("OPENAI_API_KEY", f"{SECRET}-of-models")
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.delenv(IMPORTS, raising=False)
+    monkeypatch.setattr(uvicorn.Server, "run", visited)
+    monkeypatch.setattr(serve.secrets, "token_urlsafe", lambda: "token")
+    Strangers(theirs, mine, base)
+    theirs.asked.clear()
+    for line in typed(words, command):
+        shutil.rmtree("written", ignore_errors=True)
+        code, out, err = harness(*line)
+        shown = f"harness {' '.join(line)}: {code} {err}"
+        assert theirs.asked == [], shown
+        assert MODULE not in sys.modules, shown
+        assert not (canary / "imported").exists(), shown
+        assert SECRET not in out + err, shown
+        assert "Traceback" not in err, shown
+        if Path("written").is_dir():
+            for file in Path("written").rglob("*"):
+                assert not file.is_file() or SECRET.encode() not in file.read_bytes(), (shown, file)
+    for asked in mine.asked:
+        assert asked.headers["Authorization"] == f"Bearer {SECRET}-of-models"
+
+
+def visited(self: uvicorn.Server, sockets: Any) -> None:
+    """The pages of `harness view` as a browser opens them, in place of a server."""
+    browser = TestClient(self.config.app, base_url="http://127.0.0.1:7654", raise_server_exceptions=False)
+    assert browser.get("/?token=token").status_code == 200
+    for run in RUNS:
+        name = run.removeprefix("reports/")
+        for page in ("run", "report", "compare"):
+            browser.get(f"/{page}", params={"path": [name, "served"][: 1 + (page == "compare")]})
