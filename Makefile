@@ -1,14 +1,14 @@
-# Everything installs into .venv, with the versions of requirements.lock.
+# Everything installs into .venv, with the versions of requirements.lock and the digests that stand there.
 PYTHON ?= python3
 BIN := .venv/bin
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
+INSTALL := $(PYTHON) requirements.py install
 # Half of the build of llama.cpp is tools that nothing here uses. Without GGML_NATIVE one wheel runs on any
 # x86-64 of the last ten years; SOURCE_DATE_EPOCH would take AVX2 from it as well.
 LLAMA_CPP := env -u SOURCE_DATE_EPOCH CMAKE_ARGS="-DMTMD_VIDEO=OFF -DGGML_NATIVE=OFF \
 	-DCMAKE_PROJECT_llama.cpp_INCLUDE=$(CURDIR)/llama-cpp.cmake"
 # pip keeps the wheels that it built, whatever they were built with: an older one may read no pictures.
-SEES := $(BIN)/python -c "import llama_cpp.mtmd_cpp" 2>/dev/null || $(LLAMA_CPP) $(INSTALL) \
-	--no-cache-dir --force-reinstall --no-deps llama-cpp-python
+SEES := $(BIN)/python -c "import llama_cpp.mtmd_cpp" 2>/dev/null || $(LLAMA_CPP) \
+	$(PYTHON) requirements.py rebuild llama-cpp-python $(BIN)/python
 
 .PHONY: eval test check light browser docs bench clean
 
@@ -62,27 +62,26 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(PYTHON) -m venv .venv
 
 .venv/base: .venv/bin/python pyproject.toml requirements.lock
-	$(INSTALL) --no-compile --editable .
+	$(INSTALL) base $(BIN)/python --no-compile
 	touch $@
 
 .venv/llama-cpp: .venv/base
-	$(LLAMA_CPP) $(INSTALL) --editable '.[llama-cpp]'
+	$(LLAMA_CPP) $(INSTALL) llama-cpp $(BIN)/python
 	$(SEES)
 	touch $@
 
 .venv/docs: .venv/bin/python pyproject.toml requirements.lock
-	$(INSTALL) --editable '.[docs]'
+	$(INSTALL) docs $(BIN)/python
 	touch $@
 
 .venv/dev: .venv/bin/python pyproject.toml requirements.lock
-	$(LLAMA_CPP) $(INSTALL) --editable '.[transformers,llama-cpp,dev]'
+	$(LLAMA_CPP) $(INSTALL) dev $(BIN)/python
 	$(SEES)
 	touch .venv/base .venv/llama-cpp .venv/docs $@
 
 .venv-light/test: pyproject.toml requirements.lock
 	$(PYTHON) -m venv .venv-light
-	.venv-light/bin/python -m pip install --quiet --disable-pip-version-check --no-compile \
-		--constraint requirements.lock --editable '.[test]'
+	$(INSTALL) test .venv-light/bin/python --no-compile
 	touch $@
 
 clean:

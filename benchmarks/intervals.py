@@ -6,7 +6,7 @@ is how alike the seeds, or the answers, of one episode are: their intraclass cor
 changes anything. `<` marks less than 94 %, `>` more than 96 %; with 2 000 runs a cell of exactly 95 % is
 measured within 1 point of it.
 
-    python benchmarks/intervals.py [--runs 2000] [--seed 0]
+    python benchmarks/intervals.py [--runs 2000] [--seed 0] [--twins]
 """
 
 import argparse
@@ -29,6 +29,7 @@ from harness.core.statistics import (
 from harness.runs.metrics import SUCCESS, difference, over_episodes, over_seeds
 
 EPISODES, SEEDS, ANSWERS = (20, 60, 240), 5, (3, 9)  # an episode has so many answers, at least and at most
+TWINS = (12, 24, 40)  # episodes of `harness twins`
 RATES = (0.54, 0.75, 0.9, 0.97, 0.99)
 PAIRS = ((0.54, 0.54), (0.54, 0.75), (0.75, 0.9), (0.9, 0.97), (0.97, 0.99), (0.97, 0.97))
 LOSSES = (0.012, 0.1, 0.5)
@@ -122,6 +123,17 @@ def answers(rate: float, alike: float) -> Kind:
     return draw
 
 
+def twins(rate: float, alike: float, pairs: int) -> Kind:
+    """The share of questions whose twin agrees, with so many of each episode: 6 of the ego, 18 of helpers."""
+
+    def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
+        of = np.repeat(np.arange(episodes), pairs)
+        for _ in range(runs):
+            yield rate_interval(outcomes(rng, rate, alike, episodes, pairs).T.ravel(), of), rate
+
+    return draw
+
+
 def seed_means(loss: float) -> Kind:
     """A success rate over seeds, of these very episodes: some hang on a message, which may be lost."""
 
@@ -168,6 +180,18 @@ def suite(families: Sequence[Kind]) -> Kind:
     return draw
 
 
+def twin_kinds() -> Iterator[tuple[str, str, Kind]]:
+    """What is measured of `harness twins`."""
+    for pairs in (6, 18):
+        for alike in (0.1, 0.3, 0.6):
+            for rate in (0.75, 0.9, 0.95):
+                yield (
+                    f"twins, {pairs} questions an episode, alike {alike}",
+                    f"{rate:.2f}",
+                    twins(rate, alike, pairs),
+                )
+
+
 def kinds() -> Iterator[tuple[str, str, Kind]]:
     """What is measured: its heading, its row, and how it is drawn."""
     for seeds, alike in ((1, 1.0), (SEEDS, 0.1), (SEEDS, 0.6), (SEEDS, 0.9)):
@@ -205,14 +229,16 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--runs", type=int, default=2000)
     arguments.add_argument("--seed", type=int, default=0)
+    arguments.add_argument("--twins", action="store_true", help="those of `harness twins` alone")
     given = arguments.parse_args()
     began, found, before = perf_counter(), list[Cell](), ""
-    for n, (heading, row, kind) in enumerate(kinds()):
+    of = TWINS if given.twins else EPISODES
+    for n, (heading, row, kind) in enumerate(twin_kinds() if given.twins else kinds()):
         if heading != before:
-            print(f"\n{heading:<52}" + "".join(f"{f'E = {e}':>9}" for e in EPISODES))
+            print(f"\n{heading:<52}" + "".join(f"{f'E = {e}':>9}" for e in of))
             before = heading
         print(f"{row:<52}", end="", flush=True)
-        for episodes in EPISODES:
+        for episodes in of:
             rng = np.random.default_rng((given.seed, n, episodes))
             drawn = list(kind(rng, given.runs, episodes))
             covered = 100 * float(np.mean([e.low - 1e-9 <= truth <= e.high + 1e-9 for e, truth in drawn]))

@@ -19,7 +19,7 @@ HEAD = """\
 # Commands
 
 Written by `python docs/reference.py` out of the program, which says the same with `--help`. Bad input is one
-line on stderr and exit code 2.
+line on stderr and exit code 2; all codes are in [a table](answers.md#exit-codes).
 """
 
 

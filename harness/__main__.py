@@ -1,3 +1,18 @@
-from harness.cli import main
+"""The program's entry point, which takes signals before it imports the command line."""
 
-main()
+from harness.core import process
+
+
+def main() -> None:
+    """Run the command that was typed."""
+    process.run(_program)
+
+
+def _program() -> None:
+    from harness import cli
+
+    cli.main()
+
+
+if __name__ == "__main__":
+    main()

@@ -74,6 +74,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        if not self.path.endswith("/chat/completions"):  # Ollama is asked so for what it says of a model
+            self.server.listed(Asked(self.path, dict(self.headers), body, -1, self))
+            return
         with self.server.lock:
             asked = Asked(self.path, dict(self.headers), body, len(self.server.asked), self)
             self.server.asked.append(asked)

@@ -266,3 +266,39 @@ def test_a_change_by_hand_is_read_again(run: Path) -> None:
     assert (read.decisions["latency_ms"] == 3.0).all()
     assert {episode.failure for episode in read.episodes} == {"late"}
     assert json.loads((run / "run.json").read_text())["name"] == "run"
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ({"window_s": "soon"}, "conditions: window_s = 'soon'; allowed: float"),
+        ({"tau_nats": None}, "conditions: tau_nats = None; allowed: float"),
+        ({"loss": [0.1]}, "conditions: loss = [0.1]; allowed: float"),
+        ({"profile": 6}, "conditions: profile = 6; allowed: str"),
+        ({"on_demand": 1}, "conditions: on_demand = 1; allowed: bool"),
+    ],
+)
+def test_a_condition_of_another_type_is_named(setting: dict[str, Any], said: str, run: Path) -> None:
+    stated = json.loads((run / "run.json").read_text())
+    stated["conditions"][0] |= setting
+    (run / "run.json").write_text(json.dumps(stated))
+    assert said in refused(run, "run.json")
+
+
+def test_a_condition_of_another_version_may_have_other_settings(run: Path) -> None:
+    stated = json.loads((run / "run.json").read_text())
+    stated["conditions"][0]["of_a_later_version"] = 1
+    del stated["conditions"][0]["edge"]
+    (run / "run.json").write_text(json.dumps(stated))
+    assert folder.read(run).conditions[0] == stated["conditions"][0]["name"]
+
+
+def test_an_answer_to_messages_that_is_no_fusion_calls_is_named(run: Path) -> None:
+    change(run, answer=lambda row: row.update(heard=["v2"]))
+    assert "heard messages, and is no fusion call's" in refused(run, "answers.jsonl")
+
+
+def test_a_run_saved_with_a_byte_order_mark_is_the_same_run(run: Path) -> None:
+    before = folder.read(run).manifest
+    (run / "run.json").write_bytes(b"\xef\xbb\xbf" + (run / "run.json").read_bytes())
+    assert folder.read(run).manifest == before

@@ -469,3 +469,11 @@ def test_whatever_is_typed_is_a_hub_id_or_one_printable_line(text: str) -> None:
         assert message.isprintable(), message
     else:
         assert (card.name, card.engine) == (text, "transformers")
+
+
+def test_a_card_saved_with_a_byte_order_mark_is_the_same_card(shelf: Path) -> None:
+    write_card(shelf, MINIMAL)
+    plain = cards.load("mine")
+    write_card(shelf, "\ufeff" + MINIMAL)
+    assert (shelf / "models/mine.toml").read_bytes().startswith(b"\xef\xbb\xbf")
+    assert cards.load("mine") == plain

@@ -64,6 +64,16 @@ def test_the_same_again_is_refused_and_goes_on_where_it_was_stopped(
     assert not Path("run/.work").exists()
 
 
+def test_a_number_behind_the_usual_name_is_said(harness: Callable[..., Said], small_path: Path) -> None:
+    typed = ("eval", "--model", "brake", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--quiet")
+    assert harness(*typed, "--condition", "single-local")[2] == ""
+    code, out, err = harness(*typed, "--condition", "single-local")
+    first = "reports/brake-v2-small"
+    assert (code, out) == (0, "")
+    assert err == f"{first} is there already; this goes to {first}-2\n"
+    assert Path(f"{first}-2/run.json").is_file()
+
+
 def test_a_dataset_in_the_command_has_its_name_or_a_path_from_here(
     small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -90,3 +100,9 @@ def test_the_command_in_the_manifest_runs_it_again(
     code, _, _ = harness(*shlex.split(manifest["command"])[1:])
     assert code == 0
     assert same_files(tmp_path / "a b", tmp_path / "first")
+
+
+def test_a_limit_beyond_the_dataset_is_said(harness: Callable[..., Said], small_path: Path) -> None:
+    code, out, err = harness("eval", "--dataset", small_path, "--limit", "9999", "--seeds", "0:1")
+    assert (code, err) == (0, "--limit 9999: small has 4 episodes, all of which are used\n")
+    assert "n = 4 episodes" in out

@@ -2,12 +2,15 @@
 
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
 from pathlib import Path
+from types import GenericAlias
 from typing import Annotated, Any, Literal
 
 import pytest
-from msgspec import Meta, Struct
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec import Meta, Struct, defstruct
 
 from harness.core.config import convert, toml
 from harness.core.errors import UserError
@@ -125,3 +128,87 @@ def test_a_folder_a_pipe_a_dangling_link_and_a_device_are_no_toml(tmp_path: Path
     for name in ("folder", "pipe", "link", "device"):
         with pytest.raises(UserError, match=r"^r is no TOML: .*; fix the file$"):
             toml(tmp_path / name, "r")
+
+
+LEAVES: dict[Any, Any] = {
+    int: 1, float: 0.5, str: "x", bool: True, Share: 0.5, Literal["ideal", "radio"]: "radio",
+    Annotated[str, Meta(pattern="^x")]: "x",
+}  # fmt: skip
+NAMES = st.sampled_from(["a", "rate_hz", "b2"])
+KEYS = st.sampled_from(["a", "x.y", "[0]", "...", "with blank", "`"])
+
+
+@st.composite
+def kinds(draw: st.DrawFn, depth: int = 3) -> tuple[Any, Any]:
+    """A type, and a value that fits it."""
+    shape = draw(st.sampled_from(["leaf", "list", "pair", "table", "optional", "dataclass", "struct"]))
+    if not depth or shape == "leaf":
+        leaf: tuple[Any, Any] = draw(st.sampled_from(list(LEAVES.items())))
+        return leaf
+    if shape in ("dataclass", "struct"):
+        names = sorted(draw(st.sets(NAMES, min_size=1)))
+        fields = {name: draw(kinds(depth - 1)) for name in names}
+        make: Any = make_dataclass if shape == "dataclass" else defstruct
+        record = make(f"Record{depth}", [(name, kind) for name, (kind, _) in fields.items()])
+        return record, {name: value for name, (_, value) in fields.items()}
+    kind, value = draw(kinds(depth - 1))
+    if shape == "list":
+        return GenericAlias(list, (kind,)), [value] * draw(st.integers(1, 3))
+    if shape == "pair":
+        return GenericAlias(tuple, (str, kind)), ["x", value]
+    if shape == "table":
+        return GenericAlias(dict, (str, kind)), dict.fromkeys(draw(st.sets(KEYS, min_size=1)), value)
+    return kind | None, value
+
+
+def paths(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """The paths of all leaves of a value."""
+    pairs: Any = (
+        value.items() if isinstance(value, dict) else enumerate(value if isinstance(value, list) else ())
+    )
+    return [leaf for key, inner in pairs for leaf in paths(inner, (*path, key))] or [path]
+
+
+def with_other(value: Any, path: tuple[Any, ...], other: Any) -> Any:
+    """A value with something else at a path."""
+    if not path:
+        return other
+    if isinstance(value, dict):
+        return {**value, path[0]: with_other(value[path[0]], path[1:], other)}
+    return [with_other(each, path[1:], other) if n == path[0] else each for n, each in enumerate(value)]
+
+
+@given(st.data())
+def test_a_wrong_leaf_anywhere_in_any_record_is_one_line_that_names_it(data: st.DataObject) -> None:
+    kind, good = data.draw(kinds())
+    record, table = defstruct("Whole", [("whole", kind)]), {"whole": good}
+    convert(table, record, "r")
+    path = data.draw(st.sampled_from(paths(table)))
+    wrong = data.draw(st.sampled_from([{"wrong": 1}, [[1]]]))
+    with pytest.raises(UserError) as caught:
+        convert(with_other(table, path, wrong), record, "r")
+    *tables, key = map(str, path)
+    where = f"r [{'.'.join(tables)}]" if tables else "r"
+    assert str(caught.value).startswith(
+        (f"{where}: {key} = {wrong}; allowed: ", f"unknown {key} in {where} ")
+    )
+
+
+@pytest.mark.parametrize("number", ["nan", "inf"])
+def test_a_number_is_finite_also_where_it_has_no_bounds(number: str) -> None:
+    with pytest.raises(UserError, match=rf"r \[hops\.0\]: delay_s = {number}; allowed: a finite number"):
+        convert({**GOOD, "hops": [{"delay_s": float(number)}]}, Route, "r", name="r")
+
+
+def test_the_tags_of_a_union_are_named() -> None:
+    class One(Struct, tag="one", tag_field="kind"):
+        n: int
+
+    class Two(Struct, tag="two", tag_field="kind"):
+        n: Share
+
+    whole = defstruct("Whole", [("part", One | Two)])
+    with pytest.raises(UserError, match=r"unknown kind in r \[part\] 'three'; known: one, two"):
+        convert({"part": {"kind": "three", "n": 1}}, whole, "r")
+    with pytest.raises(UserError, match=r"r \[part\]: n = 3; allowed: a share, 0 to 1"):
+        convert({"part": {"kind": "two", "n": 3}}, whole, "r")

@@ -141,9 +141,16 @@ def test_an_ego_that_hears_nobody_falls_back_to_its_own_intent():
 def test_without_helpers_the_ego_asks_nobody_and_acts_at_once():
     none = {"helpers": np.zeros((0, 3)), "valid": np.zeros(0, bool), "range_m": (), "jitter": ()}
     decision = play(V2X, distance_m=(20.0,), inference_s=(0.145,), link=np.zeros((0, 2)), **none)
-    assert decision.triggered
+    assert not decision.triggered
     assert decision.messages == 0
     assert decision.fused.tolist() == list(DOUBT)
+    assert decision.latency_s == 0.145
+
+
+def test_an_unsure_ego_with_nobody_in_its_radius_asks_nobody():
+    decision = play(replace(SIXG, radius_m=1.0))
+    assert not decision.triggered
+    assert (decision.requests, decision.messages) == (0, 0)
     assert decision.latency_s == 0.145
 
 

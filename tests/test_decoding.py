@@ -23,6 +23,7 @@ from run_on_disk import UNTIMED
 from harness.backends import decoding, sampling
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.cards import resolve
+from harness.backends.chat import Chat
 from harness.backends.decoding import Decoding
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import open_backend
@@ -267,6 +268,72 @@ def test_a_read_out_needs_room_for_one_token(backend: LanguageModel) -> None:
         assert f"{tokens + 1} tokens > {tokens}" in str(backend.complete([request])[0].error)
     finally:
         engine_of(backend).context_tokens = context
+
+
+class Said:
+    """A session of one sequence, with these probabilities of tokens."""
+
+    def __init__(self, p: dict[int, float]) -> None:
+        self.p, self.asked = p, [0]
+
+    def log_probs(self, tokens: Sequence[int]) -> Any:
+        self.asked = list(tokens)
+        return [[math.log(self.p[token]) for token in tokens]]
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def test_a_letter_counts_in_all_of_its_spellings() -> None:
+    """A 1/4 + 1/4, B 1/8 in one spelling, C 1/16 + 1/32 + 1/32: 4, 1 and 1 parts of 3/4."""
+    ids = {"\n": [0], "\nA": [0, 1], "\nB": [0, 2], "\nC": [0, 3]}
+    spellings = {"A": [1, 11], "B": [2], "C": [13, 3, 23]}
+    session = Said({1: 1 / 4, 11: 1 / 4, 2: 1 / 8, 3: 1 / 16, 13: 1 / 32, 23: 1 / 32})
+    chat = SimpleNamespace(name="spelt", encode=ids.__getitem__, spellings=lambda letters: spellings)
+    engine: Any = SimpleNamespace(chat=chat, begin=lambda prompts: session)
+    [answer] = Decoding(engine).answer([ask(0, "readout")], [[5, 6]])
+    assert json.loads(answer.text)["action_distribution"] == pytest.approx(
+        dict(zip(ACTIONS, (4 / 6, 1 / 6, 1 / 6), strict=True)), abs=1e-6
+    )
+    assert answer.label_mass == pytest.approx(3 / 4)
+    assert session.asked == [1, 2, 3, 11, 13, 23]
+
+
+def test_one_spelling_alone_is_read_out_to_the_last_bit_as_ever() -> None:
+    p = {1: 0.3, 2: 0.2, 3: 0.1}
+    chat = SimpleNamespace(
+        name="plain", encode=lambda text: [0, *("ABC".index(x) + 1 for x in text[1:])],
+        spellings=lambda letters: {x: [] for x in letters},
+    )  # fmt: skip
+    engine: Any = SimpleNamespace(chat=chat, begin=lambda prompts: Said(p))
+    [answer] = Decoding(engine).answer([ask(0, "readout")], [[5, 6]])
+    log_p = [math.log(x) for x in p.values()]
+    weights = [math.exp(x - max(log_p)) for x in log_p]
+    assert answer.text == readout.stated(ACTIONS, weights)
+    assert answer.label_mass == math.exp(max(log_p)) * sum(weights)
+
+
+@pytest.mark.parametrize(
+    ("texts", "decoder"),
+    [
+        (["A", "\u0120A", "\u0120\u0120A", "\u010aB", "B", "AB", "a", "A.", "\u0120a"], "ByteLevel"),
+        (["A", "\u2581A", "\u2581\u2581A", "<0x42>", "B", "AB", "a", "A.", "<0x43>"], "Metaspace"),
+    ],
+)
+def test_the_spellings_of_a_letter_are_found_in_any_vocabulary(texts: list[str], decoder: str) -> None:
+    from tokenizers import Tokenizer, decoders, models
+    from transformers import PreTrainedTokenizerFast
+
+    made = Tokenizer(models.WordLevel({text: n for n, text in enumerate(texts)}, unk_token="a"))
+    made.decoder = (
+        decoders.ByteLevel() if decoder == "ByteLevel"
+        else decoders.Sequence([decoders.ByteFallback(), decoders.Metaspace(), decoders.Fuse()])
+    )  # fmt: skip
+    chat = Chat("any", PreTrainedTokenizerFast(tokenizer_object=made, chat_template="{{ messages }}"))
+    found = chat.spellings("ABC")
+    assert {letter: sorted(ids) for letter, ids in found.items()} == {
+        "A": [0, 1, 2], "B": [3, 4], "C": [8] if decoder == "Metaspace" else [],
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("encode", [lambda text: [1] * len(text), lambda text: list(text.encode("utf-16"))])

@@ -113,6 +113,32 @@ def test_seconds_and_joules_of_one_decision_by_hand(counted: Callable[..., folde
     assert of["waiting_j"]["cloud"] == pytest.approx(5 * 0.51)
 
 
+def test_helpers_that_infer_before_they_are_asked_cost_energy_unasked(
+    counted: Callable[..., folder.Run],
+) -> None:
+    """All in the radius think from the start; on demand only the one that is asked."""
+    one = replace(CLEAR, name="one", max_helpers=1)
+    demand, narrow = replace(one, name="demand", on_demand=True), replace(CLEAR, name="narrow", radius_m=0.5)
+    sure_ego = replace(CLEAR, name="sure", tau_nats=5.0)
+    told = counted(ALONE, CLEAR, one, demand, narrow, sure_ego)
+    d = told.decisions
+    messages, helpers_j = (dict(zip(d.labels("condition"), d[name].tolist(), strict=True))
+                           for name in ("messages", "helpers_j"))  # fmt: skip
+    assert messages == {"single-local": 0, "clear": 3, "one": 1, "demand": 1, "narrow": 0, "sure": 0}
+    assert helpers_j == {"single-local": 0, "clear": 21, "one": 21, "demand": 7, "narrow": 0, "sure": 21}
+
+
+def test_a_message_takes_a_frame_at_least(counted: Callable[..., folder.Run]) -> None:
+    radio = named_point("mode4")
+    told = counted(CLEAR, radio, device_profile=msgspec.structs.replace(DESK, frame_ms=known(1.5)))
+    d = told.decisions
+    mj, airtime_ms = (dict(zip(d.labels("condition"), d[name].tolist(), strict=True))
+                      for name in ("radio_mj", "airtime_ms"))  # fmt: skip
+    # A request and three replies at 2 W; Mode 4 has slots of its own, and 23 dBm.
+    assert mj["clear"] == pytest.approx(4 * 1.5 * 2)
+    assert mj["mode4"] == pytest.approx(airtime_ms["mode4"] * 10**-0.7 / 0.5, rel=1e-4)
+
+
 def test_a_runs_summary_has_the_energy_of_a_decision(counted: Callable[..., folder.Run]) -> None:
     """Asking costs energy because helpers think, not because they transmit."""
     told = counted(ALONE, CLEAR)

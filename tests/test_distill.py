@@ -308,8 +308,14 @@ def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
     def stop(stage: str, seen: int, loss: float) -> None:
         raise Killed
 
-    with pytest.raises(UserError, match=r"with other files in it; choose an empty or a new one"):
+    with pytest.raises(
+        UserError, match=r"already holds a finished model; choose another folder or delete it"
+    ):
         distill(CURRICULUM, PLAN, student, silent, stop, "cpu")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/thesis.tex").touch()
+    with pytest.raises(UserError, match=r"with other files in it; choose an empty or a new one"):
+        distill(CURRICULUM, PLAN, tmp_path / "other", silent, stop, "cpu")
     with pytest.raises(Killed):
         distill(CURRICULUM, PLAN, tmp_path / "m", silent, stop, "cpu")
     with pytest.raises(UserError, match=r"was begun with another seed"):

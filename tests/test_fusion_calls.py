@@ -345,6 +345,22 @@ def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(done: Evaluated, tmp
     assert again == []
 
 
+def test_what_another_process_has_asked_meanwhile_is_not_asked_again(done: Evaluated, tmp_path: Path) -> None:
+    """Both looked at the run before either asked."""
+    folder = Path(shutil.copytree(done.out, tmp_path / "run"))
+    asked: dict[str, list[int]] = {"one": [], "other": []}
+    one, other = (Stored(folder, done=asked[name].append) for name in asked)
+    [[first]] = one.walked([Setting("6g", FUSION, 2)], one.seeds)
+    kept = (folder / MORE).read_bytes()
+    with (folder / MORE).open("ab") as file:
+        file.write(kept[:100])  # a third was killed
+    [[second]] = other.walked([Setting("6g", FUSION, 2)], other.seeds)
+    assert np.array_equal(first.columns["latency_ms"], second.columns["latency_ms"])
+    [[_]] = other.walked([Setting("6g", FUSION, 3)], other.seeds)
+    ids = [line.partition(b',"raw"')[0] for line in (folder / MORE).read_bytes().splitlines()]
+    assert len(ids) == len(set(ids)) > len(kept.splitlines())
+
+
 def test_points_that_are_walked_together_make_the_calls_of_each(done: Evaluated, tmp_path: Path) -> None:
     """Each set of messages is asked about once, and answers are what each point has alone."""
     texts = ("loss=0", "loss=0.3", "loss=0.3,defence=quoted+schema", "attack=injection:share=1/3")

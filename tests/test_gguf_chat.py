@@ -13,6 +13,7 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 import tiny_qwen3
 
 from harness.backends.chat import Chat
+from harness.backends.chat_template import ChatTemplate
 from harness.backends.llama_cpp.chat import GgufChat
 from harness.core.errors import UserError
 
@@ -29,6 +30,7 @@ class Words:
     template: str
     specials: dict[str, str] = field(default_factory=lambda: {"eos_token": "<|im_end|>"})
     bos: int | None = None
+    vocabulary: int = 256
 
     def encode(self, text: str) -> list[int]:
         return list(text.encode())
@@ -71,9 +73,18 @@ TEMPLATES = {
 @pytest.mark.parametrize("template", TEMPLATES.values(), ids=TEMPLATES)
 @pytest.mark.parametrize("thinking", [True, False])
 def test_a_template_renders_as_in_transformers(tokenizer: Any, template: str, thinking: bool) -> None:
-    tokenizer.chat_template = template
-    theirs, ours = Chat("tiny", tokenizer), GgufChat("tiny", Words(template))
-    assert ours.render(MESSAGES, thinking=thinking) == theirs.render(MESSAGES, thinking=thinking)
+    theirs = tokenizer.apply_chat_template(
+        list(MESSAGES), chat_template=template, tokenize=False, add_generation_prompt=True,
+        enable_thinking=thinking,
+    )  # fmt: skip
+    values = {**tokenizer.special_tokens_map, "enable_thinking": thinking}
+    assert ChatTemplate("tiny", template).render(list(MESSAGES), **values) == theirs
+
+
+def test_a_checkpoint_and_a_gguf_file_have_one_prompt(tokenizer: Any) -> None:
+    tokenizer.chat_template = tiny_qwen3.TEMPLATE
+    theirs, ours = Chat("tiny", tokenizer), GgufChat("tiny", Words(tiny_qwen3.TEMPLATE))
+    assert ours.render(MESSAGES, thinking=False) == theirs.render(MESSAGES, thinking=False)
     assert (ours.thinking, ours.template) == (theirs.thinking, theirs.template)
 
 
@@ -95,6 +106,8 @@ def test_a_template_that_is_no_jinja_is_known_at_once() -> None:
 
 
 def test_tokens_and_bos_are_the_files(tmp_path: Path) -> None:
-    chat = GgufChat("words", Words("{{ bos_token }}", {"bos_token": "<s>"}, bos=1))
+    every = "{% for m in messages %}{{ m.content }}{% endfor %}"
+    chat = GgufChat("words", Words("{{ bos_token }}" + every, {"bos_token": "<s>"}, bos=1))
     assert (chat.bos, chat.encode("ab"), chat.decode([97, 98])) == (1, [97, 98], "ab")
-    assert chat.render(MESSAGES, thinking=False) == "<s>"
+    assert chat.spellings("Ba") == {"B": [66], "a": [97]}
+    assert chat.render(MESSAGES[1:], thinking=False) == f"<s>{MESSAGES[1]['content']}"

@@ -1,5 +1,6 @@
 """`harness export --inspect`: the log as Inspect AI itself reads it."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,23 @@ def test_a_prompt_or_dataset_that_is_not_here_leaves_the_digest(tmp_path: Path, 
     configure(tmp_path / "run", prompt={"version": "mine", "sha256": "1" * 64, "released": False})
     for sample in log_of(tmp_path / "run", harness).samples:
         assert sample.input == f"a prompt that is not here, sha256 {'0' * 64}"
+
+
+def test_a_kept_prompt_is_in_the_log_once_the_version_is_gone(tmp_path: Path, harness: Harness) -> None:
+    Path("swarmdrive.toml").touch()
+    shutil.copytree(Path(__file__).parent.parent / "prompts" / "v6", "prompts/mine")
+    typed = ("eval", "--model", "proxy", "--prompt", "mine", "--limit", "1", "--seeds", "0", "--quiet")
+    assert harness(*typed, "--condition", "6g", "--out", "run")[0] == 0
+    shutil.rmtree("prompts")
+    for sample in log_of(Path("run"), harness).samples:
+        asked = [{"role": message.role, "content": message.text} for message in sample.input]
+        assert digest(asked) == sample.metadata["prompt_sha256"]
+    before = Path("run.eval").read_bytes()
+    shutil.rmtree("run/sources")
+    code, out, err = harness("export", "run", "--inspect", "run.eval")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "run.eval is kept: a new page would lack its prompts" in err
+    assert Path("run.eval").read_bytes() == before
 
 
 def test_a_driven_run_has_no_regret(tmp_path: Path, harness: Harness) -> None:

@@ -1,11 +1,18 @@
 """What is said of the project outside its code: version, licence and authors are the same everywhere."""
 
+import importlib.util
+import re
 import tomllib
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
+import pytest
 import yaml
 
 from harness.backends import cards
+from harness.core.errors import UserError
+from harness.report import library
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -31,3 +38,39 @@ def test_code_dataset_and_weights_have_one_licence() -> None:
             if line.startswith(f"| `{manifest.parent.name}` |")
         ]  # fmt: skip
         assert licence in row
+
+
+def _requirements() -> Any:
+    spec = importlib.util.spec_from_file_location("requirements", ROOT / "requirements.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("install", ["base", "test", "dev"])
+def test_the_lock_has_all_that_an_install_needs_with_digests(install: str) -> None:
+    if install == "dev":
+        pytest.importorskip("torch")
+        pytest.importorskip("llama_cpp")
+    requirements = _requirements()
+    groups = re.split(r"^# (.*)\n", requirements.LOCK.read_text(), flags=re.MULTILINE)[1:]
+    text = "".join(
+        lines for head, lines in zip(groups[::2], groups[1::2], strict=True)
+        if {"base", install} & {*head.split()}
+    )  # fmt: skip
+    blocks = re.findall(
+        r"^([\w.-]+)==(\S+) \\\n((?: +--hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", text, re.MULTILINE
+    )
+    assert {name for name, *_ in blocks} == requirements.needed(requirements.INSTALLS[install]) - {"torch"}
+    assert {name: release for name, release, _ in blocks} == {name: version(name) for name, *_ in blocks}
+
+
+def test_no_other_charting_library_runs_in_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    library.vega.cache_clear()
+    assert len(library.vega()) > 500_000
+    library.vega.cache_clear()
+    monkeypatch.setattr(library, "BUNDLE_SHA256", "0" * 64)
+    with pytest.raises(
+        UserError, match=r"^the charting library of .* has sha256 b6f62605c995…, not 000000000000…"
+    ):
+        library.vega()

@@ -169,7 +169,7 @@ def test_a_check_as_json_has_every_token_and_asks_for_a_thought_in_json_only(
         monkeypatch, capsys, "model", "check", str(short), "--device", "cpu", "--thinking", "--json"
     )
     seen = json.loads(out)
-    assert code == 1  # its context is too short for a thought, and that is the only way it is asked
+    assert code == 3  # its context is too short for a thought, and that is the only way it is asked
     assert (seen["thinking_asked"], seen["thinking"]) == (True, "switch")
     assert seen["prompt"].endswith("<|im_start|>assistant\n")
     assert "".join(piece for _, piece in seen["tokens"]) == seen["prompt"]
@@ -211,7 +211,7 @@ basis = "b"
 base_url = "{url}"
 retries = 0
 """
-ANSWER = '{"action_distribution":{"SLOWER":0.%d,"IDLE":0.20,"FASTER":0.%d}}'
+ANSWER = '{"action_distribution":{"SLOWER":0.%02d,"IDLE":0.20,"FASTER":0.%02d}}'
 
 
 def pictures_of(body: Any) -> list[str]:

@@ -6,10 +6,12 @@ import re
 import socket
 import sys
 import threading
+import tomllib
 from base64 import b64decode
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import sleep
 from typing import Any, get_args
@@ -28,6 +30,7 @@ from harness.backends.openai import farm as openai_farm
 from harness.backends.openai.shapes import body, read
 from harness.backends.servers import KINDS, Kind, Server
 from harness.core import resources
+from harness.core.config import convert
 from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.parsing.parse import parse
@@ -341,13 +344,28 @@ def test_the_reason_to_finish_is_cut_off_or_not(theirs: Any, ours: str) -> None:
     assert read(completion("a", theirs), request()).finish_reason == ours
 
 
-def test_tokens_that_are_no_counts_are_unknown() -> None:
-    made = {**completion("a"), "usage": {"prompt_tokens": -1, "completion_tokens": True}}
+@pytest.mark.parametrize(
+    "count", [-1, True, 1e300, 10**300, 10**7 + 1, 2.0, float("nan"), float("inf"), "26", [26], {}, None]
+)
+def test_tokens_that_are_no_counts_are_unknown(count: Any) -> None:
+    made = {**completion("a"), "usage": {"prompt_tokens": count, "completion_tokens": count}}
+    said = ask_one(lambda asked: asked.reply(made))
+    assert (said.text, said.prompt_tokens, said.completion_tokens, said.token_s) == ("a", None, None, None)
+
+
+def test_tokens_that_are_counts_are_known() -> None:
+    made = {**completion("a"), "usage": {"prompt_tokens": 10**7, "completion_tokens": 0}}
     said = read(made, request())
-    assert (said.text, said.prompt_tokens, said.completion_tokens) == ("a", None, None)
+    assert (said.prompt_tokens, said.completion_tokens) == (10**7, 0)
 
 
 # -- thoughts -----------------------------------------------------------------------------------------------
+
+
+def without_content(finish_reason: str, **message: Any) -> dict[str, Any]:
+    made = completion("", finish_reason, **message)
+    del made["choices"][0]["message"]["content"]
+    return made
 
 
 @pytest.mark.parametrize(
@@ -356,6 +374,13 @@ def test_tokens_that_are_no_counts_are_unknown() -> None:
         (completion(GOOD, reasoning_content="Clear."), True, "strict"),
         (completion(GOOD, reasoning="Clear."), True, "strict"),
         (completion(GOOD, reasoning_content=""), True, "strict"),
+        (completion(GOOD, reasoning_content=None, reasoning="Clear."), True, "strict"),
+        (completion(GOOD, reasoning_content="", reasoning="Clear."), True, "strict"),
+        (completion(GOOD, reasoning_content="Clear.", reasoning=None), True, "strict"),
+        (completion(GOOD, reasoning_content={"text": "Clear."}, reasoning="Clear."), True, "strict"),
+        (without_content("length", reasoning=f"Maybe {GOOD}, but"), True, "truncated_reasoning"),
+        (without_content("length", reasoning_content=None, reasoning="Hm"), True, "truncated_reasoning"),
+        (without_content("stop", reasoning=f"So {GOOD}"), True, "empty"),
         (completion(f"<think>Clear.</think>{GOOD}"), True, "strict"),
         (completion(f"<think>Clear.</think>{GOOD}", reasoning_content=None), True, "strict"),
         (completion(GOOD, reasoning_content=None), True, "truncated_reasoning"),
@@ -393,8 +418,24 @@ def shares(*likeliest: tuple[str, float]) -> tuple[list[float], float | None]:
 
 
 def test_a_read_out_is_the_letters_probabilities_among_themselves() -> None:
-    """A 1/2, B 1/4, C 1/8: 4/7, 2/7, 1/7 of a mass of 7/8. ` A` is another token than `A`."""
-    p, mass = shares(("A", HALF), ("B", QUARTER), ("C", EIGHTH), (" A", SIXTEENTH), ("the", SIXTEENTH))
+    """A 1/2, B 1/4, C 1/8: 4/7, 2/7, 1/7 of a mass of 7/8."""
+    p, mass = shares(("A", HALF), ("B", QUARTER), ("C", EIGHTH), ("a", SIXTEENTH), ("the", SIXTEENTH))
+    assert p == pytest.approx([4 / 7, 2 / 7, 1 / 7], abs=1e-6)
+    assert mass == pytest.approx(7 / 8)
+
+
+@pytest.mark.parametrize("blank", [" ", "\u2581", "\u0120", "\n"])
+def test_a_letter_counts_in_both_of_its_spellings(blank: str) -> None:
+    """A 1/4 + 1/4, B 1/8 + 1/8, C 1/16: 8, 4 and 1 parts of 13/16; then each in the second spelling alone."""
+    p, mass = shares(
+        ("A", QUARTER), (f"{blank}A", QUARTER), ("B", EIGHTH), (f"{blank}B", EIGHTH),
+        (f"{blank}C", SIXTEENTH), ("the", SIXTEENTH),
+    )  # fmt: skip
+    assert p == pytest.approx([8 / 13, 4 / 13, 1 / 13], abs=1e-6)
+    assert mass == pytest.approx(13 / 16)
+    p, mass = shares(
+        *((f"{blank}{x}", logprob) for x, logprob in zip("ABC", (HALF, QUARTER, EIGHTH), strict=True))
+    )
     assert p == pytest.approx([4 / 7, 2 / 7, 1 / 7], abs=1e-6)
     assert mass == pytest.approx(7 / 8)
 
@@ -431,6 +472,132 @@ def test_a_read_out_asks_for_one_token_and_the_likeliest() -> None:
         openai_backend.open(card(there.url), batch_size=1).complete([request(answer="readout")])
     asked = there.asked[0].body
     assert (asked["max_tokens"], asked["logprobs"], asked["top_logprobs"]) == (1, True, 20)
+
+
+# -- fields that a card changes ------------------------------------------------------------------------------
+
+
+def sent(fields: str = "", answer: AnswerMode = "json", kind: Kind = "vllm", **more: Any) -> dict[str, Any]:
+    """What a server is sent by a card with these lines under [server]."""
+    table = tomllib.loads(f'base_url = "http://a/v1"\nkind = "{kind}"\n{fields}')
+    mine = replace(card("http://a/v1"), server=convert(table, Server, "model card"))
+    assert mine.server is not None
+    return body(mine, mine.server, request(answer=answer, **more))
+
+
+def test_a_card_leaves_out_and_renames_fields_and_limits_log_probabilities() -> None:
+    plain = sent()
+    made = sent('fields = { max_tokens = "max_completion_tokens", seed = false, repetition_penalty = false }')
+    assert made == {
+        "model": "m", "messages": list(MESSAGES), "max_completion_tokens": 64, "temperature": 0,
+        "stream": False,
+    }  # fmt: skip
+    assert {*plain} - {*made} == {"max_tokens", "seed", "repetition_penalty"}
+    assert sent("fields = { max_tokens = true }") == plain
+    drawn = sent('fields = { top_k = false, seed = "random_seed" }', temperature=0.5, sample=3)
+    assert (drawn["random_seed"], drawn["top_p"], "top_k" in drawn, drawn["min_p"]) == (3, 1, False, 0)
+    assert sent(answer="readout")["top_logprobs"] == 20
+    limited = sent('top_logprobs = 5\nfields = { max_tokens = "max_completion_tokens" }', "readout")
+    assert (limited["top_logprobs"], limited["max_completion_tokens"], limited["logprobs"]) == (5, 1, True)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ('fields = { seed = "messages" }', "seed is sent as messages, the name of another field"),
+        ('fields = { max_tokens = "model" }', "max_tokens is sent as model, the name of another field"),
+        ('fields = { max_tokens = "seed", seed = false }', "max_tokens is sent as seed, the name of another"),
+        ('fields = { top_p = "x", top_k = "x" }', "top_p is sent as x, the name of another field"),
+        ('fields = { seed = "a b" }', "[fields]: seed = 'a b'; allowed: true, false or another name"),
+        ("fields = { seed = 3 }", "seed = 3; allowed: bool or str"),
+        ("fields = { messages = false }", "unknown key in model card [fields] 'messages'"),
+        ("fields = { model = false }", "unknown key in model card [fields] 'model'"),
+        ("fields = { grammar = false }", "unknown key in model card [fields] 'grammar'"),
+        ("top_logprobs = 0", "top_logprobs = 0; allowed: 1 to 20"),
+        ("top_logprobs = 21", "top_logprobs = 21; allowed: 1 to 20"),
+        ("top_logprobs = true", "top_logprobs = True; allowed: int"),
+    ],
+)  # fmt: skip
+def test_no_field_overrides_what_is_asked(fields: str, said: str) -> None:
+    with pytest.raises(UserError) as caught:
+        sent(fields)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_temperature_that_is_never_sent_is_refused() -> None:
+    assert "temperature" not in sent("fields = { temperature = false }")
+    with pytest.raises(UserError, match=r"'mine': its card sends no temperature, and 0\.7 is asked for"):
+        sent("fields = { temperature = false }", temperature=0.7)
+
+
+def test_a_card_with_fields_is_recorded_and_read_again_and_one_without_as_ever() -> None:
+    table = {"base_url": "http://a/v1", "fields": {"seed": False}, "top_logprobs": 5}
+    mine = replace(card("http://a/v1"), server=convert(table, Server, "model card"))
+    record = json.loads(json.dumps(mine.record()))
+    assert record["server"]["fields"] == {"seed": False}
+    assert convert(record, Card, "run") == mine
+    assert hash(mine)
+    plain = card("http://a/v1")
+    assert plain.record()["server"] == {
+        "base_url": "http://a/v1", "kind": "generic", "key_env": "OPENAI_API_KEY", "timeout_s": 20.0,
+        "retries": 2,
+    }  # fmt: skip
+    assert convert(plain.record(), Card, "run") == plain
+
+
+@pytest.mark.parametrize(
+    ("refusal", "hint"),
+    [
+        ("top_logprobs may be 5 at most", "; set top_logprobs under [server] in its card"),
+        ("unknown field: seed", "; its card can leave seed out or rename it: fields under [server]"),
+        (
+            "use max_completion_tokens in place of max_tokens",
+            "; its card can leave max_tokens out or rename it",
+        ),
+        ("no", ""),
+    ],
+)
+def test_a_refused_field_says_what_a_card_can_do(refusal: str, hint: str) -> None:
+    done = ask_one(lambda asked: asked.reply({"error": {"message": refusal}}, 400))
+    assert done.error is not None
+    assert done.error.startswith(f"HTTP 400: {refusal}{hint}")
+    assert hint or done.error == f"HTTP 400: {refusal}"
+
+
+# -- who answered --------------------------------------------------------------------------------------------
+
+
+def named(*models: Any) -> Play:
+    def play(asked: Asked) -> None:
+        asked.reply({**completion(GOOD), "model": models[asked.number % len(models)]})
+
+    return play
+
+
+def test_a_server_that_answers_as_another_model_is_said_once_and_kept(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    with serving(named("m", "other\x1b", None, "third", 7)) as there:
+        backend = openai_backend.open(card(there.url), batch_size=1)
+        done = backend.complete([request(f"s/v{n}") for n in range(5)])
+        assert {c.text for c in done} == {GOOD}
+        served = backend.served()
+        assert [(each.id, each.model) for each in served] == [
+            ("s/v0", "m"), ("s/v1", "other\\x1b"), ("s/v2", None), ("s/v3", "third"), ("s/v4", None),
+        ]  # fmt: skip
+        assert {each.server for each in served} == {there.url}
+        assert backend.served() == []
+    said = f"harness: model 'mine': server {there.url} was asked for m, and says that other\\x1b answers\n"
+    assert capfd.readouterr().err == said
+
+
+@pytest.mark.parametrize("name", ["m", "m:latest", "qwen.gguf"])
+def test_a_name_that_the_server_lists_is_no_other(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    listed: Play = lambda asked: asked.reply({"data": [{"id": "qwen.gguf"}]})  # noqa: E731
+    with serving(named(name), listed) as there:
+        openai_backend.open(card(there.url), batch_size=1).complete([request()])
+    assert capfd.readouterr().err == ""
 
 
 # -- several at a time --------------------------------------------------------------------------------------
@@ -577,8 +744,8 @@ def test_a_redirect_to_what_is_no_address_is_the_answers_error(location: str) ->
     assert done.text == ""
 
 
-def echo(asked: Asked) -> None:
-    """Say the Authorization header back, another way each time."""
+def echo(asked: Asked, most: int = 9) -> None:
+    """Say the Authorization header back, another way each time; the first four of them are answers."""
     header = asked.headers["Authorization"]
     spelt = "".join(f"\\u{ord(c):04x}" for c in header)
     ways = [
@@ -592,7 +759,7 @@ def echo(asked: Asked) -> None:
         lambda: asked.raw(header.encode() + b"\r\n\r\n"),
         lambda: asked.reply({**completion(), "choices": [{"message": {"content": {header: header}}}]}),
     ]
-    ways[asked.number % len(ways)]()
+    ways[asked.number % most]()
 
 
 def test_a_key_that_the_server_says_back_stands_in_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -613,7 +780,7 @@ def test_a_short_key_is_no_secret_and_changes_no_answer(monkeypatch: pytest.Monk
 def test_after_a_run_the_key_is_nowhere(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, small_path: Path
 ) -> None:
-    """A whole `harness eval` against a server that says the key back in every way."""
+    """A whole `harness eval` against a server that says the key back in every way, then in answers."""
     monkeypatch.setenv("SWARMDRIVE_KEYS", "MY_KEY")
     monkeypatch.setenv("MY_KEY", KEY)
     monkeypatch.chdir(tmp_path)
@@ -627,17 +794,19 @@ def test_after_a_run_the_key_is_nowhere(
         )
         options = ["--model", "served", "--dataset", str(small_path), "--limit", "1", "--out", "run"]
         monkeypatch.setattr(sys, "argv", ["harness", "eval", *options])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-    assert ended.value.code in (None, 0)
+        for code, made in ((3, {"unanswered.txt"}), (0, {"run.json", "answers.jsonl", "decisions.parquet"})):
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
+            assert (ended.value.code or 0) == code
+            printed = capfd.readouterr()
+            files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
+            texts = [path.read_bytes().decode("utf-8", "replace") for path in files]
+            assert made <= {path.name for path in files}
+            for text in (printed.out, printed.err, *texts):
+                assert "5ecret" not in text
+            assert any("[key]" in text for text in texts)
+            there.play = partial(echo, most=4)
     assert len(there.asked) > 9
-    printed = capfd.readouterr()
-    files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
-    texts = [path.read_bytes().decode("utf-8", "replace") for path in files]
-    assert {"run.json", "answers.jsonl", "decisions.parquet"} <= {path.name for path in files}
-    for text in (printed.out, printed.err, *texts):
-        assert "5ecret" not in text
-    assert any("[key]" in text for text in texts)
     assert "MY_KEY" in (tmp_path / "run" / "run.json").read_text()
 
 

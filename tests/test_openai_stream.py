@@ -184,6 +184,17 @@ def test_a_stream_without_a_count_of_tokens_has_no_time_per_token() -> None:
     )
 
 
+def test_a_thought_beside_an_empty_field_of_a_thought_is_one() -> None:
+    """The rename of the field: both are in each piece, one of them null or empty."""
+    for old in (None, ""):
+        sent = [
+            {"choices": [{"delta": {"reasoning_content": old, "reasoning": text}, "finish_reason": None}]}
+            for text in ("The gap ", "is short.")
+        ]
+        [done], _ = ask(lambda asked, sent=sent: asked.stream(*sent, *pieces("{}")))
+        assert done.text == "<think>\nThe gap is short.\n</think>\n\n{}"
+
+
 def test_a_key_that_is_cut_through_by_pieces_is_taken_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     [done], _ = ask(lambda asked: asked.stream(*pieces("I am ", KEY[:6], KEY[6:])))

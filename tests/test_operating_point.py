@@ -170,3 +170,56 @@ def test_only_a_point_with_a_channel_asks_again():
 def test_a_setting_of_the_channel_is_refused_where_there_is_none(setting: str) -> None:
     with pytest.raises(UserError, match=r"single-local has no channel, so .* changes nothing; leave it out"):
         named_point(f"single-local:{setting}")
+
+
+TABLE = "distance_m,reception,latency_ms\n0,1,20\n400,0,30\n"
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A project with channels of tables, one of which has latencies and ends where nothing is received."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "swarmdrive.toml").touch()
+    (tmp_path / "channels").mkdir()
+    for name, table in (("timed", TABLE), ("untimed", "distance_m,reception\n0,1\n400,0.5\n")):
+        (tmp_path / f"channels/{name}.csv").write_text(table)
+        (tmp_path / f"channels/{name}.toml").write_text(
+            f'model = "trace"\ndescription = "x"\nsource = "x"\nstatus = "assumed"\n'
+            f'[parameters]\nfile = "{name}.csv"\n'
+        )
+
+
+IDLE = [
+    ("timed", "latency_s", "its table timed.csv has latencies of its own"),
+    ("timed:edge=relay,loss=0.1", "latency_s", "its table timed.csv has latencies of its own"),
+    ("timed", "beyond", "its table timed.csv ends where nothing is received"),
+    ("untimed:loss=0.1", "beyond", "its loss is given"),
+    ("timed", "helper_rounds", "the load of its channel does not depend on it"),
+    ("6g", "edge_delay_s", "it has no roadside unit (edge is none)"),
+    ("mode4", "edge_x_m", "it has no roadside unit (edge is none)"),
+    ("6g:schedule=margin", "tau_nats", "schedule margin has a threshold of its own"),
+    ("6g:schedule=never", "loss", "schedule never asks nobody"),
+    ("6g:schedule=never", None, "schedule never asks nobody"),
+    ("6g:max_helpers=0", "consensus", "max_helpers is 0, so it asks nobody"),
+    ("6g:consensus=ego-prompt", "weight_cap", "consensus ego-prompt weighs no distances"),
+    ("6g:consensus=bayes", "min_distance_m", "consensus bayes weighs no distances"),
+    ("cloud", "tau_nats", "it has no channel"),
+]
+
+
+@pytest.mark.parametrize(("condition", "setting", "why"), IDLE)
+def test_a_setting_that_changes_nothing_says_why(project, condition, setting, why):
+    assert named_point(condition).idle(setting) == why
+
+
+@pytest.mark.parametrize(
+    ("condition", "setting"),
+    [
+        ("untimed", "latency_s"), ("untimed", "beyond"), ("6g", "latency_s"), ("6g:edge=relay", "tau_nats"),
+        ("mode4:edge=relay", "edge_delay_s"), ("6g:schedule=margin,helper_rounds=true", "tau_nats"),
+        ("6g:schedule=never", "schedule"), ("6g:max_helpers=0", "max_helpers"), ("6g", None),
+        ("6g:schedule=never", "fallback"), ("6g", "weight_cap"), ("cloud", "round_trip_s"),
+    ],
+)  # fmt: skip
+def test_a_setting_that_may_change_something_says_nothing(project, condition, setting):
+    assert named_point(condition).idle(setting) is None

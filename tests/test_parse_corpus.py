@@ -68,3 +68,16 @@ def test_a_megabyte_of_noise_is_given_up_before_it_takes_minutes(
     """Seconds by size: benchmarks/campaigns/sizes.py. Here: tries are few where each is long."""
     parsed = parse(unit * (1_000_000 // len(unit)), role="ego", actions=ACTIONS)
     assert (parsed.status, parsed.detail) == (status, detail)
+
+
+@pytest.mark.parametrize(
+    "opening", ["<think>", "<thinking>\n", "[think] ", "<|channel|>analysis ", "```\n<reasoning>"]
+)
+@pytest.mark.parametrize("thinking", [True, False])
+def test_a_thought_after_an_answer_is_not_called_one_before_it(opening: str, thinking: bool) -> None:
+    answer = '{"action_distribution": {"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}}'
+    parsed = parse(f"{answer}\n{opening}hm", role="ego", actions=ACTIONS, thinking=thinking)
+    assert parsed.status is Status.TRUNCATED_REASONING
+    assert parsed.detail.endswith("it may overturn what stands before it")
+    begun = parse(f"{opening.removeprefix('```')}hm", role="ego", actions=ACTIONS, thinking=thinking)
+    assert begun.detail == "the thought was not closed, so no answer was begun"

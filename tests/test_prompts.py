@@ -426,3 +426,10 @@ def test_tokens_decode_to_the_prompt_and_every_digit_is_one(
     encoded = qwen.encode(said)
     assert qwen.decode(encoded.ids) == said
     assert [t for t in encoded.tokens if any(c.isdigit() for c in t)] == [c for c in said if c.isdigit()]
+
+
+def test_a_version_saved_with_byte_order_marks_is_the_same_version(copied: Path) -> None:
+    plain = prompts.load("v6", copied)
+    for file in (copied / "v6").iterdir():
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert prompts.load("v6", copied) == plain

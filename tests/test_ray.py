@@ -76,6 +76,22 @@ def test_a_run_has_the_bytes_of_one_process_where_its_command_is_killed_and_goes
         assert (tmp_path / "killed" / name).read_bytes() == (whole / name).read_bytes(), name
 
 
+def test_a_command_that_is_terminated_while_it_connects_says_so(cluster: Any, tmp_path: Path) -> None:
+    """Ray has a handler of its own until it is connected: here the connection waits, and then it comes."""
+    waits = (
+        "import os, signal, ray\n"
+        "ray.init = lambda **options: ("
+        "signal.signal(signal.SIGTERM, lambda number, frame: exit(number)), os.kill(os.getpid(), 15))\n"
+        "from harness.__main__ import main\n"
+        "main()\n"
+    )
+    command = [*DRIVE, "--workers", "ray", "--out", "run"]
+    done = subprocess.run(
+        [sys.executable, "-c", waits, *command], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (143, "harness: terminated\n")
+
+
 def test_both_nodes_work(cluster: Any) -> None:
     found = spread(where, range(8), Ray(), lambda done: None, repeatable=False)
     assert len(set(found)) == 2

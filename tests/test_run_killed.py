@@ -3,22 +3,25 @@
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from evaluating import FILES, run, same_files, spec_of, walked
 from killed_run import TREES_AT_ONCE, WALKS_AT_ONCE
 
+from harness.backends.base import Backend, Completion, Request
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.core.files import alone
 from harness.dataset.load import Dataset
-from harness.evaluate.asking import read_kept
+from harness.evaluate.asking import MORE_FOLLOWS, read_kept
 from harness.evaluate.latency import PAPER
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 
-RESULT = {*FILES, "run.json"}
+RESULT = {*FILES, "run.json", "sources"}
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +108,36 @@ def test_what_follows_a_torn_line_can_be_read_again(answers: bytes, small: Datas
     assert read_kept(kept) == read_kept(tmp_path / "whole.jsonl")
 
 
+def test_a_torn_chunk_is_asked_again_as_a_whole(answers: bytes, small: Dataset, tmp_path: Path) -> None:
+    """Wherever it is torn, also between two lines: its batches must hold the same questions again."""
+    spec, kept = spec_of(small), tmp_path / "answers.jsonl"
+    lines = answers.splitlines(keepends=True)
+    ends = [n for n, line in enumerate(lines, 1) if not line.endswith(MORE_FOLLOWS)]
+    assert len(ends) > 2
+    for count in (1, ends[0] - 1, ends[0], ends[0] + 1, ends[1] - 1):
+        kept.write_bytes(b"".join(lines[:count]))
+        whole = max([end for end in ends if end <= count], default=0)
+        assert len(read_kept(kept)) == whole, count
+        asked: list[int] = []
+        walked(spec, Counting(open_backend(spec.ego.card), asked), PAPER, kept)
+        assert kept.read_bytes() == answers
+        assert sum(asked) == len(lines) - whole
+
+
+class Counting:
+    """A backend that writes down how many requests it is asked at a time."""
+
+    def __init__(self, backend: Backend, asked: list[int]) -> None:
+        self._backend, self._asked = backend, asked
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        self._asked.append(len(requests))
+        return self._backend.complete(requests)
+
+    def identity(self) -> dict[str, Any]:
+        return self._backend.identity()
+
+
 def test_answers_that_are_all_there_are_not_asked_for_again(
     answers: bytes, small: Dataset, tmp_path: Path
 ) -> None:
@@ -159,7 +192,8 @@ def test_a_run_that_was_stopped_while_it_tidied_up_asks_and_writes_nothing(
     files = [p for p in (tmp_path / "run").iterdir() if p.is_file()]
     before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in files}
     again = run(spec_of(small), tmp_path / "run")
-    assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "run").iterdir()} == before, "tidy"
+    assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in files} == before
+    assert not (tmp_path / "run" / ".work").exists(), "tidy"
     assert again.manifest == first.manifest
     assert list(again.scores) == list(first.scores)
 

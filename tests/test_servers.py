@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -15,13 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from evaluating import same_decisions, same_files, spec_of, with_ego
+from evaluating import FILES, same_decisions, same_files, spec_of, with_ego
 from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import Asked, Play, Server, completion, serving
 from served import served
 
-from harness.backends.base import Request
+from harness.backends.base import Request, Served
 from harness.backends.cards import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai import farm as openai_farm
@@ -32,6 +33,7 @@ from harness.core import resources
 from harness.core.errors import UserError
 from harness.core.work import tidy
 from harness.dataset.load import Dataset
+from harness.evaluate import servers
 from harness.evaluate.asking import Asker
 from harness.evaluate.latency import PAPER
 from harness.evaluate.run import evaluate
@@ -129,13 +131,13 @@ def test_connections_stay_open_between_calls_and_are_closed_with_the_backend() -
 
 
 def test_a_chunk_does_not_wait_for_the_last_answer_of_the_one_before(small: Dataset, tmp_path: Path) -> None:
-    """The first request is answered only when one of the second chunk has come."""
+    """The first request of many is answered only when one of the second chunk has come."""
     second = threading.Event()
 
     def play(asked: Asked) -> None:
-        if asked.number == 0:
+        if asked.number == 1:
             assert second.wait(20)
-        if asked.number >= 64:
+        if asked.number > 64:
             second.set()
         said_back(asked)
 
@@ -144,10 +146,11 @@ def test_a_chunk_does_not_wait_for_the_last_answer_of_the_one_before(small: Data
         backend, asked, counts = opened(there), decisions(32), []
         asker = Asker(spec, lambda: backend, PAPER, tmp_path / "answers.jsonl", progress=counts.append)
         asked += [request(f"t/v{v}") for v in range(3)]
+        asker.ask([request("t/v9")])  # until something is answered, only a few are asked
         asker.ask(asked)
-    assert list(asker.answers) == [r.id for r in asked]
-    assert sorted(counts) == [64, 67], "the last is too few to fill a batch, and goes with the others"
-    assert {a.batch_size for a in asker.answers.values()} == {4}
+    assert list(asker.answers) == ["t/v9", *(r.id for r in asked)]
+    assert sorted(counts) == [1, 64, 67], "the last is too few to fill a batch, and goes with the others"
+    assert {a.batch_size for a in list(asker.answers.values())[1:]} == {4}
 
 
 def test_an_answer_that_had_company_has_no_time() -> None:
@@ -402,10 +405,60 @@ def test_with_no_server_left_the_run_stops_and_goes_on_at_others(
         evaluated(served_spec(small, one, other), tmp_path / "run")
     said = str(caught.value)
     assert f"model 'mine': no server is left: {one} (" in said
-    assert "start one again, and type the same command to continue" in said
+    assert said.endswith("; start one again")
     assert "\n" not in said
     with served() as url:
         assert same_files(evaluated(served_spec(small, url), tmp_path / "run"), whole)
+
+
+def lines(run: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (run / servers.FILE).read_bytes().splitlines()]
+
+
+def test_which_server_gave_each_answer_stands_beside_the_tables(
+    whole: Path, small: Dataset, tmp_path: Path
+) -> None:
+    """One of two servers dies in mid-run: the tables are those of one server, and the file tells of both."""
+    with served(20) as one, served() as other:
+        out = evaluated(served_spec(small, one, other), tmp_path / "run")
+        again = evaluated(served_spec(small, other), tmp_path / "again")
+    assert same_files(out, whole)
+    asked, of_one = lines(out), [line for line in lines(out) if line["server"] == one]
+    assert {line["server"] for line in asked} == {one, other}
+    assert len(of_one) == 20
+    assert [line["id"] for line in asked] == sorted(answer.id for answer in folder.read(out).answers)
+    assert {line["server"] for line in lines(again)} == {other}
+    assert {*map(str, asked[0])} == {"id", "server", "model"}
+    assert not any(one.encode() in (out / name).read_bytes() for name in FILES)
+
+
+def test_a_run_that_is_stopped_and_goes_on_still_says_who_answered(small: Dataset, tmp_path: Path) -> None:
+    with served(70) as one, pytest.raises(UserError):
+        evaluated(served_spec(small, one), tmp_path / "run")
+    kept = (tmp_path / "run/.work/answers.jsonl").read_bytes().count(b"\n")
+    with served() as other:
+        out = evaluated(served_spec(small, other), tmp_path / "run")
+    counts = Counter(line["server"] for line in lines(out))
+    assert counts[one] == kept > 0, "what was kept is not asked again"
+    assert counts[one] + counts[other] == len(folder.read(out).answers)
+
+
+def test_a_run_without_servers_has_no_such_file(small: Dataset, tmp_path: Path) -> None:
+    assert not (evaluated(spec_of(small, seeds=(0,)), tmp_path / "run") / servers.FILE).exists()
+
+
+def test_the_shards_lines_are_put_together_and_a_torn_one_is_left_out(tmp_path: Path) -> None:
+    for n in (0, 1):
+        (tmp_path / f"{n}").mkdir()
+        asked = [Served(f"s{n}/v{v}", f"http://{n}/v1", None) for v in range(2)]
+        servers.keep(tmp_path / f"{n}", asked)
+        servers.keep(tmp_path / f"{n}", [Served("twice/v0", f"http://{n}/v1", "m")])
+        servers.keep(tmp_path / f"{n}", [])
+    servers.keep(tmp_path / "1", b'{"id":"torn/v0","serv')
+    servers.write(tmp_path, [tmp_path / "0", tmp_path / "1", tmp_path / "missing"])
+    assert [(line["id"], line["server"][7]) for line in lines(tmp_path)] == [
+        ("s0/v0", "0"), ("s0/v1", "0"), ("s1/v0", "1"), ("s1/v1", "1"), ("twice/v0", "1"),
+    ]  # fmt: skip
 
 
 def test_an_answer_of_one_server_is_kept_for_all(small: Dataset, whole: Path, tmp_path: Path) -> None:
@@ -469,6 +522,11 @@ def test_servers_are_named_on_the_command_line(harness: Typed, project: Path, sm
     assert manifest["model"]["server"]["base_url"] == "http://127.0.0.1:9/v1", "the card's own"
     assert manifest["identity"]["listed"] == {"id": "m", "owned_by": "tests"}
     assert manifest["engine_errors"] == 0
+    for run in ("run", "driven"):
+        asked, answers = lines(project / run), folder.read(project / run).answers
+        assert {line["server"] for line in asked} <= {one, other}
+        assert {line["id"] for line in asked} >= {answer.id for answer in answers}
+        assert len(asked) >= len(answers) > 0
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from harness.core.errors import UserError
 from harness.core.files import alone
 from harness.core.shards import Shard, shard_of
+from harness.runs.sources import read as read_sources
 
 Typed = Callable[..., tuple[int, str, str]]
 DRIVE = ("drive", "--model", "cruise", "--episodes", "36", "--seeds", "0", "--workers", "1", "--quiet")
@@ -108,7 +109,8 @@ def test_merged_shards_are_the_run_that_was_not_split(split: Path, harness: Type
         k: v for k, v in theirs.items() if k not in TIMES
     }
     assert shlex.split(ours["command"])[:-1] == shlex.split(theirs["command"])[:-1]
-    assert {path.name for path in merged.iterdir()} == {*FILES, "run.json", "report.html"}
+    assert {path.name for path in merged.iterdir()} == {*FILES, "run.json", "report.html", "sources"}
+    assert read_sources(merged) == read_sources(whole) != {}
     code, _, said = harness("merge", *shards, "--out", "merged")
     assert (code, "already holds a finished run" in said) == (2, True)
     (merged / ".work").mkdir()  # killed while it tidied up

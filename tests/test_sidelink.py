@@ -1,6 +1,6 @@
 """LTE Mode 4: its factors against the equations, its collisions against a simulation, and its limits."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Links, Site
 from harness.radio.fading import Trips
 from harness.radio.lte_mode4 import LteMode4
 from harness.radio.nr_mode2 import NrMode2
+from harness.radio.profiles import CHANNELS, outside
 from harness.radio.sps import Scheduling, taken
 
 QUIET = LteMode4(density_per_km=0.0)
@@ -245,6 +246,20 @@ def test_a_packet_takes_the_sub_channels_that_it_needs():
     assert NR.block_error(np.array([16.1, 16.2])).tolist() == [1.0, 0.0]
     with pytest.raises(UserError, match="raise bandwidth_mhz or mcs"):
         replace(radio, numerology=2, packet_bytes=300)
+
+
+def test_the_profile_mode2_has_the_set_up_of_the_simulations_it_is_held_against():
+    radio = CHANNELS["mode2"]
+    assert isinstance(radio, NrMode2)
+    # 4.5e-17 W/Hz in each of 10 resource blocks of 180 kHz.
+    assert radio.sensing_dbm == pytest.approx(10 * np.log10(4.5e-17 * 10 * 180e3) + 30, abs=0.02)
+    # Free space in sight: 23 dBm less 93.9 dB, at 201.6 m. Half is above that, less half duplex.
+    alone = replace(radio, density_per_km=0.0)
+    reach_m = np.array([10 ** ((23 + 70.9 - 32.4 - 20 * np.log10(5.89)) / 20)])
+    assert alone.reception(reach_m, CLEAR)[0] == pytest.approx(0.5 * 0.99, abs=0.005)
+    # 2^(2.16 / 0.62) - 1 = 10.2, 10.1 dB.
+    assert radio.block_error(np.array([10.0, 10.2])).tolist() == [1.0, 0.0]
+    assert outside(asdict(radio), CHANNELS.profile("mode2").limits) == []
 
 
 def test_the_selection_window_is_in_the_delay_alone():

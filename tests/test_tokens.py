@@ -9,6 +9,7 @@ import pytest
 from harness.backends.cards import resolve
 from harness.backends.tokens import counter, tokenizer
 from harness.core.errors import UserError
+from harness.core.resources import find
 
 MESSAGES = ({"role": "system", "content": "ab"}, {"role": "user", "content": "ba 17"})
 
@@ -98,3 +99,41 @@ def test_the_tokenizer_beside_the_weights_counts_where_none_is_given(tmp_path: P
     assert count(MESSAGES) == 3
     assert counter(None, resolve("proxy")) is None
     assert counter(None) is None
+
+
+SHIPPED = find("models", "swarm-tiny") / "tokenizer.json"
+BOS = "<|endoftext|>"
+
+
+def saved(folder: Path, **changes: Any) -> Path:
+    """The tokenizer that ships, saved with other settings."""
+    folder.mkdir(exist_ok=True)
+    (folder / "tokenizer.json").write_text(json.dumps({**json.loads(SHIPPED.read_text()), **changes}))
+    return folder
+
+
+def test_a_saved_limit_or_padding_changes_no_count(tmp_path: Path) -> None:
+    long = [{"role": "user", "content": "v2 vehicle 63 17 89 6.0 exit-left ?\n" * 40}]
+    cut = {"direction": "Right", "max_length": 16, "strategy": "LongestFirst", "stride": 0}
+    padded = {"strategy": {"Fixed": 4096}, "direction": "Right", "pad_to_multiple_of": None, "pad_id": 0,
+              "pad_type_id": 0, "pad_token": BOS}  # fmt: skip
+    counts = [
+        counted(long)
+        for source in (SHIPPED, saved(tmp_path, truncation=cut, padding=padded))
+        if (counted := counter(source))
+    ]
+    assert counts[0] == counts[1] > 400
+
+
+def test_a_token_around_a_whole_prompt_is_not_counted_for_each_message(tmp_path: Path) -> None:
+    from tokenizers import Tokenizer, processors
+
+    shipped = Tokenizer.from_file(str(SHIPPED))
+    begins = processors.TemplateProcessing(
+        single=f"{BOS} $A", pair=f"{BOS} $A $B", special_tokens=[(BOS, shipped.token_to_id(BOS))]
+    )
+    shipped.post_processor = begins
+    shipped.save(str(tmp_path / "tokenizer.json"))
+    assert len(tokenizer(tmp_path).encode("a").ids) == 2
+    counts = [counted(MESSAGES) for source in (SHIPPED, tmp_path) if (counted := counter(source))]
+    assert counts[0] == counts[1]

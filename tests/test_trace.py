@@ -45,6 +45,21 @@ def test_reception_is_on_straight_lines_between_rows_held_before_them_and_zero_a
     assert math.isnan(trace.busy_ratio())
 
 
+@pytest.mark.parametrize("nothing", ["", "nan", " NaN "])
+def test_what_never_arrives_needs_no_latency(nothing: str, tmp_path: Path) -> None:
+    """Half of the messages at 75 m arrive; they take as long as those at 50 m."""
+    rows = f"0,0,{nothing}\n10,1,3\n50,1,5\n100,0,{nothing}\n"
+    trace = load(table(tmp_path, f"distance_m,reception,latency_ms\n{rows}"))
+    assert [p.latency_s for p in trace.receptions.points] == pytest.approx([0.003, 0.003, 0.005, 0.005])
+    sight = "clear,vehicle,building"
+    rows = "".join(f"{d},{r},{w},{t}\n" for w in sight.split(",") for d, r, t in ((0, w != "building", 7),))
+    rows = rows.replace("0,True,", "0,1,").replace("0,False,building,7", f"0,0,building,{nothing}")
+    walled = load(table(tmp_path, f"distance_m,reception,sight,latency_ms\n{rows}"))
+    assert [p.latency_s for p in walled.receptions.points] == [0.007] * 3
+    none = load(table(tmp_path, f"distance_m,reception,latency_ms\n0,0,{nothing}\n"), latency_s=0.1)
+    assert none.receptions.points[0].latency_s is None
+
+
 def test_what_stands_between_has_a_curve_of_its_own_and_an_unknown_place_none(tmp_path):
     trace = load(table(tmp_path, SIGHTED))
     assert trace.reception(np.array([100.0])).tolist() == pytest.approx([0.95]), "clear, if nothing is said"
@@ -93,6 +108,12 @@ def test_a_reply_comes_after_the_latency_of_its_distance_if_both_messages_cross(
             "distance_m,reception,sight\n1,1,clear\n",
             "has no row of sight 'vehicle'; with sight it needs clear",
         ),
+        (
+            "distance_m,reception,latency_ms\n1,1,\n",
+            "line 2: latency_ms is ''; it must be milliseconds, 0 or",
+        ),
+        ("distance_m,reception,latency_ms\n1,0.1,nan\n", "it may be blank where reception is 0"),
+        ("distance_m,reception,latency_ms\n1,0,soon\n", "line 2: latency_ms is 'soon'"),
         ("distance_m,reception,latency_ms\n1,1,-4\n", "line 2: latency_ms is '-4'; it must be milliseconds"),
     ],
 )

@@ -132,10 +132,11 @@ def test_the_thinking_switch_alters_the_prompt(backend: LanguageModel) -> None:
 
 
 def test_a_template_without_the_switch_is_rendered_as_it_is(tmp_path: Path) -> None:
-    bare = tiny_qwen3.build(tmp_path / "bare", template="{{ messages[0].content }}>")
+    bare = tiny_qwen3.build(tmp_path / "bare", template="{{ messages | map(attribute='content') | join }}>")
     opened = open_tiny(bare)
     assert opened.chat.thinking == "none"
-    assert opened.chat.render(ask(0).messages, thinking=True) == "You drive.>"
+    said = "".join(message["content"] for message in ask(0).messages)
+    assert opened.chat.render(ask(0).messages, thinking=True) == f"{said}>"
     always = tiny_qwen3.build(tmp_path / "always", template="{{ messages[0].content }}<think>\n")
     assert open_tiny(always).chat.thinking == "always"
 

@@ -76,7 +76,7 @@ def twins_of(name: str, dataset: Dataset) -> Iterator[tuple[dict[str, Any], dict
 def asked(spec: Spec, out: Path, *names: str) -> list[scoring.Row]:
     """The rows of a study."""
     names = names or tuple(TWINS)
-    pairs = asking.ask(Study(spec, names, 0), out, lambda done: None, None, 1)
+    pairs, _ = asking.ask(Study(spec, names, 0), out, lambda done: None, None, 1)
     tidy(out)
     return scoring.rows(pairs, [TWINS[name] for name in names])
 
@@ -370,8 +370,7 @@ def test_a_failed_answer_holds_nothing_and_has_no_distance(
     spec = spec_for(crossing, "swarm-tiny")
     study = Study(spec, ("ids",), 0)
     scene = study.points()[0][0]
-    wrong = f"{scene}~ids/v1"
-    answering(Scripted({wrong: failed(wrong, "out of memory")}))
+    answering(Scripted({f"{scene}~ids/v1": "I would rather not say"}))
     ego, helper = asked(spec, tmp_path / "out", "ids")
     n = ego.invariance_rate.n
     assert ego.invariance_rate.value == pytest.approx(1 - 1 / n)
@@ -379,6 +378,21 @@ def test_a_failed_answer_holds_nothing_and_has_no_distance(
     assert (ego.tv_distance.n, ego.tv_distance.value) == (n - 1, 0.0)
     assert (ego.broken[0].scene, ego.broken[0].q, ego.broken[0].distance) == (scene, None, None)
     assert helper.invariance_rate.value == 1
+
+
+def test_what_a_helper_did_not_answer_is_left_out_and_counted(
+    crossing: Dataset, tmp_path: Path, answering: Callable[[Any], None]
+) -> None:
+    spec = spec_for(crossing, "swarm-tiny")
+    study = Study(spec, ("ids",), 0)
+    lost = f"{study.points()[0][0]}~ids/v2"
+    answering(Scripted({lost: failed(lost, "out of memory")}))
+    pairs, said = asking.ask(study, tmp_path / "out", lambda done: None, None, 1)
+    [helper] = [row for row in scoring.rows(pairs, [TWINS["ids"]]) if row.role == "helper"]
+    n = helper.invariance_rate.n + 1
+    assert said == f"questions of helpers 1 of {2 * n}"
+    assert (helper.invariance_rate.value, helper.failed_rate.value) == (1.0, 0.0)
+    assert lost not in (tmp_path / "out/.work/answers-000000.jsonl").read_text()
 
 
 def pair(episode: int, p: Any, q: Any, name: str = "ids") -> Pair:
@@ -490,7 +504,7 @@ def test_the_command_prints_writes_and_gates(
     assert links.targets <= links.ids
     code, _, err = harness("twins", "--model", "proxy-faulty", "--sample", "3", "--out", "faulty")
     assert code == 2
-    assert "has finished twins" in err
+    assert "already holds finished twins" in err
 
 
 def test_workers_change_nothing(harness: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:

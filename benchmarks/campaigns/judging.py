@@ -18,7 +18,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from harness import cli
+import harness.cli  # noqa: F401 (loaded before it is forked)
+from harness import __main__ as entry
 
 SCENARIO = "occluded-intersection"
 LIMIT_S = 120.0
@@ -28,12 +29,13 @@ TESTS = Path(__file__).parents[2] / "tests"
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: its exit code, or the negative signal, and what it said."""
+    """How a command ended: its exit code or negative signal, what it said, and the most memory, in bytes."""
 
     command: Sequence[str]
     code: int
     out: str
     err: str
+    peak: int
 
     @property
     def faults(self) -> list[str]:
@@ -67,7 +69,7 @@ class Running:
             resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
             sys.argv = ["harness", *self.command]
             prepare()
-            cli.main()
+            entry.main()
             code = 0
         except SystemExit as ended:
             code = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
@@ -83,7 +85,7 @@ class Running:
     def ended(self, within_s: float = LIMIT_S) -> Ended:
         """Wait for it; it is killed when it takes longer."""
         until_s = time.monotonic() + within_s
-        while (done := os.waitpid(self.pid, os.WNOHANG))[0] == 0:
+        while (done := os.wait4(self.pid, os.WNOHANG))[0] == 0:
             if time.monotonic() > until_s:
                 os.killpg(self.pid, signal.SIGKILL)
             time.sleep(0.01)
@@ -91,21 +93,26 @@ class Running:
         for file in self._said:
             file.seek(0)
             said.append(file.read().decode("utf-8", "replace"))
-        return Ended(self.command, os.waitstatus_to_exitcode(done[1]), *said)
+        return Ended(self.command, os.waitstatus_to_exitcode(done[1]), *said, done[2].ru_maxrss << 10)
 
     def left(self, within_s: float = 5.0) -> list[int]:
         """Processes of its session that are still there so long after it ended; they are then killed."""
-        until_s = time.monotonic() + within_s
-        while (alive := list(_session(self.pid))) and time.monotonic() < until_s:
-            time.sleep(0.05)
-        for pid in alive:
-            os.kill(pid, signal.SIGKILL)
-        return alive
+        return of_session(self.pid, within_s)
 
 
 def typed(*command: object, prepare: Callable[[], object] = lambda: None) -> Ended:
     """Run a command to its end."""
     return Running(command, prepare).ended()
+
+
+def of_session(leader: int, within_s: float = 5.0) -> list[int]:
+    """Processes of a session that are still there after so many seconds; they are then killed."""
+    until_s = time.monotonic() + within_s
+    while (alive := list(_session(leader))) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    for pid in alive:
+        os.kill(pid, signal.SIGKILL)
+    return alive
 
 
 def _session(leader: int) -> Iterator[int]:

@@ -3,11 +3,12 @@
 How a backend batches or threads inside is its own matter; the rest of the program does not depend on it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
+from harness.core.files import canonical_json
 from harness.core.image import Image
 
 if TYPE_CHECKING:
@@ -146,6 +147,21 @@ class Backend(Protocol):
         ...
 
 
+def same_model(stored: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Whether an identity is that of a stored one; what an earlier version did not store is not compared."""
+    return canonical_json(_as_stored(now, stored)) == canonical_json(stored)
+
+
+def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an identity without what servers state, if the stored one lacks that; the helpers' as well."""
+    made = {key: value for key, value in now.items() if key != "states" or key in stored}
+    helpers, others = made.get("helpers"), stored.get("helpers")
+    if isinstance(helpers, list | tuple) and isinstance(others, list | tuple) and len(helpers) == len(others):
+        pairs = zip(helpers, others, strict=True)
+        made["helpers"] = [_as_stored(h, o) if isinstance(o, Mapping) else h for h, o in pairs]
+    return made
+
+
 class Rendering(Backend, Protocol):
     """A backend of a language model that can show the prompts that its model is sent."""
 
@@ -164,6 +180,34 @@ def window(backend: Backend) -> int:
     0 for a backend that takes one call at a time; it has no attribute `window`.
     """
     return getattr(backend, "window", 0)
+
+
+class Served(NamedTuple):
+    """Which server gave an answer.
+
+    Attributes:
+        id: the request's id.
+        server: base URL of the server.
+        model: the model that the server says has answered; None if it says none.
+    """
+
+    id: str
+    server: str
+    model: str | None
+
+
+def served(backend: Backend) -> list[Served]:
+    """Return which server gave each answer since the last call; empty for a backend without servers."""
+    taken: Callable[[], list[Served]] | None = getattr(backend, "served", None)
+    return taken() if taken else []
+
+
+def doubt(backend: Backend) -> str | None:
+    """Return why a backend's cached answers may be of other weights, in one line; None if it can tell.
+
+    A backend whose identity does not show that its weights have changed has an attribute `doubt`.
+    """
+    return getattr(backend, "doubt", None)
 
 
 class Timed(Backend, Protocol):

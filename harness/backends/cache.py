@@ -10,10 +10,11 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from harness.backends.base import Backend, Completion, Rendering, Request, window
+from harness.backends.base import Backend, Completion, Rendering, Request, Served, doubt, served, window
 from harness.backends.cards import Card
 from harness.backends.registry import capabilities
 from harness.core import kept
@@ -100,6 +101,12 @@ class CompletionFile:
             yield file
 
 
+@lru_cache
+def _say_once(line: str, identity: str) -> None:
+    """Print a line about a model on stderr; a run has several caches of one model."""
+    print(line, file=sys.stderr)
+
+
 def _completion(kept: dict[str, Any]) -> Completion:
     return Completion(request_id="", seconds=None, cached=True, **kept)
 
@@ -123,12 +130,15 @@ class Cached:
         self._identity = backend.identity()
         self._file: CompletionFile | None = CompletionFile(file)
         self.window = window(backend)
+        self._doubt = doubt(backend)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """Return one completion per request, in order; the backend answers those that are not cached."""
         prompts = self.backend.rendered(requests)
         keys = [key(self._identity, p, r) for p, r in zip(prompts, requests, strict=True)]
         known = self._try(lambda file: file.find(keys)) or {}
+        if known and self._doubt:
+            _say_once(f"harness: {self._doubt}", digest(self._identity))
         missing = [r for k, r in zip(keys, requests, strict=True) if k not in known]
         answers = iter(self.backend.complete(missing) if missing else [])
         completions = [
@@ -142,6 +152,9 @@ class Cached:
 
     def identity(self) -> dict[str, Any]:
         return self._identity
+
+    def served(self) -> list[Served]:
+        return served(self.backend)
 
     def _try(self, work: Callable[[CompletionFile], T]) -> T | None:
         """Return the result of some work on the file; None once the file has failed."""

@@ -1,6 +1,6 @@
 """The model card: a record of a model, its engine, its weights and its latency, read from a TOML file."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,6 +15,7 @@ from harness.core.errors import UserError, printable, unknown
 
 Dtype = Literal["float32", "bfloat16", "auto"]
 Thinking = Literal["none", "switch", "always"]
+System = Literal["first-user"]
 LatencySource = Literal["card", "paper"]
 Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z", description="64 digits 0-9 a-f")]
 
@@ -67,6 +68,8 @@ class Card:
         failures: how often the proxy fails on purpose; None if it never does.
         vision: how the model takes pictures; None if it only reads text.
         projector: name of the GGUF file beside `file` that turns pictures into tokens.
+        system: `first-user` puts the system text at the beginning of the first user turn, for a chat template
+            that has no place for it; None gives it a message of its own.
     """
 
     name: str
@@ -90,6 +93,7 @@ class Card:
     failures: Failures | None = None
     vision: Vision | None = None
     projector: str | None = None
+    system: System | None = None
 
     def at(self, urls: tuple[str, ...]) -> "Card":
         """Return the card of a served model with other servers; the card itself if `urls` is empty.
@@ -98,6 +102,22 @@ class Card:
             ValueError: one is not a base URL, or is named twice.
         """
         return replace(self, server=replace(self.server, base_url=urls)) if self.server and urls else self
+
+    def record(self) -> dict[str, Any]:
+        """Return the card as plain values, from which `convert` makes it again.
+
+        Keys that later versions added stand in it only where they are set: a run that an earlier version
+        began has the same settings.
+        """
+        record = asdict(self)
+        if self.system is None:
+            del record["system"]
+        if self.server:
+            server = {key: value for key, value in record["server"].items() if value is not None}
+            if self.server.fields:
+                server["fields"] = dict(self.server.fields.changed)
+            record["server"] = server
+        return record
 
 
 @dataclass(frozen=True)
@@ -109,7 +129,7 @@ class _File(Card):
 
 # Keys that only some engines understand; a `Registration` says which.
 _ENGINE_KEYS = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation",
-                "failures", "privileged", "vision", "projector")  # fmt: skip
+                "failures", "privileged", "vision", "projector", "system")  # fmt: skip
 # Keys that a model may set again for each further engine.
 _PER_ENGINE = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
                "server", "projector")  # fmt: skip

@@ -7,17 +7,19 @@ lists. For a directory, a GGUF file, a hub id or `replay:RUN_DIR`, a card is mad
 import json
 import os.path
 import re
+import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 
-from harness.backends.card import Card, Dtype, Latency, LatencySource, Thinking, read
+from harness.backends.card import Card, Dtype, Latency, LatencySource, System, Thinking, read
 from harness.backends.registry import engines
 from harness.backends.vision import Vision, of_checkpoint
 from harness.core import resources
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import bytes_of, opened, text_of
 
 __all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", "each_engine", "load",
            "load_all", "names", "own", "resolve"]  # fmt: skip
@@ -30,6 +32,7 @@ _PLACE = ("description", "latency", "weights", "file", "revision", "sha256", "ga
 _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 PROJECTOR = "mmproj-"  # prefix of a projector's GGUF file
 _SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
+_GGUF_TEMPLATE = b"tokenizer.chat_template" + struct.pack("<I", 8)  # the key, and the type of a text
 _GGUF_HEAD = 1 << 25  # the first bytes of a GGUF file, with its vocabulary and its template
 
 
@@ -166,7 +169,7 @@ def _of_directory(text: str, where: Path, engine: str | None) -> Card:
     files = sorted(file for file in where.glob("*.gguf") if not file.name.startswith(PROJECTOR))
     if (where / "config.json").is_file() and engine != "llama-cpp":
         card = _new_card(where.name, "transformers", str(where), "Local directory", _thinking(where))
-        return replace(card, vision=_vision(text, where))
+        return replace(card, vision=_vision(text, where), system=_system(_template(where)))
     if len(files) == 1:
         return _of_file(text, files[0])
     if files:
@@ -181,10 +184,15 @@ def _of_directory(text: str, where: Path, engine: str | None) -> Card:
 
 def _of_file(text: str, file: Path) -> Card:
     """Make the card of a GGUF file, with the projector beside it that has the same name behind its prefix."""
-    card = _new_card(file.stem, "llama-cpp", str(file), "Local GGUF file", _gguf_thinking(file))
+    with opened(file, "weights") as data:
+        head = data.read(_GGUF_HEAD)
+    thinking: Thinking = "switch" if _SWITCH in head else "none"
+    card = _new_card(file.stem, "llama-cpp", str(file), "Local GGUF file", thinking)
     beside = file.with_name(f"{PROJECTOR}{file.name}")
     vision = _vision(text, file.parent) if beside.is_file() else None
-    return replace(card, vision=vision, projector=beside.name if vision else None)
+    return replace(
+        card, vision=vision, projector=beside.name if vision else None, system=_system(_gguf_template(head))
+    )
 
 
 def _path(text: str) -> Path | None:
@@ -201,13 +209,13 @@ def _new_card(name: str, engine: str, weights: str, description: str, thinking: 
 def _thinking(checkpoint: Path) -> Thinking:
     """Return `switch` if a checkpoint's chat template has the thinking switch; reads the file's text only."""
     files = (checkpoint / name for name in _TEMPLATE_FILES)
-    return "switch" if any(_SWITCH in f.read_bytes() for f in files if f.is_file()) else "none"
+    return "switch" if any(_SWITCH in bytes_of(f, "record") for f in files if f.is_file()) else "none"
 
 
 def _run_vision(run: Path) -> Vision | None:
     """Return how a run's model took pictures; None also for an unreadable run, which fails on opening."""
     with suppress(OSError, ValueError, TypeError, KeyError, UserError):
-        stated = json.loads((run / "run.json").read_bytes())["model"]["vision"]
+        stated = json.loads(text_of(run / "run.json", "record"))["model"]["vision"]
         return stated and convert(stated, Vision, "vision")
     return None
 
@@ -216,7 +224,7 @@ def _vision(text: str, checkpoint: Path) -> Vision | None:
     """Return how a checkpoint takes pictures, from its config files. Raises UserError if they do not say."""
     try:
         config, processor = (
-            json.loads(file.read_bytes()) if file.is_file() else {}
+            json.loads(text_of(file, "record")) if file.is_file() else {}
             for file in (checkpoint / "config.json", checkpoint / "preprocessor_config.json")
         )
         return of_checkpoint(config, processor)
@@ -227,7 +235,30 @@ def _vision(text: str, checkpoint: Path) -> Vision | None:
         ) from None
 
 
-def _gguf_thinking(file: Path) -> Thinking:
-    """Return `switch` if the chat template in a GGUF file has the thinking switch; the file is not parsed."""
-    with file.open("rb") as data:
-        return "switch" if _SWITCH in data.read(_GGUF_HEAD) else "none"
+def _system(template: str | None) -> System | None:
+    """Return how a card made on the spot gives the system text, so that its chat template takes it."""
+    from harness.backends.chat_template import needs_first_user  # imports Jinja, as few cards do
+
+    return "first-user" if template and needs_first_user(template) else None
+
+
+def _template(checkpoint: Path) -> str | None:
+    """Return a checkpoint's chat template; None if its files do not say, which opening it reports."""
+    with suppress(OSError, ValueError):
+        if (file := checkpoint / _TEMPLATE_FILES[0]).is_file():
+            return text_of(file)
+        template = json.loads(text_of(checkpoint / _TEMPLATE_FILES[1], "record")).get("chat_template")
+        return template if isinstance(template, str) else None
+    return None
+
+
+def _gguf_template(head: bytes) -> str | None:
+    """Return the chat template in the first bytes of a GGUF file; None if it is not among them.
+
+    A text follows its key, its type and its length.
+    """
+    _, found, rest = head.partition(_GGUF_TEMPLATE)
+    if not found or len(rest) < 8:
+        return None
+    (length,) = struct.unpack_from("<Q", rest)
+    return rest[8 : 8 + length].decode(errors="replace") if length <= len(rest) - 8 else None

@@ -1,6 +1,6 @@
 """Check a language model before a run: the prompt it reads, token by token, its answers and their time."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -57,7 +57,10 @@ class Checkup:
     Attributes:
         prompt: the first question as the model reads it, or as a server is sent it.
         tokens: its token ids, each with its text; None if only a server knows them.
-        bos_tokens: number of BOS tokens among them; more than one harms most models.
+        bos_tokens: number of BOS tokens that it begins with; more than one harms most models. Further on,
+            BOS may be the mark of a turn.
+        turn_end: text of the token with which its chat template ends an answer; None if there is no such
+            token, and for a server's.
         thinking: what the model's own template can do, whatever its card says; None for a server's.
         answers: one answer in each answer mode, asked alone after a warm-up; the seconds are of batch size 1.
         identity: identity of the backend, as in a run's manifest.
@@ -67,39 +70,56 @@ class Checkup:
     prompt: str
     tokens: list[tuple[int, str]] | None
     bos_tokens: int | None
+    turn_end: str | None
     thinking: Thinking | None
     answers: dict[AnswerMode, Completion]
     identity: dict[str, Any]
     looks: Looks | None = None
 
 
-def check(backend: Rendering, asked: Sequence[Request], shown: Sequence[Pictured] = ()) -> Checkup:
+def check(
+    backend: Rendering, asked: Sequence[Request], shown: Sequence[Pictured] = (),
+    progress: Callable[[int], None] = lambda done: None,
+) -> Checkup:  # fmt: skip
     """Check a model with some questions, one in each answer mode.
 
     Args:
         backend: the model's backend.
         asked: the questions.
         shown: questions of an image prompt; empty for a model without vision.
+        progress: called with 1 as soon as a question is answered.
     """
+
+    def answer(request: Request, warm: bool = False) -> Completion:
+        completion = _answer(backend, request, warm)
+        progress(1)
+        return completion
+
     [prompt] = backend.rendered(asked[:1])
     chat: Chat | None = getattr(backend, "chat", None)
     ids = chat.encode(prompt) if chat else []
     return Checkup(
         prompt=prompt,
         tokens=list(zip(ids, chat.pieces(ids), strict=True)) if chat else None,
-        bos_tokens=ids.count(chat.bos) if chat and chat.bos is not None else (0 if chat else None),
+        bos_tokens=_leading(ids, chat.bos) if chat else None,
+        turn_end=chat.pieces([end])[0] if chat and (end := chat.turn_end) is not None else None,
         thinking=chat.thinking if chat else None,
-        answers={request.answer: _answer(backend, request) for request in asked},
+        answers={request.answer: answer(request) for request in asked},
         identity=backend.identity(),
-        looks=_looks(backend, shown) if shown else None,
+        looks=_looks(answer, shown) if shown else None,
     )
 
 
-def _looks(backend: Rendering, shown: Sequence[Pictured]) -> Looks:
-    answers = {own.answer: _answer(backend, own) for own, _, _ in shown}
-    others = {blank.answer: _answer(backend, blank, warm=True) for _, blank, _ in shown}
+def _leading(ids: Sequence[int], token: int | None) -> int:
+    """Return how often a token stands at the beginning."""
+    return next((n for n, other in enumerate(ids) if other != token), len(ids))
+
+
+def _looks(answer: Callable[..., Completion], shown: Sequence[Pictured]) -> Looks:
+    answers = {own.answer: answer(own) for own, _, _ in shown}
+    others = {blank.answer: answer(blank, warm=True) for _, blank, _ in shown}
     answered = [text for _, _, text in shown if not (answers[text.answer].error or others[text.answer].error)]
-    return Looks(answers, others, _answer(backend, answered[-1], warm=True) if answered else None)
+    return Looks(answers, others, answer(answered[-1], warm=True) if answered else None)
 
 
 def _answer(backend: Rendering, request: Request, warm: bool = False) -> Completion:

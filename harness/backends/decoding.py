@@ -49,7 +49,7 @@ class Decoding:
         self._engine = engine
         self._chat = engine.chat
         self._skeletons: dict[tuple[str, str, tuple[str, ...]], Skeleton] = {}
-        self._letters: dict[tuple[str, ...], list[int]] = {}
+        self._letters: dict[tuple[str, ...], list[list[int]]] = {}
 
     def room(self, request: Request) -> int:
         """Return the most tokens that the answer can take after the prompt.
@@ -167,18 +167,20 @@ class Decoding:
 
     def _read_out(self, session: Session, requests: Sequence[Request]) -> list[Answer]:
         # Requests may have different numbers of actions: each column stands for one letter's token.
-        letter_tokens = sorted({token for r in requests for token in self._letter_tokens(r.actions)})
+        spellings = {r.actions: self._letter_tokens(r.actions) for r in requests}
+        letter_tokens = sorted({token for of in spellings.values() for tokens in of for token in tokens})
         column = {token: j for j, token in enumerate(letter_tokens)}
         answers = []
         for request, row in zip(requests, session.log_probs(letter_tokens), strict=True):
-            log_p = [float(row[column[token]]) for token in self._letter_tokens(request.actions)]
-            largest = max(log_p)
-            weights = [math.exp(x - largest) for x in log_p]
+            log_p = [[float(row[column[token]]) for token in of] for of in spellings[request.actions]]
+            largest = max(map(max, log_p))
+            weights = [math.fsum(math.exp(x - largest) for x in of) for of in log_p]
             text = stated(request.actions, weights)
             answers.append(Answer(text, 1, "stop", min(1.0, math.exp(largest) * sum(weights))))
         return answers
 
-    def _letter_tokens(self, actions: tuple[str, ...]) -> list[int]:
+    def _letter_tokens(self, actions: tuple[str, ...]) -> list[list[int]]:
+        """Return the tokens of each letter, in all its spellings: with a blank before it, and without."""
         if actions not in self._letters:
             encodings = [tokens_after(self._chat, "\n", letter) for letter in letters(actions)]
             if any(len(tokens) != 1 for tokens in encodings) or len(set(encodings)) < len(encodings):
@@ -186,7 +188,11 @@ class Decoding:
                     f"model {printable(self._chat.name)!r}: its tokenizer has no single token for each of "
                     f"the letters {letters(actions)}; use --answer json"
                 )
-            self._letters[actions] = [token for (token,) in encodings]
+            known = self._chat.spellings(letters(actions))
+            self._letters[actions] = [
+                sorted({token, *known[letter]})
+                for (token,), letter in zip(encodings, letters(actions), strict=True)
+            ]
         return self._letters[actions]
 
 

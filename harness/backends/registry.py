@@ -102,7 +102,7 @@ BUILT_IN: Mapping[str, Registration] = {
     "transformers": Registration(
         "harness.backends.transformers.engine:open",
         Capabilities(has_weights=True, samples=True),
-        card_keys=(*_WEIGHTS, "dtype", "vision"),
+        card_keys=(*_WEIGHTS, "dtype", "vision", "system"),
         required_keys=("weights",),
         packages={"torch": "torch", "transformers": "transformers"},
         install=extras.install("transformers"),
@@ -112,7 +112,7 @@ BUILT_IN: Mapping[str, Registration] = {
     "llama-cpp": Registration(
         "harness.backends.llama_cpp.backend:open",
         Capabilities(has_weights=True, samples=True),
-        card_keys=(*_WEIGHTS, "file", "quantisation", "vision", "projector"),
+        card_keys=(*_WEIGHTS, "file", "quantisation", "vision", "projector", "system"),
         required_keys=("weights",),
         packages={"llama_cpp": "llama-cpp-python"},
         install=extras.install("llama-cpp"),
@@ -121,7 +121,7 @@ BUILT_IN: Mapping[str, Registration] = {
     "openai": Registration(
         "harness.backends.openai.backend:open",
         Capabilities(thinks="card", samples=True),
-        card_keys=("vision",),
+        card_keys=("vision", "system"),
         required_keys=("weights", "server"),
     ),
 }

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import AGAIN, Backend, Completion, Request
+from harness.backends.base import AGAIN, Backend, Completion, Request, same_model
 from harness.backends.cache import cached, default_file
 from harness.backends.cards import Card, own
 from harness.backends.registry import find, open_backend
@@ -14,13 +14,15 @@ from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_file
 from harness.runs.folder import Run, read
 from harness.runs.records import BLIND, Answer, FirstTurn, Latency
+from harness.runs.unanswered import why
 
 
 def open(card: Card, **_: Any) -> "Replay":
     """Open the run folder that a card names.
 
     Raises:
-        UserError: it is not a finished run, or it is a driver's run, which has answers of the ego only.
+        UserError: it is not a finished run, it is a driver's run, which has answers of the ego only, or it
+            lacks answers that no run can do without.
     """
     run = read(Path(card.weights or ""))
     engine = find(str(run.manifest.model.get("engine")))
@@ -29,6 +31,8 @@ def open(card: Card, **_: Any) -> "Replay":
             f"{printable(run.path)} is a run of a driver; "
             f"run it again with --model {printable(run.manifest.model['name'])}"
         )
+    if said := why(run.path):
+        raise UserError(f"{printable(run.path)} lacks answers, so nothing replays it: {said}; run it again")
     return Replay(run)
 
 
@@ -90,8 +94,9 @@ class Replay:
             model = open_backend(card, dtype=manifest.dtype, batch_size=manifest.batch_size)
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":
-                stored = manifest.identity["helpers"][0]
-            if digest(model.identity()) != digest(stored):
+                helpers = manifest.identity.get("helpers")
+                stored = helpers[0] if isinstance(helpers, list) and helpers else {}
+            if not same_model(stored, model.identity()):
                 raise UserError(
                     f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} has "
                     "changed since that run; make the run again"
@@ -139,7 +144,7 @@ class Replay:
     def identity(self) -> dict[str, Any]:
         """Return the digest of the run's answers, with its model and identity."""
         return {
-            "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl"),
+            "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl", "rows"),
             "of": {"model": self._run.manifest.model, "identity": self._run.manifest.identity},
         }  # fmt: skip
 

@@ -5,9 +5,10 @@ A card is a public file: it names the environment variable of the key and holds 
 
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from sys import float_info
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 from urllib.parse import urlsplit
 
 from msgspec import Meta
@@ -16,7 +17,66 @@ from harness.core.errors import UserError
 
 Kind = Literal["generic", "vllm", "llama-server", "ollama", "lm-studio", "llama-cpp-python"]
 KINDS = get_args(Kind)
+MOST_LOGPROBS = 20  # most log-probabilities of one token that OpenAI and vLLM give
 _VARIABLE = re.compile(r"[A-Z][A-Z0-9_]{0,63}")
+_NAME = Meta(pattern=r"^[a-z][a-z0-9_]{0,63}\Z", description="true, false or another name of the field")
+_Sent = bool | Annotated[str, _NAME]
+_Listed = Annotated[int, Meta(ge=1, le=MOST_LOGPROBS, description=f"1 to {MOST_LOGPROBS}")]
+# Fields that say what is asked, how the answer comes, or how often; no other field may take their names.
+_RESERVED = frozenset({
+    "model", "messages", "prompt", "input", "stream", "stream_options", "logprobs", "top_logprobs", "n",
+    "best_of", "response_format", "structured_outputs", "grammar", "json_schema", "chat_template",
+    "chat_template_kwargs", "tools", "tool_choice", "functions", "function_call", "stop", "user", "store",
+    "metadata",
+})  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Fields:
+    """How a server is sent the fields of a request that servers refuse, or call by other names.
+
+    Each is true (as it is), false (left out), or the name under which it is sent, as in `max_tokens =
+    "max_completion_tokens"`. No other field can be changed.
+
+    Attributes:
+        max_tokens: most tokens of the answer.
+        temperature: 0, or that of `--temperature`. Left out, the server draws its answers as it likes.
+        seed: number of the answer among several to one question.
+        top_p: 1, if answers are drawn.
+        top_k: all tokens, if answers are drawn.
+        min_p: 0, if answers are drawn.
+        repetition_penalty: 1, for `vllm`.
+        repeat_penalty: 1, for the kinds of llama.cpp.
+    """
+
+    max_tokens: _Sent = True
+    temperature: _Sent = True
+    seed: _Sent = True
+    top_p: _Sent = True
+    top_k: _Sent = True
+    min_p: _Sent = True
+    repetition_penalty: _Sent = True
+    repeat_penalty: _Sent = True
+
+    def __post_init__(self) -> None:
+        others = [other for other in vars(self).values() if isinstance(other, str)]
+        for name, other in self.changed.items():
+            if other in _RESERVED or other in vars(self) or others.count(str(other)) > 1:
+                raise ValueError(f"{name} is sent as {other}, the name of another field; give one of its own")
+
+    @property
+    def changed(self) -> Mapping[str, str | bool]:
+        """The fields that are left out or renamed."""
+        return {name: other for name, other in vars(self).items() if other is not True}
+
+    def applied(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a request with the fields left out and renamed, in their order."""
+        sent = {name: vars(self).get(name, True) for name in body}
+        return {
+            name if other is True else other: body[name] for name, other in sent.items() if other is not False
+        }
+
+
 KEYS = "SWARMDRIVE_KEYS"  # environment variable: names of further variables, with commas, that cards may use
 # Words of which one is in the name of a variable that holds a key of models, such as AZURE_OPENAI_API_KEY.
 _OF_MODELS = {
@@ -39,6 +99,8 @@ class Server:
         timeout_s: longest time of one attempt, from connecting to the last byte, in seconds.
         retries: attempts after the first, if a server was busy, broke down or was not reached; of several
             servers, each is tried at least once.
+        top_logprobs: log-probabilities that it is asked for in a read-out; None asks for 20, the usual limit.
+        fields: fields of a request that it is sent otherwise; None if there are none.
     """
 
     base_url: str | tuple[str, ...]
@@ -46,6 +108,8 @@ class Server:
     key_env: str = "OPENAI_API_KEY"
     timeout_s: Annotated[float, Meta(gt=0, le=float_info.max, description="seconds, more than 0")] = 120.0
     retries: Annotated[int, Meta(ge=0, le=10, description="0 to 10")] = 3
+    top_logprobs: _Listed | None = None
+    fields: Fields | None = None
 
     def __post_init__(self) -> None:
         # A refused URL is not shown, since it may hold a password.

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import Backend, Completion, Request, window
+from harness.backends.base import Backend, Completion, Request, Served, served, window
 from harness.backends.cache import cached
 from harness.backends.cards import Card
 
@@ -31,6 +31,9 @@ class Swarm:
         """Return the identity of the ego's model, with those of the helpers."""
         ego, *helpers = (backend.identity() for backend in self._backends)
         return {**ego, "helpers": helpers}
+
+    def served(self) -> list[Served]:
+        return [each for backend in self._backends for each in served(backend)]
 
 
 def open_each(cards: Sequence[Card], opens: Callable[[Card], Backend]) -> list[Backend]:

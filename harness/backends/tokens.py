@@ -7,6 +7,7 @@ from typing import Any
 
 from harness.backends.cards import Card
 from harness.core.errors import UserError, printable
+from harness.core.files import text_of
 from harness.core.resources import find
 
 # Qwen2's pre-tokeniser, for `tokenizer.ggml.pre = qwen2`: every digit is a piece of its own.
@@ -20,6 +21,8 @@ QWEN2_SPLIT = (
 def tokenizer(source: Path) -> Any:
     """Load a `tokenizers.Tokenizer` from a GGUF file (Qwen2 kind), a tokenizer.json, or a folder with one.
 
+    A file may have been saved with a longest length or with padding; both are switched off.
+
     Raises:
         UserError: there is no tokenizer, or it is of another kind.
     """
@@ -31,11 +34,26 @@ def tokenizer(source: Path) -> Any:
             f"no tokenizer at {printable(file)}; give a tokenizer.json, its folder, or a GGUF file"
         )
     try:
-        return _from_gguf(file) if file.suffix == ".gguf" else Tokenizer.from_file(str(file))
+        return (
+            _from_gguf(file) if file.suffix == ".gguf" else whole(Tokenizer.from_str(text_of(file, "record")))
+        )
     except UserError:
         raise
     except Exception as error:  # tokenizers and gguf raise bare Exceptions on a broken file
         raise UserError(f"{printable(file)} is no readable tokenizer: {printable(error)}") from None
+
+
+def whole(loaded: Any) -> Any:
+    """Let a `tokenizers.Tokenizer` neither cut texts off nor pad them, and return it."""
+    loaded.no_truncation()
+    loaded.no_padding()
+    return loaded
+
+
+def token_ids(loaded: Any, text: str) -> list[int]:
+    """Return the token ids of a text in a chat, without those that a tokenizer puts around a whole prompt."""
+    encoded: list[int] = loaded.encode(text, add_special_tokens=False).ids
+    return encoded
 
 
 def _from_gguf(file: Path) -> Any:
@@ -90,7 +108,7 @@ def counter(
     if source is None:
         return None
     loaded = tokenizer(source)
-    return lambda messages: sum(len(loaded.encode(m["content"]).ids) for m in messages)
+    return lambda messages: sum(len(token_ids(loaded, m["content"])) for m in messages)
 
 
 def spread_of(counts: Sequence[int]) -> dict[str, float]:

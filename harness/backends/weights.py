@@ -11,12 +11,13 @@ from pathlib import Path
 from harness.backends.cards import Card
 from harness.backends.registry import capabilities, registration, resolve
 from harness.core.errors import UserError, printable
-from harness.core.files import sha256_file
+from harness.core.files import opened, sha256_file, text_of
 from harness.core.resources import find
 
 # Without one of these AutoTokenizer silently builds an empty tokenizer.
 _TOKENIZERS = ("tokenizer.json", "tokenizer.model", "vocab.json")
 _WEIGHTS = ("*.safetensors",)  # a pickle, such as pytorch_model.bin, may hold code and is never read
+_SMALL, _LARGE = {".json", ".jinja", ".model", ".txt"}, {".safetensors"}
 _SHARDS = "model.safetensors.index.json"
 # The files that transformers loads; a repository may hold the same weights in other formats as well.
 _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
@@ -36,6 +37,7 @@ def find_checkpoint(card: Card) -> Path:
             f"model {card.name!r}: no directory {card.weights!r}, and none{at} in the hub cache "
             f"{_hub_cache()}; {fetching(card)}"
         )
+    _check_files(card, where)
     required = {"config.json": ("config.json",), "weights": _WEIGHTS, "tokenizer": _TOKENIZERS}
     required |= {f"shard {printable(name)}": (name,) for name in _shards(where)}
     for what, patterns in required.items():
@@ -44,6 +46,19 @@ def find_checkpoint(card: Card) -> Path:
                 f"model {card.name!r} in {where} has no {what} ({' or '.join(patterns)}); {fetching(card)}"
             )
     return where
+
+
+def _check_files(card: Card, checkpoint: Path) -> None:
+    """Raise UserError if a file that the engine would open by itself is none, or is too large to be it."""
+    for path in checkpoint.iterdir():
+        try:
+            if path.suffix in _SMALL or path.suffix in _LARGE:
+                opened(path, "record" if path.suffix in _SMALL else "weights").close()
+        except OSError as error:
+            raise UserError(
+                f"model {printable(card.name)!r}: {printable(path)} cannot be read: {error.strerror}; "
+                f"{fetching(card)}"
+            ) from None
 
 
 def find_gguf(card: Card) -> Path:
@@ -121,7 +136,8 @@ def _download(card: Card) -> None:
             f"{shown}: there is no {at}{revision}, or it is private; see `hf auth login`"
         ) from None
     except Exception as error:  # the hub, the network and the disk fail in any of a dozen types
-        reason = printable(" ".join(str(error).split()), 160)
+        # Its first sentence, as long as it may be: those after it give advice of the library's own.
+        reason = printable(" ".join(str(error).split()).partition(". ")[0].rstrip("."), 400)
         raise UserError(
             f"{shown}: cannot fetch {at}: {reason}; try again, or copy the weights here and give their path"
         ) from None
@@ -152,7 +168,7 @@ def _snapshot(card: Card) -> Path | None:
     repository = _hub_cache() / f"models--{(card.weights or '').replace('/', '--')}"
     revision = card.revision or "main"
     reference = repository / "refs" / revision
-    commit = reference.read_text().strip() if reference.is_file() else revision
+    commit = text_of(reference).strip() if reference.is_file() else revision
     snapshot = repository / "snapshots" / commit
     return snapshot if snapshot.is_dir() else None
 
@@ -160,7 +176,7 @@ def _snapshot(card: Card) -> Path | None:
 def _shards(checkpoint: Path) -> list[str]:
     """Return the names of the files that weights are split into; an interrupted download lacks some."""
     try:
-        index = json.loads((checkpoint / _SHARDS).read_bytes())
+        index = json.loads(text_of(checkpoint / _SHARDS, "record"))
         return sorted(set(index["weight_map"].values()))
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return []

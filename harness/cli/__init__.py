@@ -8,7 +8,6 @@ import errno
 import gc
 import os
 import shlex
-import signal
 import sys
 from functools import cache
 from importlib import import_module
@@ -20,7 +19,8 @@ from typer.main import get_command
 from harness import __version__
 from harness.cli import shell
 from harness.core import extras
-from harness.core.errors import UserError, printable
+from harness.core.errors import EXIT_CODES, UserError, printable
+from harness.core.process import Stop
 
 PANELS = {
     "Evaluate": (
@@ -47,6 +47,7 @@ app = typer.Typer(
     cls=shell.Map,
     no_args_is_help=True,
     rich_markup_mode=None,
+    epilog=f"Exit codes: {'; '.join(f'{code} {meaning}' for code, meaning in EXIT_CODES.items())}.",
     pretty_exceptions_enable=False,
 )
 
@@ -83,16 +84,12 @@ MACHINE = frozenset({
 COLLECT_AFTER = 50_000  # new objects; at 700, as usual, imports and tables are walked again and again
 
 
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM, which ends a command as Ctrl-C does."""
-
-
 # typer carries a click of its own and exports of its errors only this one's children.
 _UsageError: Any = typer.BadParameter.__mro__[1]
 
 
 def main() -> None:
-    """Entry point: what a user can mend is one line on stderr and exit code 2."""
+    """Entry point: what a user can mend is one line on stderr, and one of `EXIT_CODES`."""
     gc.set_threshold(COLLECT_AFTER, 10, 10)
     atexit.register(gc.freeze)  # all memory goes as the process ends; its last collections would walk it all
     out = sys.stdout
@@ -106,7 +103,9 @@ def main() -> None:
     except BrokenPipeError:  # as SIGPIPE ends a program: `| head` has left
         sys.exit(141)
     except OSError as error:
-        if error.errno not in MACHINE:
+        from harness.core.files import Refused
+
+        if error.errno not in MACHINE and not isinstance(error, Refused):
             raise
         where = f"{printable(error.filename)}: " if error.filename else ""
         _fail(f"{where}{error.strerror}; fix that, and type the same command again")
@@ -117,24 +116,24 @@ def _program() -> Any:
     """Return the commands as one program, made once a process: tests type a thousand in one."""
     program = get_command(app)
     shell.hasten(program)
+    shell.keep_encoding()
     return program
 
 
 def _typed() -> None:
-    signal.signal(signal.SIGTERM, _terminate)
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # Arrow's own takes 20 MB more, and time
     try:
         sys.exit(_program()(standalone_mode=False))
     except UserError as error:
-        _fail(_noted(str(error), error))
+        _fail(_noted(str(error), error), error.code)
     except ModuleNotFoundError as error:
         if (lack := extras.OPTIONAL.get((error.name or "").partition(".")[0])) is None:
             raise
         _fail(str(extras.without("this command", *lack)))
     except shell.Stopped as stopped:
-        terminated = isinstance(stopped.__cause__, _Terminated)
-        said = _noted("terminated" if terminated else "interrupted", stopped.__cause__)
-        _fail(said, 143 if terminated else 130)
+        stop = stopped.__cause__
+        said, code = (stop.said, stop.code) if isinstance(stop, Stop) else ("interrupted", 130)
+        _fail(_noted(said, stop), code)
     except _UsageError as error:
         message, context = error.format_message(), error.ctx
         if message.startswith("Usage:"):  # a group without a command shows its help
@@ -152,10 +151,6 @@ def _noted(said: str, error: BaseException | None) -> str:
         return said
     typed = printable(shlex.join(["harness", *sys.argv[1:]]), 2000)
     return "; ".join((said, *notes, f"type the same command to continue: {typed}"))
-
-
-def _terminate(number: int, frame: object) -> None:
-    raise _Terminated
 
 
 def _fail(message: str, code: int = 2) -> None:

@@ -23,6 +23,7 @@ def command(
     condition: str | None = typer.Option(
         None, help="Condition to draw decision points from. Default: 6g, or the run's last if it has no 6g."
     ),
+    dataset: options.RunsDataset = None,
     model: options.RunModel = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
@@ -39,7 +40,8 @@ def command(
 
     options.in_range("--sample", sample, 1, MOST)
     with bar("asking without", quiet=as_json or quiet) as progress:
-        stored = Stored(run, more=progress.more, done=progress, models=options.cards(model))
+        own = options.cards(model)
+        stored = Stored(run, more=progress.more, done=progress, dataset=dataset, models=own)
         chosen = condition or (USUAL if USUAL in stored.points else stored.run.conditions[-1])
         found = attribute(stored, chosen, sample, sample_seed)
     made, file = rows(found), write(found, run)
@@ -68,6 +70,8 @@ def command(
             for r in made
         )
         table(HEADS, cells)
+        if stored.lost:
+            typer.echo(fill(stored.lost, WIDTH))
         typer.echo(fill(f"{rule(found)}; intervals over episodes", WIDTH))
         typer.echo(
             "of: the prompt it is left out of; fusion: a message that came in time; shift:\n"

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import echo_json, table
+from harness.cli.estimates import echo_json, echo_wrong, table
+from harness.core import resources
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import as_mapping, known, shown
 
@@ -27,11 +28,18 @@ def list_channels(as_json: options.Json = False) -> None:
     """List the channel profiles. Each name is also a condition that --condition takes."""
     from harness.radio.profiles import CHANNELS
 
-    profiles = {name: CHANNELS.profile(name) for name in CHANNELS}
+    profiles = resources.each(CHANNELS, CHANNELS.profile)
     if as_json:
-        echo_json([{"name": name, **asdict(profile)} for name, profile in profiles.items()])
+        echo_json([
+            {"name": name, "error": str(profile)} if isinstance(profile, UserError)
+            else {"name": name, **asdict(profile)}
+            for name, profile in profiles.items()
+        ])  # fmt: skip
         return
     for name, profile in profiles.items():
+        if isinstance(profile, UserError):
+            echo_wrong(name, profile)
+            continue
         typer.echo(f"{printable(name)} · {printable(profile.model)} · {profile.status}")
         typer.echo(f"  {printable(profile.description, 78)}")
 
@@ -242,9 +250,7 @@ def crowd(
     if sight not in SIGHTS:
         raise unknown("--sight", sight, SIGHTS)
     _picture(out)
-    every = (
-        {name: CHANNELS[name] for name in CHANNELS} if not names else {name: _of(name)[1] for name in names}
-    )
+    every = {name: _of(name)[1] for name in names} if names else CHANNELS.usable()
     loaded = {
         name: channel for name, channel in every.items()
         if isinstance(channel, Physical) and "density_per_km" in settable(channel)

@@ -34,6 +34,8 @@ def command(
     from harness.report.compare.difference import compare as compared
     from harness.report.compare.gate import gate, judge
     from harness.report.compare.pair import pair
+    from harness.report.page import refuse_less, save
+    from harness.runs.unanswered import why
 
     if as_markdown and as_json:
         raise UserError("--markdown and --json: give one of them")
@@ -44,13 +46,18 @@ def command(
     if junit and not fail_if:
         raise UserError("--junit writes gates; give one or more with --fail-if")
     gates = [gate(typed) for typed in fail_if or ()]
+    if said := [f"{words} ({printable(run)})" for run in (a, b) if gates and (words := why(run))]:
+        lacks = f"{'; '.join(said)}: the model could not be asked, so that --fail-if has nothing to judge"
+        if junit:
+            save([text.junit_of_none([each.text for each in gates], lacks)], junit, "--junit")
+        raise UserError(f"{lacks}; type the command of the run again")
     difference = compared(pair(a, b))
     verdicts = [judge(each, difference) for each in gates]
-    if html or junit:
-        from harness.report.page import save
     if html:
         from harness.report.compare import page
 
+        lacking = difference.prompts
+        refuse_less(html, {"prompts": lacking} if isinstance(lacking, str) else {}, "--html")
         save([page.render(difference, verdicts, show, page.beside(html))], html, "--html")
     if junit:
         save([text.junit(difference, verdicts)], junit, "--junit")

@@ -81,9 +81,10 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
     with bar(f"checking {printable(path.name, 30)}", quiet=as_json):
         problems = verify.check(path)
     manifest, digest = verify.read_manifest(path)
+    lost = 0 if problems else load.load(path).lost
     if as_json:
         counts = {k: getattr(manifest, k) for k in ("name", "episodes", "nodes")}
-        echo_json({**counts, "sha256": digest, "problems": problems})
+        echo_json({**counts, "sha256": digest, "problems": problems, "lost_before_first_action": lost})
     elif problems:
         typer.echo("\n".join(problems))
     else:
@@ -91,6 +92,11 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
             f"{manifest.name} is sound: {manifest.episodes} layouts, {manifest.nodes} decision points\n"
             f"manifest sha256 {digest}"
         )
+        if lost:
+            console().print(
+                f"{lost} of {manifest.episodes} episodes are lost before the ego's first action: it begins "
+                "in a collision, or cannot escape one; mend the environment, or choose other seeds"
+            )
     if problems:
         raise typer.Exit(1)
 

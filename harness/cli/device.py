@@ -8,7 +8,8 @@ import msgspec
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import echo_json, table
+from harness.cli.estimates import echo_json, echo_wrong, table
+from harness.core import resources
 from harness.core.errors import UserError, printable
 from harness.core.figures import as_mapping, known, shown
 
@@ -33,11 +34,18 @@ def list_devices(as_json: options.Json = False) -> None:
     """List the device profiles, which --device-profile takes."""
     from harness.backends import devices
 
-    every = [devices.load(name) for name in devices.names()]
+    every = resources.each(devices.names(), devices.load)
     if as_json:
-        echo_json([msgspec.to_builtins(device) for device in every])
+        echo_json([
+            {"name": name, "error": str(device)} if isinstance(device, UserError)
+            else msgspec.to_builtins(device)
+            for name, device in every.items()
+        ])  # fmt: skip
         return
-    for device in every:
+    for name, device in every.items():
+        if isinstance(device, UserError):
+            echo_wrong(name, device)
+            continue
         typer.echo(f"{printable(device.name)} · {', '.join(printable(row.model) for row in device.rows)}")
         typer.echo(f"  {printable(device.description, 78)}")
 

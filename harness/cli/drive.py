@@ -12,6 +12,7 @@ from harness.cli.progress import bar
 from harness.cli.run import Column, Swarm, as_mapping, default_out, show
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
+from harness.core.files import text_of
 from harness.core.resources import folder
 from harness.core.seeds import purpose, stated
 
@@ -184,6 +185,8 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
 
 def _shipped(scenario: str, otherwise: str) -> dict[str, Any]:
     """Manifest of the dataset that ships of a scenario; where none does, of the one `otherwise`."""
-    manifests = [json.loads(file.read_text()) for file in sorted(folder("datasets").glob("*/manifest.json"))]
+    manifests = [
+        json.loads(text_of(file, "record")) for file in sorted(folder("datasets").glob("*/manifest.json"))
+    ]
     by_scenario: dict[str, dict[str, Any]] = {manifest["scenario"]: manifest for manifest in manifests}
     return by_scenario.get(scenario) or by_scenario[otherwise]

@@ -6,11 +6,18 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from harness.core.errors import UserError, printable
+
 if TYPE_CHECKING:
     from rich.console import Console
 
 WIDTH = 80  # columns of a terminal
 HEAD = 21  # of a table's column at most: three of them leave room for a name
+
+
+def echo_wrong(name: str, error: UserError) -> None:
+    """Print a thing of a list that cannot be used, and why."""
+    typer.echo(f"{printable(name)} · wrong\n  {error}")
 
 
 def echo_json(value: Any, indent: int | None = 1) -> None:

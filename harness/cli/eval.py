@@ -116,6 +116,7 @@ def command(
         selection.of(load.load(load.find(name), None if selection.given else limit))
         for name in (named.datasets if named else (dataset,))
     ]
+    options.say_all(limit, frozen)
     swarm = Swarm(
         model, engine, prompt, answer, thinking, image,
         helper_model, helper_prompt, helper_answer, helper_thinking,

@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
+from harness.cli import options
 from harness.cli.progress import bar
-from harness.core import extras
+from harness.core import extras, work
 from harness.core.errors import UserError, printable
 
 File = Path | None
@@ -16,7 +17,11 @@ def command(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
     as_csv: Annotated[
         bool,
-        typer.Option("--csv", help="Write decisions.csv and answers.csv, one row per decision and answer."),
+        typer.Option(
+            "--csv",
+            help="Write decisions.csv and answers.csv, one row per decision and answer. A text that a "
+            "spreadsheet would take for a formula gets an apostrophe before it.",
+        ),
     ] = False,
     as_jsonl: Annotated[
         bool, typer.Option("--jsonl", help="Write decisions.jsonl, one object per decision.")
@@ -37,6 +42,7 @@ def command(
             "trees show to be right."
         ),
     ] = None,
+    dataset: options.RunsDataset = None,
     report_seeds_too: Annotated[
         bool,
         typer.Option(
@@ -55,10 +61,18 @@ def command(
         raise UserError(f"{', '.join(asked)}: give exactly one of them")
     if report_seeds_too and not sft:
         raise UserError("--report-seeds-too only goes with --sft; give --sft, or leave it out")
+    if dataset and option not in ("--inspect", "--sft"):
+        raise UserError("--dataset only goes with --inspect and --sft; leave it out")
     if out and option in files:
         raise UserError(
             f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
         )
+    if junit and (said := work.unanswered(run)):
+        from harness.report.page import save
+
+        save([export.junit_of_none(run, said)], junit, "--junit")
+        typer.echo(printable(junit, 1000))
+        return
     source, folder = read(run), out or run
     target = files.get(option)
     try:
@@ -76,13 +90,13 @@ def command(
             from harness.training import pairs
 
             with bar("writing chats"):
-                written = [pairs.write(source, sft, report_seeds_too)]
+                written = [pairs.write(source, sft, report_seeds_too, dataset)]
         elif inspect:
             extras.need("--inspect", "inspect_ai")
             from harness.report import inspect_log
 
             with bar("writing a log"):
-                written = [inspect_log.write(source, inspect)]
+                written = [inspect_log.write(source, inspect, dataset)]
     except OSError as error:
         where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"
         other = "name another file" if target else "choose another folder with --out"

@@ -64,6 +64,7 @@ def command(
 
     extras.need("harness grid", "matplotlib")
     frozen = load.load(load.find(dataset), limit)
+    options.say_all(limit, [frozen])
     prompt = prompt or frozen.scenario.prompt
 
     def agents(choices: Mapping[str, str]) -> list[Agent]:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import WIDTH, echo_json
-from harness.core.errors import printable
+from harness.cli.estimates import WIDTH, echo_json, echo_wrong
+from harness.core.errors import UserError, printable
 from harness.core.figures import interval
 from harness.runs.listing import SUCCESS
 
@@ -36,7 +36,8 @@ def command(
     from harness.report import history
     from harness.runs.metrics import unit
 
-    groups = history.history(folder, metric, condition, dataset)
+    wrong: dict[str, UserError] = {}
+    groups = history.history(folder, metric, condition, dataset, wrong.__setitem__)
     if html:
         history.write(groups, metric, html)
     if as_json:
@@ -44,7 +45,7 @@ def command(
             {"scenes": group.of, "condition": group.condition, "metric": metric,
              "runs": [_mapping(line) for line in group.lines]}
             for group in groups
-        ])  # fmt: skip
+        ] + [{"run": name, "error": str(error)} for name, error in wrong.items()])  # fmt: skip
         return
     factor, suffix, decimals = unit(metric)
     typer.echo(f"{metric}{suffix if suffix.strip() == '%' else ''} with its 95 % interval")
@@ -56,6 +57,9 @@ def command(
                 value, n = interval(score.value, score.low, score.high, factor, decimals), str(score.n)
             who = printable(line.run.manifest.variant, VARIANT)
             typer.echo(f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}")
+    for name, error in wrong.items():
+        typer.echo()
+        echo_wrong(name, error)
     if len(groups) > 1:
         typer.echo("\nruns on different scenes do not compare, so each group has its own table")
 

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any, cast, get_args
 import typer
 
 from harness.cli import options
+from harness.cli.estimates import echo_json, echo_wrong
 from harness.cli.progress import bar
-from harness.core.errors import printable
+from harness.core import resources
+from harness.core.errors import Unanswered, UserError, printable
 from harness.core.resources import DATASET
 
 if TYPE_CHECKING:
@@ -34,19 +36,31 @@ def list_models(as_json: options.Json = False) -> None:
     from harness.backends import cards
     from harness.backends.registry import missing
 
-    rows = [(card, missing(card)) for card in cards.load_all()]
+    rows: list[tuple[str, Card | UserError, str | None]] = []
+    for name, found in resources.each(cards.names(), cards.each_engine).items():
+        if isinstance(found, UserError):
+            rows.append((name, found, None))
+        else:
+            rows += [(card.name, card, missing(card)) for card in found]
     if as_json:
-        typer.echo(json.dumps([{**asdict(card), "missing": lack} for card, lack in rows], indent=2))
+        echo_json([
+            {"name": name, "error": str(card)} if isinstance(card, UserError)
+            else {**asdict(card), "missing": lack}
+            for name, card, lack in rows
+        ], indent=2)  # fmt: skip
         return
     line = "{:<22}{:<14}{:<10}{:<13}{}"
     typer.echo(line.format("name", "engine", "thinking", "latency", "runs here"))
-    for card, lack in rows:
+    for name, card, lack in rows:
+        if isinstance(card, UserError):
+            echo_wrong(name, card)
+            continue
         seconds = card.latency.inference_s
         latency = "paper" if seconds is None else f"card {seconds * 1000:g} ms"
         here = f"no: {lack}" if lack else "yes"
-        name, _, other = card.name.partition(":")
+        stem, _, other = name.partition(":")
         # A card's other engines stand below it.
-        typer.echo(line.format("" if other else printable(name), card.engine, card.thinking, latency, here))
+        typer.echo(line.format("" if other else printable(stem), card.engine, card.thinking, latency, here))
         if not other:
             typer.echo(f"  {printable(card.description, 78)}")
 
@@ -82,7 +96,7 @@ def check(
     """Load a model, show its prompt and time one answer.
 
     It does so in each answer mode. A model that takes pictures is also asked with a picture and with a blank
-    one. Exit code 1 if it answers in no mode, or if it ignores the picture.
+    one. Exit code 1 if no answer can be read, or if it ignores the picture; 3 if it answers in no mode.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities
@@ -106,10 +120,32 @@ def check(
         )
     else:
         _show(spec, seen)
+    every = [*seen.answers.values(), *(seen.looks.answers.values() if seen.looks else ())]
+    errors = [answer.error for answer in every if answer.error is not None]
+    if len(errors) == len(every):
+        who = printable(card.name)
+        raise Unanswered(f"{printable(errors[0], 300)}: no answer of {who} in any answer mode")
     if seen.looks and seen.looks.fault:
         typer.echo(f"harness: {_blind(card, seen.looks.fault)}", err=True)
         raise typer.Exit(1)
-    raise typer.Exit(int(all(answer.error is not None for answer in seen.answers.values())))
+    if not _usable(spec, seen):
+        typer.echo(f"harness: no answer of {printable(card.name)} can be read as a decision", err=True)
+        raise typer.Exit(1)
+
+
+def _usable(spec: "Spec", seen: "Checkup") -> bool:
+    """Whether an answer in any mode says what to do."""
+    from harness.parsing.parse import parse
+
+    ego = spec.ego
+    return any(
+        parse(
+            answer.text, role="ego", actions=spec.actions, thinking=ego.thinking,
+            reasons_first="ego" in ego.prompt.reasons_first, finish_reason=answer.finish_reason,
+            error=answer.error,
+        ).intent
+        for answer in seen.answers.values()
+    )  # fmt: skip
 
 
 def _blind(card: "Card", fault: str) -> str:
@@ -148,7 +184,8 @@ def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -
         for way in ways if sees
     ]  # fmt: skip
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
-    return spec, look(cast("Rendering", backend), asked, shown)
+    with bar(f"asking {printable(card.name, 30)}", len(asked) + 2 * len(shown)) as progress:
+        return spec, look(cast("Rendering", backend), asked, shown, progress)
 
 
 def _show(spec: "Spec", seen: "Checkup") -> None:
@@ -159,7 +196,15 @@ def _show(spec: "Spec", seen: "Checkup") -> None:
     if seen.tokens is None:
         typer.echo("tokens       not known here: the server renders the prompt and counts them")
     else:
-        typer.echo(f"tokens       {len(seen.tokens)} in the prompt, {seen.bos_tokens} of them BOS")
+        typer.echo(
+            f"tokens       {len(seen.tokens)} in the prompt, {seen.bos_tokens} of them BOS at its beginning"
+        )
+        if seen.turn_end:
+            typer.echo(f"answer ends  at {printable(seen.turn_end)}, as its chat template ends a turn")
+        else:
+            typer.echo("answer ends  at no token of its chat template: it may write on after its answer")
+    if card.system:
+        typer.echo("system       at the beginning of the first user turn: its template has no place for it")
     typer.echo(f"thinking     {seen.thinking or 'as the server is set'}; "
                f"{'asked' if spec.ego.thinking else 'not asked'} here; card: {card.thinking}")  # fmt: skip
     typer.echo(f"prompt       {PROMPT}, the ego of {DATASET}'s first scene")

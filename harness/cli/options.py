@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option, echo
 
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import text_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from harness.backends.base import AnswerMode
     from harness.backends.cards import Card
     from harness.coordination.operating_point import OperatingPoint
     from harness.core import parallel, shards
+    from harness.dataset.load import Dataset as Frozen  # Dataset is an option here
     from harness.evaluate.agent import ImageMode
 else:  # typer takes any text; what is evaluated says which are allowed
     AnswerMode = ImageMode = str
@@ -58,6 +60,13 @@ Prompt = Annotated[str, Option(help="Prompt version; `harness prompt list` shows
 ScenarioPrompt = Annotated[
     str | None,
     Option(help="Prompt version; `harness prompt list` shows them. Default: the scenario's usual one."),
+]
+RunsDataset = Annotated[
+    Path | None,
+    Option(
+        "--dataset",
+        help="Folder of the run's dataset, if it has moved. Default: where the run states, or by its name.",
+    ),
 ]
 Dataset = Annotated[str, Option(help="Name of a shipped dataset, or a dataset's folder.")]
 Conditions = Annotated[
@@ -240,6 +249,16 @@ def cards(models: "Sequence[str] | None") -> "list[Card]":
     return [resolve(model) for model in models or ()]
 
 
+def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
+    """Say on stderr which of these have fewer episodes than --limit."""
+    for dataset in datasets:
+        if limit is not None and limit > (n := dataset.manifest.episodes):
+            echo(
+                f"--limit {limit}: {printable(dataset.name)} has {n} episodes, all of which are used",
+                err=True,
+            )
+
+
 def parse_seeds(text: str) -> tuple[int, ...]:
     """Seeds from `0:5` (0 to 4) or `3,7,9`."""
     start, colon, stop = text.partition(":")
@@ -277,12 +296,13 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     if env_config is None:
         return f"{environment.PREFIX}{env}"
     try:
-        changes = json.loads(env_config.read_bytes())
+        named = environment.named(env, json.loads(text_of(env_config, "settings")))
+        named.encode()  # JSON can write half a character, which no file can hold
+        return named
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a JSON file"
         ) from None
-    return environment.named(env, changes)
 
 
 def typed(scenario: str) -> str:

@@ -1,15 +1,16 @@
 """`harness parse`: how one answer is parsed. A failed verdict is data, so the exit code is 0."""
 
+import os
 import sys
-from pathlib import Path
 
 import typer
 
 from harness.cli import options
 from harness.cli.estimates import echo_json
 from harness.core import errors
+from harness.core.files import LARGEST, bytes_of
 
-MOST_BYTES = 1 << 24
+HANDED_OVER = ("/dev/fd", "/proc/self/fd")  # folders of pipes that a shell opens for `<(command)`
 FINISH_REASONS = ("stop", "length", "error")
 
 
@@ -64,18 +65,21 @@ def command(
 def _read(file: str) -> str:
     """The text, line ends untouched. Bytes that are not UTF-8 become U+FFFD, and a note on stderr says so."""
     try:
-        with sys.stdin.buffer if file == "-" else Path(file).open("rb") as source:
-            data = source.read(MOST_BYTES + 1)
-        if len(data) > MOST_BYTES:
-            raise ValueError(f"it is larger than {MOST_BYTES >> 20} MB")
+        if file == "-" or os.path.dirname(file) in HANDED_OVER:
+            with sys.stdin.buffer if file == "-" else open(file, "rb") as source:
+                data = source.read(LARGEST["text"] + 1)
+            if len(data) > LARGEST["text"]:
+                raise ValueError(f"it is larger than {LARGEST['text'] >> 20} MB, the limit")
+        else:
+            data = bytes_of(file, "text")
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         shown = errors.printable(file)
         raise errors.UserError(
-            f"cannot read completion file {shown!r}: {reason}; give a text file, or - for standard input"
+            f"cannot read completion file {shown!r}: {reason}; give a text file, or - for what is piped in"
         ) from None
     try:
-        return data.decode()
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         typer.echo(f"note: not UTF-8 from byte {error.start} on; such bytes are read as U+FFFD", err=True)
-        return data.decode(errors="replace")
+        return data.decode("utf-8-sig", errors="replace")

@@ -77,7 +77,11 @@ def show(
         None, help="Vehicle that is asked, such as v1 (the ego). Default: every viewer."
     ),
     dataset: options.Dataset = resources.DATASET,
-    model: Model = None,
+    model: str | None = typer.Option(
+        None,
+        help="Model that is sent it: its card says where the system text stands, and how large pictures are. "
+        f"Default for pictures: {pictures.MODEL}.",
+    ),
     out: Path | None = typer.Option(
         None, help="Image prompts only: folder to write the pictures to, as PNG files."
     ),
@@ -85,8 +89,11 @@ def show(
 ) -> None:
     """Print exactly what a model is sent about a scene.
 
-    Its chat template is not applied yet. Pictures are drawn if the terminal has colours.
+    Its chat template is not applied yet; the system text stands in the first user turn if the card of
+    `--model` says so. Pictures are drawn if the terminal has colours.
     """
+    from harness.backends.cards import resolve
+    from harness.backends.chat_template import with_system
     from harness.dataset import load
     from harness.prompts import versions as prompts
     from harness.world.perception.camera import Sight
@@ -98,9 +105,13 @@ def show(
     viewers = at.viewers if viewer is None else [viewer]
     words = data.scenario.prompt_words
     taker = pictures.taker(prompt, model)
-    if taker is None and (given := "--model" if model else "--out" if out else ""):
-        raise UserError(f"{given}: prompt {version} shows no picture; leave it out")
-    sent = {v: prompt.render(at.record["graphs"][v], data.actions, words=words) for v in viewers}
+    if taker is None and out:
+        raise UserError(f"--out: prompt {version} shows no picture; leave it out")
+    system = resolve(model).system if model else None
+    sent = {
+        v: with_system(prompt.render(at.record["graphs"][v], data.actions, words=words), system)
+        for v in viewers
+    }
     seen = {v: Sight(data.scenario, at.state, v, taker.vision.size_px) for v in viewers if taker}
     wrote = {v: pictures.write(image, out / f"{at.id}-{v}.png") for v, image in seen.items() if out}
     if as_json:

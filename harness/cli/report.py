@@ -20,20 +20,28 @@ def command(
     out: Path | None = typer.Option(
         None, help="File to write. Default: RUN/report.html; needed for several runs."
     ),
+    dataset: options.RunsDataset = None,
     workers: options.PageWorkers = "2",
 ) -> None:
     """Write one HTML page about a run or suite, or about several. It works offline."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
-    typer.echo(f"wrote {write(runs, out, workers=options.workers_of(workers))}")
+    typer.echo(f"wrote {write(runs, out, dataset=dataset, workers=options.workers_of(workers))}")
 
 
 def write(
-    runs: list[Path], out: Path | None = None, quiet: bool = False, dataset: "Dataset | None" = None,
+    runs: list[Path], out: Path | None = None, quiet: bool = False, dataset: "Dataset | Path | None" = None,
     workers: "Workers" = 1,
 ) -> Path:  # fmt: skip
-    """Write a report, with a progress bar; returns the file. `dataset` spares reading theirs again."""
+    """Write a report, with a progress bar; returns the file.
+
+    `dataset` spares reading theirs again, or says in which folder it is.
+    """
     if any((run / SUITE).is_file() for run in runs):
+        if isinstance(dataset, Path):
+            raise UserError(
+                f"--dataset {printable(dataset)}: a suite has several; report its runs one by one"
+            )
         return _write_suites(runs, out, quiet)
     from harness.report.page import write_report
     from harness.report.runs import gather

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+import typer
 
 from harness.cli.estimates import console, table
 from harness.core import work
@@ -117,9 +118,16 @@ def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], 
 
 
 def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
-    """The first under reports/ of this name, or of this name with a number, that can be used."""
-    folders = (Path("reports") / (name if n == 1 else f"{name}-{n}") for n in count(1))
-    return next(filter(usable, folders))
+    """The first under reports/ of this name, or of this name with a number, that can be used.
+
+    On stderr it says of a number that it was needed.
+    """
+    named = Path("reports") / name
+    folders = (named if n == 1 else named.with_name(f"{name}-{n}") for n in count(1))
+    found = next(filter(usable, folders))
+    if found != named:
+        typer.echo(f"{printable(named)} is there already; this goes to {printable(found)}", err=True)
+    return found
 
 
 @dataclass(frozen=True)
@@ -185,7 +193,8 @@ def as_mapping(done: "Evaluated") -> dict[str, Any]:
 
 def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str]) -> None:
     """Print a run's table, a row a condition, with what it was run on and what to know about it."""
-    from harness.report.caveats import caveats
+    from harness.report.caveats import caveats, lost_at_once
+    from harness.runs.folder import read
 
     m = done.manifest
     figures = {(s.condition, s.metric): s for s in done.scores if s.interval != "seed means"}
@@ -194,7 +203,7 @@ def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Seque
     text.print(f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · {scenes}")
     if m.helpers:
         text.print(f"helpers: {printable(m.variant.helpers)}")
-    for caveat in caveats(m, done.scores):
+    for caveat in (*caveats(m, done.scores), *lost_at_once(read(done.out))):
         text.print(caveat)
     table(
         ("condition", *(column.head for column in columns)),
@@ -217,7 +226,11 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: st
     if m.cached_answers:
         yield f"{m.cached_answers} answers came from the cache (--no-cache asks the model again)"
     if m.engine_errors:
-        yield f"{m.engine_errors} answers are engine errors; answers.jsonl has the error messages"
+        asked = sum(s.n for role in ("helper", "blind") if (s := figures.get(("all", f"failed_rate_{role}"))))
+        yield (
+            f"{m.engine_errors} of {asked} questions to helpers got no answer, and count as lost messages; "
+            "answers.jsonl has the errors"
+        )
     if m.retries:
         yield f"{m.retries} attempts failed before an answer came; answers.jsonl counts them as retries"
     for role in ("ego", "helper", "merge", "blind"):

@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import console, echo_json, table
+from harness.cli.estimates import console, echo_json, echo_wrong, table
 from harness.cli.progress import bar
+from harness.core import resources
 from harness.core.errors import UserError, printable
 from harness.core.figures import as_mapping, interval, shown
 from harness.core.seeds import FIRST, purpose, stated
@@ -23,12 +24,19 @@ def list_scenarios(as_json: options.Json = False) -> None:
     """List the scenarios, each with a summary."""
     from harness.world import scenarios
 
-    rows = [{"name": name, "summary": scenarios.get(name).summary} for name in scenarios.names()]
+    found = resources.each(scenarios.names(), scenarios.get)
     if as_json:
-        echo_json(rows)
+        echo_json([
+            {"name": name, "error": str(each)} if isinstance(each, UserError)
+            else {"name": name, "summary": each.summary}
+            for name, each in found.items()
+        ])  # fmt: skip
         return
-    for row in rows:
-        typer.echo(f"{row['name']}: {row['summary']}")
+    for name, each in found.items():
+        if isinstance(each, UserError):
+            echo_wrong(name, each)
+        else:
+            typer.echo(f"{name}: {each.summary}")
 
 
 @app.command()

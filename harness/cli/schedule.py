@@ -94,13 +94,14 @@ def compare(
     answers.
     """
     from harness.coordination.schedules import SCHEDULES
+    from harness.studies.folder import refuse_other
     from harness.studies.learning import layouts
     from harness.studies.schedules import compare as compared_on
     from harness.studies.stored import Stored
     from harness.studies.sweep import point_of
 
     extras.need("harness schedule compare", "matplotlib")
-    names = list(dict.fromkeys(schedule or SCHEDULES))
+    names = list(dict.fromkeys(schedule or SCHEDULES.usable()))
     for name in names:
         if name not in SCHEDULES:
             raise unknown("--schedule", name, SCHEDULES)
@@ -119,6 +120,11 @@ def compare(
         for other in stored[len(runs) :]:
             layouts(other, "tune")
         draws = options.parse_seeds(seeds) if seeds else stored[0].seeds
+        where = out or runs[0] / "schedules"
+        refuse_other(where, "schedule", {
+            "sources": [each.manifest() for each in stored], "condition": condition, "schedules": names,
+            "budget": budget, "seeds": list(draws),
+        })  # fmt: skip
         steps = sum(each.dataset.scenario.parameters.decisions for each in stored)
         progress.more(steps + len(runs) * len(names))
         apart: list[Stored | None] = [*stored[len(runs) :]] if tune else [None] * len(runs)
@@ -126,9 +132,10 @@ def compare(
             compared_on(run, other, point_of([run], condition), names, draws, budget, progress)
             for run, other in zip(stored, apart, strict=False)
         ]
+        for each in stored:
+            each.settle()
     from harness.studies.schedule_page import in_sentences, said, tables, write_schedules
 
-    where = out or runs[0] / "schedules"
     page = write_schedules(found, [each.manifest() for each in stored], draws, where)
     if as_json:
         typer.echo(tables(found)["schedules"].to_json(orient="records"))
@@ -151,6 +158,9 @@ def compare(
         )  # fmt: skip
         for sentence in in_sentences(run):
             text.print(printable(sentence, 400))
+    for source in stored:
+        if source.lost:
+            text.print(source.lost)
     text.print(
         "after a schedule's name: the most helpers it asks, and its threshold; 95 % intervals over episodes, "
         "paired; the page also has costs, p, areas, and random with as many messages"

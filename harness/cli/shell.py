@@ -3,10 +3,11 @@
 import os
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
-from typer import Context
+from typer import Context, echo
 from typer.core import TyperGroup
 
 UNREAD = object()
@@ -39,6 +40,16 @@ class Map(TyperGroup):
             ]
             with formatter.section(panel):
                 formatter.write_dl(rows)
+
+
+def keep_encoding() -> None:
+    """Have typer write in the terminal's encoding: where that is ASCII, it would write UTF-8."""
+    streams: Any = import_module(echo.__module__.replace("utils", "_compat"))
+    streams._stream_is_misconfigured = _never
+
+
+def _never(stream: object) -> bool:
+    return False
 
 
 def hasten(command: Any) -> None:

@@ -46,6 +46,7 @@ def command(
     proxy: bool = typer.Option(
         False, "--proxy", help="Also draw the calibrated proxy, which plays the paper's study."
     ),
+    dataset: options.RunsDataset = None,
     out: Path | None = typer.Option(
         None, help="Folder to write. Default: RUN/sweep-AXES, in the first run's folder."
     ),
@@ -76,7 +77,7 @@ def command(
     conditions, silent = list(dict.fromkeys(condition)), as_json or quiet
     with bar("grid points", quiet=silent) as progress:
         own = options.cards(model)
-        stored = [Stored(run, latency, progress.more, progress, not no_model, own) for run in runs]
+        stored = [Stored(run, latency, progress.more, progress, not no_model, dataset, own) for run in runs]
         panels = {
             axis.name: settings(stored, axis, values, conditions)
             for axis, values in zip(axes, grids, strict=True)
@@ -91,6 +92,8 @@ def command(
     if not silent:
         show_tables(summary)
         for source in stored:
+            if source.lost:
+                typer.echo(source.lost)
             if left := source.left_out:
                 typer.echo(
                     f"{printable(source.name)}: left out episodes that reach one of {len(left)} decision "

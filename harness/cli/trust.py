@@ -101,6 +101,8 @@ def command(
     if as_json or quiet:
         return
     typer.echo(f"{printable(bench.name)} · {printable(bench.source)} · {printable(bench.condition)}")
+    if stored.lost:
+        typer.echo(fill(stored.lost, WIDTH))
     for sentence in in_a_sentence(bench):
         typer.echo(fill(printable(sentence, 1000), WIDTH))
     for part in bench.shares:

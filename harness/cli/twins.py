@@ -17,7 +17,7 @@ from harness.core.figures import shown
 if TYPE_CHECKING:
     from harness.studies.twins.scoring import Row
 
-EPISODES = 12  # that are drawn where nothing is said
+EPISODES = 40  # that are drawn where nothing is said; with fewer, intervals near 90 % are too narrow
 HEADS = ("twin", "role", "holds", "invariant % [95 %]", "TV distance", "fail%", "n")
 
 
@@ -79,6 +79,7 @@ def command(
     example = "mirrored:invariance_rate < 0.9"
     gates = [gate(typed, scoring.METRICS, "TWIN", example) for typed in fail_if or ()]
     whole = load.load(load.find(dataset), None if sample else limit)
+    options.say_all(limit, [whole])
     if limit is None and sample is None:
         sample = min(EPISODES, len(whole.episodes))
     selection = Selection(limit, sample=sample, sample_seed=sample_seed)
@@ -101,14 +102,14 @@ def command(
     where = out or free_folder([spec], f"twins-{source.name}", study.goes_on)
     label = f"asking {printable(spec.ego.card.name, 30)}, episodes"
     with bar(label, len(study.points()), as_json or quiet) as progress:
-        pairs = asking.ask(study, where, progress, None if no_cache else default_file(), who)
+        pairs, lost = asking.ask(study, where, progress, None if no_cache else default_file(), who)
     with work.going_on(where):
         rows = scoring.rows(pairs, [TWINS[name] for name in study.twins])
         verdicts = [scoring.judge(each, rows) for each in gates]
-        written = page.write(study, pairs, rows, verdicts, where)
+        written = page.write(study, pairs, rows, verdicts, where, lost)
     work.tidy(where)
     if as_json:
-        echo_json(page.mapping(study, rows, verdicts))
+        echo_json(page.mapping(study, rows, verdicts, lost))
     elif not quiet:
         typer.echo(f"{printable(spec.ego.name)} · {source.name}")
         table(HEADS, map(_cells, rows))
@@ -119,7 +120,7 @@ def command(
             "count as not holding"
         )
         gated = (judged(verdict, "-") for verdict in verdicts)
-        for said in (scoring.headline(rows), *page.notes(study, rows), *gated):
+        for said in (scoring.headline(rows), *page.notes(study, rows, lost), *gated):
             typer.echo(fill(said, WIDTH))
         typer.echo(f"wrote {printable(written)}")
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)

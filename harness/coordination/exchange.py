@@ -46,9 +46,11 @@ class Exchange:
         own: the ego's intent after the fallback, `(..., A)`.
         own_failed: whether the ego's answer was unusable, so that `own` is the fallback, `(...)`.
         entropy_nats: entropy of `own`, `(...)`.
-        triggered: whether the point has a channel and its schedule asks, if there is anyone to ask, `(...)`.
-            By default it asks if the entropy is above tau.
+        triggered: whether the ego asks at least one helper, `(...)`. By default it asks those in the radius
+            if the entropy is above tau. Without a channel, or with nobody in the radius, it asks nobody.
         asked: which helpers are asked; each has a scheduled reply, `(..., H)`.
+        infers: which helpers' computers infer for this decision, `(..., H)`: those in the radius, asked or
+            not, or on demand those that are asked. None without a channel.
         requests: number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of a unit
             that asks for the ego; 0 if nobody is asked.
         request_bits: size of the requests, `(...)`; 0 if nobody is asked.
@@ -69,6 +71,7 @@ class Exchange:
     entropy_nats: Floats
     triggered: Bools
     asked: Bools
+    infers: Bools
     requests: Ints
     request_bits: Floats
     reply_bits: Floats
@@ -114,14 +117,12 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
     own_failed, known = _base_knowledge(point, intents)
     in_radius = known.may_ask
     if point.profile is None:
-        triggers, asked = np.zeros_like(own_failed), np.zeros_like(in_radius)
+        asked = np.zeros_like(in_radius)
     elif asked is None:
-        worth, threshold = _worth(point, known, intents, draws), point.asks_above
-        triggers = any_of(worth > threshold)
-        asked = chosen(worth, threshold, in_radius, intents.range_m, point.max_helpers)
+        worth = _worth(point, known, intents, draws)
+        asked = chosen(worth, point.asks_above, in_radius, intents.range_m, point.max_helpers)
     else:
         asked = asked & in_radius
-        triggers = any_of(asked)
     request_s, outcome, waits_until_s = _ask_helpers(point, intents, asked, in_radius, draws)
     delivered = outcome.up if intents.silent is None else outcome.up & ~intents.silent
     loss, arrival_s = outcome.loss, np.where(delivered, request_s + outcome.end_s, np.inf)
@@ -130,8 +131,9 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         own=known.own,
         own_failed=own_failed,
         entropy_nats=known.entropy_nats,
-        triggered=triggers,
+        triggered=any_of(asked),
         asked=outcome.asked,
+        infers=_infers(point, intents, outcome.asked),
         requests=outcome.requests,
         request_bits=outcome.request_bits,
         reply_bits=np.sum(np.where(outcome.asked, intents.payload_bits, 0.0), axis=-1) + outcome.policy_bits,
@@ -142,6 +144,12 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         on_time=outcome.fused & (arrival_s <= point.window_s),
         exchange_s=np.minimum(request_s[..., 0] + outcome.acts_s, waits_until_s),
     )
+
+
+def _infers(point: OperatingPoint, intents: Intents, asked: Bools) -> Bools:
+    if point.profile is None or point.on_demand:
+        return asked
+    return np.asarray(intents.range_m <= point.radius_m)  # before they know who is asked
 
 
 def _ask_helpers(

@@ -7,12 +7,14 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 from harness.coordination.attacks import attacks_of, in_text
+from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.coordination.schedules import SCHEDULES
-from harness.coordination.scheduling import ORACLE, PAPER
-from harness.core.config import changed, settable, value_of
+from harness.coordination.scheduling import NEVER, ORACLE, PAPER
+from harness.core.config import LONGEST_S, changed, settable, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Channel, Physical, Unit
+from harness.radio.constant import Radio
 from harness.radio.networks import Network, network
 from harness.radio.profiles import CHANNELS, NO_CHANNEL
 from harness.radio.roadside import Relay
@@ -25,7 +27,13 @@ OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a 
 RELAY, FUSION = "relay", "fusion"
 EDGES = ("none", RELAY, FUSION)
 UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")  # settings of a roadside unit with a place
+ALONE = ("fallback", "round_trip", "round_trip_s", "window_s")  # settings of an ego that asks nobody
+WEIGHING = ("weight_cap", "min_distance_m", "ego_distance_m")  # settings of the weights by distance
 _LARGEST = sys.float_info.max
+LONGEST_NAME, MOST_HELPERS = 1000, 1000
+TEXTS = (
+    "schedule", "fallback", "consensus", "edge", "messages", "round_trip", "radio", "attack", "defence",
+)  # fmt: skip
 
 
 class Rewrites(NamedTuple):
@@ -132,6 +140,13 @@ class OperatingPoint:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
             raise UserError(f"operating point name {printable(self.name)!r}: give it some text")
+        if len(self.name) > LONGEST_NAME:
+            raise UserError(
+                f"operating point name {printable(self.name)!r}: give it {LONGEST_NAME} characters at most"
+            )
+        for key in TEXTS:
+            if not isinstance(getattr(self, key), str):
+                raise self._wrong(key, "a text")
         if self.profile is not None and str(self.profile) not in CHANNELS:
             raise unknown("channel profile", str(self.profile), CHANNELS, "; leave it out to disable V2V")
         if self.fallback not in FALLBACKS:
@@ -154,30 +169,30 @@ class OperatingPoint:
                 raise self._wrong("threshold", f"left out where schedule is {PAPER}: its is tau_nats")
             if SCHEDULES[self.schedule].threshold is None:
                 raise self._wrong("threshold", f"left out where schedule is {self.schedule}, which has none")
-        self._number("window_s", "seconds above 0")
-        self._number("radius_m", "metres above 0")
-        self._number("min_distance_m", "metres above 0")
+        self._number("window_s", "seconds above 0, at most 3600", most=LONGEST_S)
+        self._number("radius_m", "metres above 0, at most 1000000", most=1e6)
+        self._number("min_distance_m", "metres above 0, at most 1000000", most=1e6)
         if self.ego_distance_m is not None:
-            self._number("ego_distance_m", "metres above 0")
+            self._number("ego_distance_m", "metres above 0, at most 1000000", most=1e6)
         self._number("weight_cap", "a share above 0, up to 1", most=1.0)
-        self._number("request_bits", "bits, 0 or more", zero=True)
+        self._number("request_bits", "bits, 0 or more, at most 1e12", zero=True, most=1e12)
         if self.loss is not None:
             self._number("loss", "a probability from 0 to 1", zero=True, most=1.0)
         if self.latency_s is not None:
-            self._number("latency_s", "seconds, 0 or more", zero=True)
+            self._number("latency_s", "seconds, 0 or more, at most 3600", zero=True, most=LONGEST_S)
         if self.round_trip_s is not None:
-            self._number("round_trip_s", "seconds, 0 or more", zero=True)
+            self._number("round_trip_s", "seconds, 0 or more, at most 3600", zero=True, most=LONGEST_S)
         if self.round_trip:
             _ = self.network
             if self.round_trip_s is not None:
                 raise self._wrong("round_trip", "left out where round_trip_s says all; keep one of the two")
             if self.asks_again:
                 raise self._wrong("round_trip", f"left out where consensus is {EGO_PROMPT}, which asks twice")
-        if type(self.max_helpers) is not int or self.max_helpers < 0:
-            raise self._wrong("max_helpers", "a whole number, 0 or more")
+        if type(self.max_helpers) is not int or not 0 <= self.max_helpers <= MOST_HELPERS:
+            raise self._wrong("max_helpers", f"a whole number, 0 or more, at most {MOST_HELPERS}")
         if self.edge not in EDGES:
             raise unknown("edge", str(self.edge), EDGES)
-        self._number("edge_delay_s", "seconds, 0 or more", zero=True)
+        self._number("edge_delay_s", "seconds, 0 or more, at most 3600", zero=True, most=LONGEST_S)
         for key in ("edge_x_m", "edge_y_m"):
             self._number(key, "metres from -10000 to 10000", least=-10_000.0, zero=True, most=10_000.0)
         self._number("edge_antenna_m", "metres from 1 to 100", least=1.0, most=100.0)
@@ -285,6 +300,35 @@ class OperatingPoint:
             return self.tau_nats
         default = SCHEDULES[self.schedule].threshold
         return self.threshold if self.threshold is not None else 0.0 if default is None else default
+
+    def idle(self, setting: str | None) -> str | None:
+        """Return why a setting changes nothing here, whatever its value; None if it may change something.
+
+        Args:
+            setting: a setting of the point or of its channel; None for the number of vehicles.
+        """
+        if self.profile is None and setting not in ALONE:
+            return "it has no channel"
+        if self.schedule == NEVER and setting not in (*ALONE, "schedule"):
+            return f"schedule {NEVER} asks nobody"
+        if self.max_helpers == 0 and setting not in (*ALONE, "max_helpers"):
+            return "max_helpers is 0, so it asks nobody"
+        if setting == "tau_nats" and self.schedule != PAPER and not self.helper_rounds:
+            return f"schedule {self.schedule} has a threshold of its own"
+        if setting in UNIT and self.edge == "none":
+            return "it has no roadside unit (edge is none)"
+        if setting in WEIGHING and (self.consensus == EGO_PROMPT or isinstance(RULES[self.consensus], Heads)):
+            return f"consensus {self.consensus} weighs no distances"
+        counts_rounds = isinstance(self.channel, Radio) and not self.channel.density_coupled
+        if setting == "helper_rounds" and not counts_rounds:
+            return "the load of its channel does not depend on it"
+        channel: Any = self.channel
+        while channel is not None:
+            says = getattr(channel, "idle", None)
+            if says and (why := says(setting)):
+                return str(why)
+            channel = getattr(channel, "channel", None)  # what a wrapper wraps
+        return None
 
     def needs(self, what: str) -> bool:
         """Whether its schedule, its rule or an attack needs `in_time`, `outlook`, `lot` or `claims`."""

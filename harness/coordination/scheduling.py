@@ -150,9 +150,10 @@ def random(known: Known) -> Floats:
     return known.lot[..., None]
 
 
+NEVER = "never"
 FORMULAS = {
     "entropy": Formula(entropy),
-    "never": Formula(never),
+    NEVER: Formula(never),
     "always": Formula(always),
     "margin": Formula(margin, 0.5),
     "risk": Formula(risk, 0.35, ("outlook",)),

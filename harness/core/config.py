@@ -17,12 +17,14 @@ nearest known one.
 """
 
 import dataclasses
+import math
 import re
 import tomllib
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec.inspect import type_info
@@ -36,9 +38,20 @@ LONGEST_S = 3600.0  # the longest time that a model may be declared to take for 
 Seconds = Annotated[
     float, msgspec.Meta(ge=0, le=LONGEST_S, description=f"seconds, 0 or more, at most {LONGEST_S:g}")
 ]
+
+
+def between(least: float, most: float) -> msgspec.Meta:
+    """Return the bounds of an annotated number, with words for them."""
+    return msgspec.Meta(ge=least, le=most, description=f"a number from {least:g} to {most:g}")
+
+
 _type_info = cache(type_info)
 _MISSING = re.compile(r"Object missing required field `(.+)`")
-_STEPS = re.compile(r"[^.\[\]`]+")  # the steps of a path such as `.points[1].loss`
+_STEPS = re.compile(r"\.([^.\[`]+)|\[(\d+)\]|(\[\.{3}\])")  # the steps of a path such as `$.points[1].loss`
+_OF_VALUES = ("Expected", "Invalid", "Number out of range", "Integer")
+_DOTS = 100
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+"""
+_LONG_KEY = re.compile(rf"(?<![\w.-])(?:{_PART}\.[ \t]*+){{{_DOTS}}}")
 _IN_WORDS = {"object": "a table", "array": "a list"}
 
 
@@ -53,14 +66,20 @@ def toml(path: Path, where: str) -> dict[str, Any]:
         UserError: the file cannot be read or is not TOML.
     """
     try:
-        return loads(text_of(path), where)
+        return loads(text_of(path, "settings"), where)
     except (OSError, UnicodeDecodeError) as error:
         reason = printable(getattr(error, "strerror", None) or error)
         raise UserError(f"{where} is no TOML: {reason}; fix the file") from None
 
 
 def loads(text: str, where: str) -> dict[str, Any]:
-    """Parse a TOML text into tables. Raises UserError if it is not TOML."""
+    """Parse a TOML text into tables. Raises UserError if it is not TOML.
+
+    A dotted key with thousands of parts is refused: the parser takes time and memory by the square of their
+    number.
+    """
+    if _LONG_KEY.search(text):
+        raise UserError(f"{where} is no TOML: a key has more than {_DOTS} dots; fix the file")
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also raised for too many digits or brackets
@@ -83,9 +102,13 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
     for path, key, known in _unknown_keys(table, info, (), given):
         raise unknown(f"key in {_place(where, path)}", key, known)
     try:
-        return msgspec.convert({**table, **given}, kind)
+        record = msgspec.convert({**table, **given}, kind)
     except msgspec.ValidationError as error:
-        raise _mistake(str(error), table, info, where) from None
+        raise _mistake(str(error), {**table, **given}, kind, where) from None
+    for path, value in _endless(table, ()):  # last, since a bound has better words
+        *tables, key = path
+        raise UserError(f"{_place(where, tables)}: {key} = {value}; allowed: a finite number")
+    return record
 
 
 def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
@@ -153,26 +176,129 @@ def _unknown_keys(
             yield from _unknown_keys(inner, item, (*path, str(key)))
 
 
+def _endless(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float]]:
+    """Yield each number that is infinite or none, which TOML can write: its path and itself."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield path, value
+    elif isinstance(value, Mapping | list):
+        for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from _endless(inner, (*path, str(key)))
+
+
 def _mistake(message: str, table: Mapping[str, Any], kind: Any, where: str) -> UserError:
     """Rewrite a message of msgspec, such as "Expected `int`, got `str` - at `$.latency.n`", for people."""
-    problem, _, location = message.partition(" - at `$")
-    path = _STEPS.findall(location)
+    problem, _, location = message.partition(" - at `")
+    of_key = location.startswith("key` in `")
+    path, value, hint = _found(table, kind, location)
+    here = _place(where, path)
     if missing := _MISSING.fullmatch(problem):
-        return UserError(f"{_place(where, path)} has no {missing[1]}; add it")
-    # The message is a __post_init__'s, is about the whole, or is inside a member that msgspec does not name.
-    if not problem.startswith(("Expected", "Invalid enum")) or not path or "[...]" in location[:-6]:
-        return UserError(f"{_place(where, path)}: {printable(problem)}")
-    value: Any = table
-    for step in path:
-        value = value[int(step) if isinstance(value, list) else step]
-        kind = (_fields(kind) or {}).get(step) or _item(kind)
+        return UserError(f"{here} has no {missing[1]}; add it")
+    if not problem.startswith(_OF_VALUES) or not path:  # a __post_init__'s, or about the whole
+        return UserError(f"{here}: {printable(problem)}")
     *tables, key = path
-    if problem.startswith("Invalid enum"):
-        return unknown(f"{key} in {_place(where, tables)}", str(value), map(str, _plain(kind).values))
+    if of_key:
+        wrong = next((name for name in value if not _fits(name, hint)), "")
+        return UserError(f"{here}: {printable(repr(wrong))} is no name for this; {printable(problem)}")
+    info = type_info(hint)
+    if problem.startswith("Invalid") and (names := _names(info)):
+        return unknown(f"{key} in {_place(where, tables)}", str(value), names)
     expected, _, got = problem.removeprefix("Expected ").replace("`", "").partition(", got ")
     kinds = " or ".join(_IN_WORDS.get(name, name) for name in expected.split(" | ") if name != "null")
-    allowed = kinds if got else _description(kind) or kinds
+    allowed = kinds if got else _description(info) or kinds
+    if not problem.startswith("Expected"):
+        allowed = _description(info) or "a number that a computer holds"
     return UserError(f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}")
+
+
+def _found(value: Any, hint: Any, location: str) -> tuple[list[str], Any, Any]:
+    """Follow a location such as `$.points[...][1].loss` to the wrong value: its path, itself and its type.
+
+    msgspec writes `[...]` for a value of a mapping; it is the first one that does not fit. Where the way is
+    lost, in a type that is not known here, the path ends.
+    """
+    path: list[str] = []
+    for name, index, _ in _STEPS.findall(location):
+        if name:
+            fits = [hints[name] for member in _members(hint, value) if name in (hints := _hints(member))]
+            if fits and all(get_origin(each) is Literal for each in fits):  # the tags of a union's records
+                fits = [Literal[tuple(tag for each in fits for tag in get_args(each))]]
+            key: Any = name
+        else:
+            fits = [item for member in _members(hint, value) for item in _items(member, index)]
+            key = int(index) if index else _first_wrong(value, fits)
+        if not fits or not _has(value, key):
+            break
+        path.append(str(key))
+        value, hint = value[key], fits[0]
+    if location.startswith("key` in `"):
+        hint = next((get_args(member)[0] for member in _members(hint, value) if get_args(member)), str)
+    return path, value, hint
+
+
+def _has(value: Any, key: Any) -> bool:
+    return (
+        key in value
+        if isinstance(value, Mapping)
+        else isinstance(value, list | tuple) and key in range(len(value))
+    )
+
+
+def _first_wrong(value: Any, fits: Sequence[Any]) -> Any:
+    pairs = value.items() if isinstance(value, Mapping) else enumerate(value)
+    return next((key for key, inner in pairs if fits and not _fits(inner, fits[0])), None)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    try:
+        msgspec.convert(value, hint)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def _members(hint: Any, value: Any) -> list[Any]:
+    """Return the types of a union, without descriptions; of tagged records the one that a value names."""
+    while get_origin(hint) is Annotated:
+        hint = get_args(hint)[0]
+    if get_origin(hint) not in (Union, UnionType):
+        return [hint]
+    members = [member for each in get_args(hint) for member in _members(each, value)]
+    tags = [getattr(member, "__struct_config__", None) for member in members]
+    named = [
+        member for member, tag in zip(members, tags, strict=True)
+        if tag and tag.tag is not None and isinstance(value, Mapping) and value.get(tag.tag_field) == tag.tag
+    ]  # fmt: skip
+    return named or members
+
+
+def _hints(kind: Any) -> dict[str, Any]:
+    """Return the types of a record's fields by their names in a file; empty for any other type."""
+    if not hasattr(kind, "__struct_fields__") and not dataclasses.is_dataclass(kind):
+        return {}
+    hints = get_type_hints(kind, include_extras=True)
+    names = getattr(kind, "__struct_fields__", hints)
+    tag = getattr(kind, "__struct_config__", None)
+    tagged = {tag.tag_field: Literal[tag.tag]} if tag and tag.tag_field else {}
+    return tagged | dict(
+        zip(getattr(kind, "__struct_encode_fields__", names), map(hints.get, names), strict=True)
+    )
+
+
+def _items(hint: Any, index: str) -> list[Any]:
+    """Return the type of the item at an index of a list, or of a mapping's values; none for another type."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if not arguments or not isinstance(origin, type):
+        return []
+    if issubclass(origin, Mapping):
+        return [arguments[1]]
+    if issubclass(origin, tuple) and arguments[-1] is not ...:
+        return [arguments[int(index)]] if index and int(index) < len(arguments) else []
+    return [arguments[0]]
+
+
+def _names(info: Any) -> list[str]:
+    """Return the choices of a type; none if it has no list of them."""
+    return [str(name) for name in getattr(_plain(info), "values", ())]
 
 
 def _fields(kind: Any) -> dict[str, Any]:

@@ -1,19 +1,44 @@
 """Errors for users: bad input is reported in one line.
 
-Three kinds of failure are kept apart. A bad completion is data (a parse status). Bad input is a
-`UserError`: one line, exit code 2. Anything else is a bug and crashes with a traceback.
+Four kinds of failure are kept apart. A bad completion is data (a parse status). Bad input is a `UserError`:
+one line, exit code 2. A question that got no answer is no data either: `Unanswered`, exit code 3. Anything
+else is a bug and crashes with a traceback.
 """
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from typing import ClassVar
+
+# What a command ends with; no other code is used.
+EXIT_CODES = {
+    0: "done",
+    1: "a gate or a check failed",
+    2: "bad input",
+    3: "the model could not be asked",
+    130: "interrupted (Ctrl-C)",
+    141: "nobody reads the output",
+    143: "terminated (SIGTERM)",
+}
 
 
 class UserError(Exception):
-    """Bad input. The message names the thing, the value, what is allowed and what to do."""
+    """Bad input. The message names the thing, the value, what is allowed and what to do.
+
+    Attributes:
+        code: what the command ends with, one of `EXIT_CODES`.
+    """
+
+    code: ClassVar[int] = 2
 
 
 class Unfinished(UserError):
     """Some parts of the work cannot be done; all others are done."""
+
+
+class Unanswered(Unfinished):
+    """The model could not be asked. The message begins with the words of its server or engine."""
+
+    code = 3
 
 
 def printable(text: object, limit: int = 120) -> str:
@@ -27,5 +52,8 @@ def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserE
     names = sorted(known)
     nearest = get_close_matches(name, names, n=1)
     suggestion = f"; did you mean {nearest[0]!r}?" if nearest else ";"
+    # Of several names that begin so, the nearest is only the shortest.
+    if len(begin := [known for known in names if name and known.startswith(name)]) > 1:
+        suggestion = f"; did you mean one of {', '.join(begin)}?"
     listed = ", ".join(names) or "(none)"
     return UserError(f"unknown {kind} {printable(name)!r}{suggestion} known: {listed}{hint}")

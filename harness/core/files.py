@@ -1,4 +1,8 @@
-"""Write files atomically, lock them, and compute digests of files and JSON values."""
+"""Read files, write them atomically, lock them, and compute digests of files and JSON values.
+
+Every file that the harness reads passes `opened`. A file may come from a stranger: a pipe in its place would
+block, a device would never end, and a large one would fill memory.
+"""
 
 import errno
 import hashlib
@@ -6,19 +10,20 @@ import json
 import os
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from glob import escape
+from io import BufferedReader
 from pathlib import Path
 from types import NoneType
-from typing import Any
+from typing import Any, Literal, TypeVar
 
-import msgspec
-
-_QUICK = msgspec.json.Encoder(order="sorted")
 _EXACT = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False, check_circular=False
 )
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a formula begins with, and what spreadsheets skip before it
+T = TypeVar("T")
 _PLAIN = frozenset({str, int, bool, NoneType})
 
 
@@ -38,10 +43,17 @@ def _quickly(value: Any) -> bytes | None:
     # Digests depend on this text, which the standard library defines; msgspec takes half the time for most.
     if _written_alike(value):
         try:
-            return _QUICK.encode(value)
+            return _quick()(value)
         except (TypeError, UnicodeEncodeError):  # a key that is not a string, or a lone surrogate
             pass
     return None
+
+
+@cache
+def _quick() -> Callable[[Any], bytes]:
+    import msgspec  # here, since lists of runs do without it
+
+    return msgspec.json.Encoder(order="sorted").encode
 
 
 def _written_alike(value: Any) -> bool:
@@ -67,18 +79,89 @@ def _without_exponent(number: float) -> bool:
     return 1e-4 <= number < 1e16 or number == 0.0 or -1e16 < number <= -1e-4
 
 
-def text_of(path: Path, most: int = 1 << 24) -> str:
-    """Read a UTF-8 text file.
+class Refused(OSError):
+    """A file that is not read: it is no regular file, or it is larger than the limit of its kind."""
+
+
+Kind = Literal["settings", "text", "record", "picture", "rows", "weights"]
+_MB = 1 << 20
+LARGEST: dict[Kind, int] = {
+    "settings": 1 * _MB,  # what people write in TOML and JSON: cards, channels, suites, --env-config
+    "text": 16 * _MB,  # a prompt's files, one completion, a table of measurements
+    "record": 256 * _MB,  # JSON by programs: run.json, manifest.json, a checkpoint's config and vocabulary
+    "picture": 64 * _MB,  # figures and pages
+    "rows": 32 << 30,  # one line or row for each answer or decision, layouts, logs of work
+    "weights": 4 << 40,
+}  # fmt: skip
+"""The largest file of each kind, bytes."""
+
+
+def opened(path: str | Path, kind: Kind) -> BufferedReader:
+    """Open a file for reading; it is checked after it is opened, so nothing can take its place in between.
 
     Raises:
-        OSError: it is not a regular file, or is larger than `most` bytes.
+        OSError: the file cannot be opened.
+        Refused: it is not a regular file, or is larger than `LARGEST` of its kind.
+    """
+    file = open(path, "rb", opener=_at_once)  # noqa: SIM115
+    try:
+        state = os.fstat(file.fileno())
+        if not stat.S_ISREG(state.st_mode):
+            raise Refused(errno.EINVAL, "it is no file, but a pipe or a device", str(path))
+        if state.st_size > LARGEST[kind]:
+            raise Refused(errno.EFBIG, f"it is larger than {_size(LARGEST[kind])}, the limit", str(path))
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+def _at_once(path: str, flags: int) -> int:
+    # Without the flag, opening a pipe waits for somebody who writes to it.
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0))
+
+
+def _size(size: int) -> str:
+    return f"{size / (1 << 30):g} GB" if size >= 1 << 30 else f"{size / _MB:g} MB"
+
+
+def bytes_of(path: str | Path, kind: Kind) -> bytes:
+    """Read a file as it was when it was opened. Raises what `opened` raises."""
+    with opened(path, kind) as file:
+        return file.read(os.fstat(file.fileno()).st_size)
+
+
+def text_of(path: str | Path, kind: Kind = "text") -> str:
+    """Read a UTF-8 text file. A byte order mark, which some editors put first, is left out.
+
+    Raises:
+        OSError: it cannot be opened.
+        Refused: it is not a regular file, or is larger than `LARGEST` of its kind.
         UnicodeDecodeError: it is not UTF-8.
     """
-    if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe would block, and a device never ends
-        raise OSError(errno.EINVAL, "it is no file")
-    if path.stat().st_size > most:
-        raise OSError(errno.EFBIG, f"it is larger than {most >> 20} MB")
-    return path.read_bytes().decode("utf-8")
+    return bytes_of(path, kind).decode("utf-8-sig")
+
+
+def written_ns(path: Path) -> int:
+    """Return when a file was last written, in nanoseconds; 0 if nobody knows, as for a link to nowhere."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+def neutral(cell: T) -> T | str:
+    """Return a cell of a CSV file for spreadsheets: a text that they would take for a formula as text.
+
+    It gets an apostrophe before it. Numbers, also those that are texts, stay as they are.
+    """
+    if not isinstance(cell, str) or not cell.startswith(FORMULA):
+        return cell
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}"
+    return cell
 
 
 def sha256_bytes(data: bytes) -> str:
@@ -86,9 +169,9 @@ def sha256_bytes(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def sha256_file(path: Path) -> str:
-    """Return the hex SHA-256 digest of a file's content."""
-    with path.open("rb") as f:
+def sha256_file(path: Path, kind: Kind = "weights") -> str:
+    """Return the hex SHA-256 digest of a file's content. Raises what `opened` raises."""
+    with opened(path, kind) as f:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
 

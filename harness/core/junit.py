@@ -11,19 +11,35 @@ WHOLE = 10**6  # most characters of a message
 
 @dataclass(frozen=True)
 class Case:
-    """One test case of a class `of`; `failure` says why it failed, and is None if it passed."""
+    """One test case of a class `of`.
+
+    Attributes:
+        of: the class.
+        name: the case's own name.
+        failure: why it failed; None if it passed.
+        error: why it has no result; None if it has one.
+    """
 
     of: str
     name: str
-    failure: str | None
+    failure: str | None = None
+    error: str | None = None
 
 
 def junit(name: str, cases: Sequence[Case]) -> str:
     """Return a test suite as XML; texts may hold any characters."""
-    failed = sum(case.failure is not None for case in cases)
-    suite = Element("testsuite", {"name": name, "tests": str(len(cases)), "failures": str(failed)})
+    failed = sum(case.failure is not None and case.error is None for case in cases)
+    errors = sum(case.error is not None for case in cases)
+    counts = {
+        "tests": str(len(cases)),
+        "failures": str(failed),
+        **({"errors": str(errors)} if errors else {}),
+    }
+    suite = Element("testsuite", {"name": name, **counts})
     for case in cases:
         element = SubElement(suite, "testcase", classname=printable(case.of), name=printable(case.name))
-        if case.failure is not None:
+        if case.error is not None:
+            SubElement(element, "error", message=printable(case.error, WHOLE))
+        elif case.failure is not None:
             SubElement(element, "failure", message=printable(case.failure, WHOLE))
     return tostring(suite, encoding="unicode", xml_declaration=True) + "\n"

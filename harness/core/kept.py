@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 from harness import __version__
-from harness.core.files import digest, sha256_bytes, write_whole
+from harness.core.files import bytes_of, digest, sha256_file, write_whole
 
 _PACKAGE = Path(__file__).parent.parent
 
@@ -22,7 +22,7 @@ def folder() -> Path:
 def recall(name: str) -> bytes | None:
     """Read what was kept under a name; None if it cannot be read."""
     try:
-        return (folder() / name).read_bytes()
+        return bytes_of(folder() / name, "rows")
     except OSError:
         return None
 
@@ -37,4 +37,4 @@ def keep(name: str, data: bytes) -> None:
 def code_sha256(*patterns: str) -> str:
     """Return the digest of the package's files that match, for keys that change with the code."""
     files = sorted(file for pattern in patterns for file in _PACKAGE.glob(pattern))
-    return digest([__version__, *(sha256_bytes(file.read_bytes()) for file in files)])
+    return digest([__version__, *(sha256_file(file) for file in files)])

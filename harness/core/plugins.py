@@ -33,6 +33,11 @@ class Plugins(Mapping[str, T], Generic[T]):
             self._loaded[name] = self._load(name)
         return self._loaded[name]
 
+    def usable(self) -> dict[str, T]:
+        """Return those that work, by name."""
+        found = resources.each(self, self.__getitem__)
+        return {name: plugin for name, plugin in found.items() if not isinstance(plugin, UserError)}
+
     def __iter__(self) -> Iterator[str]:
         return iter({**self.built_in, **self._entries()})
 

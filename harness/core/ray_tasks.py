@@ -17,8 +17,9 @@ import ray
 from ray import exceptions
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import Unanswered, UserError, printable
 from harness.core.parallel import Lost
+from harness.core.process import Stop
 from harness.core.versions import differing, of_node
 
 DEAD = (
@@ -112,9 +113,13 @@ def _connect(address: str | None) -> None:
             host, _, port = target.rpartition("/")[2].rpartition(":")
             socket.create_connection((host.strip("[]"), int(port)), REACHED_S).close()
         handler = signal.getsignal(signal.SIGTERM)
-        ray.init(address=address, **quiet)
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, handler)  # Ray replaces it with one that ends without a message
+        try:
+            ray.init(address=address, **quiet)
+        except SystemExit as ended:  # what Ray's own handler raises
+            raise (Stop(signal.SIGTERM) if ended.code == signal.SIGTERM else ended) from None
+        finally:
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGTERM, handler)
     # A version of Ray or Python other than the cluster's raises one of these, too.
     except (OSError, RuntimeError, ValueError, ImportError) as error:
         raise UserError(
@@ -149,5 +154,7 @@ def _on_node(job: tuple[Callable[[Any], Any], dict[str, str], str], item: Any) -
         os.chdir(folder)
     try:
         return node, name, work(item)
+    except Unanswered:  # the words of its server come first
+        raise
     except UserError as error:
         raise UserError(f"node {name}: {error}") from None

@@ -6,10 +6,13 @@ They ship with the harness, at the checkout's top level or inside the wheel. A f
 """
 
 import os
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TypeVar
 
 from harness.core.errors import UserError, printable
 
+T = TypeVar("T")
 DATASET = "occluded-intersection-v2"  # the dataset that ships
 MARKER = "swarmdrive.toml"
 
@@ -35,6 +38,17 @@ def entries(kind: str, pattern: str) -> list[Path]:
 def names(kind: str) -> list[str]:
     """Return the sorted names (file stems) of the TOML files of one kind."""
     return sorted({path.stem for path in entries(kind, "*.toml")})
+
+
+def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserError]:
+    """Load all that a list shows; one that is wrong stands there as its error, and takes no other with it."""
+    found: dict[str, T | UserError] = {}
+    for name in names:
+        try:
+            found[name] = load(name)
+        except UserError as error:
+            found[name] = error
+    return found
 
 
 def find(kind: str, name: str) -> Path:

@@ -15,6 +15,7 @@ import msgspec
 
 from harness.core import work
 from harness.core.errors import UserError, printable
+from harness.core.files import bytes_of, text_of
 from harness.core.formats import CONFIG, WORK
 
 T = TypeVar("T")
@@ -102,7 +103,7 @@ def read(folders: Sequence[Path], kind: type[Begun]) -> list[Begun]:
 def _read(folder: Path, kind: type[Begun]) -> Begun:
     file = folder / WORK / CONFIG
     try:
-        config = msgspec.json.decode(file.read_bytes(), type=kind)
+        config = msgspec.json.decode(text_of(file, "record"), type=kind)
     except (OSError, ValueError, RecursionError):
         config = None
     if config is None or not config.shard:
@@ -156,10 +157,16 @@ def collect(parts: Mapping[str, Path], folder: Path) -> None:
         copy = folder / f".{name}.{os.getpid()}.part"
         if not (folder / name).exists():
             shutil.rmtree(copy, ignore_errors=True)
-            (shutil.copytree if part.is_dir() else shutil.copyfile)(part, copy)
+            content = _content(part)
+            if part.is_dir():
+                copy.mkdir()
+                for file, data in content.items():
+                    (copy / file).write_bytes(data)
+            else:
+                copy.write_bytes(content[part.name])
             os.replace(copy, folder / name)
 
 
 def _content(part: Path) -> dict[str, bytes]:
     files = sorted(part.iterdir()) if part.is_dir() else [part]
-    return {file.name: file.read_bytes() for file in files}
+    return {file.name: bytes_of(file, "rows") for file in files}

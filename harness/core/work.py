@@ -13,11 +13,13 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from harness.core.errors import Unfinished, UserError, printable
-from harness.core.files import alone, forget_halves, write_whole
+from harness.core.errors import Unanswered, Unfinished, UserError, printable
+from harness.core.files import alone, forget_halves, text_of, write_whole
 from harness.core.formats import CONFIG, WORK
 
 LOCK = "lock"
+UNANSWERED = "unanswered.txt"  # why the work stopped, if the model could not be asked
+MOST_WORDS = 10_000  # characters of it that are read
 GONE_S = 3.0  # seconds until the processes of a killed command are gone
 
 
@@ -41,15 +43,15 @@ Kind = TypeVar("Kind", bound=Begun)
 
 
 def begun(out: Path, kind: type[Kind]) -> Kind | None:
-    """Read what the unfinished work in a folder began with; None if the folder is new or empty.
+    """Read what the unfinished work in a folder began with; None if the folder is new, empty or `idle`.
 
     Raises:
         UserError: the file is damaged, or the folder holds something else.
     """
     shown, file = printable(out), out / WORK / CONFIG
     try:
-        if file.is_file():
-            return msgspec.json.decode(file.read_bytes(), type=kind)
+        if file.is_file() and not idle(out):
+            return msgspec.json.decode(text_of(file, "record"), type=kind)
         others = out.is_dir() and any(path.name != WORK for path in out.iterdir())
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
@@ -59,6 +61,29 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
         what = "a folder with other files in it" if others else "no folder"
         raise UserError(f"--out {shown} is {what}; choose an empty or a new one")
     return None
+
+
+def unanswered(out: Path) -> str | None:
+    """Return why the work in a folder stopped, if its model could not be asked; else None."""
+    try:
+        return printable(text_of(out / WORK / UNANSWERED), MOST_WORDS)
+    except (OSError, ValueError, UserError):
+        return None
+
+
+def idle(out: Path) -> bool:
+    """Whether the work in a folder stopped before its model answered anything.
+
+    Nothing is lost if it begins anew, with other settings or a model that its server has only now.
+    """
+    work = out / WORK
+    with suppress(OSError):
+        return (work / UNANSWERED).is_file() and _nothing_done(work)
+    return False
+
+
+def _nothing_done(work: Path) -> bool:
+    return {path.name for path in work.iterdir()} <= {CONFIG, LOCK, UNANSWERED}
 
 
 def same(out: Path, now: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
@@ -84,7 +109,8 @@ def held(out: Path) -> bool:
 def working(out: Path, begin: Begun, last: str | None = None) -> Iterator[Path]:
     """Lock the working folder, an existing one or a new one that begins with `begin`, and yield it.
 
-    If a UserError or OSError ends the work before anything is done, the folders created here are deleted.
+    If a UserError or OSError ends the work before anything is done, the folders created here are deleted; but
+    if the model could not be asked, the folder keeps why (`unanswered`).
 
     Args:
         out: the output folder.
@@ -112,12 +138,17 @@ def working(out: Path, begin: Begun, last: str | None = None) -> Iterator[Path]:
                 write_whole(work / CONFIG, msgspec.json.encode(begin))
             elif earlier != begin or (last and (out / last).exists()):
                 raise BlockingIOError
-            yield work
+            (work / UNANSWERED).unlink(missing_ok=True)
+            try:
+                yield work
+            except Unanswered as error:
+                write_whole(work / UNANSWERED, str(error))
+                raise
     except BlockingIOError:
         raise UserError(f"--out {printable(out)} is being written by another process; wait for it") from None
     except (UserError, OSError):
         with suppress(OSError):  # another process may be working in one of them by now
-            if {path.name for path in work.iterdir()} <= {CONFIG, LOCK}:
+            if _nothing_done(work) and not (work / UNANSWERED).exists():
                 shutil.rmtree(work)
                 for path in created:
                     path.rmdir()

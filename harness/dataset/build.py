@@ -20,7 +20,7 @@ import msgspec
 from harness import __version__
 from harness.core import extras, shards, work
 from harness.core.errors import UserError, printable
-from harness.core.files import canonical_json, replacing, sha256_bytes, write_whole
+from harness.core.files import canonical_json, opened, replacing, sha256_bytes, write_whole
 from harness.core.formats import WORK
 from harness.core.parallel import Workers, each
 from harness.core.seeds import purpose, stated
@@ -227,7 +227,7 @@ def _join_layouts(work: Path, episodes: int, layouts: Path) -> list[bytes]:
     trees = []
     with replacing(layouts) as part, ZipFile(part, "w") as file:
         for episode in range(episodes):
-            with ZipFile(work / part_of(episode)) as layout:
+            with opened(work / part_of(episode), "rows") as data, ZipFile(data) as layout:
                 for name in layout.namelist():
                     file.writestr(_entry(name), layout.read(name))
                 trees.append(layout.read(tree_name(episode)))

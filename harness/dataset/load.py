@@ -16,6 +16,7 @@ import numpy as np
 
 from harness.core.arrays import Bools
 from harness.core.errors import UserError, unknown
+from harness.core.files import text_of
 from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
 from harness.core.resources import find as beside
@@ -167,6 +168,15 @@ class Dataset:
         """The trees as arrays."""
         return Forest.of(tuple(self.trees), self.actions, self.scenario.parameters.delay_allowance_s)
 
+    @property
+    def lost(self) -> int:
+        """In how many episodes the ego collides before its first action, whatever that is."""
+        lag_s = self.scenario.parameters.decision_lag_s
+        firsts = [[self.forest.edges[n].end for n in edges] for edges in self.forest.edge[self.forest.root]]
+        return sum(
+            all(end and end.result == "collision" and end.time_s <= lag_s for end in ends) for ends in firsts
+        )
+
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
         """Return the dataset with only these episodes."""
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
@@ -274,7 +284,7 @@ def argument(path: Path) -> str:
 def released_digests() -> set[str]:
     """Return the manifests' digests of released datasets, from `datasets/released.toml`."""
     pins = folder("datasets") / "released.toml"
-    return set(tomllib.loads(pins.read_text()).values()) if pins.is_file() else set()
+    return set(tomllib.loads(text_of(pins)).values()) if pins.is_file() else set()
 
 
 @uncollected()

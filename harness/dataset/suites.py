@@ -11,7 +11,7 @@ from msgspec import Meta, Struct
 
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
-from harness.core.resources import entries
+from harness.core.resources import each, entries
 
 PREFIX = "suite:"  # marks a suite's name where a dataset's name is expected
 
@@ -41,8 +41,16 @@ def named(text: str) -> Suite | None:
     if not text.startswith(PREFIX):
         return None
     name, files = text.removeprefix(PREFIX), entries("datasets", "suites.toml")
-    tables = [(file, key, table) for file in files for key, table in _tables(file).items()]
+    found = each(map(str, files), lambda file: _tables(Path(file)))
+    wrong = [read for read in found.values() if isinstance(read, UserError)]
+    tables = [
+        (file, key, table)
+        for file, read in found.items() if not isinstance(read, UserError)
+        for key, table in read.items()
+    ]  # fmt: skip
     matches = [(file, table) for file, key, table in tables if key == name]
+    if not matches and wrong:
+        raise wrong[0]
     if not matches:
         raise unknown("suite", name, {key for _, key, _ in tables})
     if len(matches) > 1:

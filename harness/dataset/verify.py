@@ -10,13 +10,15 @@ from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from weakref import finalize
 from zipfile import ZipFile
 
 import msgspec
 
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import sha256_bytes, sha256_file
+from harness.core.files import bytes_of, sha256_bytes, sha256_file
+from harness.core.files import opened as opened_file
 from harness.dataset.schema import LAYOUTS, Manifest, Record, Taken, Tree, record_type
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
@@ -33,7 +35,7 @@ def read_manifest(path: Path) -> tuple[Manifest, str]:
     """Read a dataset's manifest and its digest. Raises UserError if it is missing or wrong."""
     file = path / "manifest.json"
     try:
-        data = file.read_bytes()
+        data = bytes_of(file, "record")
         manifest = _MANIFEST.decode(data)
     except FileNotFoundError:
         raise UserError(
@@ -68,7 +70,7 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
         elif any(
             isinstance(value, a) != isinstance(expected[name], b) for a, b in ((list, tuple), (str, str))
         ):
-            yield f"[parameters]: {name} = {value}; wanted is a value such as {expected[name]}"
+            yield f"[parameters]: {name} = {printable(value)}; wanted is a value such as {expected[name]}"
     if missing := scenario.parameters.stated().keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"
     if scenario.start and manifest.environment != (here := environment.config(scenario.name)):
@@ -116,7 +118,7 @@ def file_problems(path: Path, manifest: Manifest) -> Iterator[str]:
     for name, expected in manifest.files.items():
         if not (path / name).is_file():
             yield f"{name}: missing"
-        elif sha256_file(path / name) != expected:
+        elif sha256_file(path / name, "rows") != expected:
             yield f"{name}: changed, its sha256 is not the manifest's"
 
 
@@ -142,7 +144,14 @@ def _layouts(file: Path, state: tuple[int, int, int], process: int) -> ZipFile:
     A changed `state` opens it anew. So does another `process`, since a forked one shares its parent's
     position in the file.
     """
-    return ZipFile(file)
+    data = opened_file(file, "rows")
+    try:
+        layouts = ZipFile(data)
+    except BaseException:
+        data.close()
+        raise
+    finalize(layouts, data.close)
+    return layouts
 
 
 def _entry(file: ZipFile, name: str, sha256: str) -> bytes:

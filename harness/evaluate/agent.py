@@ -1,7 +1,7 @@
 """Describe an agent: the model that answers for a vehicle, and how it is asked."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from harness.backends.base import AnswerMode, Role
@@ -106,7 +106,7 @@ class Agent:
     def settings(self) -> dict[str, Any]:
         """Return everything that decides its answers, as plain values."""
         return {
-            "model": asdict(self.card),
+            "model": self.card.record(),
             "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
             "thinking": self.thinking,
             "answer": self.answer,

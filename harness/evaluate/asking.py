@@ -3,7 +3,8 @@
 import math
 import os
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import cache, partial
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -13,14 +14,14 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from harness.backends.base import Backend, Completion, Request, Role, window
+from harness.backends.base import Backend, Completion, Request, Role, Served, served, window
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Ints
-from harness.core.errors import UserError, printable
-from harness.core.files import canonical_bytes, digest
+from harness.core.errors import Unanswered, UserError, printable
+from harness.core.files import bytes_of, canonical_bytes, digest
 from harness.dataset.load import Scene
-from harness.evaluate import repair
+from harness.evaluate import repair, servers
 from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
@@ -29,9 +30,13 @@ from harness.evaluate.walk import Fuses
 from harness.parsing.parse import parse
 from harness.runs.records import BLIND, REWRITTEN, Answer, Latency
 from harness.runs.records import Role as RecordedRole
+from harness.runs.unanswered import HELPERS, Tally
 from harness.world.perception.graph import blinded, truth_graph
 
 CHUNK = 64  # fewest requests that are asked, and kept, together
+FIRST = 8  # fewest questions that a server is asked before it has answered any
+IN_A_ROW = CHUNK  # questions without an answer, one after the other, after which nothing more is asked
+MORE_FOLLOWS = b" \n"  # ends every kept line but the last of its chunk, so that a torn chunk can be told
 SYNC_S = 1.0  # kept answers reach the disk this often; if power fails, those since are asked again
 
 
@@ -119,10 +124,14 @@ def answer_of(request: Request, completion: Completion) -> Answer:
 class Asker:
     """Asks for the answers that are missing, and turns answers into arrays of intents.
 
+    A question that gets no answer is never kept, so that it is asked again when the work goes on.
+
     Attributes:
         spec: the evaluation.
         answers: answers by request id, in the order of the requests.
         latency: how long inference takes.
+        tally: what became of the questions that were asked here.
+        served: which server gave each answer that is not kept in a file.
     """
 
     def __init__(
@@ -141,7 +150,8 @@ class Asker:
             spec: the evaluation.
             backend: opens the backend, at the first request.
             latency: how long inference takes.
-            kept: JSON Lines file of the answers so far; its last line may be torn if a run was killed.
+            kept: JSON Lines file of the answers so far; its last chunk may be torn if a run was killed. Only
+                one process at a time may ask.
             answers: further answers that need not be asked for, by request id.
             progress: called with the number of new answers, those kept by a stopped run included.
             more: called with the number of requests before they are made.
@@ -149,33 +159,99 @@ class Asker:
         self.spec, self._backend, self._kept = spec, backend, kept
         self._progress, self._more = progress, more
         self.latency, self._on_disk_s = latency, -math.inf
-        self._given = frozenset(answers or {})
-        self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
+        self._given, self.served = frozenset(answers or {}), list[Served]()
+        self.answers: dict[str, Answer] = {}
+        self._read_b = 0  # bytes of the file whose answers are among these
+        self._recall()
+        self.answers |= answers or {}
+        self.tally, self._in_a_row = Tally(), 0
 
     def ask(self, asked: Sequence[Request]) -> None:
-        """Ask for the missing answers, and keep each chunk as soon as it is answered."""
-        if all(request.id in self.answers for request in asked):
-            self._progress(len(asked))
+        """Ask for the missing answers, each once, and keep each chunk as soon as it is answered.
+
+        Raises:
+            Unanswered: a question of the ego or a fusion call got no answer, and all others of these were
+                asked; or none of the first questions was answered, or none of the last `IN_A_ROW`.
+        """
+        self._recall(cut=True)  # another process may have asked, too
+        missing = [request for request in asked if request.id not in self.answers]
+        if len(missing) < len(asked):
+            self._progress(len(asked) - len(missing))
+        if not missing:
             return
-        # An answer may depend on the other requests in its batch. So the chunks of a resumed run begin at the
-        # same places, and a chunk with an answer missing is asked again as a whole.
+        # An answer may depend on the other requests in its batch. Chunks are kept whole or not at all, and
+        # all but the last are equally long. So what a resumed run lacks falls into the same chunks.
         backend, batch = self._backend(), self.spec.batch_size
         size = batch * math.ceil(CHUNK / batch)
-        chunks = [asked[start : start + size] for start in range(0, len(asked), size)]
+        chunks = [missing[start : start + size] for start in range(0, len(missing), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
-            chunks[-2:] = [asked[size * (len(chunks) - 2) :]]  # a short last chunk would not fill a batch
-        incomplete = [chunk for chunk in chunks if any(request.id not in self.answers for request in chunk)]
-        if len(incomplete) < len(chunks):
-            self._progress(len(asked) - sum(map(len, incomplete)))
+            chunks[-2:] = [missing[size * (len(chunks) - 2) :]]  # a short last chunk would not fill a batch
+        waves, first = [chunks], self._first()
+        if window(backend) and self._refused_so_far() and len(chunks[0]) >= first + batch:
+            chunks[:1] = [chunks[0][:first], chunks[0][first:]]
+            waves = [chunks[:1], chunks[1:]]
         new_answers: dict[str, Answer] = {}
-        for answers in _answer_chunks(
-            partial(self._answered, backend), incomplete, 1 + math.ceil(window(backend) / size)
-        ):
-            new_answers |= answers
-            if self._kept:
-                _keep(self._kept, answers.values(), self._to_disk())
-            self._progress(len(answers))
-        self.answers |= {request.id: new_answers[request.id] for chunk in incomplete for request in chunk}
+        answering = partial(self._answered, backend)
+        calls = 1 + math.ceil(window(backend) / size)
+        try:
+            for wave in waves:
+                with closing(_answer_chunks(answering, wave, calls)) as chunks_answered:
+                    for answers in chunks_answered:
+                        new_answers |= answers
+                        self._keep_servers(served(backend))
+                        self._take(answers.values(), single=window(backend) > 0)
+        finally:
+            there = (request.id for request in missing if request.id in new_answers)
+            self.answers |= {name: new_answers[name] for name in there}
+        found = Tally(new_answers.values())
+        if found.missing - set(HELPERS):
+            raise Unanswered(str(found))
+
+    def settle(self) -> None:
+        """Raise Unanswered if too many of the questions that were asked here got no answer."""
+        if self.tally.missing:
+            raise Unanswered(str(self.tally))
+
+    def _take(self, answers: Collection[Answer], single: bool) -> None:
+        """Count and keep what came; stop if nothing is answered any more.
+
+        Args:
+            answers: those of a chunk.
+            single: whether each question stands alone. Otherwise an answer may depend on the others of its
+                chunk, which is then kept only if all of it was answered.
+        """
+        answered = [answer for answer in answers if answer.error is None]
+        if self._kept and answered and (single or len(answered) == len(answers)):
+            self._read_b += _keep(self._kept, answered, self._to_disk())
+        refused_so_far = self._refused_so_far()
+        self.tally.add(answers)
+        self._in_a_row = 0 if answered else self._in_a_row + len(answers)
+        if self._in_a_row >= (self._first() if refused_so_far else IN_A_ROW):
+            raise Unanswered(str(self.tally))
+        self._progress(len(answers))
+
+    def _keep_servers(self, these: Sequence[Served]) -> None:
+        """Keep which server gave each answer."""
+        if self._kept:
+            servers.keep(self._kept.parent, these)
+        else:
+            self.served += these
+
+    def _first(self) -> int:
+        """How many questions are asked before anything was answered: whole batches."""
+        return self.spec.batch_size * math.ceil(FIRST / self.spec.batch_size)
+
+    def _refused_so_far(self) -> bool:
+        """Whether no question that was asked here got an answer."""
+        return self.tally.asked == self.tally.unanswered
+
+    def _recall(self, cut: bool = False) -> None:
+        """Read what the file has that is not known yet; with `cut`, a torn chunk is cut from it."""
+        if self._kept and self._kept.is_file() and (size_b := self._kept.stat().st_size) != self._read_b:
+            whole = _whole(bytes_of(self._kept, "rows"))
+            self.answers, self._read_b = _answers_in(self._kept, whole) | self.answers, len(whole)
+            if cut and self._read_b < size_b:
+                os.truncate(self._kept, self._read_b)
 
     def _to_disk(self) -> bool:
         """Whether the last answers reached the disk long enough ago."""
@@ -286,7 +362,7 @@ class Asker:
 
 def _answer_chunks(
     work: Callable[[Sequence[Request]], dict[str, Answer]], chunks: Sequence[Sequence[Request]], calls: int
-) -> Iterator[dict[str, Answer]]:
+) -> Generator[dict[str, Answer], None, None]:
     """Yield the answers of each chunk as they come, by request id.
 
     Up to `calls` chunks are asked at the same time, so that no chunk waits for the last answer of another.
@@ -324,30 +400,41 @@ def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
 
 
 def read_kept(kept: Path) -> dict[str, Answer]:
-    """Read the answers kept so far, by request id, and cut a torn last line from the file."""
-    if not kept.is_file():
-        return {}
-    data = kept.read_bytes()
-    whole = data[: data.rfind(b"\n") + 1]
-    if len(whole) < len(data):
-        with kept.open("r+b") as file:
-            file.truncate(len(whole))
+    """Read the answers kept so far, by request id.
+
+    Those of a torn chunk do not count, nor does a question without an answer, wherever the file comes from.
+    """
+    return _answers_in(kept, _whole(bytes_of(kept, "rows"))) if kept.is_file() else {}
+
+
+def _answers_in(kept: Path, lines: bytes) -> dict[str, Answer]:
     try:
-        answers = [_DECODER.decode(line) for line in whole.splitlines()]
+        answers = [_DECODER.decode(line) for line in lines.splitlines()]
     except (ValueError, RecursionError) as error:
         raise UserError(
             f"{printable(kept)} is damaged ({printable(error)}); delete its folder and start again"
         ) from None
-    return {answer.id: answer for answer in answers}
+    return {answer.id: answer for answer in answers if answer.error is None}
+
+
+def _whole(data: bytes) -> bytes:
+    """Return the chunks of a file that were kept to their ends."""
+    lines = data.splitlines(keepends=True)
+    while lines and (lines[-1].endswith(MORE_FOLLOWS) or not lines[-1].endswith(b"\n")):
+        lines.pop()
+    return b"".join(lines)
 
 
 _DECODER, _ENCODER = msgspec.json.Decoder(Answer), msgspec.json.Encoder()
 
 
-def _keep(kept: Path, answers: Iterable[Answer], to_disk: bool) -> None:
-    """Append answers to a file; with `to_disk`, return once it is on the disk."""
+def _keep(kept: Path, answers: Iterable[Answer], to_disk: bool) -> int:
+    """Append a chunk of answers to a file, and return its bytes; with `to_disk`, once it is on the disk."""
+    lines = _ENCODER.encode_lines(answers)
+    chunk = lines[:-1].replace(b"\n", MORE_FOLLOWS) + lines[-1:]
     with kept.open("ab") as file:
-        file.write(_ENCODER.encode_lines(answers))
+        file.write(chunk)
         file.flush()
         if to_disk:
             os.fsync(file.fileno())
+    return len(chunk)

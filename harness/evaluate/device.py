@@ -5,15 +5,16 @@ prompts share is counted as read each time.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from harness.backends import devices
-from harness.core.arrays import Floats
+from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError, printable
 from harness.evaluate.fusion import key_of
+from harness.radio.channel import Physical
 from harness.radio.wrapped import innermost
 from harness.runs.decisions import Decisions
 from harness.runs.records import Answer, Constant, Device, DeviceRow, Latency, Speed
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint
     from harness.dataset.load import Scene
     from harness.evaluate.agent import Agent
+    from harness.evaluate.walk import Decided
 
 
 def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> list[DeviceRow]:
@@ -78,19 +80,47 @@ def answer_j(speed: Speed, answer: Answer) -> float:
 
 
 def vehicles_j(latency: Latency, scenes: "Sequence[Scene]", answers: Mapping[str, Answer]) -> Floats:
-    """Return the joules of each vehicle's own answer, (n, 1+H), the ego first; NaN without an answer.
+    """Return the joules of each vehicle's own answer, (n, 1+H), the ego first.
+
+    It is NaN for an answer that is missing or that no tokens are known of, and 0 where there is no vehicle.
 
     Args:
         latency: the latency of a run with a device profile.
         scenes: decision points.
         answers: answers by request id.
     """
-    joules = np.full((len(scenes), max(len(scene.viewers) for scene in scenes)), np.nan)
+    joules = np.zeros((len(scenes), max(len(scene.viewers) for scene in scenes)))
     for n, scene in enumerate(scenes):
         for place, viewer in enumerate(scene.viewers):
-            if answer := answers.get(f"{scene.id}/{viewer}"):
-                joules[n, place] = answer_j(latency.speed(place), answer)
+            answer = answers.get(f"{scene.id}/{viewer}")
+            joules[n, place] = answer_j(latency.speed(place), answer) if answer else np.nan
     return joules
+
+
+def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
+    """Return the joules of the helpers that infer, (n,).
+
+    Args:
+        infers: who does, (n, H): `Exchange.infers`. An attacker's further voices, behind the H vehicles, run
+            no model.
+        vehicles: joules of each vehicle's answer, (n, 1+H), the ego first: `vehicles_j`.
+    """
+    count = min(infers.shape[1], vehicles.shape[1] - 1)
+    own = vehicles[:, 1 : 1 + count]
+    return np.asarray(np.sum(np.where(infers[:, :count], own, 0.0), axis=1))
+
+
+def decided_helpers_j(
+    latency: Latency, decided: "Sequence[Decided[Scene]]", answers: Mapping[str, Answer]
+) -> Floats:
+    """Return the joules of the helpers that infer for each decision, (n,), in the order of `decided`."""
+    of: dict[int, Floats] = {}
+    parts = []
+    for part in decided:
+        if id(part.moments) not in of:
+            of[id(part.moments)] = vehicles_j(latency, part.moments, answers)
+        parts.append(helpers_j(part.result.infers, of[id(part.moments)][part.due.at]))
+    return np.concatenate(parts)
 
 
 def tokens(answer: Answer) -> tuple[float, float]:
@@ -111,7 +141,7 @@ def tokens(answer: Answer) -> tuple[float, float]:
 
 def energy(
     device: Device, latency: Latency, points: "Sequence[OperatingPoint]", decisions: Decisions,
-    answers: Iterable[Answer],
+    answers: Mapping[str, Answer],
 ) -> dict[str, Floats]:  # fmt: skip
     """Return the energy of each decision as columns (n,) by name; NaN where a part of it is unknown.
 
@@ -119,30 +149,42 @@ def energy(
         device: the computer that every vehicle has.
         latency: the run's latency.
         points: the run's conditions.
-        decisions: the run's decisions.
-        answers: all answers of the run.
+        decisions: the run's decisions, with `helpers_j` (`decided_helpers_j`).
+        answers: all answers of the run, by request id.
 
     Returns:
-        `inference_j`, joules of the ego, the helpers asked, and a fusion call; `helpers_j`, the helpers' part
-        of it; `radio_mj`, millijoules to send the request and the replies; `waiting_j`, joules of the ego's
-        computer while it waits for messages and does not infer.
+        `inference_j`, joules of the ego, of the helpers that infer, and of a fusion call; `radio_mj`,
+        millijoules to send the request and the replies; `waiting_j`, joules of the ego's computer while it
+        waits for messages and does not infer.
     """
-    ego_j, ego_s, helpers_j, call_j = _inference(latency, points, decisions, answers)
-    watts, idle_watts = np.full(len(decisions), np.nan), np.nan
+    ego_j, ego_s, call_j = _inference(latency, points, decisions, answers)
+    sent_mj, idle_watts = np.full(len(decisions), np.nan), np.nan
     condition = decisions.codes("condition", [point.name for point in points])
+    sent = decisions["requests"] + decisions["messages"]
     for place, point in enumerate(points):
-        watts[condition == place] = transmit_watts(device, point)
+        here = condition == place
+        sent_mj[here] = 1000 * radio_j(device, point, decisions["airtime_ms"][here] / 1000, sent[here])
         if point.round_trip_s is not None or point.round_trip:  # the ego's model is in a cloud
             ego_j[condition == place], ego_s[condition == place] = np.nan, 0.0
     if device.idle_watts:
         idle_watts = device.idle_watts.value
     waits_s = (decisions["latency_ms"] - decisions["fusion_ms"]) / 1000 - ego_s
     return {
-        "inference_j": ego_j + helpers_j + call_j,
-        "helpers_j": helpers_j,
-        "radio_mj": watts * decisions["airtime_ms"],
+        "inference_j": ego_j + decisions["helpers_j"] + call_j,
+        "radio_mj": sent_mj,
         "waiting_j": idle_watts * np.maximum(waits_s, 0.0),
     }
+
+
+def radio_j(device: Device, point: "OperatingPoint", airtime_s: Floats, messages: Floats) -> Floats:
+    """Return the joules to send messages, (n,), from their number and their total time on air.
+
+    A radio model has frames of its own, with what they hold besides a message. A declared channel has bits
+    and a bandwidth alone, so there each message takes a frame of the device profile at least.
+    """
+    if device.frame_ms is not None and not isinstance(innermost(point.channel), Physical):
+        airtime_s = np.maximum(airtime_s, messages * device.frame_ms.value / 1000)
+    return transmit_watts(device, point) * airtime_s
 
 
 def transmit_watts(device: Device, point: "OperatingPoint") -> float:
@@ -154,33 +196,25 @@ def transmit_watts(device: Device, point: "OperatingPoint") -> float:
 
 
 def _inference(
-    latency: Latency, points: "Sequence[OperatingPoint]", decisions: Decisions, answers: Iterable[Answer]
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the ego's joules and seconds, the helpers' joules and those of fusion calls, (n,) each."""
-    by_id = {answer.id: answer for answer in answers}
-    egos = {answer.scene: answer for answer in by_id.values() if answer.role == "ego"}
-    calls = {(a.scene, a.heard): a for a in by_id.values() if a.role == "merge"}
+    latency: Latency, points: "Sequence[OperatingPoint]", decisions: Decisions, answers: Mapping[str, Answer]
+) -> tuple[Floats, Floats, Floats]:
+    """Return the ego's joules and seconds, and the joules of fusion calls, (n,) each."""
+    egos = {answer.scene: answer for answer in answers.values() if answer.role == "ego"}
+    calls = {(a.scene, a.heard): a for a in answers.values() if a.role == "merge"}
     n, condition = len(decisions), decisions.codes("condition", [point.name for point in points])
     fusing = {place: point.rewrites for place, point in enumerate(points) if point.asks_again}
     senders = [decisions.labels(f"helper_{place}") for place in range(1, decisions.helpers + 1)]
     on_time, attackers = (decisions.of_messages(name) == 1.0 for name in ("on_time", "attacker"))
-    ego_j, ego_s, helpers_j, call_j = np.zeros((4, n))
+    ego_j, ego_s, call_j = np.zeros((3, n))
     for scene, rows in decisions.scenes.items():
         ego_j[rows.start : rows.stop] = answer_j(latency.speeds[0], egos[scene])
         ego_s[rows.start : rows.stop] = answer_s(latency.speeds[0], egos[scene])
-        joules_of: dict[str, float] = {}
         for row in rows:
-            asked = [(place, helper) for place, column in enumerate(senders) if (helper := column[row])]
-            for place, helper in asked:
-                if helper not in joules_of:  # an attacker's further voices run no model
-                    answer = by_id.get(f"{scene}/{helper}")
-                    joules_of[helper] = answer_j(latency.speed(1 + place), answer) if answer else 0.0
-                helpers_j[row] += joules_of[helper]
             if rewrites := fusing.get(int(condition[row])):
                 heard = tuple(
-                    key_of(helper, rewrites, attackers[row, index])
-                    for index, helper in asked
-                    if on_time[row, index]
+                    key_of(helper, rewrites, attackers[row, place])
+                    for place, column in enumerate(senders)
+                    if (helper := column[row]) and on_time[row, place]
                 )
                 call_j[row] = answer_j(latency.speeds[0], calls[scene, heard]) if heard else 0.0
-    return ego_j, ego_s, helpers_j, call_j
+    return ego_j, ego_s, call_j

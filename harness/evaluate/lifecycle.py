@@ -8,9 +8,9 @@ from typing import Any
 
 import msgspec
 
+from harness.backends.base import same_model
 from harness.core import work
 from harness.core.errors import UserError, printable
-from harness.core.files import digest
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
 from harness.evaluate.spec import Spec
@@ -62,7 +62,7 @@ def begin(
             settings=spec.settings(), shard=shard, created=datetime.now(UTC).isoformat(timespec="seconds"),
             command=spec.words(), identity=identity, tags=spec.tags, latency=latency, versions=versions(),
         )  # fmt: skip
-    if digest(begun.identity) != digest(identity):
+    if not same_model(begun.identity, identity):
         raise UserError(
             f"--out {printable(out)} was begun with {another_model(spec)}; delete it, or choose "
             "another folder"
@@ -98,7 +98,7 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> Begun | None:
 def resumable(spec: Spec, out: Path) -> bool:
     """Whether this run was stopped in a folder and no process is working there."""
     try:
-        return unfinished(spec, out) is not None and not work.held(out)
+        return (work.idle(out) or unfinished(spec, out) is not None) and not work.held(out)
     except UserError:
         return False
 

@@ -5,7 +5,6 @@ taken in the first frame that begins after the decision's latency; until then th
 decision that is still open when the next one is due continues, and the next one is skipped.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,7 +14,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
-from harness.core.errors import UserError
 from harness.dataset.freeze import moments
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
@@ -162,11 +160,6 @@ class LiveWorld(Placed):
             for (_, course), latency_s, action in zip(
                 self._places(part.point), latencies_s, chosen, strict=True
             ):
-                if math.isnan(latency_s):
-                    raise UserError(
-                        "an answer of the ego is an error of its engine, and no device profile says how long "
-                        "that takes; fix the engine, or use --latency"
-                    )
                 course.open = Decision(actions[action], due_frame + frames(latency_s, hz))
                 self._decisions.append(course.open)
         self._advance()

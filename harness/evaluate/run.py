@@ -1,8 +1,10 @@
 """Run an evaluation, for `harness eval` and `harness drive`: walk its chunks, score them, write the run."""
 
 import math
+import os
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -11,21 +13,21 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from harness.backends.base import Backend
+from harness.backends.base import Backend, Served, same_model
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
-from harness.core.errors import UserError
-from harness.core.files import digest
+from harness.core.errors import Unanswered, UserError
+from harness.core.files import write_whole
 from harness.core.formats import FORMAT, WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
-from harness.evaluate import device, timing
+from harness.evaluate import device, servers, timing
 from harness.evaluate import latency as latencies
-from harness.evaluate.asking import Asker
+from harness.evaluate.asking import Asker, read_kept
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.lifecycle import (
     Begun,
@@ -38,13 +40,16 @@ from harness.evaluate.lifecycle import (
     refuse_finished,
     unfinished,
 )
+from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import of_all_seeds, table, walk
 from harness.runs import folder
+from harness.runs import sources as kept_sources
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
-from harness.runs.records import Answer, ClosedLoop, Episode, Latency, Manifest
+from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Manifest
 from harness.runs.summary import Figures, counted
+from harness.runs.unanswered import Tally
 
 if TYPE_CHECKING:  # only driving loads the simulator
     from harness.evaluate.live_world import LiveSource, LiveWorld
@@ -87,6 +92,8 @@ def evaluate(
     Raises:
         UserError: the folder holds another run or something else, or the model is not available. Nothing is
             written then.
+        Unanswered: a question of the ego or a fusion call, or too many of the helpers', got no answer. The
+            folder keeps all answers, and the same call asks the others again.
     """
     if (out / "run.json").exists() and (out / WORK).is_dir():
         return finished(spec, out)
@@ -98,10 +105,11 @@ def evaluate(
         return _frozen(
             spec, spec.source, out, begun, progress, cache, more, opens or open_backend, given, workers
         )
+    made_of = sources(spec)
     begun, chunks = _begin_driving(spec, out, begun, workers)
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, chunks, place, progress, cache, workers)
-        return _gather(out, as_finished(spec, begun), chunks, place)
+        return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
 
 def evaluate_shard(
@@ -125,11 +133,15 @@ def evaluate_shard(
         UserError: as in `evaluate`, or the latency is to be measured.
     """
     refuse_finished(out)
+    made_of = sources(spec)
     begun, chunks = _begin_driving(spec, out, unfinished(spec, out, str(shard)), workers, str(shard))
     own_chunks = shard.part(chunks)
     more(sum(map(len, own_chunks)))
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, own_chunks, place, progress, None, workers)
+        kept_sources.write(place, made_of, place)
+        parts = [place / _folder_name(chunk) for chunk in own_chunks]
+        _settle(parts, chain.from_iterable(map(folder.facts_of, parts)))
     return sum(map(len, own_chunks))
 
 
@@ -154,13 +166,18 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
         work.same(out, {**whole.facts(), "shard": ""}, {**stopped.facts(), "shard": stopped.shard})
     with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)
-        return _gather(out, whole, chunks, place)
+        try:
+            return _gather(out, whole, chunks, place, kept_sources.read(folders[0] / WORK), folders)
+        except Unanswered as error:
+            raise UserError(f"{error}; type the commands of the shards again, and merge then") from None
 
 
 def _walk(
     spec: Spec, chunk: Sequence[int], asker_of: Callable[[int, Mapping[str, Answer]], Asker]
 ) -> dict[str, bytes]:
     """Walk a chunk's episodes to their ends and return the files of this part of the run, by name.
+
+    Which servers gave answers that are not kept yet is one of them; it is no part of the run's tables.
 
     Frozen scenes are walked for some seeds at a time: the decisions of all would not fit into memory.
     `asker_of` returns the asker of the n-th of these walks, which is given the answers so far.
@@ -169,19 +186,24 @@ def _walk(
     if isinstance(spec.source, FrozenSource):
         at_once = max(1, WALKS_AT_ONCE // (len(chunk) * len(spec.points)))
     answers: Mapping[str, Answer] = {}
-    tables, episodes = list[Decisions](), list[Episode]()
+    tables, episodes, viewers = list[Decisions](), list[Episode](), dict[str, Sequence[str]]()
+    served = list[Served]()
     for n, seeds in enumerate(_split(spec.seeds, at_once)):
         world, asker = _world_of(spec, chunk, seeds), asker_of(n, answers)
         decided = list(chain.from_iterable(walk(world, spec.points, asker)))
-        answers, decisions = asker.answers, table(decided, world.columns(), spec.actions)
+        viewers |= {scene.id: scene.viewers for part in decided for scene in part.moments}
+        served += asker.served
+        answers, more = asker.answers, world.columns()
         if spec.device_profile:
-            joules = device.energy(
-                spec.device_profile, asker.latency, spec.points, decisions, answers.values()
-            )
+            more = {**more, "helpers_j": device.decided_helpers_j(asker.latency, decided, answers)}
+        decisions = table(decided, more, spec.actions)
+        if spec.device_profile:
+            joules = device.energy(spec.device_profile, asker.latency, spec.points, decisions, answers)
             decisions = decisions.replace(**joules)
         tables.append(decisions.rounded())
         episodes += world.episodes()
-    return folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values())
+    files = folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values(), viewers)
+    return {**files, servers.FILE: servers.lines(served)} if served else files
 
 
 def _frozen(
@@ -191,6 +213,7 @@ def _frozen(
 ) -> Evaluated:  # fmt: skip
     dataset = source.dataset
     options = {"device": spec.device, "dtype": spec.dtype, "batch_size": spec.batch_size}
+    made_of = sources(spec)
     models = open_each(spec.cards, partial(opens, **options))
     identity = together(spec.cards, models).identity()
     latency = _latency(spec, begun, models, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
@@ -201,12 +224,15 @@ def _frozen(
         todo = [chunk for chunk in chunks if not (place / _folder_name(chunk)).is_dir()]
         in_workers = len(todo) > 1 and workers != 1 and _reproducible(spec) and not given
 
-        def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
-            # Each has a file of its own, so that a resumed run asks in the same chunks.
-            kept = place / (f"answers-{n + 1}.jsonl" if n else "answers.jsonl")
-            return Asker(spec, lambda: backend, latency, kept, {**given, **so_far}, progress, more)
-
         def walk_here(chunk: Sequence[int]) -> dict[str, bytes]:
+            before = read_kept(_answered_file(place, chunk))
+
+            def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
+                # Each has a file of its own, so that a resumed run asks in the same chunks.
+                kept = place / (f"answers-{n + 1}.jsonl" if n else "answers.jsonl")
+                there = {**given, **before, **so_far}
+                return Asker(spec, lambda: backend, latency, kept, there, progress, more)
+
             return _walk(spec, chunk, asker_of)
 
         def report_kept(chunk: Sequence[int]) -> None:
@@ -216,17 +242,17 @@ def _frozen(
 
         def keep(index: int, files: dict[str, bytes]) -> None:
             folder.write_part(place / _folder_name(todo[index]), files)
-            for kept in place.glob("answers*.jsonl"):
-                kept.unlink()
+            for kept in (*place.glob("answers*.jsonl"), _answered_file(place, todo[index])):
+                kept.unlink(missing_ok=True)
             if in_workers:
                 report_kept(todo[index])
 
         for chunk in chunks:
             if chunk not in todo:
                 report_kept(chunk)
-        walk_chunk = partial(_walk_chunk, spec, begun, None) if in_workers else walk_here
+        walk_chunk = partial(_walk_chunk, spec, begun, None, None) if in_workers else walk_here
         each(walk_chunk, todo, workers if in_workers else 1, keep, _label)
-        return _gather(out, as_finished(spec, begun), chunks, place)
+        return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
 
 def _begin_driving(
@@ -264,6 +290,31 @@ def _folder_name(chunk: Sequence[int]) -> str:
     return f"episodes-{chunk[0]:06d}-{chunk[-1]:06d}"
 
 
+def _answered_file(place: Path, chunk: Sequence[int]) -> Path:
+    """Return the file of the answers that a chunk has before it is walked to its end."""
+    return place / f"{_folder_name(chunk)}.jsonl"
+
+
+def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> None:
+    """Raise Unanswered if a run cannot do without the answers that it lacks; its parts lose what lacks them.
+
+    Args:
+        parts: folders of the chunks.
+        answers: all that is in them.
+    """
+    found = Tally(answers)
+    if not found.missing:
+        return
+    for part in parts:
+        answered = read_kept(part / "answers.jsonl")
+        if len(answered) < folder.answers_in(part):
+            write_whole(part.with_suffix(".jsonl"), folder.lines(list(answered.values())))
+            gone = part.with_name(f".{part.name}.{os.getpid()}.part")
+            os.replace(part, gone)  # so that no part is ever half there
+            shutil.rmtree(gone)
+    raise Unanswered(str(found))
+
+
 def _label(chunk: Sequence[int]) -> str:
     """Return a chunk's name for people."""
     whole = chunk == range(chunk[0], chunk[-1] + 1)
@@ -279,11 +330,14 @@ def _drive(
     progress(sum(map(len, chunks)) - sum(map(len, todo)))
 
     def keep(index: int, files: dict[str, bytes]) -> None:
+        servers.keep(place, files.pop(servers.FILE, b""))
         folder.write_part(place / _folder_name(todo[index]), files)
+        _answered_file(place, todo[index]).unlink(missing_ok=True)
         progress(len(todo[index]))
 
-    # The cache is a file of this machine, which the nodes of a cluster cannot share.
-    walk_chunk = partial(_walk_chunk, spec, begun, cache if isinstance(workers, int) else None)
+    # These are files of this machine, which the nodes of a cluster cannot share.
+    files = (cache, None if _reproducible(spec) else place) if isinstance(workers, int) else (None, None)
+    walk_chunk = partial(_walk_chunk, spec, begun, *files)
     each(walk_chunk, todo, workers, keep, _label, _reproducible(spec))
 
 
@@ -292,18 +346,21 @@ def _reproducible(spec: Spec) -> bool:
     return not any(agent.can.language_model for agent in spec.agents)
 
 
-def _walk_chunk(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[int]) -> dict[str, bytes]:
-    """Walk a chunk in a worker process and return its files by name."""
+def _walk_chunk(
+    spec: Spec, begun: Begun, cache: Path | None, place: Path | None, chunk: Sequence[int]
+) -> dict[str, bytes]:  # fmt: skip
+    """Walk a chunk in a worker process and return its files by name; `place` keeps its answers until then."""
+    kept = place and _answered_file(place, chunk)
 
     def backend() -> Backend:
         combined = together(spec.cards, _open_all(spec), cache)
-        if digest(combined.identity()) != digest(begun.identity):
+        if not same_model(begun.identity, combined.identity()):
             raise UserError(
                 f"a worker opens {another_model(spec)} than this run began with; give it the same"
             )
         return combined
 
-    return _walk(spec, chunk, lambda n, so_far: Asker(spec, backend, begun.latency, answers=so_far))
+    return _walk(spec, chunk, lambda n, so_far: Asker(spec, backend, begun.latency, kept, so_far))
 
 
 def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "FrozenWorld | LiveWorld":
@@ -317,8 +374,20 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
     return LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, seeds, spec.ego_alone)
 
 
-def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
-    """Score the chunks in a working folder and write the files of the finished run."""
+def _gather(
+    out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes],
+    others: Sequence[Path] = (),
+) -> Evaluated:  # fmt: skip
+    """Score the chunks in a working folder and write the files of the finished run, with its sources.
+
+    Args:
+        out: the run's folder.
+        begun: what the work began with.
+        chunks: the episodes of each part.
+        place: the working folder.
+        made_of: the run's sources, by name.
+        others: folders that the run is merged from.
+    """
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
 
@@ -332,7 +401,9 @@ def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Pat
         # One part after the other: the decisions of all would not fit into memory.
         by_part, figures = zip(*map(scored, chunks, parts), strict=True)
         whole = Figures.joined(figures)
-        answers, summary = [answer for answer, _ in whole.answers], whole.scores()
+        answers = [answer for answer, _ in whole.answers]
+        _settle(parts, answers)
+        summary = whole.scores()
         cells = len(names) * len(settings["seeds"])
         episodes = [
             episode for cell in range(cells) for chunk, of_part in zip(chunks, by_part, strict=True)
@@ -348,6 +419,8 @@ def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Pat
             "retries": sum(answer.retries for answer in answers),
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
+        kept_sources.write(out, made_of, place)
+        servers.write(out, [place, *(other / WORK for other in others)])
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)

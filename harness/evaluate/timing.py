@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from harness.backends.base import Backend
-from harness.core.errors import UserError, printable
+from harness.core.errors import Unanswered, UserError, printable
 from harness.dataset.load import Scene
 from harness.evaluate.asking import answer_of, fusion_request, requests
 from harness.evaluate.latency import EXAMPLE, MEASURED, times
 from harness.evaluate.spec import Spec
 from harness.runs.records import Latency
+from harness.runs.unanswered import Tally
 
 SCENES = 5  # how many scenes are timed
 IDLE = 0.25  # highest load of an idle machine, in processes a core
@@ -55,6 +56,7 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
 
     Raises:
         UserError: no answer of the ego can be timed.
+        Unanswered: some of its questions got none.
     """
     first = [replace(request, timed=True) for request in requests(spec, scenes)]
     backend.complete(first[:1])  # the first request of a process includes the warm-up
@@ -66,6 +68,8 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
             fusion.append(replace(fusion_request(spec, scene, by_viewer, heard), timed=True))
     sample = times([*answers.values(), *(answer_of(r, backend.complete([r])[0]) for r in fusion)])
     if "ego" not in sample:
+        if (found := Tally(answers.values())).unanswered["ego"]:
+            raise Unanswered(str(found))
         name = printable(spec.ego.card.name)
         raise UserError(
             f"--latency {MEASURED}: no answer of {name} could be timed in {len(scenes)} scenes; see what "

@@ -29,6 +29,10 @@ class Answer(Struct, frozen=True):
         """Return the answer with one more repair."""
         return replace(self, repairs=self.repairs | {repair})
 
+    def without(self, repairs: frozenset[Repair]) -> "Answer":
+        """Return the answer without some repairs, which are not true of it."""
+        return replace(self, repairs=self.repairs - repairs)
+
 
 def read(members: dict[str, Any], so_far: frozenset[Repair], role: str, actions: Sequence[str]) -> Answer:
     """Read an answer-shaped object. Raises `Failure` with one of the statuses for values."""

@@ -7,7 +7,7 @@ json_repair tries only if neither finds anything.
 import html
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from harness.parsing import mend, relaxed
@@ -18,6 +18,7 @@ from harness.parsing.values import is_schema, match
 _MAX_BROKEN = 200  # most braces that open nothing; a text with more is noise, and each costs a try
 _MAX_TRIED = 4_000_000  # most characters that these tries read in total; without it, a megabyte takes minutes
 _MAX_OBJECTS = 5_000  # no answer has so many
+_MISSING = {"evidence": Repair.MISSING_EVIDENCE, "risk": Repair.MISSING_RISK}
 _OPENING = re.compile(r"[{｛]")
 _FENCE = re.compile(r"```[ \t]*[\w+-]*|~~~[ \t]*\w*")
 _STRAY = frozenset("[](){},;:.\"'`*\\")
@@ -25,10 +26,17 @@ _STRAY = frozenset("[](){},;:.\"'`*\\")
 
 @dataclass(frozen=True)
 class Candidate:
-    """An object shaped like an answer, and the repairs that reading it took."""
+    """An object shaped like an answer.
+
+    Attributes:
+        members: what it holds.
+        repairs: the repairs that reading it took.
+        lost: repairs that would say of members which could not be read that they were not given.
+    """
 
     members: dict[str, Any]
     repairs: frozenset[Repair] = frozenset()
+    lost: frozenset[Repair] = frozenset()
 
 
 @dataclass
@@ -82,10 +90,15 @@ def candidates(
         if answers:
             other_text.append(text[at:start])
             at = reading.end
+    if shaped and role == "helper" and objects.broken is not None:
+        if whole_again := _around(text, objects, role, actions, cut, reasons_first):
+            return [replace(whole_again, repairs=whole_again.repairs | escapes)]
+        lost = frozenset(repair for name, repair in _MISSING.items() if f'"{name}"' in text)
+        shaped = [replace(candidate, lost=lost) for candidate in shaped]
     if shaped:
         before, *after = [*other_text, text[at:]]
         around = _repairs_around(before, "\n".join(after), reasons_first)
-        return [Candidate(candidate.members, candidate.repairs | around) for candidate in shaped]
+        return [replace(candidate, repairs=candidate.repairs | around) for candidate in shaped]
     if objects.broken is not None:
         mended, rest = mend.mended(text[objects.broken :], FIELDS[role] + actions, cut)
         extra = escapes | _repairs_around(text[: objects.broken], rest, reasons_first) | {Repair.JSON_REPAIR}
@@ -107,6 +120,27 @@ def spans(text: str, role: str, actions: tuple[str, ...]) -> list[tuple[int, int
         for start, reading in objects.readings
         if any(_answers(reading.value, role, actions))
     ]
+
+
+def _around(
+    text: str, objects: _Objects, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool
+) -> Candidate | None:
+    """Return a helper's message whose distribution alone can be read, with the fields around it mended.
+
+    A quote in its evidence breaks the object, and nothing else. None if there is no such object.
+    """
+    start = objects.broken or 0
+    inner = [(at, one) for at, one in objects.readings if at > start and _shaped(one.value, role, actions)]
+    if len(inner) != 1 or len(objects.readings) != 1:
+        return None
+    [(at, reading)] = inner
+    try:
+        others, name, rest = mend.around(text[start:], at - start, reading.end - start, FIELDS[role], cut)
+    except Failure:
+        return None
+    around = _repairs_around(text[:start], rest, reasons_first)
+    repairs = frozenset(reading.repairs) | around | {Repair.JSON_REPAIR}
+    return Candidate({**others, name: reading.value}, repairs)
 
 
 def _objects(text: str, cut: bool) -> _Objects:

@@ -14,6 +14,7 @@ _AMBIGUOUS = re.compile(
     r"[~≈<>()+*/^=%|]|(?<![\w.])-?(?:true|false|null|none|nan|inf(?:inity)?)\b|\d\s*-|\d\.(?!\d)",
     re.IGNORECASE,
 )
+_HOLE = "\ue000"  # stands for a value that has been read; in no language's text
 _NUMBER = re.compile(r"(?<![\w.])-?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 
 
@@ -52,6 +53,48 @@ def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
     except Exception:  # any error of a third-party reader is a syntax error of the text
         raise unreadable() from None
     return value, text[len(source) :]
+
+
+def around(text: str, at: int, end: int, fields: Sequence[str], cut: bool) -> tuple[dict[str, Any], str, str]:
+    """Return the broken object at the start of `text` around a value that can be read.
+
+    The numbers of that value are as they are written, so the text of other members may hold anything. The
+    object counts only if it has no other members than `fields`, and each text in it stands in `text`.
+
+    Args:
+        text: the text from the object's brace on.
+        at: where the value begins.
+        end: where it ends.
+        fields: names of the members that it may have.
+        cut: whether the engine stopped at its token limit; then nothing is repaired.
+
+    Returns:
+        The other members, the name of the value, and the text after the object.
+
+    Raises:
+        Failure: syntax.
+    """
+    import json_repair
+
+    source = text[: text.rfind("}") + 1]
+    if cut or end >= len(source) or len(source) > _MAX_CHARS or _HOLE in text:
+        raise unreadable()
+    try:
+        value = json_repair.loads(f'{source[:at]}"{_HOLE}"{source[end:]}', skip_json_loads=True)
+        members = DECODER.decode(json.dumps(value))
+        [name] = [key for key, member in members.items() if member == _HOLE]
+    except Exception:  # any error of a third-party reader is a syntax error of the text
+        raise unreadable() from None
+    others = {key: member for key, member in members.items() if key != name}
+    texts = [member for member in others.values() if isinstance(member, str)]
+    repeated = any(len(re.findall(rf'"{re.escape(field)}"\s*:', source)) > 1 for field in fields)
+    if repeated or not set(members) <= set(fields) or not all(member in source for member in texts):
+        raise unreadable()
+    if _numbers(list(others.values())) != [
+        float(number) for number in _NUMBER.findall(source[:at] + source[end:])
+    ]:
+        raise unreadable()
+    return others, name, text[len(source) :]
 
 
 def _numbers(value: object) -> list[float]:

@@ -178,7 +178,8 @@ def _choose(objects: list[Candidate], role: str, actions: tuple[str, ...]) -> An
     failures: list[Failure] = []
     for candidate in objects:
         try:
-            answers.append(read(candidate.members, candidate.repairs, role, actions))
+            answer = read(candidate.members, candidate.repairs, role, actions)
+            answers.append(answer.without(candidate.lost) if candidate.lost else answer)
         except Failure as failure:
             failures.append(failure)
     serious = [failure for failure in failures if failure.status is not Status.SCHEMA_ECHO]

@@ -60,6 +60,9 @@ def split(text: str, thinking: bool) -> tuple[str | None, str]:
             thoughts += answers
             answers.clear()
         thoughts.append(piece)
+    if depth and any(piece.strip() for piece in answers):
+        detail = "a thought was begun after other text and not closed; it may overturn what stands before it"
+        raise Failure(Status.TRUNCATED_REASONING, detail)
     if depth or (thinking and not closed):
         raise Failure(Status.TRUNCATED_REASONING, "the thought was not closed, so no answer was begun")
     thought = "\n".join(piece.strip() for piece in thoughts if piece.strip())

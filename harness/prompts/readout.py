@@ -12,6 +12,8 @@ from harness.core.files import canonical_json
 from harness.core.rounding import rounded
 
 LETTERS = "ABCDEFGHIJ"
+# What stands for a blank or a line break in a token: itself, or SentencePiece's and byte-level BPE's signs.
+_BLANKS = " \t\r\n\u2581\u0120\u010a"
 
 
 def letters(actions: Sequence[str]) -> str:
@@ -19,6 +21,11 @@ def letters(actions: Sequence[str]) -> str:
     if len(actions) > len(LETTERS):
         raise UserError(f"--answer readout: {len(actions)} actions, and {len(LETTERS)} letters; use json")
     return LETTERS[: len(actions)]
+
+
+def spelt(token: str) -> str:
+    """Return a token's text without blanks around it: ` A` is another token than `A`, and the same letter."""
+    return token.strip(_BLANKS)
 
 
 def question(actions: Sequence[str]) -> str:

@@ -7,13 +7,26 @@ from functools import lru_cache
 from typing import Any
 
 from jinja2 import nodes
-from jinja2.compiler import CodeGenerator, Frame, optimizeconst
+from jinja2.compiler import Frame, optimizeconst
 from jinja2.exceptions import SecurityError
 from jinja2.runtime import Context, LoopContext
-from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from harness.core import templates
 
 WIDE = re.compile(r"\d{3}|\*")  # in a format: a width of 100 characters or more, or one given as an argument
 PADDING = frozenset({"center", "ljust", "rjust", "zfill", "expandtabs", "format", "format_map", "translate"})
+# What binds a name to something that a template works out, or works out more than a loop over given things.
+BINDING = (
+    nodes.Assign, nodes.AssignBlock, nodes.Call, nodes.CallBlock, nodes.Concat, nodes.FilterBlock,
+    nodes.Macro, nodes.With,
+)  # fmt: skip
+# Filters whose result is no larger than their value, whatever small constants they are given.
+SHORTENING = frozenset({
+    "abs", "capitalize", "d", "default", "first", "float", "int", "last", "length", "lower", "round", "title",
+    "trim", "truncate", "upper",
+})  # fmt: skip
+NUMBERS = frozenset({"float", "int", "length"})  # filters that return one
+LONGEST_CHAIN = 3  # filters one after another that need not pay
 SHORT = 32  # most items of a loop whose places are made beforehand
 
 
@@ -30,7 +43,7 @@ class Place:
 LOOP = frozenset(Place.__dataclass_fields__)
 
 
-class Code(CodeGenerator):
+class Code(templates.Code):
     """Jinja's compiler with shorter code for what prompts do most; every template renders the same text.
 
     `_at` is a variable of the code, which no template can name.
@@ -90,9 +103,49 @@ class Code(CodeGenerator):
         self.writeline(f"yield {text!r} % (", node)
         for part in node.nodes:
             if not isinstance(part, nodes.TemplateData):
-                self.visit(part, frame)
+                self._side(part, "read", frame)
                 self.write(", ")
         self.write(")")
+
+
+def _is_path(node: nodes.Node) -> bool:
+    """Whether an expression is a name or a member of one."""
+    return isinstance(node, nodes.Name) or (isinstance(node, nodes.Getattr) and _is_path(node.node))
+
+
+def _is_given(node: nodes.Node, chain: int = LONGEST_CHAIN) -> bool:
+    """Whether a value is about as small as those that a template is given, in one that binds no name."""
+    if isinstance(node, nodes.Filter):
+        return node.node is not None and chain > 0 and _keeps_small(node) and _is_given(node.node, chain - 1)
+    if isinstance(node, nodes.Or | nodes.And):
+        return _is_given(node.left, chain) and _is_given(node.right, chain)
+    if isinstance(node, nodes.CondExpr):
+        return all(_is_given(way, chain) for way in (node.expr1, node.expr2) if way)
+    return isinstance(node, nodes.Const) or _is_path(node)
+
+
+def _keeps_small(node: nodes.Filter) -> bool:
+    """Whether a filter makes a value not much larger."""
+    name = node.name.removeprefix(templates.FREE)
+    if node.kwargs or node.dyn_args or node.dyn_kwargs:
+        return False
+    if name == "format":
+        form = node.node
+        narrow = isinstance(form, nodes.Const) and isinstance(form.value, str) and not WIDE.search(form.value)
+        return narrow and all(_is_path(value) for value in node.args)
+    constants = node.args[1:] if name == "truncate" else node.args  # whatever its length, it adds no more
+    if not all(isinstance(value, nodes.Const) for value in constants):
+        return False
+    given = [value.as_const() for value in constants]
+    if name == "replace":
+        return (
+            len(given) == 2
+            and all(isinstance(x, str) and x for x in given)
+            and len(given[0]) >= len(given[1])
+        )
+    if name == "join":
+        return len(given) <= 1 and all(isinstance(x, str) and len(x) < 8 for x in given)
+    return name in SHORTENING and all(not isinstance(x, int) or 0 <= x < 1000 for x in given)
 
 
 def _is_loop(node: nodes.Node) -> bool:
@@ -102,7 +155,7 @@ def _is_loop(node: nodes.Node) -> bool:
 def _bare(node: nodes.Filter, name: str) -> bool:
     """Whether a filter is the one of this name, without arguments, and applied to an expression."""
     given = node.args or node.kwargs or node.dyn_args or node.dyn_kwargs
-    return node.name == name and not given and node.node is not None
+    return node.name.removeprefix(templates.FREE) == name and not given and node.node is not None
 
 
 @lru_cache(maxsize=SHORT + 1)
@@ -117,20 +170,19 @@ def placed(items: Any, undefined: Any) -> Iterable[tuple[Any, Any]]:
     return LoopContext(items, undefined)
 
 
-class Sandbox(ImmutableSandboxedEnvironment):
-    """Jinja environment for untrusted templates: nothing in it can build a text or number that fills memory.
+class Sandbox(templates.Sandbox):
+    """Jinja environment for prompt templates: fewer operators and filters, and shorter code.
 
     `graph.ego` always means the member of that name; no method of a mapping hides it.
     """
 
-    intercepted_binops = frozenset({"*", "**", "%"})
     code_generator_class = Code
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
+        self._binds_nothing = False
         for name in ("center", "indent"):
             del self.filters[name]
-        self.filters["format"] = _formatted
 
     def _generate(
         self, source: nodes.Template, name: str | None, filename: str | None, defer_init: bool = False
@@ -140,17 +192,33 @@ class Sandbox(ImmutableSandboxedEnvironment):
         loops = [node for node in source.find_all(nodes.Name) if node.name == "loop"]
         recursive = any(node.recursive for node in source.find_all(nodes.For))
         loop = "LoopContext" if recursive or len(loops) > len(read) else "placed as LoopContext"
-        return f"{code}\nfrom {__name__} import Place, {loop}\n"  # at the end, so lines keep their numbers
+        return f"{code}from {__name__} import Place, {loop}\n"
+
+    def _put_steps_into(self, source: nodes.Template) -> None:
+        # A template that binds no name can keep nothing, so its texts are as small as what it is given.
+        self._binds_nothing = not any(source.find_all(BINDING)) and all(
+            _is_path(loop.iter) and not loop.recursive for loop in source.find_all(nodes.For)
+        )
+        for node in list(source.find_all(nodes.Filter)) if self._binds_nothing else ():
+            if _is_given(node):
+                node.name = templates.FREE + node.name
+        super()._put_steps_into(source)
+
+    def is_small(self, node: nodes.Node) -> bool:
+        """Whether it is known of an expression that its value costs nothing to read."""
+        number = isinstance(node, nodes.Filter) and node.name.removeprefix(templates.FREE) in NUMBERS
+        return number or super().is_small(node) or (self._binds_nothing and _is_given(node))
 
     def whole(self, value: Any) -> Any:
         """Return what `value | round | int` is."""
         return self.filters["int"](self.filters["round"](value))
 
-    def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:
-        """Allow the intercepted operators on numbers only, and only small powers."""
-        numbers = all(isinstance(side, int | float) for side in (left, right))
-        if not numbers or (operator == "**" and not (abs(left) < 1e6 and abs(right) < 64)):
-            raise SecurityError(f"{operator} is not allowed on such values")
+    def call_binop(self, context: Context | None, operator: str, left: Any, right: Any) -> Any:
+        """Allow products, powers and remainders of numbers only, and only small powers."""
+        if operator in ("*", "**", "%"):
+            numbers = all(isinstance(side, int | float) for side in (left, right))
+            if not numbers or (operator == "**" and not (abs(left) < 1e6 and abs(right) < 64)):
+                raise SecurityError(f"{operator} is not allowed on such values")
         return super().call_binop(context, operator, left, right)
 
     def is_safe_attribute(self, obj: Any, attr: str, value: Any) -> bool:
@@ -165,10 +233,3 @@ class Sandbox(ImmutableSandboxedEnvironment):
         if isinstance(obj, str) and attribute in PADDING:
             return self.unsafe_undefined(obj, attribute)
         return super().getattr(obj, attribute)
-
-
-def _formatted(text: str, *values: Any) -> str:
-    """Apply Jinja's `format` filter, for narrow fields only."""
-    if WIDE.search(text):
-        raise SecurityError(f"a format as wide as {text!r} is not allowed")
-    return text % values

@@ -3,10 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jinja2 import StrictUndefined, nodes
+from jinja2 import StrictUndefined, TemplateSyntaxError, nodes
 from jinja2.nodes import EvalContext
 from jinja2.runtime import Context
 
+from harness.core import templates
 from harness.prompts.sandbox import Sandbox
 
 # What a block may consist of whose text follows from names that it reads: no call, no assignment, no draw.
@@ -35,16 +36,22 @@ class Template:
         """Compile a template's text. Raises jinja2.TemplateSyntaxError."""
         environment = Sandbox(undefined=StrictUndefined, keep_trailing_newline=False)
         tree = environment.parse(text)
-        compiled = environment.from_string(tree)
+        try:
+            paths = {block.name: _paths(block) for block in tree.find_all(nodes.Block)}
+            reads = frozenset(node.name for node in tree.find_all(nodes.Name))
+        except RecursionError:
+            raise TemplateSyntaxError("its parts are nested too deeply", 1) from None
+        compiled = environment.from_string(tree)  # adds to the tree
         self._empty = compiled.new_context()  # Jinja's own functions and the template's blocks
         self._blocks = compiled.blocks
-        self._paths = {block.name: _paths(block) for block in tree.find_all(nodes.Block)}
+        self._paths = paths
         self._texts: dict[str, dict[Any, str]] = {name: {} for name in compiled.blocks}
         self.blocks = tuple(compiled.blocks)
-        self.reads = frozenset(node.name for node in tree.find_all(nodes.Name))
+        self.reads = reads
 
     def render(self, variables: Mapping[str, Any], blocks: Sequence[str]) -> list[str]:
         """Render some blocks. May raise any exception, since a template is a program."""
+        templates.begin()
         context = None
         rendered = []
         for block in blocks:

@@ -7,7 +7,7 @@ versions are pinned by digest in `prompts/released.toml`: a changed text is a ne
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -20,6 +20,7 @@ from harness.core.config import Count, convert, loads
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, sha256_bytes, text_of, write_whole
 from harness.core.resources import entries, find
+from harness.core.templates import TooMuch
 from harness.prompts.examples import EXAMPLES, Examples
 from harness.prompts.examples import read as read_examples
 from harness.prompts.template import Template
@@ -55,6 +56,7 @@ class Prompt:
         texts: template text by role.
         examples: earlier turns of the chat, from one scenario; None without any.
         image: picture before the user's text: what the viewer's `camera` sees; None if there is none.
+        files: the text of each of its files by name, as they were read.
     """
 
     version: str
@@ -72,6 +74,7 @@ class Prompt:
     max_conflicts: Count | None = None
     examples: Examples | None = None
     image: Literal["camera"] | None = None
+    files: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         least, most = self.token_budget
@@ -186,6 +189,11 @@ class Prompt:
         """Render blocks of a role's template. Raises UserError, whose message ends with `needs`."""
         try:
             return self._templates[role].render(variables, blocks)
+        except TooMuch as error:
+            raise UserError(
+                f"prompt {self.version} {role}.j2 does not render: it takes {printable(error)}; "
+                "let it loop less, or write less"
+            ) from None
         except Exception as error:  # a template is a program and may fail in any way
             raise UserError(
                 f"prompt {self.version} {role}.j2 does not render: {printable(error)}; {needs}"
@@ -253,14 +261,14 @@ def load(version: str, where: Path | None = None) -> Prompt:
     examples = [read_examples(texts[file], f"prompt {version} {file}") for file in optional]
     return convert(
         table, Prompt, what, version=version, sha256=sha256, released=version in released,
-        texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=next(iter(examples), None),
+        texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=next(iter(examples), None), files=texts,
     )  # fmt: skip
 
 
-def as_it_was(version: str, sha256: str) -> Prompt | None:
-    """Load a version if its files have this digest; None if they differ or it is not installed here."""
+def as_it_was(version: str, sha256: str, where: Path | None = None) -> Prompt | None:
+    """Load a version, from a folder if one is given, if its files have this digest; else None."""
     try:
-        prompt = load(version)
+        prompt = load(version, where)
     except UserError:
         return None
     return prompt if prompt.sha256 == sha256 else None

@@ -10,13 +10,14 @@ error 0.012 at most); a name says technology, modulation and coding, size and su
 import csv
 from collections.abc import Callable
 from functools import cache
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 from scipy.special import expit
 
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
+from harness.core.files import text_of
 
 BlockError = Callable[[Floats], Floats]
 """Maps SINR in dB to the probability that a block is lost, of the same shape."""
@@ -53,6 +54,4 @@ def threshold(bits_per_s_per_hz: float, efficiency: float) -> BlockError:
 
 @cache
 def _rows(name: str) -> list[dict[str, str]]:
-    return list(
-        csv.DictReader((resources.files(__package__) / name).read_text(encoding="utf-8").splitlines())
-    )
+    return list(csv.DictReader(text_of(Path(__file__).with_name(name)).splitlines()))

@@ -35,7 +35,7 @@ class Radio:
 
     latency_s: Seconds
     loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")]
-    bandwidth_bps: Annotated[float, Meta(gt=0, description="bits per second above 0")]
+    bandwidth_bps: Annotated[float, Meta(ge=1, le=1e15, description="bits per second, 1 or more")]
     access: Literal["serial", "parallel"]
     jitter_s: Seconds = 0.0
     density_coupled: bool = False

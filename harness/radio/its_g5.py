@@ -25,12 +25,13 @@ of any length; 802.11 would split one of more than 2304 bytes.
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.config import between
 from harness.core.errors import UserError
 from harness.radio import back_off
 from harness.radio.back_off import SLOT_S, free_share
@@ -83,15 +84,15 @@ class ItsG5(Transceiver):
             needs.
     """
 
-    frequency_ghz: float = 5.89
-    environment_height_m: float = 0.5
-    density_per_km: float = 60.0
-    sensing_dbm: float = -85.0
-    packet_bytes: int = 190
-    header_bytes: int = 30
-    data_rate_mbps: float = 6.0
-    aifs_slots: int = 6
-    contention_window: int = 15
+    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89
+    environment_height_m: Annotated[float, between(0, 100)] = 0.5
+    density_per_km: Annotated[float, between(0, 10000)] = 60.0
+    sensing_dbm: Annotated[float, between(-200, 50)] = -85.0
+    packet_bytes: Annotated[int, between(1, 2304)] = 190
+    header_bytes: Annotated[int, between(0, 2304)] = 30
+    data_rate_mbps: Annotated[float, between(1, 100)] = 6.0
+    aifs_slots: Annotated[int, between(0, 15)] = 6
+    contention_window: Annotated[int, between(1, 1023)] = 15
     curve: str = "11p-goubet"
 
     def __post_init__(self) -> None:

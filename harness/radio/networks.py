@@ -11,6 +11,7 @@ from harness.core import resources
 from harness.core.arrays import Floats
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import written_ns
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def network(name: str) -> Network:
     if name not in names():
         raise unknown("round_trip", name, names())
     path = resources.find("networks", f"{name}.toml")
-    return _read(path, path.stat().st_mtime_ns)
+    return _read(path, written_ns(path))
 
 
 @lru_cache(maxsize=64)

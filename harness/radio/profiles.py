@@ -4,8 +4,9 @@ A file names a model and its parameters, and states their source. A package adds
 in the group `swarmdrive.channels`.
 """
 
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 
 from harness.core.config import convert, settable, toml
 from harness.core.errors import printable, unknown
+from harness.core.files import written_ns
 from harness.core.plugins import FilesAndPlugins
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
@@ -59,15 +61,39 @@ class Profiles(FilesAndPlugins[Channel]):
 
     def read(self, file: Path) -> Channel:
         """Read the channel of a file."""
-        return _read(file, file.stat().st_mtime_ns)[1]
+        return _read(file, written_ns(file))[1]
 
     def profile(self, name: str) -> Profile:
         """Return the profile in the channel's file, or one made up for a package's channel."""
         if file := self.file(name):
-            return _read(file, file.stat().st_mtime_ns)[0]
+            return _read(file, written_ns(file))[0]
         kind = type(self[name])
         doc = (kind.__doc__ or "").strip().partition("\n")[0]
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
+
+    def files(self, name: str) -> dict[str, Path]:
+        """Return a profile's file and the table that it names, by their paths within `channels/`.
+
+        A table that lies outside is given the profile's name.
+        """
+        file = self.file(name)
+        if file is None:
+            return {}
+        files, table = {file.name: file}, self.profile(name).parameters.get("file")
+        if isinstance(table, str):
+            inside = os.path.normpath(table)
+            outside = os.path.isabs(inside) or inside.split(os.sep)[0] == os.pardir
+            files[f"{name}.csv" if outside else Path(inside).as_posix()] = file.parent / table
+        return files
+
+    def unchanged(self, name: str, recorded: Any) -> bool:
+        """Return whether the channel does what a record of it said; a newer parameter had its default."""
+        if name not in self:
+            return False
+        now, then = self.record(name), msgspec.to_builtins(recorded)
+        defaults = {f.name: f.default for f in fields(self[name]) if f.default is not MISSING}  # type: ignore[arg-type]
+        before = {**msgspec.to_builtins(defaults), **then["parameters"]}
+        return bool((now["model"], now["parameters"]) == (then["model"], before))
 
     def record(self, name: str) -> dict[str, Any]:
         """Return all that decides what the channel does, as plain values."""

@@ -7,12 +7,13 @@ Gonzalez-Martin et al. (IEEE TVT 68(2), 2019) use it, and Mangel, Klemp and Hart
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.special import ndtr
 
 from harness.core.arrays import Floats, Ints
+from harness.core.config import between
 from harness.radio.channel import CLEAR, VEHICLE
 
 Environment = Literal["winner-b1", "tr37885-highway", "tr37885-urban"]
@@ -41,12 +42,12 @@ class Propagation:
     """
 
     environment: Environment = "winner-b1"
-    frequency_ghz: float = 5.91
-    antenna_m: float = 1.5
-    environment_height_m: float = 0.0
-    blocker_m: float = 1.6
-    street_m: float = 14.0
-    wall_m: float = 7.0
+    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.91
+    antenna_m: Annotated[float, between(0, 100)] = 1.5
+    environment_height_m: Annotated[float, between(0, 100)] = 0.0
+    blocker_m: Annotated[float, between(0, 100)] = 1.6
+    street_m: Annotated[float, between(0.1, 1000)] = 14.0
+    wall_m: Annotated[float, between(0.1, 1000)] = 7.0
     suburban: bool = False
 
     def path_loss_db(

@@ -14,12 +14,13 @@ are both lost; `loss` does not include that.
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from scipy.special import ndtr
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.config import between
 from harness.core.errors import UserError
 from harness.radio.block_error import BlockError
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Links
@@ -46,10 +47,10 @@ class Sidelink(Transceiver):
             has no reservation.
     """
 
-    keep: float = 0.0
-    transmissions: int = 1
-    t1_slots: int = 1
-    t2_slots: int = 100
+    keep: Annotated[float, between(0, 1)] = 0.0
+    transmissions: Annotated[int, between(1, 100)] = 1
+    t1_slots: Annotated[int, between(0, 10000)] = 1
+    t2_slots: Annotated[int, between(0, 10000)] = 100
 
     ranks: ClassVar[bool]
     """Whether vehicles rank the remaining resources by received power (Step 3 of Mode 4)."""

@@ -1,14 +1,16 @@
 """A channel from a user's table of packet reception by distance, such as a run of ns-3 or Veins gives.
 
 The table is a CSV file with the columns `distance_m` and `reception` (share of packets received), and
-optionally `sight` (`clear`, `vehicle` or `building`, with a curve for each) and `latency_ms`. Values are
-interpolated linearly between distances; below the first distance its values hold.
+optionally `sight` (`clear`, `vehicle` or `building`, with a curve for each) and `latency_ms`, which may be
+blank or `nan` where nothing is received. Values are interpolated linearly between distances; below the first
+distance its values hold.
 """
 
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -18,7 +20,7 @@ import numpy as np
 from harness.core.arrays import Floats, Ints
 from harness.core.config import Seconds, convert
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import sha256_file
+from harness.core.files import sha256_file, text_of
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Broadcast, Delivery, Draws, Links, Site
 from harness.radio.constant import link_up
 
@@ -100,6 +102,19 @@ class Trace:
         delay_s = np.where(links.asked, links.ready_s + latency_s, np.inf)
         return Delivery(link_up(draws.packet, loss), delay_s, loss, np.full_like(loss, np.nan))
 
+    def idle(self, setting: str | None) -> str | None:
+        """Return why a setting changes nothing, whatever its value; None if it may change something."""
+        received = [point for point in self.receptions.points if point.reception > 0]
+        if setting == "latency_s" and all(point.latency_s is not None for point in received):
+            return f"its table {printable(self.receptions.file)} has latencies of its own"
+        if setting == "beyond" and not any(point.reception for point in self._last()):
+            return f"its table {printable(self.receptions.file)} ends where nothing is received"
+        return None
+
+    def _last(self) -> list[Point]:
+        """Return the last row of each curve, the rows of a sight."""
+        return list({point.sight: point for point in self.receptions.points}.values())
+
     def _latency_s(self, point: Point) -> float:
         return self.latency_s if point.latency_s is None else point.latency_s
 
@@ -125,7 +140,7 @@ def of_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace
             f"{where}: file {printable(parameters['file'])!r} lies elsewhere; put it beside the profile"
         )
     points = read(path)
-    table = Table(parameters["file"], sha256_file(path), points)
+    table = Table(parameters["file"], sha256_file(path, "text"), points)
     rest = {key: value for key, value in parameters.items() if key != "file"}
     return convert(rest, Trace, where, receptions=table)
 
@@ -134,14 +149,13 @@ def read(path: Path) -> tuple[Point, ...]:
     """Read the rows of a table, sorted by sight and distance. Raises UserError if the table is wrong."""
     shown = printable(path)
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.DictReader(file)
-            if missing := {"distance_m", "reception"} - {*(rows.fieldnames or ())}:
-                raise UserError(f"{shown}: has no column {' or '.join(sorted(missing))}")
-            for name in rows.fieldnames or ():
-                if name not in COLUMNS:
-                    raise unknown(f"column of {shown}", name, COLUMNS)
-            points = [_point(f"{shown}, line {rows.line_num}", row) for row in rows]
+        rows = csv.DictReader(StringIO(text_of(path), newline=""))
+        if missing := {"distance_m", "reception"} - {*(rows.fieldnames or ())}:
+            raise UserError(f"{shown}: has no column {' or '.join(sorted(missing))}")
+        for name in rows.fieldnames or ():
+            if name not in COLUMNS:
+                raise unknown(f"column of {shown}", name, COLUMNS)
+        points = _with_latencies([_point(f"{shown}, line {rows.line_num}", row) for row in rows])
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
         raise UserError(f"{shown}: cannot be read as a table ({printable(problem)})") from None
     if not points:
@@ -155,6 +169,25 @@ def read(path: Path) -> tuple[Point, ...]:
         if (a.sight, a.distance_m) == (b.sight, b.distance_m):
             raise UserError(f"{shown}: distance_m {a.distance_m:g} stands there twice; give each once")
     return tuple(points)
+
+
+def _with_latencies(points: Sequence[Point]) -> list[Point]:
+    """Give points where nothing is received, which have no latency of their own, that of points beside them.
+
+    Reception is interpolated, so that something is received next to them.
+    """
+    known = [p for p in points if p.latency_s is not None and not math.isnan(p.latency_s)]
+    longest_s = max((p.latency_s for p in known if p.latency_s is not None), default=None)
+    full = []
+    for point in points:
+        if point.latency_s is not None and math.isnan(point.latency_s):
+            beside = sorted((p.distance_m, p.latency_s) for p in known if p.sight == point.sight)
+            latency_s = longest_s
+            if beside:
+                latency_s = float(np.interp(point.distance_m, *np.array(beside, dtype=float).T))
+            point = point._replace(latency_s=latency_s)
+        full.append(point)
+    return full
 
 
 def _point(where: str, row: dict[str, str]) -> Point:
@@ -174,5 +207,11 @@ def _point(where: str, row: dict[str, str]) -> Point:
         raise UserError(f"{where}: sight is {printable(sight)!r}; it must be {', '.join(SIGHTS)}")
     distance_m = number("distance_m", 1e6, "metres, 0 or more")
     reception = number("reception", 1.0, "a share from 0 to 1")
-    latency_s = number("latency_ms", 1e6, "milliseconds, 0 or more") / 1000 if "latency_ms" in row else None
+    latency_s = None
+    if "latency_ms" in row:
+        if reception == 0 and row["latency_ms"].strip().lower() in ("", "nan"):
+            latency_s = math.nan
+        else:
+            allowed = "milliseconds, 0 or more; it may be blank where reception is 0"
+            latency_s = number("latency_ms", 1e6, allowed) / 1000
     return Point(distance_m, reception, sight, latency_s)

@@ -2,12 +2,13 @@
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.config import between
 from harness.radio.channel import Broadcast, Delivery, Draws, Links, Site
 from harness.radio.propagation import Propagation
 
@@ -28,12 +29,12 @@ class Transceiver(Propagation):
         sensing_dbm: least power of a whole packet at which it is received or sensed.
     """
 
-    density_per_km: float = 100.0
-    rate_hz: float = 10.0
-    power_dbm: float = 23.0
-    gain_dbi: float = 0.0
-    noise_figure_db: float = 9.0
-    sensing_dbm: float = -90.5
+    density_per_km: Annotated[float, between(0, 10000)] = 100.0
+    rate_hz: Annotated[float, between(0, 1000)] = 10.0
+    power_dbm: Annotated[float, between(-100, 100)] = 23.0
+    gain_dbi: Annotated[float, between(-50, 50)] = 0.0
+    noise_figure_db: Annotated[float, between(0, 50)] = 9.0
+    sensing_dbm: Annotated[float, between(-200, 50)] = -90.5
 
     @abstractmethod
     def wait_s(self, uniforms: Floats) -> Floats:

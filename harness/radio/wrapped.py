@@ -65,6 +65,10 @@ class AtLoss(Wrapped):
         up = np.all(draws.packet >= self.probability, axis=-1)
         return Delivery(up, delay_s, np.full_like(loss, self.probability), airtime_s)
 
+    def idle(self, setting: str | None) -> str | None:
+        """Return why a setting changes nothing, whatever its value; None if it may change something."""
+        return "its loss is given" if setting == "beyond" else None
+
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Return the same share at any distance, whatever stands between."""
         return np.full(np.shape(distance_m), 1 - self.probability)

@@ -1,5 +1,6 @@
 """What must be said before a run's numbers: that its answers were not read, or that it read no prompt."""
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from harness.backends.registry import find
@@ -9,7 +10,9 @@ from harness.radio.profiles import outside
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
 from harness.runs.metrics import ALL
-from harness.runs.records import Manifest, Score
+from harness.runs.records import ClosedLoop, Manifest, Score
+from harness.runs.unanswered import tally
+from harness.world.scenario import Parameters
 
 FEW = 100  # episodes; with fewer a page warns of wide intervals
 OFF_LAG = 0.5  # least share of decisions that act in another frame of which a page warns
@@ -27,7 +30,8 @@ _CONTROLS = {
 
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
     """Sentences for a run's headline; none for a language model whose answers could be read."""
-    return [*unread(scores), *no_prompt([manifest]), *beyond_sources(manifest), *on_device(manifest)]
+    first = [*unread(scores), *no_prompt([manifest]), *moved_system(manifest)]
+    return [*first, *beyond_sources(manifest), *on_device(manifest)]
 
 
 def said(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
@@ -51,6 +55,12 @@ def unread(scores: Sequence[Score]) -> Iterator[str]:
             yield f"{share} of {whose} {score.n} answers could be read: {instead}."
 
 
+def unanswered(run: Run) -> Iterator[str]:
+    """What the questions said that got no answer, where a run cannot do without."""
+    if (found := tally(run)).missing:
+        yield f"{found}: the model could not be asked, so that this is no result."
+
+
 def of_run(run: Run) -> Iterator[str]:
     """What else a reader of a run's page has to know first: few episodes, a stumbling engine, another lag."""
     n = len(run.grid.episodes)
@@ -62,12 +72,15 @@ def of_run(run: Run) -> Iterator[str]:
             f"{run.manifest.sampling_seed}: another seed gives other answers."
         )
     retries = sum(answer.retries for answer in run.answers)
-    if run.manifest.engine_errors or retries:
-        errors = run.manifest.engine_errors
-        yield f"The engine had errors: {errors} requests ended in one, {retries} attempts were repeated."
+    if (found := tally(run)).words and not found.missing:
+        yield f"{found}: each counts as a lost message."
+    if retries:
+        yield f"The engine had errors: {retries} attempts were repeated."
     for control, heard in _CONTROLS.items():
         if names := [c["name"] for c in run.manifest.conditions if c.get("messages") == control]:
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
+    yield from lost_at_once(run)
+    yield from moved_system(run.manifest)
     yield from beyond_sources(run.manifest)
     yield from on_device(run.manifest)
     off = [c for c in run.conditions if (s := run.score(c, "off_lag_rate")) and (s.value or 0.0) >= OFF_LAG]
@@ -75,6 +88,33 @@ def of_run(run: Run) -> Iterator[str]:
         yield (
             f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
             "closed-loop success may differ. harness fidelity compares the two."
+        )
+
+
+def lost_at_once(run: Run) -> Iterator[str]:
+    """That episodes are lost before the ego's first action, so that no model could have saved them."""
+    world = run.manifest.world
+    if isinstance(world, ClosedLoop):
+        lag_s = world.scenario["parameters"].get("decision_lag_s", Parameters.decision_lag_s)
+    else:
+        lag_s = world.decision_lag_s
+    ended = [(e.episode, e.failure == "collision" and (e.time_s or math.inf) <= lag_s) for e in run.episodes]
+    lost = {episode for episode, at_once in ended if at_once}
+    lost -= {episode for episode, at_once in ended if not at_once}
+    if lost:
+        yield (
+            f"{len(lost)} of {len(run.grid.episodes)} episodes are lost before the ego's first action, in a "
+            "collision that no answer could prevent."
+        )
+
+
+def moved_system(manifest: Manifest) -> Iterator[str]:
+    """Whose system text stands in the first user turn, since the chat template has no place for it."""
+    agents = (manifest.agent(0), *manifest.helpers)
+    for name in dict.fromkeys(str(a["model"]["name"]) for a in agents if a["model"].get("system")):
+        yield (
+            f"{printable(name, 30)} reads the system text at the beginning of the first user turn: its chat "
+            "template has no place for a system message."
         )
 
 

@@ -11,6 +11,7 @@ from harness.report.choose import failures, lost, pick, spread
 from harness.report.details import BLOCK, Details, Part, Prompts, prompts_of
 from harness.report.runs import Runs
 from harness.runs.folder import check_scenes
+from harness.runs.sources import lacking
 
 AT_ONCE = 64 * BLOCK  # scenes of a part, which are in memory together
 FRAMES = 400  # cameras' pictures in a page, each some 3.5 kB of it
@@ -40,6 +41,7 @@ class Decisions:
         if runs.dataset:
             for run in runs.runs:
                 check_scenes(run, runs.dataset, ())  # decisions are checked where their trees are read
+        self._not_replayed = 0
         self._replayed = {} if runs.dataset else self._played(failed)
         framed = self._telling()
         self._details = Details(runs, self._replayed, framed, prompts)
@@ -57,18 +59,20 @@ class Decisions:
         """The telling decision points, replayed; none where this simulator differs from the run's."""
         from harness.evaluate.replay import scene_of  # loads the simulator
 
-        telling = [
+        telling = dict.fromkeys(
             scene
             for run, of in zip(self._runs.runs, failed, strict=True)
             for scene in pick(run, of, REPLAYED)
-        ]
+        )
+        self._not_replayed = len(telling)
         replayed: dict[str, Scene] = {}
-        for name in dict.fromkeys(telling):
+        for name in telling:
             # A run without helpers, such as a driver's, has fewer viewers.
             here = [run for run in self._runs.runs if name in run.decisions.scenes]
             scene = scene_of(max(here, key=lambda run: len(run.answers_by_scene.get(name, ()))), name)
             if scene.id == name:
                 replayed[name] = scene
+        self._not_replayed -= len(replayed)
         return replayed
 
     def _telling(self) -> frozenset[str]:
@@ -109,6 +113,15 @@ class Decisions:
             "statuses": [sum(1 << statuses.index(s) for s in of if s in statuses) for of in met],
             "first": [place[scene] for scene in first_failures],
         }  # fmt: skip
+
+    def lacks(self) -> dict[str, str]:
+        """What these scenes could show and do not, in a word, and why."""
+        lacks = {}
+        if unknown := self._details.without_prompts():
+            lacks["prompts"] = lacking(unknown[0]) or "they are not known"
+        if self._not_replayed:
+            lacks["pictures"] = f"{self._not_replayed} moments come out otherwise in this simulator"
+        return lacks
 
     def parts(self) -> list[Part]:
         """The details of all scenes, in parts."""

@@ -9,19 +9,22 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
+from harness.core.errors import UserError, printable
 from harness.core.files import digest
+from harness.core.places import text
 from harness.dataset.forest import Forest
 from harness.dataset.load import Scene
 from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.device import answer_s
 from harness.evaluate.fusion import messages_of
 from harness.parsing.parse import spans
-from harness.prompts import versions
+from harness.prompts.versions import Prompt
 from harness.report import scenes
 from harness.report.library import packed
 from harness.report.runs import Runs
 from harness.runs.folder import Run, check_scenes
 from harness.runs.records import Answer, Decision, Episode
+from harness.runs.sources import prompt_of
 from harness.world import scenarios
 from harness.world.perception.graph import blinded
 
@@ -41,10 +44,11 @@ LEFT_OUT = ("scene", "episode", "step", "danger", "seed", "safe", "delay_s")
 
 
 def prompts_of(run: Run) -> Sent | None:
-    """Gives the chat messages that a viewer was sent; None if a prompt of the run is not here as it was."""
-    manifest, prompts = run.manifest, dict[str, versions.Prompt]()
+    """Gives the chat messages that a viewer was sent; None if one of its prompts is neither here nor kept."""
+    manifest, prompts = run.manifest, dict[str, Prompt]()
+    failed = set[str]()
     for agent in (manifest.agent(0), *manifest.helpers):
-        prompt = versions.as_it_was(agent["prompt"]["version"], agent["prompt"]["sha256"])
+        prompt = prompt_of(run, agent["prompt"])
         if prompt is None:
             return None
         prompts[prompt.version] = prompt
@@ -54,8 +58,14 @@ def prompts_of(run: Run) -> Sent | None:
         agent = manifest.agent(scene.viewers.index(viewer))
         prompt = prompts[agent["prompt"]["version"]]
         graph = scene.record["graphs"][viewer]
-        messages = shown(agent.get("image", "own"), prompt.render(graph, run.actions, heard, words))
-        return in_mode(agent["answer"], prompt, messages, graph["role"], run.actions)
+        if prompt.version in failed:  # it would take as long again
+            return ()
+        try:
+            messages = shown(agent.get("image", "own"), prompt.render(graph, run.actions, heard, words))
+            return in_mode(agent["answer"], prompt, messages, graph["role"], run.actions)
+        except UserError:  # a stranger's, which no run can have used
+            failed.add(prompt.version)
+            return ()
 
     return sent
 
@@ -104,6 +114,10 @@ class Details:
     def _sent(self) -> list[Sent | None]:
         return [self.prompts(run) for run in self.runs.runs]
 
+    def without_prompts(self) -> list[Run]:
+        """The runs whose prompts are not known."""
+        return [run for run, sent in zip(self.runs.runs, self._sent, strict=True) if sent is None]
+
     @cached_property
     def ends(self) -> list[Any]:
         """What each decision of each run led to, a letter a decision (n,)."""
@@ -133,11 +147,17 @@ class Details:
         answers = []
         by_viewer = {answer.key: answer for answer in run.answers_by_scene.get(name, ())}
         for answer in by_viewer.values():
+            if scene and answer.viewer not in scene.viewers:
+                raise UserError(
+                    f"{printable(run.path / 'answers.jsonl')} has an answer of {printable(answer.viewer)} in "
+                    f"scene {printable(name)}, where nobody of that name answers; make the run again"
+                )
             shown = {
                 key: v
                 for key in KEPT
                 if (v := getattr(answer, key)) is not None and v is not False and v != ()
             }
+            shown |= {key: text(shown[key]) for key in ("error", "detail") if key in shown}
             asked = None
             if scene and prompts:
                 shown_to = as_shown(scene, answer)
@@ -154,7 +174,7 @@ class Details:
                     (agent["model"]["name"], agent["prompt"]["version"], agent["answer"])
                 )
             if run.manifest.latency.speeds:
-                shown["took_s"] = answer_s(run.speed(answer), answer)
+                shown["took_s"] = None if answer.error else answer_s(run.speed(answer), answer)
             spans_read = _read_in(answer, run) if answer.repairs else []
             answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
         decisions: dict[str, dict[str, Any]] = {}  # seeds with the same decision share an entry

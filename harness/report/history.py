@@ -55,8 +55,9 @@ class Group:
 
 
 def history(
-    folder: Path, metric: str, condition: str | None = None, dataset: str | None = None
-) -> list[Group]:
+    folder: Path, metric: str, condition: str | None = None, dataset: str | None = None,
+    wrong: Callable[[str, UserError], object] = lambda name, error: None,
+) -> list[Group]:  # fmt: skip
     """The finished runs in a folder, the group whose last run is the newest first.
 
     Args:
@@ -64,14 +65,20 @@ def history(
         metric: a metric of `summary.csv`.
         condition: of the values; None for the last of those that most of a group's runs have.
         dataset: name of the dataset, or of the scenario of driven runs; None for all.
+        wrong: called with the name of a run that is left out since a file of it is broken, and the error.
 
     Raises:
-        UserError: there is no such folder, metric, condition or dataset, or a run's file is broken.
+        UserError: there is no such folder, metric, condition or dataset.
     """
     lines: dict[object, list[Line]] = {}
     for one in reversed(listed(folder)):
         if one.state == "finished" and one.kind in ("eval", "drive"):
-            run = read(folder / one.name)
+            try:
+                run = read(folder / one.name)
+                assert run.scores is not None  # they are read from a file of their own
+            except UserError as error:
+                wrong(one.name, error)
+                continue
             lines.setdefault(repr(scenes_of(run)), []).append(Line(one.name, one.date, run, None))
     if not lines:
         raise UserError(f"no finished runs in {printable(folder)}; `harness eval` makes one")

@@ -15,11 +15,14 @@ from inspect_ai.viewer import ViewerConfig
 
 from harness.core.errors import UserError
 from harness.core.files import digest, replacing
+from harness.core.places import nameless, text
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import messages_of
 from harness.report.details import as_shown, prompts_of
+from harness.report.page import refuse_less
 from harness.runs.folder import Run, check_scenes, dataset_of
 from harness.runs.records import Answer, FrozenScenes
+from harness.runs.sources import lacking
 
 VALUES = {"strict": "C", "recovered": "P", "failed": "I"}  # as Inspect calls correct, partial and incorrect
 STOPS = {"stop": "stop", "length": "max_tokens"}
@@ -28,20 +31,31 @@ SPOKEN = {
 }  # fmt: skip
 
 
-def write(run: Run, path: Path) -> Path:
-    """Write a run to an `.eval` file, or to JSON if its name ends so."""
+def write(run: Run, path: Path, dataset: Path | None = None) -> Path:
+    """Write a run to an `.eval` file, or to JSON if its name ends so; its dataset may be in another folder.
+
+    Raises:
+        UserError: the file is there already, and would lose the prompts.
+    """
+    scenes = _scenes(run, dataset)
+    if isinstance(run.manifest.world, FrozenScenes):
+        why = lacking(run) or (None if scenes else "its dataset is not here")
+        refuse_less(path, {"prompts": why} if why else {}, "--inspect")
     with replacing(path) as part:
-        log.write_eval_log(log_of(run), str(part), format="json" if path.suffix == ".json" else "eval")
+        log.write_eval_log(
+            log_of(run, scenes), str(part), format="json" if path.suffix == ".json" else "eval"
+        )
     return path
 
 
-def log_of(run: Run) -> log.EvalLog:
+def log_of(run: Run, scenes: Mapping[str, Scene]) -> log.EvalLog:
     """The log: its task is dataset and prompt version, its results the run's summary over episodes."""
     manifest, variant = run.manifest, run.manifest.variant
-    stated = msgspec.to_builtins(manifest)
+    whole = msgspec.to_builtins(manifest)
+    stated = nameless(whole)
     asked = ("prompt", "helpers", "answer", "thinking", "seeds", "conditions")
-    samples = list(_samples(run))
-    name = digest(stated)[:22]
+    samples = list(_samples(run, scenes))
+    name = digest(whole)[:22]
     return log.EvalLog(
         status="success",
         eval=log.EvalSpec(
@@ -74,8 +88,8 @@ def _results(run: Run) -> Iterator[log.EvalScore]:
         yield log.EvalScore(name=condition, scorer="swarmdrive-harness", metrics=metrics)
 
 
-def _samples(run: Run) -> Iterator[log.EvalSample]:
-    sent, scenes = prompts_of(run), _scenes(run)
+def _samples(run: Run, scenes: Mapping[str, Scene]) -> Iterator[log.EvalSample]:
+    sent = prompts_of(run)
     d = run.decisions
     regret, safe = d["regret"], d.of_actions("safe")
     condition = d.codes("condition", run.conditions)
@@ -105,19 +119,20 @@ def _sample(
         n = answer.prompt_tokens, answer.completion_tokens
         usage = model.ModelUsage(input_tokens=n[0], output_tokens=n[1], total_tokens=sum(n))
     stop = STOPS.get(answer.finish_reason, "unknown")
-    plain = msgspec.to_builtins(answer)
+    plain = msgspec.to_builtins(answer) | {"detail": text(answer.detail)}
     left_out = ("raw", "prompt_tokens", "completion_tokens", "finish_reason", "error", "seconds")
     intent = "failed" if answer.intent is None else " ".join(
         f"{action} {p:.2f}" for action, p in zip(run.actions, answer.intent, strict=True)
     )  # fmt: skip
     verdict = Score(
-        value=VALUES[answer.verdict], answer=intent, explanation=f"{answer.status}: {answer.detail}"
+        value=VALUES[answer.verdict], answer=intent, explanation=f"{answer.status}: {plain['detail']}"
     )
     return log.EvalSample(
         id=answer.id, epoch=1, input=chat or f"a prompt that is not here, sha256 {answer.prompt_sha256}",
         target=target, messages=[*chat, reply],
         output=model.ModelOutput(
-            model=run.agent(answer)["model"]["name"], usage=usage, time=answer.seconds, error=answer.error,
+            model=run.agent(answer)["model"]["name"], usage=usage, time=answer.seconds,
+            error=answer.error and text(answer.error),
             choices=[model.ChatCompletionChoice(message=reply, stop_reason=stop)],
         ),
         scores={"parsed": verdict, **kept},
@@ -136,13 +151,15 @@ def _kept(run: Run, condition: Any, regret: Any) -> dict[str, Score]:
     return scores
 
 
-def _scenes(run: Run) -> dict[str, Scene]:
+def _scenes(run: Run, folder: Path | None) -> dict[str, Scene]:
     """The run's decision points; none where its dataset is not here as it was, or it was driven."""
     if not isinstance(run.manifest.world, FrozenScenes):
         return {}
     try:
-        names, dataset = list(run.decisions.scenes), dataset_of(run)
+        names, dataset = list(run.decisions.scenes), dataset_of(run, folder)
         check_scenes(run, dataset)
         return dict(zip(names, dataset.scenes(names), strict=True))
     except UserError:
+        if folder:
+            raise
         return {}

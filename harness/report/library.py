@@ -2,7 +2,8 @@
 
 Charts are drawn by Vega-Lite (BSD 3-Clause, University of Washington Interactive Data Lab), which the package
 django-js-lib-vega-embed carries as its authors built it. It is compressed in the page as everything large is;
-scripts are let run by their digest alone.
+scripts are let run by their digest alone. The library's own digest stands here: what another package or
+release puts in its place runs in no page.
 """
 
 import base64
@@ -18,6 +19,9 @@ from typing import Any
 
 from markupsafe import Markup
 
+from harness.core.errors import UserError
+from harness.core.files import sha256_bytes, text_of
+
 # In the order in which they need each other.
 SCRIPTS = (
     "dom", "tables", "charts", "ends", "scene", "cameras", "answers", "decision", "list", "episodes", "main",
@@ -25,18 +29,30 @@ SCRIPTS = (
 FOLDER = Path(__file__).parent / "scripts"
 PACKAGE = "django-js-lib-vega-embed"  # of which nothing needs Django
 BUNDLE = "static/js_lib_vega_embed/vega-embed-full.js"
+BUNDLE_SHA256 = "b6f62605c995662b5682ff986bddf3a1e2fe7f309b8acc82db8b8a4feb4d9cef"  # of release 6.29.0.3
 
 
 @cache
 def vega() -> str:
-    """Vega, Vega-Lite and Vega-Embed as one script that leaves `vegaEmbed` behind."""
-    return (files("js_lib_vega_embed") / BUNDLE).read_text(encoding="utf-8")
+    """Return Vega, Vega-Lite and Vega-Embed as one script that leaves `vegaEmbed` behind.
+
+    Raises:
+        UserError: the installed script is not the one whose digest stands here.
+    """
+    bundle = (files("js_lib_vega_embed") / BUNDLE).read_bytes()
+    if (actual := sha256_bytes(bundle)) != BUNDLE_SHA256:
+        raise UserError(
+            f"the charting library of {PACKAGE} {version(PACKAGE)} has sha256 {actual[:12]}…, not "
+            f"{BUNDLE_SHA256[:12]}…, and would run in every report; install the harness again, whose "
+            "requirements name the release"
+        )
+    return bundle.decode()
 
 
 @cache
 def script() -> Markup:
     """The page's own script."""
-    parts = "\n".join((FOLDER / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS)
+    parts = "\n".join(text_of(FOLDER / f"{name}.js") for name in SCRIPTS)
     return Markup(f'"use strict";\n(() => {{\n{parts}}})();\n')
 
 

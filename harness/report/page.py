@@ -5,7 +5,8 @@ text nodes and nothing else of what it reads, characters that show nothing or tu
 out, and the page's own policy lets two scripts run, named by their digests, and forbids every request.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import replacing
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each
+from harness.core.places import nameless, text
 from harness.parsing.parse import Repair, Status
 from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
@@ -29,6 +31,7 @@ from harness.report.panels import panels
 from harness.report.runs import Runs
 
 TEMPLATES = Path(__file__).parent / "templates"
+HEAD = 1 << 14  # bytes of a page within which it states what it lacks
 
 
 @uncollected()
@@ -57,8 +60,31 @@ def write_report(
     """
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
-    save(_pieces(runs, prompts, progress, workers), out, "--out")
+    decisions = Decisions(runs, prompts)
+    refuse_less(out, decisions.lacks(), "--out")
+    save(_pieces(runs, decisions, progress, workers), out, "--out")
     return out
+
+
+def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
+    """Raise UserError if a page that lacks something would replace one that has it.
+
+    Args:
+        out: the file to replace.
+        lacks: what the new page lacks, in a word, and why. A page states these words itself.
+        option: names another file.
+    """
+    if not lacks or not out.is_file():
+        return
+    with out.open("rb") as page:
+        stated = re.search(rb'<meta name="lacks" content="([a-z ]*)">', page.read(HEAD))
+    lacked = stated[1].decode().split() if stated else []
+    for what, why in lacks.items():
+        if what not in lacked:
+            raise UserError(
+                f"{printable(out)} is kept: a new page would lack its {what} ({why}); name another file with "
+                f"{option}, or delete it"
+            )
 
 
 def save(pieces: Iterable[str], out: Path, option: str) -> None:
@@ -77,22 +103,27 @@ def render(
     runs: Runs, prompts: Prompts = prompts_of, progress: Callable[[int], None] = lambda done: None
 ) -> str:
     """The page."""
-    return "".join(_pieces(runs, prompts, progress, 1))
+    return "".join(_pieces(runs, Decisions(runs, prompts), progress, 1))
 
 
-def _pieces(runs: Runs, prompts: Prompts, progress: Callable[[int], None], workers: Workers) -> Iterator[str]:
+def _pieces(
+    runs: Runs, decisions: Decisions, progress: Callable[[int], None], workers: Workers
+) -> Iterator[str]:
     """The page in pieces, since that of a million decisions weighs as much as all that is read for it."""
     lines = matrix.lines(runs)
     charts = list(panels(runs))
-    decisions = Decisions(runs, prompts)
     alone = len(runs.names) == 1
     by_name = dict(zip(runs.names, runs.runs, strict=True))
-    unread = caveats.said(by_name, lambda run: caveats.unread(run.scores))
+    unread = [
+        *caveats.said(by_name, caveats.unanswered),
+        *caveats.said(by_name, lambda run: caveats.unread(run.scores)),
+    ]
     others = caveats.said(by_name, caveats.of_run)
     return environment().get_template("page.html.j2").generate(
         runs=runs,
         title=runs.names[0] if alone else f"{len(runs.names)} runs",
         policy=library.policy(library.vega(), library.script()),
+        lacks=" ".join(decisions.lacks()),
         warnings=[*unread, *caveats.no_prompt(run.manifest for run in runs.runs), *others],
         unread=len(unread),
         size=contents.size(runs),
@@ -186,7 +217,7 @@ def environment(*more: Path) -> Environment:
     templates.filters |= {
         "number": words.number, "facts": words.facts, "shown": words.shown, "p_value": words.p_value,
         "latency_source": words.latency_source, "answer_times": words.answer_times, "pace": words.pace,
-        "mapping": msgspec.to_builtins, "columns": _table,
+        "mapping": _mapping, "columns": _table, "nameless": text,
     }  # fmt: skip
     return templates
 
@@ -200,6 +231,11 @@ def visible(value: Any) -> Any:
     if not isinstance(value, str) or isinstance(value, Markup) or value.isprintable():
         return value
     return "".join(c if c.isprintable() or c in "\n\t" else f"⟨U+{ord(c):04X}⟩" for c in value)
+
+
+def _mapping(record: Any) -> Any:
+    """A record as plain values, without the folders of the machine that it was made on."""
+    return nameless(msgspec.to_builtins(record))
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[Any]]]:

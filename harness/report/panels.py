@@ -108,9 +108,9 @@ def panels(runs: Runs) -> Iterator[Panel]:
         yield Panel(
             "energy", "communication", "Energy of a decision",
             "Joules of inference on the declared device and of the radios, as means over decisions; the "
-            "interval is that of the total, over episodes. A helper's inference counts if the helper was "
-            "asked. If the radios' part is too small to see, asking costs energy because helpers infer, not "
-            "because they transmit.",
+            "interval is that of the total, over episodes. All helpers in the radius infer from the start, "
+            "asked or not; with on_demand=true those alone that are asked. If the radios' part is too small "
+            "to see, cooperation costs energy because helpers infer, not because they transmit.",
             charts.energies(rows),
         )  # fmt: skip
     if rows := joined(statistics.arrivals):

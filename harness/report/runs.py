@@ -61,12 +61,13 @@ class Runs:
 
 
 @uncollected()
-def gather(paths: Sequence[Path], dataset: Dataset | None = None) -> Runs:
+def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs:
     """Read runs to be reported together.
 
     Args:
         paths: their folders.
-        dataset: one that was read already; it is read again where it is not that of the runs.
+        dataset: one that was read already, which is read again where it is not that of the runs; or the
+            folder that theirs is in.
 
     Raises:
         UserError: a folder is no run, its dataset is gone or has changed, or two are not of the same scenes.
@@ -82,10 +83,16 @@ def gather(paths: Sequence[Path], dataset: Dataset | None = None) -> Runs:
             )
     world = first.manifest.world
     if not isinstance(world, FrozenScenes):
-        dataset = None
-    elif dataset is None or dataset.sha256 != world.sha256:
-        dataset = dataset_of(first)
-    return Runs(tuple(runs), _names(runs), dataset)
+        if isinstance(dataset, Path):
+            raise UserError(
+                f"--dataset {printable(dataset)}: {printable(first.path)} was driven; leave it out"
+            )
+        found = None
+    elif isinstance(dataset, Dataset) and dataset.sha256 == world.sha256:
+        found = dataset
+    else:
+        found = dataset_of(first, dataset if isinstance(dataset, Path) else None)
+    return Runs(tuple(runs), _names(runs), found)
 
 
 def _scenes(run: Run) -> Any:

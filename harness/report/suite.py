@@ -117,7 +117,10 @@ def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> s
         {
             "suite": suite,
             "lines": found,
-            "unread": caveats.said(suite.runs, lambda run: caveats.unread(run.scores)),
+            "unread": [
+                *caveats.said(suite.runs, caveats.unanswered),
+                *caveats.said(suite.runs, lambda run: caveats.unread(run.scores)),
+            ],
             "warnings": [
                 *caveats.no_prompt(run.manifest for run in suite.runs.values()),
                 *caveats.said(suite.runs, caveats.of_run),

@@ -31,6 +31,8 @@ class Answers:
             for answer in _ANSWER.decode_lines(line):  # one; none in a blank line
                 if answer.intent is not None and len(answer.intent) != actions:
                     raise ValueError(f"answer {answer.id} has {len(answer.intent)} probabilities")
+                if answer.heard and answer.role != "merge":
+                    raise ValueError(f"answer {answer.id} heard messages, and is no fusion call's")
                 if answer.scene != scene:
                     scene = answer.scene
                     keys = {other.key for place in of_scene.get(scene, ()) for other in self._span(place)}

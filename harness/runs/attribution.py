@@ -6,6 +6,8 @@ from typing import Literal
 import msgspec
 from msgspec import Struct
 
+from harness.core.files import text_of
+
 FILE = "attribution.json"
 
 
@@ -59,4 +61,4 @@ class Attribution(Struct, frozen=True, kw_only=True):
 
 def load(file: Path) -> Attribution:
     """Read a run's attribution. Raises OSError or ValueError if the file is broken."""
-    return msgspec.json.decode(file.read_bytes(), type=Attribution)
+    return msgspec.json.decode(text_of(file, "record"), type=Attribution)

@@ -1,6 +1,5 @@
 """The table of decisions, `decisions.parquet`: one row for each decision point, condition and seed."""
 
-import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,7 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.files import replacing
+from harness.core.files import bytes_of, replacing
 from harness.runs.records import Decision, Message
 
 if TYPE_CHECKING:
@@ -49,6 +48,7 @@ DECIMALS = {  # enough for every figure, and few enough to be the same on every 
     "arrival_ms": 3, "weight": 6, "trust": 6,
 }  # fmt: skip
 
+CELL, SLACK = 256, 1 << 26  # bytes of a cell at most, before compression, and of what all files have
 ROWS = 2048  # how many rows become mappings at a time
 ROW_GROUP = 1 << 18  # least rows of a group in the file but the last: about 0.1 GB in memory
 
@@ -160,6 +160,8 @@ class Decisions:
     @cached_property
     def scenes(self) -> dict[str, range]:
         """The rows of each decision point, in order. Raises ValueError if they are not adjacent."""
+        if not len(self):
+            return {}
         codes = self.table["scene"].combine_chunks()
         changes = np.flatnonzero(np.diff(_values(codes.indices, -1, np.int32))) + 1
         starts = [0, *changes.tolist(), len(self)]
@@ -238,17 +240,31 @@ class Decisions:
         _write(target, [self], schema(self.actions, self.helpers), unknown)
 
     @classmethod
-    def read(cls, path: Path, actions: Sequence[str]) -> "Decisions":
-        """Read a Parquet file. Raises OSError or ValueError if it is none or lacks a run's columns."""
+    def read(cls, path: Path, actions: Sequence[str], most: int | None = None) -> "Decisions":
+        """Read a Parquet file.
+
+        Raises OSError or ValueError if it is none, lacks a run's columns, or has more than `most` rows or
+        more bytes than its rows can need: a file of a few bytes may hold a thousand million rows.
+        """
         with arrow_file(path) as file:  # read_table would make columns of folder names
-            table = pq.ParquetFile(file).read()
+            source = pq.ParquetFile(file)
+            if most is not None and source.metadata.num_rows > most:
+                raise ValueError(f"{source.metadata.num_rows} rows; {most} is the most for its episodes")
+            there = source.schema_arrow.names
+            helpers = _helpers(there)
+            expected = schema(actions, helpers)
+            if missing := [name for name in expected.names if name not in there and name not in OPTIONAL]:
+                raise ValueError(f"it lacks {', '.join(missing)}")
+            wanted = [name for name in expected.names if name in there]
+            if (
+                _bytes(source.metadata, set(wanted))
+                > SLACK + len(source.schema_arrow) * source.metadata.num_rows * CELL
+            ):
+                raise ValueError("it holds more bytes than decisions need")
+            table = source.read(columns=wanted)
         for name in OPTIONAL:
             if name not in table.column_names:
                 table = table.append_column(name, pa.nulls(len(table), NUMBER))
-        helpers = _helpers(table.column_names)
-        expected = schema(actions, helpers)
-        if missing := [name for name in expected.names if name not in table.column_names]:
-            raise ValueError(f"it lacks {', '.join(missing)}")
         for name in NEVER_UNKNOWN:
             if table[name].null_count:
                 raise ValueError(f"{name} is unknown in some rows")
@@ -275,12 +291,19 @@ class DecisionFiles:
 
     def write(self, path: Path) -> None:
         """Write one Parquet file. Raises what `Decisions.read` raises."""
-        columns = [set(pq.read_schema(file).names) for file in self.files]
+        columns = [set(pq.read_schema(arrow_file(file)).names) for file in self.files]
         helpers = max(_helpers(names) for names in columns)
         unknown = set(OPTIONAL).difference(*columns)
         with replacing(path) as part:
             decisions = (Decisions.read(file, self.actions) for file in self.files)
             _write(part, decisions, schema(self.actions, helpers), unknown)
+
+
+def _bytes(described: pq.FileMetaData, names: Collection[str]) -> int:
+    """Return the bytes that some columns of a Parquet file take without compression, as it says."""
+    groups = (described.row_group(n) for n in range(described.num_row_groups))
+    columns = (group.column(n) for group in groups for n in range(group.num_columns))
+    return sum(column.total_uncompressed_size for column in columns if column.path_in_schema in names)
 
 
 def _helpers(columns: Iterable[str]) -> int:
@@ -314,13 +337,12 @@ def _row_group(tables: Sequence[pa.Table]) -> pa.Table:
     return pa.table(columns, schema=kinds)
 
 
-def arrow_file(path: Path) -> pa.OSFile:
+def arrow_file(path: Path) -> pa.BufferReader:
     """Open a file for Arrow.
 
-    Arrow's threads can abort the process when they release a file object of Python; this is Arrow's own.
+    Arrow's threads can abort the process when they release a file object of Python, so it gets the content.
     """
-    with path.open("rb"):  # its error says in few words why a file cannot be opened
-        return pa.OSFile(os.fsencode(path))
+    return pa.BufferReader(bytes_of(path, "rows"))
 
 
 # pyarrow loads pandas when it converts a foreign array to its own or back; going by buffers avoids that.

@@ -2,32 +2,43 @@
 
 import csv
 from collections.abc import Iterable, Sequence
+from io import StringIO
 from pathlib import Path
 
 import msgspec
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
-from harness.core.files import replacing, write_whole
+from harness.core.files import neutral, replacing, write_whole
 from harness.core.junit import Case
 from harness.core.junit import junit as test_suite
+from harness.core.places import text
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run
 from harness.runs.records import TURNS, Answer, Episode
+from harness.runs.unanswered import lacking
 
 AT_ONCE = 10_000  # decisions in a piece
 
 
 def decisions_csv(decisions: Decisions, path: Path) -> Path:
-    """Write decisions as CSV: one a line, with the columns of `decisions.parquet`; unknown is empty."""
+    """Write decisions as CSV: one a line, with the columns of `decisions.parquet`; unknown is empty.
+
+    A text that a spreadsheet would take for a formula has an apostrophe before it.
+    """
     plain = pa.schema(
         (column.name, pa.string() if pa.types.is_dictionary(column.type) else column.type)
         for column in decisions.table.schema
     )
     with replacing(path) as part, pacsv.CSVWriter(part, plain) as writer:
         for piece in decisions.table.to_batches(AT_ONCE):
-            writer.write_table(pa.Table.from_batches([piece]).cast(plain))
+            table = pa.Table.from_batches([piece]).cast(plain)
+            writer.write_table(pa.table([_neutral(column) for column in table.columns], schema=plain))
     return path
+
+
+def _neutral(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    return pa.chunked_array([map(neutral, column.to_pylist())]) if pa.types.is_string(column.type) else column
 
 
 def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
@@ -40,7 +51,11 @@ def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
 
 
 def junit(run: Run, path: Path) -> Path:
-    """Write JUnit's XML: a test case for each episode and condition, which fails if any seed fails."""
+    """Write JUnit's XML: a test case for each episode and condition, which fails if any seed fails.
+
+    An episode with a question that got no answer is an error, unless it was a message that may be lost.
+    """
+    said = _unanswered(run)
     episodes: dict[tuple[str, int], list[Episode]] = {}
     for outcome in run.episodes:
         episodes.setdefault((outcome.condition, outcome.episode), []).append(outcome)
@@ -49,24 +64,56 @@ def junit(run: Run, path: Path) -> Path:
         failed = [f"{outcome.failure} with seed {outcome.seed}" for outcome in by_seed if not outcome.success]
         group = f"{run.source} · {run.manifest.variant} · {condition}"
         failure = f"{len(failed)} of {len(by_seed)} seeds: {', '.join(failed)}"
-        cases.append(Case(group, f"episode {episode}", failure if failed else None))
+        words = said.get((condition, episode))
+        error = f"{words}: the model could not be asked" if words else None
+        cases.append(Case(group, f"episode {episode}", failure if failed else None, error))
     write_whole(path, test_suite(f"harness {run.manifest.name}", cases))
     return path
 
 
+def _unanswered(run: Run) -> dict[tuple[str, int], str]:
+    """Return by condition and episode what a question said that got no answer."""
+    answers, said = list(lacking(run)), dict[tuple[str, int], str]()
+    if not answers:
+        return said
+    decisions = run.decisions
+    numbers, conditions = decisions.whole("episode"), decisions.codes("condition", run.conditions)
+    for answer in answers:
+        for row in decisions.scenes.get(answer.scene, ()):
+            if answer.role != "merge" or decisions["fusion_failed"][row] == 1.0:
+                said.setdefault((run.conditions[conditions[row]], int(numbers[row])), answer.error or "")
+    return said
+
+
+def junit_of_none(run: Path, said: str) -> str:
+    """Return JUnit's XML of a run that did not finish, since its model could not be asked: one error."""
+    name = run.absolute().name
+    return test_suite(f"harness {name}", [Case(name, "the model answers", error=said)])
+
+
 def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -> Path:
-    """Write answers as CSV: one a line, the fields of `answers.jsonl`, a column an action for the intent."""
+    """Write answers as CSV: one a line, the fields of `answers.jsonl`, a column an action for the intent.
+
+    What an engine says of an error has the names of files without their folders. A text that a spreadsheet
+    would take for a formula has an apostrophe before it.
+    """
     fields = (*Answer.__struct_fields__, *TURNS)
     plain = [name for name in fields if name not in ("intent", "message", "first")]
     unknown = [None] * len(actions)
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*plain, *(f"intent_{action}" for action in actions), "message"])
+        file.write(_line([*plain, *(f"intent_{action}" for action in actions), "message"]))
         for answer in answers:
             values = {
                 **{name: getattr(answer, name) for name in plain},
                 "heard": "+".join(answer.heard), "repairs": " ".join(answer.repairs),
+                "detail": text(answer.detail), "error": answer.error and text(answer.error),
             }  # fmt: skip
             message = answer.message and msgspec.json.encode(answer.message).decode()
-            writer.writerow([*values.values(), *(answer.intent or unknown), message])
+            file.write(_line([*values.values(), *(answer.intent or unknown), message]))
     return path
+
+
+def _line(cells: Sequence[object]) -> str:
+    """Return a line of CSV that ends in a line feed; cells with any break are quoted."""
+    csv.writer(line := StringIO(), lineterminator="\r\n").writerow(list(map(neutral, cells)))
+    return line.getvalue()[:-2] + "\n"

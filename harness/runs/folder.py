@@ -9,9 +9,11 @@ import io
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
@@ -21,11 +23,13 @@ import pyarrow.csv as pacsv
 from msgspec import Struct
 from msgspec.structs import asdict
 
+from harness.core import work
 from harness.core.errors import UserError, printable
-from harness.core.files import replacing, write_whole
+from harness.core.files import bytes_of, replacing, text_of, write_whole
 from harness.core.formats import FORMAT, READ_BY, SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
+from harness.dataset.verify import read_manifest
 from harness.runs import attribution
 from harness.runs.answers import Answers
 from harness.runs.attribution import Attribution
@@ -42,6 +46,7 @@ from harness.runs.records import (
     Speed,
     Variant,
 )
+from harness.world.scenario import MOST_DECISIONS
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
@@ -55,9 +60,11 @@ _BROKEN = (
     OverflowError,
     csv.Error,
 )
+NOBODY: Mapping[str, Sequence[str]] = MappingProxyType({})
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 _FACTS = msgspec.json.Decoder(AnswerFacts)
 _ENCODER = msgspec.json.Encoder()
+DEEPEST = 8  # folders of a dataset's stated path that are looked for above a run
 
 
 @dataclass(frozen=True)
@@ -124,7 +131,7 @@ class Run:
     @cached_property
     def answers(self) -> Answers:
         """The lines of `answers.jsonl`."""
-        return self._read("answers.jsonl", lambda file: Answers(file.read_bytes(), len(self.actions)))
+        return self._read("answers.jsonl", lambda file: Answers(bytes_of(file, "rows"), len(self.actions)))
 
     @cached_property
     def answers_by_scene(self) -> Mapping[str, list[Answer]]:
@@ -206,7 +213,7 @@ class Run:
         return grid, tuple(grid.ordered(episodes))
 
     def _decisions(self, file: Path) -> Decisions:
-        decisions = Decisions.read(file, self.actions)
+        decisions = Decisions.read(file, self.actions, _most_rows(self.episodes))
         decisions.codes("action", self.actions)
         if infinite := decisions.infinite():
             raise ValueError(f"{infinite} is infinite")
@@ -235,10 +242,12 @@ def read(path: Path) -> Run:
         raise UserError(
             f"{printable(path)} is a suite; give the folder of one of its runs"
             if (path / SUITE).is_file()
+            else f"{printable(path)} is no finished run, since its model could not be asked: {said}"
+            if (said := work.unanswered(path))
             else f"{printable(path)} is no finished run: it has no run.json; "
             "give a folder made by `harness eval` or `harness drive`"
         )
-    stated: Any = whole(file, lambda file: msgspec.json.decode(file.read_bytes()))
+    stated: Any = whole(file, lambda file: msgspec.json.decode(text_of(file, "record")))
     version = stated.get("format") if isinstance(stated, dict) else None
     if version != FORMAT:
         old = READ_BY.get(version) if isinstance(version, str) else None
@@ -275,12 +284,16 @@ def write(
 
 
 def part_files(
-    decisions: Decisions, episodes: Sequence[Episode], answers: Iterable[Answer]
-) -> dict[str, bytes]:
-    """Return the files of a part of a run, by name; the answers may be in any order."""
+    decisions: Decisions, episodes: Sequence[Episode], answers: Iterable[Answer],
+    viewers: Mapping[str, Sequence[str]],
+) -> dict[str, bytes]:  # fmt: skip
+    """Return the files of a part of a run, by name; the answers may be in any order.
+
+    `viewers` has the ids of each decision point's viewers, the ego first.
+    """
     return {
         "decisions.parquet": decisions.encoded(),
-        "answers.jsonl": lines(ordered(answers, decisions)),
+        "answers.jsonl": lines(ordered(answers, decisions, viewers)),
         "episodes.csv": csv_text(Episode, episodes).encode(),
     }
 
@@ -299,9 +312,23 @@ def read_part(
 ) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:  # fmt: skip
     """Read a part that `write_part` wrote. Raises UserError if it is broken."""
     return whole(part, lambda part: (
-        Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
-        _FACTS.decode_lines((part / "answers.jsonl").read_bytes()),
+        *_read_tables(part, actions), facts_of(part),
     ))  # fmt: skip
+
+
+def facts_of(part: Path) -> list[AnswerFacts]:
+    """Read a part's answers, without their texts. Raises UserError if it is broken."""
+    return whole(part, lambda part: _FACTS.decode_lines(bytes_of(part / "answers.jsonl", "rows")))
+
+
+def _read_tables(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...]]:
+    episodes = _records(part / "episodes.csv", Episode)
+    return Decisions.read(part / "decisions.parquet", actions, _most_rows(episodes)), episodes
+
+
+def _most_rows(episodes: Sequence[Episode]) -> int:
+    """Return how many decisions a file may hold, so that one with a few too many is still read and named."""
+    return 2 * MOST_DECISIONS * len(episodes)
 
 
 def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:
@@ -311,13 +338,13 @@ def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles
 
 def answers_in(part: Path) -> int:
     """Return the number of answers in a part."""
-    return (part / "answers.jsonl").read_bytes().count(b"\n")
+    return bytes_of(part / "answers.jsonl", "rows").count(b"\n")
 
 
 def lines_of(parts: Iterable[Path]) -> Iterator[bytes]:
     """Yield the content of a run's `answers.jsonl` from its parts, one part at a time."""
     for part in parts:
-        yield (part / "answers.jsonl").read_bytes()
+        yield bytes_of(part / "answers.jsonl", "rows")
 
 
 def lines(answers: Sequence[Answer]) -> bytes:
@@ -325,32 +352,87 @@ def lines(answers: Sequence[Answer]) -> bytes:
     return _ENCODER.encode_lines(answers)
 
 
-def ordered(answers: Iterable[Answer], decisions: Decisions) -> list[Answer]:
+def ordered(
+    answers: Iterable[Answer], decisions: Decisions, viewers: Mapping[str, Sequence[str]] = NOBODY
+) -> list[Answer]:
     """Sort answers by decision point, and there: the ego's, the helpers', blind helpers', fusion calls'.
 
-    Answers for a decision point without a decision are left out.
+    Those of one kind are in the order of the decision point's `viewers`, where these are known. Answers for a
+    decision point without a decision are left out.
     """
+
+    def place(answer: Answer) -> tuple[Any, ...]:
+        first = viewers[answer.scene].index(answer.viewer) if answer.scene in viewers else 0
+        return order[answer.scene], answer.heard, answer.role == "blind", first
+
     order = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
     reached = (answer for answer in answers if answer.scene in order)
-    return sorted(reached, key=lambda answer: (order[answer.scene], answer.heard, answer.role == "blind"))
+    return sorted(reached, key=place)
 
 
-def dataset_of(run: Run) -> Dataset:
-    """Return the dataset of a run on frozen scenes.
+def dataset_of(run: Run, given: Path | None = None) -> Dataset:
+    """Return the dataset of a run on frozen scenes, wherever it lies now.
+
+    It is looked for where the run states, at that path seen from each folder above the run's, and by its
+    name; only a dataset with the run's digest is taken.
+
+    Args:
+        run: the run.
+        given: the dataset's folder, if the user names it; it is looked for nowhere else then.
 
     Raises:
-        UserError: the dataset is missing, or its digest is not that of the run.
+        UserError: it is not found, or what is there has another digest or is damaged.
     """
     stated = run.manifest.world
     assert isinstance(stated, FrozenScenes)
-    path = Path(stated.path)
-    dataset = load(path if path.is_dir() else find(stated.name))
-    if dataset.sha256 != stated.sha256:
+    others: list[Path] = []
+    for path in [given] if given else dict.fromkeys(_datasets(run, stated)):
+        if given or _holds(path):
+            if _sha256_of(path) == stated.sha256:
+                return load(path)
+            others.append(path)
+    repair = "restore it, give its folder to a command that has --dataset, or run again"
+    if others:
+        sha256 = _sha256_of(others[0]) or read_manifest(others[0])[1]  # which says what is wrong with it
         raise UserError(
-            f"dataset {printable(dataset.path)} is not the one that {printable(run.path)} was made on "
-            f"(sha256 {dataset.sha256[:12]}…, not {printable(stated.sha256, 13)}); restore it or run again"
+            f"dataset {printable(others[0])} is not the one that {printable(run.path)} was made on "
+            f"(sha256 {sha256[:12]}…, not {printable(stated.sha256, 13)}); {repair}"
         )
-    return dataset
+    raise UserError(
+        f"{printable(run.path)} was made on dataset {printable(stated.name, 40)}, which is neither at "
+        f"{printable(stated.path)}, seen from here or from a folder above the run, nor known by its name; "
+        f"{repair}"
+    )
+
+
+def _datasets(run: Run, stated: FrozenScenes) -> Iterator[Path]:
+    """Yield where a run's dataset may lie."""
+    path = Path(stated.path)
+    yield path
+    with suppress(UserError):
+        yield find(stated.name)
+    # The run may have moved together with its dataset, or be read from another folder.
+    parts = [part for part in path.parts if part not in (path.anchor, "..")][-DEEPEST:]
+    for above in run.path.resolve().parents:
+        yield above / path
+        yield from (above.joinpath(*parts[at:]) for at in range(len(parts)))
+        yield above / "datasets" / stated.name
+
+
+def _sha256_of(path: Path) -> str | None:
+    """Return the digest of the dataset in a folder; None if its manifest is broken."""
+    try:
+        return read_manifest(path)[1]
+    except UserError:
+        return None
+
+
+def _holds(path: Path) -> bool:
+    """Whether there is a dataset in a folder."""
+    try:
+        return (path / "manifest.json").is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        return False
 
 
 def check_scenes(run: Run, dataset: Dataset, some: Iterable[str] | None = None) -> None:

@@ -7,11 +7,13 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
-from harness.core.formats import CONFIG, FORMAT, READ_BY, SUITE, WORK
+from harness.core.files import opened, text_of
+from harness.core.formats import CONFIG, FORMAT, READ_BY, SOURCES, SUITE, WORK
 
 DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
@@ -99,7 +101,12 @@ def _entries(path: str, root: str, depth: int) -> Iterator[Listed]:
     if depth < DEPTH:
         for name in sorted(os.listdir(path)) if os.access(path, os.R_OK | os.X_OK) else ():
             subfolder = os.path.join(path, name)
-            if not name.startswith(".") and os.path.isdir(subfolder) and _within(subfolder, root):
+            if (
+                not name.startswith(".")
+                and name != SOURCES
+                and os.path.isdir(subfolder)
+                and _within(subfolder, root)
+            ):
                 yield from _entries(subfolder, root, depth + 1)
 
 
@@ -182,7 +189,7 @@ def own_name(name: str) -> bool:
 
 def _with_summary(path: str, listed: Listed) -> Listed:
     """Return an entry as finished, with the best condition of its summary."""
-    with open(os.path.join(path, "summary.csv"), encoding="utf-8") as file:
+    with opened(os.path.join(path, "summary.csv"), "rows") as data, TextIOWrapper(data, "utf-8-sig") as file:
         # Parse only the rows needed: a folder may hold a thousand summaries of a thousand rows.
         markers = (f",{SUCCESS},", f",{FAILED},")
         head, *lines = [
@@ -210,7 +217,7 @@ def _with_config(entry: Listed, config: dict[str, Any]) -> Listed:
 
 
 def _json(*parts: str) -> Any:
-    return json.loads(Path(*parts).read_text(encoding="utf-8"))
+    return json.loads(text_of(os.path.join(*parts), "record"))
 
 
 def _date(text: str) -> datetime:

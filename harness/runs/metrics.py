@@ -125,7 +125,7 @@ METRICS = {
                _column("airtime_ms"), total=True),
         Metric("busy_ratio", "share of the time that the radio's channel is busy with background traffic",
                _column("busy_ratio"), optional=True),
-        Metric("energy_j", "energy of a decision: inference of the ego, of the asked helpers and of a "
+        Metric("energy_j", "energy of a decision: inference of the ego, of the helpers that infer and of a "
                "fusion call, and their radios; known only with a device profile",
                lambda d: d["inference_j"] + d["radio_mj"] / 1000, optional=True),
         Metric("helpers_j", "energy of a decision: the part of the helpers' inference", _column("helpers_j"),

@@ -1,12 +1,15 @@
 """Define the typed records of a run's files; docs/files.md has the meaning of each name."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
-from msgspec import UNSET, Meta, Struct, UnsetType, field
+from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
 
-from harness.core.config import Count, Seconds
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.config import Count, Seconds, convert
+from harness.core.errors import UserError
 from harness.core.statistics import Estimate
 
+Rate = Annotated[float, Meta(gt=0, description="a number above 0")]
 Role = Literal["ego", "helper", "merge", "blind"]
 BLIND = "~blind"  # ends the key of a blind helper's answer
 REWRITTEN = "!"  # in a sender's key, before the attack and the defences that change its message
@@ -175,10 +178,10 @@ class Speed(Struct, frozen=True):
     """
 
     model: str
-    prefill_tokens_per_s: float | None
-    decode_tokens_per_s: float | None
-    joules_per_prompt_token: float | None = None
-    joules_per_output_token: float | None = None
+    prefill_tokens_per_s: Rate | None
+    decode_tokens_per_s: Rate | None
+    joules_per_prompt_token: Rate | None = None
+    joules_per_output_token: Rate | None = None
 
 
 class Latency(Struct, frozen=True, omit_defaults=True):
@@ -501,6 +504,8 @@ class Device(Struct, frozen=True, kw_only=True):
         idle_watts: its draw while it waits.
         transmit_dbm: radiated power of its radio, if the channel states none.
         amplifier_efficiency: the share of the radio amplifier's draw that is radiated.
+        frame_ms: least time on air of a message under a channel that states bits and bandwidth alone; None
+            counts only these.
     """
 
     name: str
@@ -512,11 +517,18 @@ class Device(Struct, frozen=True, kw_only=True):
     idle_watts: Constant | None = None
     transmit_dbm: Constant | None = None
     amplifier_efficiency: Constant | None = None
+    frame_ms: Constant | None = None
 
     def __post_init__(self) -> None:
         names = [row.model for row in self.rows]
         if not names or len(set(names)) < len(names):
             raise ValueError("rows: give one or more, of different models")
+
+
+# The settings of an operating point as a file states them; a run of another version has fewer or more.
+_CONDITION = defstruct(
+    "Condition", [(name, kind | UnsetType, UNSET) for name, kind in get_type_hints(OperatingPoint).items()]
+)
 
 
 class Manifest(Struct, frozen=True, kw_only=True):
@@ -565,10 +577,14 @@ class Manifest(Struct, frozen=True, kw_only=True):
         ):  # fmt: skip
             if missing := [key for key in keys if not isinstance(table.get(key), str)]:
                 raise ValueError(f"{table_name}: {missing[0]} is no text")
-        if any(not isinstance(point.get("profile", ""), str | None) for point in self.conditions):
-            raise ValueError("conditions: a profile is no text")
-        if any(not isinstance(point.get("radio", ""), str) for point in self.conditions):
-            raise ValueError("conditions: a radio is no text")
+        if any(not isinstance(helper.get("thinking", False), bool) for helper in self.helpers):
+            raise ValueError("helpers: thinking is neither true nor false")
+        for point in self.conditions:
+            known = {name: point[name] for name in _CONDITION.__struct_fields__ if name in point}
+            try:
+                convert(known, _CONDITION, "conditions")
+            except UserError as mistake:
+                raise ValueError(str(mistake)) from None
         names = tuple(point["name"] for point in self.conditions)
         for field_name, values in (("actions", self.actions), ("conditions", names), ("seeds", self.seeds)):
             if not 0 < len(values) == len(set(values)):
@@ -585,5 +601,5 @@ class Manifest(Struct, frozen=True, kw_only=True):
     def agent(self, place: int) -> dict[str, Any]:
         """Return the agent of a scene's viewer at this place, in the form of `helpers`; the ego is at 0."""
         if place and self.helpers:
-            return {"image": "own", **self.helpers[(place - 1) % len(self.helpers)]}
+            return {"image": "own", "thinking": False, **self.helpers[(place - 1) % len(self.helpers)]}
         return {k: getattr(self, k) for k in ("model", "prompt", "answer", "thinking", "image")}

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 
 from harness.core.errors import UserError, printable
-from harness.core.files import write_whole
+from harness.core.files import text_of, write_whole
 from harness.core.formats import SUITE
 from harness.core.statistics import mean_of
 from harness.runs import folder
@@ -103,7 +103,9 @@ def mean(scores: Sequence[Score]) -> Score:
 
 def contents_of(path: Path) -> Contents:
     """Read the contents of a suite's folder. Raises UserError if it is none."""
-    contents = folder.whole(path / SUITE, lambda file: msgspec.json.decode(file.read_bytes(), type=Contents))
+    contents = folder.whole(
+        path / SUITE, lambda file: msgspec.json.decode(text_of(file, "record"), type=Contents)
+    )
     if contents.format != FORMAT:
         raise UserError(f"{printable(path / SUITE)} is of another version; make the runs again")
     return contents

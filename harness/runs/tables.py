@@ -3,11 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from harness.core.files import bytes_of
 from harness.runs.folder import Run, read, whole
 from harness.runs.records import TURNS, Answer
 
@@ -84,7 +86,7 @@ class Tables:
         return whole(
             self.path / name,
             lambda file: pd.read_csv(
-                file,
+                BytesIO(bytes_of(file, "rows")),
                 dtype=dict.fromkeys(TEXT, str),
                 keep_default_na=False,
                 na_values=[""],

@@ -73,6 +73,7 @@ def attribute(stored: Stored, condition: str, sample: int, seed: int) -> Attribu
 
     Raises:
         UserError: the run has no such condition, or its model is not available or cannot be asked otherwise.
+        Unanswered: too many questions got no answer; the run keeps all others.
     """
     for agent in stored.spec.agents:
         name = f"{printable(stored.run.path)}: {printable(agent.card.name)}"
@@ -90,6 +91,7 @@ def attribute(stored: Stored, condition: str, sample: int, seed: int) -> Attribu
     drawn, of = draw(stored, condition, sample, seed)
     scenes = stored.dataset.scenes(list(drawn))
     left_out = [*objects(stored, scenes), *messages(stored, stored.points[condition], drawn)]
+    stored.settle()
     place = {scene: n for n, scene in enumerate(drawn)}
     left_out.sort(key=lambda each: (each.episode, place[each.scene]))
     return Attribution(
@@ -122,7 +124,8 @@ def objects(stored: Stored, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
     asked = [each for scene in scenes for each in _questions(stored, scene)]
     answers = stored.answered([request for *_, request in asked])
     for scene, viewer, item, request in asked:
-        if p := answers[f"{scene.id}/{viewer}"].intent:
+        p = answers[f"{scene.id}/{viewer}"].intent
+        if p and answers[request.id].error is None:
             yield _left_out(
                 scene, stored.dataset.actions, p, answers[request.id].intent,
                 viewer=viewer, role=request.role, item=item, kind=_kind(scene, viewer, item),

@@ -107,7 +107,8 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
 
 def _usual() -> dict[str, object]:
     """What every setting of an operating point or of a channel usually is."""
-    of_radios = {name: getattr(channel, name) for channel in CHANNELS.values() for name in settable(channel)}
+    radios = CHANNELS.usable().values()
+    of_radios = {name: getattr(channel, name) for channel in radios for name in settable(channel)}
     return of_radios | {name: getattr(POINTS["6g"], name) for name in SETTINGS}
 
 

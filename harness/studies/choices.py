@@ -20,6 +20,7 @@ from harness.coordination.scheduling import chosen
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.dataset.forest import Forest
+from harness.evaluate.device import helpers_j
 from harness.evaluate.outlook import outlook
 from harness.evaluate.walk import channel_draws
 from harness.radio.channel import Draws, Physical
@@ -201,15 +202,13 @@ def _level(stored: Stored, point: OperatingPoint, seeds: Ints, at: Ints, sets: B
         seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps, width
     )
     intents = intents.take(node)
-    own_j, watts = stored.joules(scenes, point)
-    own_j, actions, costs = own_j[node], [], []
+    own_j, actions, costs = stored.joules(scenes, point)[node], [], []
     for who in sets[:, :width]:
         heard = fuse(
             point, exchange(point, intents, draws, np.broadcast_to(who, intents.valid.shape)), intents
         )
         actions.append(heard.action.reshape(shape))
-        helpers_j = np.sum(np.where(heard.asked, own_j[:, 1 : 1 + width], 0.0), axis=-1)
-        energy_j = own_j[:, 0] + helpers_j + watts * heard.airtime_s
+        energy_j = own_j[:, 0] + helpers_j(heard.infers, own_j) + stored.radio_j(point, heard)
         each = (heard.messages, 1e3 * heard.airtime_s, 1e3 * heard.latency_s, np.ones(len(node)), energy_j)
         costs.append(np.stack(each, -1).reshape(*shape, len(COSTS)))
     return Level(at, np.stack(actions, -1), np.stack(costs, 2), intents, draws)

@@ -8,6 +8,7 @@ import numpy as np
 
 from harness.backends.base import Backend, Request
 from harness.backends.counters import Counter, metered
+from harness.core.errors import Unanswered, printable
 from harness.core.statistics import Estimate, seed_interval
 
 WINDOWS = 5  # of asking; the intervals are over them
@@ -48,8 +49,11 @@ def measure(
 
     Returns:
         What each meter says, and how many answers there were.
+
+    Raises:
+        Unanswered: a question got no answer.
     """
-    backend.complete(requests[:1])
+    _ask(backend, requests[0])
     begun = time.perf_counter()
     with metered(meters) as idle:
         sleep(window_s)
@@ -60,7 +64,7 @@ def measure(
         begun = time.perf_counter()
         with metered(meters) as spent:
             while (took := time.perf_counter() - begun) < window_s or not answers[n]:
-                backend.complete([requests[answers.sum() % len(requests)]])
+                _ask(backend, requests[answers.sum() % len(requests)])
                 answers[n] += 1
             seconds[n] = took
         for name, total in spent.items():
@@ -73,3 +77,10 @@ def measure(
         estimates = (seed_interval(each) for each in (spent_j / seconds, spent_j / answers, more / answers))
         drawn.append(Drawn(name, idle_watts, *estimates))
     return drawn, int(answers.sum())
+
+
+def _ask(backend: Backend, request: Request) -> None:
+    """Ask one question. Raises Unanswered if it gets no answer, whose joules would be those of a failure."""
+    [completion] = backend.complete([request])
+    if completion.error is not None:
+        raise Unanswered(f"{printable(completion.error, 300)}: no answer, so that nothing is measured")

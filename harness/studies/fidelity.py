@@ -13,7 +13,7 @@ import numpy as np
 from msgspec.structs import asdict
 
 from harness.core.errors import UserError
-from harness.core.files import write_whole
+from harness.core.files import bytes_of, write_whole
 from harness.core.statistics import rate_difference
 from harness.report.library import picture
 from harness.report.page import environment
@@ -140,7 +140,7 @@ def write(result: Fidelity, out: Path) -> Path:
     figure = scatter(result.table, [row["who"] for row in rows])
     folder.write(out, {"fidelity": figure}, {"fidelity": result.table, "episodes": result.episodes})
     page = environment(TEMPLATES).get_template("fidelity.html.j2").render(
-        figure=picture((out / "fidelity.svg").read_bytes()),
+        figure=picture(bytes_of(out / "fidelity.svg", "picture")),
         rows=rows,
         headline=" ".join(headline(result)),
         ways=disagreements(result.episodes).head(SHOWN).to_dict("records"),

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from matplotlib.figure import Figure
 
-from harness.core.files import replacing, write_whole
+from harness.core.errors import UserError, printable
+from harness.core.files import replacing, text_of, write_whole
 from harness.report.drawing.pictures import FORMATS, save
 from harness.studies.tables import as_csv, as_json_lines
 
@@ -35,6 +36,40 @@ def lay_out(figure: Figure) -> None:
     if layout := figure.get_layout_engine():
         layout.execute(figure)
         figure.set_layout_engine("none")
+
+
+def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
+    """Raise UserError if a folder has a finished study of this kind that was made otherwise.
+
+    Args:
+        out: the folder.
+        kind: of the study.
+        manifest: what its `<kind>.json` has to state; of sources, only what they are and their latency.
+    """
+    file = out / f"{kind}.json"
+    try:
+        stated = json.loads(text_of(file))
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, RecursionError):
+        stated = {}  # it is no study of this kind
+    theirs = stated if isinstance(stated, dict) else {}
+    now = json.loads(json.dumps(manifest))
+    if other := [key for key, value in now.items() if _plain(key, theirs.get(key)) != _plain(key, value)]:
+        raise UserError(
+            f"{printable(out)} holds another {kind}, with other {', '.join(other)}; name another folder with "
+            "--out, or delete it"
+        )
+
+
+def _plain(key: str, value: Any) -> Any:
+    """Return a value of a study's manifest without what changes where a source moves or answers more."""
+    if key != "sources" or not isinstance(value, list):
+        return value
+    return [
+        {name: source.get(name) for name in ("name", "latency")} if isinstance(source, dict) else source
+        for source in value
+    ]
 
 
 def write_manifest(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:

@@ -181,7 +181,7 @@ def run_cells(
         given = {k: v for who in roles.items() for k, v in asked.get(who, {}).items()}
         run = read_or_evaluate(of, folder, progress, cache_file, more, opens, given)
         for answer in run.answers:
-            if answer.role in roles:
+            if answer.role in roles and answer.error is None:
                 asked.setdefault((answer.role, roles[answer.role]), {})[answer.id] = answer
         cells.append(Cell(egos[i - 1], helpers[j - 1], run))
     return Grid(tuple(cells), len(egos), len(helpers))

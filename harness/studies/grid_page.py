@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.core.figures import shown
-from harness.core.files import write_whole
+from harness.core.files import bytes_of, write_whole
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
 from harness.evaluate.spec import Spec
@@ -164,7 +164,7 @@ def write_grid(grid: Grid, spec: Spec, out: Path) -> Path:
     page = out / "index.html"
     rendered = environment(TEMPLATES).get_template("grid.html.j2").render(
         grid=grid, sentences=in_a_sentence(grid), text=text, success=SUCCESS, latency=LATENCY,
-        pictures={name: picture((out / f"{name}.svg").read_bytes()) for name in drawn},
+        pictures={name: picture(bytes_of(out / f"{name}.svg", "picture")) for name in drawn},
         by_condition={c: ranked(grid, c) for c in grid.conditions}, fronts=_fronts(grid),
         effects=[e for e in grid.effects if not np.isnan(e.estimate.value)], source=spec.source.name,
         place=beside(page), seeds=spec.seeds, points=lambda e: text(SUCCESS, e.estimate),

@@ -141,15 +141,19 @@ def run_learn(
     Raises:
         UserError: a run is on layouts for another purpose, or the operating point's answers are no function
             of who is heard.
+        Unanswered: too many questions got no answer.
     """
     learnt_from = tuple(layouts(stored, "train") for stored in train)
     tuned_on = tuple(layouts(stored, "tune") for stored in tune)
     network = learn(train, point, progress)
+    threshold = tuned(network, tune, point, progress)
+    for stored in (*train, *tune):
+        stored.settle()
     weights = {name: np.asarray(part).tolist() for name, part in asdict(network).items()}
     made = Stated(
         description=f"Learnt: the gain of asking a helper, under {point.name}.", command=command,
         learnt_from=learnt_from, tuned_on=tuned_on, condition=point.name,
-        threshold=tuned(network, tune, point, progress), inputs=INPUTS, network=Weights(**weights),
+        threshold=threshold, inputs=INPUTS, network=Weights(**weights),
     )  # fmt: skip
     write_whole(out, text(made))
     return made

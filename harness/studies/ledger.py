@@ -2,10 +2,11 @@
 
 import csv
 from collections.abc import Mapping
-from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.core.figures import interval
+from harness.core.files import text_of
 from harness.studies.calibrated import FITTED_ON
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ ASSUMED = {
 
 def paper_numbers() -> list[dict[str, str]]:
     """The rows of `paper_numbers.csv`, taken from the paper's text and figures."""
-    text = (files("harness.studies") / "paper_numbers.csv").read_text(encoding="utf-8")
+    text = text_of(Path(__file__).with_name("paper_numbers.csv"))
     return list(csv.DictReader(text.splitlines()))
 
 

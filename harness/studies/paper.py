@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from harness.coordination.operating_point import POINTS
 from harness.core.figures import interval
-from harness.core.files import write_whole
+from harness.core.files import bytes_of, write_whole
 from harness.core.versions import versions
 from harness.report.library import picture
 from harness.report.page import environment
@@ -108,7 +108,7 @@ def run_paper(
         rows=rows,
         equation_2=study.equation_2,
         off={v: [f"{r['id']}, {r['what']}: {r['off']}" for r in rows if r["verdict"] == v] for v in OFF},
-        pictures={stem: picture((out / f"{stem}.svg").read_bytes()) for stem in drawn},
+        pictures={stem: picture(bytes_of(out / f"{stem}.svg", "picture")) for stem in drawn},
         **tally(study.ledger),
     )  # fmt: skip
     write_whole(out / "index.html", page)

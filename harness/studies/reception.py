@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -16,6 +16,7 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.config import changed
 from harness.core.errors import UserError, printable
+from harness.core.files import text_of
 from harness.core.statistics import Estimate, episode_interval, rate_interval, resampled
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Physical, Site
 from harness.radio.fading import Trips
@@ -161,13 +162,13 @@ def curves_of(path: Path) -> list[Curve]:
     """
     shown = printable(path)
     try:
-        rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
+        rows = list(csv.DictReader(text_of(path).splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{shown} cannot be read as a table: {printable(error)}") from None
     curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for line, row in enumerate(rows, 2):
         try:
-            point = msgspec.convert(row, _Row, strict=False, str_keys=True)
+            point = msgspec.convert({k: _plain(v) for k, v in row.items()}, _Row, strict=False, str_keys=True)
         except msgspec.ValidationError as error:
             raise UserError(f"{shown}, line {line}: {printable(error)}") from None
         key = point.configuration, point.source or path.name
@@ -175,6 +176,14 @@ def curves_of(path: Path) -> list[Curve]:
     if not curves:
         raise UserError(f"{shown} has no rows; give distance_m and reception at one distance at least")
     return [Curve(*key, *np.array(points).T) for key, points in curves.items()]
+
+
+def _plain(cell: Any) -> Any:
+    """A number as JSON writes it: `.9` is none there."""
+    try:
+        return repr(float(cell))
+    except (TypeError, ValueError):
+        return cell
 
 
 @dataclass(frozen=True)

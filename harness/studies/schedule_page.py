@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.core.figures import shown
-from harness.core.files import write_whole
+from harness.core.files import bytes_of, write_whole
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
 from harness.report.drawing.colours import COLOURS, INK, MARKERS, PALE
@@ -131,7 +131,7 @@ def write_schedules(
     rendered = environment(TEMPLATES).get_template("schedule.html.j2").render(
         compared=compared, said=said, shown=shown, seeds=seeds, budget=compared[0].budget,
         sentences=[sentence for run in compared for sentence in in_sentences(run)],
-        picture=picture((out / "fronts.svg").read_bytes()),
+        picture=picture(bytes_of(out / "fronts.svg", "picture")),
     )  # fmt: skip
     write_whole(page, rendered)
     manifest = {

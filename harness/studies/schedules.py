@@ -16,6 +16,7 @@ from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core import noise
 from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable
 from harness.core.multiplicity import holm
 from harness.core.statistics import Estimate, of_resamples, resampled
 from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
@@ -282,7 +283,12 @@ def compare(
         seeds: of the channel.
         budget: share of the paper's messages within which settings are chosen.
         progress: called with 1 for each step of the choices and each schedule.
+
+    Raises:
+        UserError: no schedule can change anything at the point.
     """
+    if why := point.idle("schedule"):
+        raise UserError(f"--condition {printable(point.name)}: no schedule changes anything: {why}")
     made = choices(stored, point, seeds, progress)
     apart = choices(tune, point, seeds, progress) if tune else None
     found: dict[str, list[Play]] = {}

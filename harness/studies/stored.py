@@ -12,11 +12,12 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
-from harness.backends.base import AnswerMode, Backend, Request
+from harness.backends.base import AnswerMode, Backend, Request, same_model
 from harness.backends.cache import default_file
 from harness.backends.cards import Card, own
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
+from harness.coordination.exchange import Exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.schedules import SCHEDULES
@@ -38,6 +39,7 @@ from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 from harness.runs.folder import dataset_of, read
 from harness.runs.records import Answer
+from harness.runs.unanswered import tally
 from harness.studies.axes import Setting
 from harness.studies.play import Walked, walk_through
 
@@ -65,7 +67,7 @@ class Stored:
     def __init__(
         self, folder: Path, latency: str | None = None,
         more: Callable[[int], None] = lambda count: None, done: Callable[[int], None] = lambda count: None,
-        asks: bool = True, models: Sequence[Card] = (),
+        asks: bool = True, dataset: Path | None = None, models: Sequence[Card] = (),
     ) -> None:  # fmt: skip
         """A run.
 
@@ -75,6 +77,7 @@ class Stored:
             more: told how many answers are owed.
             done: told how many have come.
             asks: whether its model is asked what the run has no answer to; else such walks are left out.
+            dataset: folder of its dataset; None where the run states.
             models: cards that the user gave; a model of another name is asked only if the user has a card
                 file of it. What a run says of a model's place is never used.
         """
@@ -87,29 +90,35 @@ class Stored:
         manifest = self.run.manifest
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
-        stated: dict[str, tuple[Mapping[str, Any], Callable[[str], Any]]] = {
-            "channel profile": (manifest.channels, lambda name: name in CHANNELS and CHANNELS.record(name)),
-            "network": (manifest.networks, lambda name: asdict(network(name))),
-            "schedule": (manifest.schedules, SCHEDULES.file_sha256),
+
+        def same(now: Any, recorded: Any) -> bool:
+            return bool(now == msgspec.json.decode(msgspec.json.encode(recorded)))
+
+        stated: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
+            "channel profile": (manifest.channels, CHANNELS.unchanged),
+            "network": (manifest.networks, lambda name, then: same(asdict(network(name)), then)),
+            "schedule": (manifest.schedules, lambda name, then: same(SCHEDULES.file_sha256(name), then)),
         }
-        for what, (of_run, now) in stated.items():
+        for what, (of_run, unchanged) in stated.items():
             for name, recorded in of_run.items():
-                if now(name) != msgspec.json.decode(msgspec.json.encode(recorded)):
+                if not unchanged(name, recorded):
                     raise UserError(
                         f"{printable(folder)}: {what} {printable(name)} has changed since; restore it or run "
                         "again"
                     )
         self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
-        self.dataset = dataset_of(self.run).of_episodes(self.run.grid.episodes)
+        self.dataset = dataset_of(self.run, dataset).of_episodes(self.run.grid.episodes)
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
         self._asks, self._models = asks, models
         self.left_out: set[str] = set()
         self._opened: dict[int, Backend] = {}
         self._laid_out: Intents | None = None  # at every decision point that was asked for
         self._row: dict[str, int] = {}  # of each of them, by id
+        missing = tally(self.run).missing  # a lost message is a part of the run; what it lacks is asked again
+        answers = {a.id: a for a in self.run.answers if a.error is None or a.role not in missing}
         self._asker = Asker(
             self._spec(), self._open, PAPER if latency == "paper" else manifest.latency, folder / MORE,
-            {answer.id: answer for answer in self.run.answers}, done, more,
+            answers, done, more,
         )  # fmt: skip
 
     def _roots(self) -> list[str]:
@@ -154,15 +163,22 @@ class Stored:
         for point in points:
             yield [Walked(world.numbers, world.ends(point), *walked[point])]
 
-    def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> tuple[Floats, float]:
-        """Joules of each vehicle's answer, (n, 1+H), and watts of a radio that sends; NaN where unknown."""
+    def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> Floats:
+        """Joules of each vehicle's answer, (n, 1+H); NaN where unknown."""
         manifest = self.run.manifest
         if manifest.device_profile is None:
-            return np.full((len(moments), self.vehicles), np.nan), np.nan
+            return np.full((len(moments), self.vehicles), np.nan)
         taken = device.vehicles_j(manifest.latency, moments, self._asker.answers)
         if point.round_trip_s is not None or point.round_trip:
             taken[:, 0] = np.nan  # the ego's model is in a cloud
-        return taken, device.transmit_watts(manifest.device_profile, point)
+        return taken
+
+    def radio_j(self, point: OperatingPoint, heard: Exchange) -> Floats:
+        """Joules that radios take to send the messages of each decision, (n,); NaN where unknown."""
+        profile = self.run.manifest.device_profile
+        if profile is None:
+            return np.full(heard.messages.shape, np.nan)
+        return device.radio_j(profile, point, heard.airtime_s, heard.requests + heard.messages)
 
     @property
     def spec(self) -> Spec:
@@ -174,6 +190,18 @@ class Stored:
         with self._writing():
             self._asker.answer(requests)
         return self._asker.answers
+
+    @property
+    def lost(self) -> str:
+        """What was asked here and got no answer, in a sentence; empty if everything did."""
+        counts = self._asker.tally.counts()
+        return (
+            f"{printable(self.name)}: no answer to {counts}; left out, as lost messages are" if counts else ""
+        )
+
+    def settle(self) -> None:
+        """Raise Unanswered if too many of the questions that were asked here got no answer."""
+        self._asker.settle()
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
         """What every vehicle intends. Where the run has no answer its model is asked."""
@@ -263,7 +291,7 @@ class Stored:
         models = open_each(cards, opens)
         identity = together(cards, models).identity()
         stored, now = manifest.identity, msgspec.json.decode(canonical_json(identity))
-        if now != stored:
+        if not same_model(stored, now):
             other = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
             raise UserError(
                 f"{shown}: the model is not what it was ({printable(', '.join(other))}); run again"

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
 from harness.core.figures import interval
-from harness.core.files import write_whole
+from harness.core.files import bytes_of, write_whole
 from harness.core.versions import versions
 from harness.report.library import picture
 from harness.report.page import environment
 from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Axis, Setting, Value, described, grid
-from harness.studies.folder import write, write_manifest
+from harness.studies.folder import refuse_other, write, write_manifest
 from harness.studies.play import Source, joined, play
 from harness.studies.stored import Stored
 
@@ -36,19 +36,28 @@ def settings(
     """The grid points of one axis, for each condition.
 
     Raises:
-        UserError: no such condition, one without a channel, or more vehicles than there are.
+        UserError: no such condition, one without a channel or in which the axis changes nothing, or more
+            vehicles than there are.
     """
     vehicles = min(source.vehicles for source in sources)
     if axis.field is None and max(map(float, values)) > vehicles:
         raise UserError(
             f"--grid: {max(map(float, values)):g} vehicles; the run's scenes have {vehicles} at most"
         )
-    return tuple(
-        Setting(name, axis.at(point, v), vehicles if axis.field else int(v), axis.name, v)
-        for name in conditions
-        for point in (point_of(sources, name),)
-        for v in values
-    )
+    found = []
+    for name in conditions:
+        points = [axis.at(point_of(sources, name), value) for value in values]
+        idle = [point.idle(axis.field) for point in points]
+        if idle and all(idle):
+            raise UserError(
+                f"--over {axis.name}: it changes nothing in {printable(name)}: {idle[0]}; vary another "
+                "setting or another --condition"
+            )
+        found += [
+            Setting(name, point, vehicles if axis.field else int(value), axis.name, value)
+            for point, value in zip(points, values, strict=True)
+        ]
+    return tuple(found)
 
 
 def point_of(sources: Sequence[Stored], name: str) -> OperatingPoint:
@@ -86,7 +95,16 @@ def run_sweep(
 
     Returns:
         The summary: a row a source, grid point and metric.
+
+    Raises:
+        UserError: the folder holds another sweep.
     """
+    stated = {
+        "sources": [source.manifest() for source in sources],
+        "seeds": list(seeds),
+        "panels": described(panels),
+    }
+    refuse_other(out, "sweep", stated)
     played = {
         panel: [
             play(source, panel, able, seeds, progress)
@@ -96,22 +114,20 @@ def run_sweep(
         ]
         for panel, points in panels.items()
     }
+    for source in sources:
+        if isinstance(source, Stored):
+            source.settle()
     whole = joined([part for parts in played.values() for part in parts])
     along = [whole.summary[whole.summary.panel == panel] for panel in panels if panel != CORE]
     drawn = {"sweep": figures.along(along)}
     for n, part in enumerate(played.get(CORE, ()), 1):
         drawn[f"operating-points-{n}"] = figures.composite_a(part.summary)
     write(out, drawn, {"conditions": whole.summary, "episodes": whole.episodes})
-    manifest = {
-        "sources": [source.manifest() for source in sources],
-        "seeds": list(seeds),
-        "panels": described(panels),
-        "versions": versions(),
-    }
-    write_manifest(out, "sweep", manifest)
+    asked = [source.manifest() for source in sources]  # anew: it says what was left out
+    write_manifest(out, "sweep", {**stated, "sources": asked, "versions": versions()})
     found = tables(whole.summary)
     page = environment(TEMPLATES).get_template("sweep.html.j2").render(
-        pictures={name: picture((out / f"{name}.svg").read_bytes()) for name in drawn},
+        pictures={name: picture(bytes_of(out / f"{name}.svg", "picture")) for name in drawn},
         tables=found, sentences=[f"{name}: {in_a_sentence(rows)}." for name, rows in found.items()],
         seeds=seeds, axes=len(along),
         title=f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",

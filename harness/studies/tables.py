@@ -1,4 +1,4 @@
-"""Write tables as CSV and JSON Lines, the same bytes as pandas writes.
+"""Write tables as CSV and JSON Lines, the same bytes as pandas writes, but for formulas.
 
 A study's episodes have many rows and few different values in a column. So each of these becomes text once,
 and Arrow puts the rows together.
@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.core.arrays import Ints
+from harness.core.files import neutral
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,7 +63,8 @@ def _distinct(values: "pd.Series[Any]") -> "tuple[Ints, pd.Series[Any]]":
 def _cell(value: Any) -> str:
     if not isinstance(value, str):
         return str(value)
-    csv.writer(line := StringIO(), lineterminator="\n").writerow([value, ""])  # one alone would be quoted
+    cells = [neutral(value), ""]  # one alone would be quoted
+    csv.writer(line := StringIO(), lineterminator="\n").writerow(cells)
     return line.getvalue()[:-2]
 
 

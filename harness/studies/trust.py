@@ -20,7 +20,7 @@ from harness.coordination.rules import EGO_PROMPT
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import digest
+from harness.core.files import bytes_of, digest
 from harness.core.kept import code_sha256
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import (
@@ -34,6 +34,7 @@ from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.walk import Decided, walk
 from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
+from harness.studies.folder import refuse_other
 from harness.studies.stored import Stored
 from harness.studies.sweep import point_of
 
@@ -286,14 +287,19 @@ def run_bench(
         more: called with the number of cells that are to be played.
 
     Raises:
-        UserError: the point has no channel, or its rule is a fusion call.
+        UserError: the point has no channel, or asks nobody, or its rule is a fusion call; or the folder has
+            the study of another run or condition.
     """
     point = point_of([stored], condition)
+    if why := point.idle("attack"):
+        raise UserError(f"--condition {printable(condition)}: no attack changes anything: {why}")
     if point.attack or EGO_PROMPT in rules:
         raise UserError(
             "harness trust: give a condition without attack, and rules that are arithmetic; a fusion call is "
             f"attacked by `harness eval --condition {condition}:consensus={EGO_PROMPT} --attack injection`"
         )
+    of = {"sources": [{"name": stored.name}], "dataset": stored.run.source, "condition": condition}
+    refuse_other(out, "trust", of)
     every = [
         *((rule, PEACE, 0.0) for rule in dict.fromkeys([BASE, *rules])),
         *((BASE, EXCLUDED, share) for share in shares),
@@ -302,12 +308,17 @@ def run_bench(
     kept = _Kept(out / "cells.jsonl", stored, point, seeds)
     more(len(every))
     cells = {}
-    for of in every:
-        cells[of] = kept.get(of) or kept.add(play(stored, point, seeds, of))
+    for place in every:
+        if (cell := kept.get(place)) is None:
+            cell = play(stored, point, seeds, place)
+            stored.settle()
+            kept.add(cell)
+        cells[place] = cell
         progress(1)
     never = FrozenWorld(stored.dataset, [alone := OperatingPoint("never asks", None)], seeds)
     for _ in walk(never, [alone], stored):
         pass
+    stored.settle()
     return Bench(stored.name, stored.run.source, condition, cells, never.ends(alone)["success_rate"])
 
 
@@ -321,7 +332,7 @@ class _Kept:
             versions(), code_sha256("**/*.py"),
         ])  # fmt: skip
         self._cells: dict[tuple[str, str, float], Cell] = {}
-        data = path.read_bytes() if path.is_file() else b""
+        data = bytes_of(path, "rows") if path.is_file() else b""
         for line in data.splitlines():
             self._read(line)
         self._torn = not data.endswith(b"\n") and bool(data)
@@ -341,16 +352,17 @@ class _Kept:
     def get(self, of: tuple[str, str, float]) -> Cell | None:
         return self._cells.get(of)
 
-    def add(self, cell: Cell) -> Cell:
+    def add(self, cell: Cell) -> None:
         plain = {key: _plain(value) for key, value in vars(cell).items()}
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("ab") as file:
             file.write(b"\n" * self._torn + json.dumps({"of": self._of, **plain}).encode() + b"\n")
         self._torn = False
-        return cell
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        return [[None if np.isnan(x) else round(float(x), 6) for x in row] for row in value]
+        return [
+            [None if np.isnan(x) else float(x) for x in row] for row in value
+        ]  # exact: cells are read back
     return list(value) if isinstance(value, tuple) else value

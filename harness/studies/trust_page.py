@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.core.figures import as_mapping, shown
-from harness.core.files import write_whole
+from harness.core.files import bytes_of, write_whole
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
 from harness.report.drawing.colours import INK
@@ -150,7 +150,7 @@ def write_bench(bench: Bench, out: Path) -> Path:
     page = out / "index.html"
     rendered = environment(TEMPLATES).get_template("trust.html.j2").render(
         bench=bench, sentences=in_a_sentence(bench), shown=shown, price=price, excluded=EXCLUDED, base=BASE,
-        pictures={name: picture((out / f"{name}.svg").read_bytes()) for name in drawn},
+        pictures={name: picture(bytes_of(out / f"{name}.svg", "picture")) for name in drawn},
         detections=detections(bench), n=bench.price(BASE).n, isnan=np.isnan,
     )  # fmt: skip
     write_whole(page, rendered)

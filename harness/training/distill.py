@@ -10,7 +10,9 @@ import torch
 import transformers
 
 from harness.core import work
+from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, sha256_bytes, sha256_file, write_whole
+from harness.core.formats import WORK
 from harness.core.parallel import Workers
 from harness.prompts.versions import Prompt
 from harness.training.gguf_export import export
@@ -19,6 +21,8 @@ from harness.training.model import WEIGHTS, save_tokenizer
 from harness.training.student import Progress, Student
 from harness.training.train import STAGES, Plan
 from harness.world.scenario import Scenario
+
+FACTS = "training.json"  # written last
 
 
 @dataclass(frozen=True)
@@ -79,10 +83,14 @@ def distill(
         What the model card states: data, plan, curves, and the KL of the read-out on held-out layouts.
 
     Raises:
-        UserError: the folder holds something else.
+        UserError: the folder holds a finished model or something else.
     """
     if threads:
         torch.set_num_threads(threads)
+    if (out / FACTS).is_file() and not (out / WORK).is_dir():
+        raise UserError(
+            f"--out {printable(out)} already holds a finished model; choose another folder or delete it"
+        )
     learnt = curriculum.settings()  # once: the base's file may change while this learns from it
     settings = {**learnt, **asdict(plan)}
     if begun := work.begun(out, work.Begun):
@@ -120,7 +128,7 @@ def _trained(learnt: Mapping[str, Any], student: Student, out: Path, progress: P
     save_tokenizer(student.tokenizer, out)
     export(out, out / f"{out.absolute().name}-f16.gguf")
     write_whole(out / "README.md", model_card(out.absolute().name, facts))
-    write_whole(out / "training.json", json.dumps(facts, indent=1) + "\n")
+    write_whole(out / FACTS, json.dumps(facts, indent=1) + "\n")
     return facts
 
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from harness.core import noise
 from harness.core.arrays import Floats
-from harness.core.files import write_whole
+from harness.core.files import bytes_of, write_whole
 from harness.core.parallel import Workers, each
 from harness.dataset.freeze import edges, moment, scene_id
 from harness.dataset.load import Scene
@@ -107,7 +107,7 @@ def draw(
         progress(1)
 
     each(partial(_drawn, scenario, seed), todo, workers, took, lambda number: f"layout {number}")
-    points = [point for file in files for point in msgspec.json.decode(file.read_bytes())]
+    points = [point for file in files for point in msgspec.json.decode(bytes_of(file, "record"))]
     scenes = tuple(Scene(point["moment"]) for point in points)
     labels = {point["moment"]["scene"]: np.array(point["label"]) for point in points}
     return Lessons(scenario, tuple(prompts), scenes, labels)

@@ -17,15 +17,15 @@ from harness.core.seeds import FIRST, purpose, stated
 from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.fusion import messages_of
 from harness.prompts import readout
-from harness.prompts.versions import as_it_was
 from harness.runs.folder import Run, check_scenes, dataset_of
 from harness.runs.records import BLIND, FrozenScenes
+from harness.runs.sources import prompt_of
 from harness.training.answers import answer
 from harness.training.examples import question
 from harness.training.lessons import Lessons, label
 
 
-def write(run: Run, path: Path, report_seeds_too: bool) -> Path:
+def write(run: Run, path: Path, report_seeds_too: bool, dataset: Path | None = None) -> Path:
     """Write a run's pairs to a file.
 
     Raises:
@@ -45,17 +45,18 @@ def write(run: Run, path: Path, report_seeds_too: bool) -> Path:
             "learns from them can no longer be measured on them; make a run on a dataset of train seeds, "
             f"`harness dataset build --seed {FIRST['train']}`, or give --report-seeds-too"
         )
-    write_whole(path, msgspec.json.Encoder().encode_lines(pairs(run)))
+    write_whole(path, msgspec.json.Encoder().encode_lines(pairs(run, dataset)))
     return path
 
 
-def pairs(run: Run) -> Iterator[dict[str, Any]]:
+def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
     """What each viewer was asked, fusion calls included, and the answer that the tree asks for.
 
     A decision point after which no action succeeds teaches nothing and is left out.
 
     Args:
         run: on frozen scenes.
+        folder: its dataset's; None where the run states.
 
     Raises:
         UserError: its dataset or prompt is not here as it was.
@@ -63,7 +64,7 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
     prompts = {}
     for agent in (run.manifest.agent(0), *run.manifest.helpers):
         version, sha256 = (agent["prompt"][key] for key in ("version", "sha256"))
-        if (prompt := as_it_was(version, sha256)) is None:
+        if (prompt := prompt_of(run, agent["prompt"])) is None:
             raise UserError(
                 f"--sft: {printable(run.path)} was made with prompt {printable(version)} with sha256 "
                 f"{printable(sha256, 13)}, which is not here as it was; restore it, or make the run again"
@@ -74,7 +75,7 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
                 "holds texts alone; give a run with --image none, or of another prompt"
             )
         prompts[version] = prompt
-    dataset = dataset_of(run)
+    dataset = dataset_of(run, folder)
     check_scenes(run, dataset)
     forest, names = dataset.forest, list(run.decisions.scenes)
     ends_s = np.where(forest.safe, forest.delay_s, np.inf)

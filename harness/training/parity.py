@@ -22,6 +22,8 @@ from harness.backends.llama_cpp.backend import LlamaBackend
 from harness.backends.transformers import engine as transformers_engine
 from harness.backends.weights import find_checkpoint
 from harness.core.arrays import Floats
+from harness.core.errors import Unanswered, printable
+from harness.core.files import text_of
 from harness.parsing.parse import parse
 from harness.training.gguf_export import export, projector_of
 
@@ -90,7 +92,7 @@ def compare(
         UserError: weights that are not there or do not load; a checkpoint that no GGUF can hold.
     """
     where = find_checkpoint(reference)
-    config = json.loads((where / "config.json").read_bytes())
+    config = json.loads(text_of(where / "config.json", "record"))
     rows = int(config.get("text_config", config)["vocab_size"])  # padding included
     most_logit = SEEN if reference.vision else MOST_LOGIT
     plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")
@@ -133,14 +135,18 @@ def _outputs(
     tokens = [backend.chat.encode(backend.chat.render(r.messages, thinking=r.thinking)) for r in asked]
     logits = np.concatenate([backend.next_log_probs([r], rows) for r in asked])
     readouts = [
-        parse(c.text, role="ego", actions=r.actions).intent or [np.nan] * len(r.actions)
-        for r, c in zip(letters, backend.complete(letters), strict=True)
+        parse(text, role="ego", actions=r.actions).intent or [np.nan] * len(r.actions)
+        for r, text in zip(letters, _texts(backend, letters), strict=True)
     ]
     return Outputs(tokens, logits, _texts(backend, asked), np.array(readouts))
 
 
 def _texts(backend: Backend, asked: Sequence[Request]) -> list[str]:
-    return [c.text if c.error is None else f"error: {c.error}" for c in backend.complete(asked)]
+    """Answer each question. Raises Unanswered if one gets no answer: two errors are not equal texts."""
+    completions = backend.complete(asked)
+    if errors := [printable(c.error, 300) for c in completions if c.error is not None]:
+        raise Unanswered(f"{errors[0]}: no answer to {len(errors)} of {len(asked)} questions")
+    return [completion.text for completion in completions]
 
 
 def _equal(what: str, least: float, ids: Sequence[str], a: Sequence[Any], b: Sequence[Any]) -> Finding:

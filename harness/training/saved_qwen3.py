@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from harness.backends.tokens import QWEN2_SPLIT
 from harness.core.errors import UserError, printable
+from harness.core.files import text_of
 
 # Where a file may say otherwise, and llama.cpp would not hear it. Its Unicode normalisation is none; NFC is
 # what Qwen's tokenizer does, and nothing to text that is composed already.
@@ -50,7 +51,7 @@ def read(checkpoint: Path, shown: str) -> Saved:
         UserError: one is not there, or says what no GGUF can.
     """
     texts = {
-        name: (checkpoint / name).read_text(encoding="utf-8")
+        name: text_of(checkpoint / name, "record")
         for name in ("config.json", "tokenizer.json", "tokenizer_config.json", "chat_template.jinja", _PIXELS)
         if (checkpoint / name).is_file()
     }

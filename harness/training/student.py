@@ -8,8 +8,10 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from harness.backends.tokens import token_ids, whole
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
+from harness.core.files import text_of
 from harness.prompts import readout
 from harness.training.answers import answer, evidence, sights
 from harness.training.cells import CLASSES
@@ -202,7 +204,7 @@ class Student:
         return Sample(ids, len(head), system, answer_at, target, question.weight, question.image)
 
     def _encode(self, text: str) -> Any:
-        return np.array(self.tokenizer.encode(text).ids, dtype=np.int32)
+        return np.array(token_ids(self.tokenizer, text), dtype=np.int32)
 
     def _tokenizer(self, sees: bool) -> Any:
         from tokenizers import Tokenizer
@@ -213,7 +215,7 @@ class Student:
             texts = [m["content"] for q in some for m in q.read_out]
             texts += [answer(q.prompt, q.graph, q.label, q.actions) for q in some]
             train_tokenizer(texts, sees).save(str(file))
-        return Tokenizer.from_file(str(file))
+        return whole(Tokenizer.from_str(text_of(file, "record")))
 
 
 def _place(question: Question) -> str:

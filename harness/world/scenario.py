@@ -17,6 +17,22 @@ from harness.world.road import Road
 from harness.world.state import Building, Kind, Part
 
 BeaconRule = Literal["fixed", "cam"]
+MOST_DECISIONS, MOST_SPEEDS = 10, 20
+MOST_FRAMES = 20_000  # in an episode; each takes time and memory
+# What a parameter may be at least and at most, by the unit at the end of its name. Places, and times that are
+# offsets, may lie before their origin.
+BOUNDS = {
+    "noise_m": (0.0, 100.0),
+    "noise_mps": (0.0, 100.0),
+    "offset_s": (-100.0, 100.0),
+    "_s": (0.0, MOST_FRAMES),
+    "_m": (-1000.0, 1000.0),
+    "_mps": (0.0, 200.0),
+    "_mps2": (0.0, 200.0),
+    "_hz": (0.0, 1000.0),
+    "_share": (0.0, 1.0),
+    "_shares": (0.0, 1.0),
+}
 ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
 
 
@@ -76,24 +92,37 @@ class Parameters:
 
     def __post_init__(self) -> None:
         bounds = {
+            "target_speeds_mps": (
+                0 < len(self.target_speeds_mps) <= MOST_SPEEDS,
+                f"1 to {MOST_SPEEDS} speeds",
+            ),
+            "decisions": (1 <= self.decisions <= MOST_DECISIONS, f"from 1 to {MOST_DECISIONS}"),
+            "decision_period_s": (self.decision_period_s > 0, "seconds above 0"),
+            "simulation_hz": (0 < self.simulation_hz <= 1000, "from 1 to 1000"),
+            "time_limit_s": (
+                0 < self.time_limit_s * self.simulation_hz <= MOST_FRAMES,
+                f"above 0, and {MOST_FRAMES} frames at most",
+            ),
             "ambient": (self.ambient in AMBIENTS, " or ".join(AMBIENTS)),
             "beacon_rule": (self.beacon_rule in get_args(BeaconRule), " or ".join(get_args(BeaconRule))),
             "perfect_knowledge": (isinstance(self.perfect_knowledge, bool), "true or false"),
             "beacon_hz": (0 < self.beacon_hz <= self.simulation_hz, f"above 0, at most {self.simulation_hz}"),
             "beacon_delay_s": (0 <= self.beacon_delay_s <= 1, "seconds from 0 to 1"),
             "beacon_loss": (0 <= self.beacon_loss < 1, "a probability from 0, below 1"),
-            **{
-                name: (0 <= getattr(self, name) <= most, f"from 0 to {most}")
-                for name, most in (
-                    ("beacon_noise_m", 100),
-                    ("beacon_noise_mps", 100),
-                    ("beacon_noise_rad", 7),
-                )
-            },
+            "beacon_noise_rad": (0 <= self.beacon_noise_rad <= 7, "from 0 to 7"),
         }
+        for field in fields(self):
+            value = getattr(self, field.name)
+            least, most = next((BOUNDS[unit] for unit in BOUNDS if field.name.endswith(unit)), (None, None))
+            if least is not None and bounds.get(field.name, (True, ""))[0]:
+                each = value if isinstance(value, tuple) else (value,)
+                bounds[field.name] = (
+                    all(least <= one <= most for one in each),
+                    f"from {least:g} to {most:g}",
+                )
         for name, (fits, allowed) in bounds.items():
             if not fits:
-                raise UserError(f"scenario: {name} is {getattr(self, name)}; it must be {allowed}")
+                raise UserError(f"scenario: {name} is {printable(getattr(self, name))}; it must be {allowed}")
         beacon_radio(self.beacon_channel)
 
     @property

@@ -71,16 +71,17 @@ def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: 
 
 
 def test_check_says_how_long_a_receiver_waits_for_the_next_packet(harness: Callable[..., Said]) -> None:
-    """The mean wait is 1 / (rate x reception), and at worst a little off, since shadowing comes in spells."""
+    """The mean wait is about 1 / (rate x reception); less where little arrives, as shadowing has spells."""
     for name in PHYSICAL:
         told = json.loads(harness("channel", "check", name, "-n", "2000", "--json")[1])
-        assert 0.1 < told["busy_ratio"] < 0.5
+        assert 0.05 < told["busy_ratio"] < 0.5
         for wait in told["waits"]:
             mean, p95, alone = wait["mean_s"]["value"], wait["p95_s"]["value"], wait["independent_s"]
             if mean is None:
                 assert alone is None or alone > 2.0, "a tenth of a trip"
                 continue
-            assert mean == pytest.approx(alone, rel=0.08)
+            assert mean < 1.08 * alone
+            assert mean > 0.92 * alone or alone > 0.2
             assert p95 >= 0.1
     often = json.loads(harness("channel", "check", "mode4:rate_hz=50", "-n", "500", "--json")[1])["waits"][0]
     assert 0.02 < often["mean_s"]["value"] < 0.05
@@ -92,7 +93,7 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
         "density_per_km": "200", "rate_hz": "20", "power_dbm": "20", "t2_slots": "20", "transmissions": "2",
     }  # fmt: skip
     configuration = ",".join(f"{key}={value}" for key, value in settings.items())
-    Path("nr.csv").write_text(f'distance_m,reception,configuration\n50,0.9,"{configuration}"\n50,0.9,\n')
+    Path("nr.csv").write_text(f'distance_m,reception,configuration\n50,.9,"{configuration}"\n50,0.9,\n')
     code, out, err = harness("channel", "check", "mode2", "-n", "200", "--against", "nr.csv", "--json")
     assert (code, err) == (0, "")
     own, usual = (curve["mean_difference"] for curve in json.loads(out)["curves"])

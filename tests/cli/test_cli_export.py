@@ -4,8 +4,11 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree
 
+import pyarrow as pa
 import pytest
 from run_on_disk import Row, answers_of, made_up, rows_of
 
@@ -29,6 +32,27 @@ def run(tmp_path: Path) -> Path:
             row |= {"viewer": "v1", "heard": ("v2", "v4"), "role": "merge"}
 
     return made_up(tmp_path / "run", answer=spoil)
+
+
+def test_a_spreadsheet_finds_no_formula(tmp_path: Path, harness: Callable[..., Said]) -> None:
+    """Texts of models, names of conditions; numbers are what they were, and so are the run's own files."""
+    texts = ["=1+1", "+1-1", "-cmd|' /C calc'!A0", "@SUM(1)", "\t=1", "\r=1", "-0.5", "+7", "a=1", "", "'=1"]
+    said = iter(texts)
+
+    def spoil(row: Row) -> None:
+        row["raw"] = next(said, "{}")
+
+    run = made_up(tmp_path / "run", answer=spoil)
+    before = (run / "answers.jsonl").read_bytes()
+    assert harness("export", run, "--csv")[0] == 0
+    with (run / "answers.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    written = [row["raw"] for row in rows[: len(texts)]]
+    assert written == [f"'{text}" if n < 6 else text for n, text in enumerate(texts)]
+    assert (run / "answers.jsonl").read_bytes() == before
+    made: Any = SimpleNamespace(table=pa.table({"a": ["=1", "1", None], "b": [-1.5, 2.0, None]}))
+    exported = export.decisions_csv(made, tmp_path / "decisions.csv")
+    assert exported.read_text().splitlines()[1:] == ['"\'=1",-1.5', '"1",2', ","]
 
 
 def test_csv_has_every_decision_and_answer(run: Path, harness: Callable[..., Said]) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -100,3 +101,21 @@ def test_a_device_without_an_end_is_one_line(parse: Parse) -> None:
     code, out, err = parse("/dev/zero")
     assert (code, out, len(err.splitlines())) == (2, "", 1)
     assert err.startswith("harness: ")
+
+
+def test_a_pipe_is_read_where_the_shell_hands_it_over_and_refused_by_its_name(parse: Parse) -> None:
+    os.mkfifo("pipe")
+    code, out, err = parse("pipe")
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert "it is no file, but a pipe or a device; give a text file, or - for what is piped in" in err
+    reads, writes = os.pipe()
+    os.write(writes, (COMPLETIONS / "y_recovered_fence_json.txt").read_bytes())
+    os.close(writes)
+    code, out, _ = parse(f"/dev/fd/{reads}")
+    os.close(reads)
+    assert (code, out.split()[0]) == (0, "status")
+
+
+def test_a_byte_order_mark_is_no_part_of_an_answer(parse: Parse) -> None:
+    text = (COMPLETIONS / "y_recovered_fence_json.txt").read_bytes()
+    assert parse("-", stdin=b"\xef\xbb\xbf" + text) == parse("-", stdin=text)

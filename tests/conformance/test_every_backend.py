@@ -9,10 +9,11 @@ from typing import get_args
 
 import pytest
 from evaluating import run, scenes_of, spec_of
-from misbehaving import completion, serving
+from misbehaving import Asked, completion, read_out, serving
 
 from harness.backends import cards
 from harness.backends.base import AnswerMode, Backend, Completion, Request
+from harness.backends.openai.constraint import broken
 from harness.backends.registry import BUILT_IN, capabilities, missing, open_backend
 from harness.core.files import digest
 from harness.dataset.load import load
@@ -34,8 +35,8 @@ def model_free() -> list[str]:
 
 WITH_WEIGHTS = [engine for engine in BUILT_IN if capabilities(engine).has_weights]
 ENGINES = [
-    *((name, "json") for name in (*model_free(), "replay", "openai")),
-    *((engine, answer) for engine in WITH_WEIGHTS for answer in get_args(AnswerMode)),
+    *((name, "json") for name in (*model_free(), "replay")),
+    *((engine, answer) for engine in ("openai", *WITH_WEIGHTS) for answer in get_args(AnswerMode)),
 ]
 
 
@@ -58,12 +59,13 @@ def case(
     if model == "transformers":
         model = str(folder / "tiny")
     if model == "openai":
-        with serving(lambda asked: asked.reply(completion(digest(asked.body)))) as there:
+        with serving(answered) as there:
             card = cards.load("openai-example")
             assert card.server is not None
             card = replace(card, server=replace(card.server, base_url=there.url))
             yield Case(
-                open_backend(card, batch_size=3), tuple(requests(spec_of(data), scenes_of(data)[:5]))[:5]
+                open_backend(card, batch_size=3),
+                tuple(requests(spec_of(data, "openai-example", answer=answer), scenes_of(data)[:5]))[:5],
             )
         return
     if model == "llama-cpp":
@@ -83,6 +85,31 @@ def test_every_engine_that_a_card_may_name_is_tried_here() -> None:
     tried = {cards.load(name).engine for name in model_free()} | {"replay", "openai", *WITH_WEIGHTS}
     assert tried == set(BUILT_IN)
     assert all(missing(cards.load(name)) is None for name in model_free())
+
+
+def answered(asked: Asked) -> None:
+    """A decent llama-server, whose answers depend on the question alone."""
+    said = digest(asked.body)
+    if asked.body.get("logprobs"):
+        asked.reply(read_out(("A", -0.5), (" B", -1.5 - int(said[0], 16)), ("C", -4.0)))
+    elif "grammar" in asked.body:
+        helper = '"evidence":"","risk":"low",' if "evidence" in asked.body["grammar"] else ""
+        p = f'"SLOWER":0.{said[:2].translate(DIGITS)},"IDLE":0.10,"FASTER":1.00'
+        asked.reply(completion(f'{{{helper}"action_distribution":{{{p}}}}}'))
+    else:
+        asked.reply(completion(said))
+
+
+DIGITS = str.maketrans("abcdef", "012345")
+
+
+def test_a_constrained_answer_keeps_to_the_schema(case: Case) -> None:
+    """What any engine promises, as a server is held to it: JSON Schema, without blanks or not."""
+    for r, c in zip(case.asked, case.backend.complete(case.asked), strict=True):
+        if r.answer == "constrained":
+            assert c.error is None
+            assert broken("generic", r, c.text, ended=True) is None
+            assert " " not in c.text
 
 
 def same(one: list[Completion], other: list[Completion]) -> None:

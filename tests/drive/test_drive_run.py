@@ -39,7 +39,7 @@ def whole(tmp_path_factory):
 
 
 def test_a_run_holds_what_was_driven_and_enough_to_drive_it_again(whole):
-    assert {p.name for p in whole.iterdir()} == {*FILES, "run.json"}
+    assert {p.name for p in whole.iterdir()} == {*FILES, "run.json", "sources"}
     manifest = json.loads((whole / "run.json").read_text())
     assert manifest["format"] == FORMAT
     assert (manifest["latency"]["ego_s"], manifest["latency"]["helper_s"]) == (0.145, 0.145)
@@ -84,7 +84,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
     expected = folder_of(cruise, tmp_path / "whole")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(HERE.parent)])}
     # Before the settings are kept, in chunks, before a table, tidying up.
-    places = ("6", "20", "38", "60", "90")
+    places = ("6", "20", "38", "75", "100")
     command = [sys.executable, str(HERE / "killed_drive.py"), str(tmp_path), *places]
     subprocess.run(command, env=environment, check=True)
     resumed = 0
@@ -96,7 +96,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
             resumed += 1
         if not (out / "run.json").exists() or (out / ".work").exists():
             assert folder_of(cruise, out) == expected
-        assert {p.name for p in out.iterdir()} == {*FILES, "run.json"}
+        assert {p.name for p in out.iterdir()} == {*FILES, "run.json", "sources"}
     assert resumed == 3
 
 

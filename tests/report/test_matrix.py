@@ -7,6 +7,7 @@ import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
 from markupsafe import escape
+from reading import by_workers, details
 from run_on_disk import answers_of, rows_of
 from sample_run import write_run
 
@@ -120,7 +121,7 @@ def test_the_headline_names_the_best_or_says_that_there_is_none(both):
     assert "6g: no run, since each is behind another" in matrix.headline(bare)
 
 
-def test_a_page_of_runs_of_other_lengths_says_so(run, tmp_path, small_path):
+def test_a_page_of_runs_of_other_lengths_says_so(run, tmp_path, small_path, monkeypatch):
     points, seeds = tuple(POINTS.values()), (0, 1, 2)
     paths = [
         evaluate(spec_of(load(small_path, limit), points=points, seeds=seeds), tmp_path / f"{limit}").out
@@ -134,6 +135,14 @@ def test_a_page_of_runs_of_other_lengths_says_so(run, tmp_path, small_path):
     page = render(runs)
     assert "on 2 shared" in page
     assert escape(matrix.uneven(runs)) in page
+    with monkeypatch.context() as patch:  # in parts of a few scenes, of which the shorter run has none
+        one, two = by_workers(runs, tmp_path, patch)
+    assert one == two
+    told = details(page)
+    assert [details(one), details(two)] == [told, told]
+    assert [d["runs"][1] is None for d in told.values()].count(True) > 4
+    one, two = by_workers(gather(paths[::-1]), tmp_path, monkeypatch)
+    assert one == two
 
 
 def test_runs_of_one_name_are_told_apart(run, dataset, tmp_path):

@@ -534,3 +534,16 @@ def test_a_page_of_a_frozen_run_waits_for_no_painter_no_simulator_and_no_pandas(
     )
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert said.stdout == "[]\n"
+
+
+def test_an_answer_of_somebody_who_is_not_in_the_scene_is_one_line(dataset, tmp_path):
+    run = write_run(tmp_path / "run", dataset)
+    answers = (run / "answers.jsonl").read_text().splitlines()
+    first = json.loads(answers[-1])
+    (run / "answers.jsonl").write_text(
+        "\n".join([*answers[:-1], json.dumps(first | {"viewer": "v99"})]) + "\n"
+    )
+    with pytest.raises(
+        UserError, match=r"answers\.jsonl has an answer of v99 in scene .*; make the run again"
+    ):
+        render(gather([run]))

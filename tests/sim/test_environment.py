@@ -1,5 +1,6 @@
 """Environments of highway-env as scenarios: stock ones, and one that a user wrote."""
 
+import html
 import io
 import json
 import threading
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from evaluating import scenes_of
 from highway_env.envs import HighwayEnv, MergeEnv
+from highway_env.vehicle.kinematics import Vehicle
 from my_roads import Breakdown
 
 from harness.core.errors import UserError
@@ -33,6 +35,68 @@ OWN = "env:my_roads:breakdown-v0"
 SPEED_ONLY = {"action": {"type": "DiscreteMetaAction", "lateral": False, "target_speeds": [0, 4.5, 9]}}
 
 LANES_ONLY = {"action": {"type": "DiscreteMetaAction", "longitudinal": False}}
+
+
+class Without(Breakdown):
+    """One vehicle has no lane, or was made before it knew its road."""
+
+    lane = True
+
+    def _reset(self):
+        super()._reset()
+        vehicle = Vehicle(self.road if self.lane else None, [200.0, 60.0], 0, 5)
+        vehicle.road = self.road
+        if self.lane:
+            vehicle.lane_index = vehicle.lane = None
+        self.road.vehicles.append(vehicle)
+
+
+class Roadless(Without):
+    lane = False
+
+
+class Crashed(Breakdown):
+    """Another vehicle stands where the ego begins."""
+
+    def _reset(self):
+        super()._reset()
+        self.road.vehicles.append(Vehicle(self.road, self.vehicle.position + np.array([2.0, 0.0]), 0, 10))
+
+
+for kind in (Without, Roadless, Crashed):
+    gymnasium.register(f"{kind.__name__.lower()}-v0", entry_point=kind)
+
+
+@pytest.mark.parametrize("kind", [Without, Roadless])
+def test_a_vehicle_without_a_lane_is_named(kind, tmp_path):
+    scenario = scenarios.get(f"env:{kind.__name__.lower()}-v0:decisions=1")
+    said = r"v\d, a Vehicle at 200\.0, 60\.0 m, has no lane; make every vehicle"
+    with pytest.raises(UserError, match=said):
+        build(scenario, tmp_path / "set", 1, 0, 1, lambda done: None)
+
+
+def test_an_ego_that_begins_in_a_collision_is_said_by_the_check_and_by_runs(tmp_path, harness):
+    scenario = scenarios.get("env:crashed-v0:decisions=1")
+    build(scenario, tmp_path / "set", 2, 0, 1, lambda done: None)
+    assert check(tmp_path / "set") == []
+    assert load(tmp_path / "set").lost == 2
+    code, said, _ = harness("dataset", "check", tmp_path / "set")
+    assert (code, "2 of 2 episodes are lost before the ego's first action" in said) == (0, True)
+    code, said, _ = harness("eval", "--model", "full-view", "--dataset", tmp_path / "set", "--out", "run")
+    assert code == 0
+    lost = "2 of 2 episodes are lost before the ego's first action"
+    assert lost in said
+    assert lost in html.unescape((tmp_path / "run/report.html").read_text())
+    drive_it = ("drive", "--model", "full-view", "--env", "crashed-v0", "--episodes", "2", "--workers", "1")
+    code, said, err = harness(*drive_it, "--first-seed", "0", "--seeds", "0", "--out", "driven")
+    assert code == 0, err
+    assert lost in " ".join(said.split())
+
+
+def test_a_sound_environment_loses_nothing_at_once(folder, harness):
+    assert load(folder).lost == 0
+    code, said, _ = harness("dataset", "check", folder, "--json")
+    assert (code, json.loads(said)["lost_before_first_action"]) == (0, 0)
 
 
 def places(env):

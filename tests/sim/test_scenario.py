@@ -151,3 +151,42 @@ def test_buildings_leave_the_road_free_and_stand_one_a_corner(layouts):
         for b in found.buildings:
             nearest = min(map(abs, (b.west_m, b.east_m))), min(map(abs, (b.north_m, b.south_m)))
             assert all(P.corner_m[0] <= distance <= P.corner_m[1] for distance in nearest)
+
+
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        ({"simulation_hz": 1e9}, "simulation_hz is 1000000000; it must be from 1 to 1000"),
+        ({"simulation_hz": 0.5}, "simulation_hz = 0.5; allowed: int"),
+        ({"time_limit_s": 1e9}, "time_limit_s is 1000000000.0; it must be above 0, and 20000 frames at most"),
+        ({"time_limit_s": 1e3}, "time_limit_s is 1000.0; it must be above 0, and 20000 frames at most"),
+        ({"time_limit_s": float("nan")}, "time_limit_s is nan"),
+        ({"decisions": 10**9}, "decisions is 1000000000; it must be from 1 to 10"),
+        ({"decision_period_s": 0}, "decision_period_s is 0.0; it must be seconds above 0"),
+        ({"danger_share": 2}, "danger_share is 2.0; it must be from 0 to 1"),
+        ({"danger_share": "0.5"}, "danger_share = '0.5'; allowed: float"),
+        ({"ego_start_m": [1]}, "ego_start_m = [1]; allowed: array of length 2"),
+        ({"ego_start_m": [1, "x"]}, "[ego_start_m]: 1 = 'x'; allowed: float"),
+        ({"ego_start_m": [1, 1e9]}, "ego_start_m is (1.0, 1000000000.0); it must be from -1000 to 1000"),
+        ({"target_speeds_mps": []}, "target_speeds_mps is (); it must be 1 to 20 speeds"),
+        ({"target_speeds_mps": [1] * 10_000}, "it must be 1 to 20 speeds"),
+        ({"ambient": ["day"]}, "ambient = ['day']; allowed: str"),
+        (
+            {"beacon_channel": "mode4+power_dbm=1e9"},
+            "mode4: power_dbm = 1000000000.0; allowed: a number from",
+        ),
+        ({"of_another": 1}, "has other parameters here (not of_another)"),
+    ],
+)
+def test_a_parameter_that_a_file_states_has_a_type_and_bounds(stated, said):
+    with pytest.raises(UserError) as refused:
+        scenarios.stated(NAME, stated)
+    assert said in str(refused.value)
+    assert str(refused.value).isprintable()
+
+
+def test_what_a_scenario_states_is_read_back_as_it_was():
+    for name in scenarios.names():
+        scenario = scenarios.get(name)
+        stated = {k: float(v) if type(v) is int else v for k, v in scenario.parameters.stated().items()}
+        assert scenarios.stated(name, stated) == scenario

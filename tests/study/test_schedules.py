@@ -239,7 +239,11 @@ def test_schedules_are_compared_from_the_command_line(
     names = {"index.html", "schedule.json"}
     names |= {f"{table}.{kind}" for table in ("schedules", "settings") for kind in ("csv", "jsonl")}
     assert {path.name for path in out.iterdir()} == names | {f"fronts.{k}" for k in ("svg", "pdf", "png")}
-    code, said, _ = harness("schedule", "compare", stored.run.path, *chosen, "--json", "--seeds", "0:1")
+    again = ("schedule", "compare", stored.run.path, *chosen, "--json", "--seeds", "0:1")
+    code, said, err = harness(*again)
+    assert (code, said, err.count("\n")) == (2, "", 1)
+    assert f"{out} holds another schedule, with other sources, seeds; name another folder" in err
+    code, said, _ = harness(*again, "--out", tmp_path / "other")
     rows = json.loads(said)
     assert [row["schedule"] for row in rows] == ["entropy", "entropy", "coverage", "learnt", "oracle"]
     assert rows[-1]["gap_closed"] in (1.0, None)

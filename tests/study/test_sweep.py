@@ -15,7 +15,7 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import Evaluated
 from harness.studies import stored
-from harness.studies.axes import AXES, Setting, grid
+from harness.studies.axes import AXES, Setting, axis_of, grid
 from harness.studies.stored import Stored
 from harness.studies.sweep import run_sweep, settings
 
@@ -129,3 +129,54 @@ def test_what_cannot_be_is_one_line(
 ) -> None:
     with pytest.raises(UserError, match=said):
         settings([source], AXES[axis], values, [condition])
+
+
+@pytest.mark.parametrize(
+    ("condition", "name", "values"),
+    [
+        ("6g", "edge_delay_s", (0.0, 0.1)),
+        ("mode4", "edge_x_m", (0.0, 50.0)),
+        ("mode4", "helper_rounds", ("false", "true")),
+        ("v2x:schedule=margin", "tau", (0.1, 0.9)),
+        ("v2x:schedule=never", "loss", (0.0, 0.9)),
+        ("v2x:max_helpers=0", "consensus", ("linear", "median")),
+        ("v2x:consensus=bayes", "weight_cap", (0.1, 1.0)),
+        ("v2x:consensus=geometric-median", "min_distance_m", (1.0, 1000.0)),
+    ],
+)
+def test_a_setting_that_is_refused_as_idle_changes_nothing(
+    condition: str, name: str, values: tuple[Any, ...], source: Stored
+) -> None:
+    axis, point = axis_of(name), named_point(condition)
+    assert point.idle(axis.field)
+    with pytest.raises(UserError, match=f"--over {name}: it changes nothing in {condition}: "):
+        settings([source], axis, values, [condition])
+    both = [Setting(condition, axis.at(point, value), source.vehicles, name, value) for value in values]
+    [one], [two] = source.walked(both, source.seeds)
+    assert np.isfinite(one.ends["success_rate"]).all()
+    for of_one, of_two in ((one.ends, two.ends), (one.columns, two.columns)):
+        for metric, values_of_one in of_one.items():
+            np.testing.assert_array_equal(values_of_one, of_two[metric])
+
+
+def test_a_setting_that_one_value_frees_is_drawn(source: Stored) -> None:
+    axis = axis_of("schedule")
+    assert len(settings([source], axis, ("never", "entropy"), ["6g:schedule=never"])) == 2
+
+
+def test_another_sweep_is_not_overwritten_and_the_same_one_is_made_again(
+    source: Stored, tmp_path: Path
+) -> None:
+    swept(source, tmp_path, "tau", "0.7")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    swept(source, tmp_path, "tau", "0.7")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    axis = AXES["tau"]
+    for text, condition, seeds, other in (
+        ("0.8", "6g", source.seeds, "panels"), ("0.7", "v2x", source.seeds, "panels"),
+        ("0.7", "6g", (7,), "seeds"),
+    ):  # fmt: skip
+        points = {"tau": settings([source], axis, grid(axis, text), [condition])}
+        with pytest.raises(UserError, match=f"holds another sweep, with other {other}; name another folder"):
+            run_sweep([source], points, seeds, tmp_path, lambda n: None)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

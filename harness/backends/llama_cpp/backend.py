@@ -67,4 +67,5 @@ class _RemoteChat(Chat):
         self.child = child
 
     bos = property(_of_child("bos"))
+    turn_end = property(_of_child("turn_end"))
     render, encode, decode, pieces = map(_of_child, ("render", "encode", "decode", "pieces"))

@@ -80,9 +80,9 @@ class LlamaEngine:
         shown = [text for text in _PICTURES if projector and text in model.template]
         if projector and not shown:
             raise UserError(f"model {card.name!r}: its chat template has none of {_PICTURES} for a picture")
-        self.chat: Chat = GgufChat(card.name, model, shown[0] if shown else None)
+        self.chat: Chat = GgufChat(card.name, model, shown[0] if shown else None, card.system)
         self.context_tokens = card.context_tokens or model.trained_tokens
-        self.stops: Sequence[int] = model.stops
+        self.stops: Sequence[int] = sorted({*model.stops, *self.chat.ends})
         self._card, self._file, self._model = card, file, model
         self._projector = projector
         self._context = LlamaContext(model, batch_size + BEGINNINGS, projector)
@@ -190,6 +190,7 @@ class LlamaEngine:
             "kv_cache": self._context.cache_type,
             "device": self._model.device,
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
+            **({"system": self.chat.system} if self.chat.system else {}),
         }
 
     @cached_property

@@ -3,23 +3,27 @@
 import asyncio
 import time
 import weakref
+from collections import deque
 from collections.abc import Coroutine, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from threading import Thread, current_thread
 from typing import Any, TypeVar
 
-from harness.backends.base import Completion, Request, per_token_s
+from harness.backends.base import Completion, Request, Served, per_token_s
 from harness.backends.cards import Card
 from harness.backends.openai.farm import Farm
 from harness.backends.openai.http import Client, Reply
+from harness.backends.openai.read import Reading
 from harness.backends.openai.shapes import Said, body, digest_url, read
-from harness.backends.openai.stream import ASKED
-from harness.backends.servers import Server
+from harness.backends.openai.stream import ASKED, BROKE_OFF
+from harness.backends.servers import Fields, Server
+from harness.core.errors import printable
 from harness.core.files import canonical_json
 
 T = TypeVar("T")
+_MOST_SERVED = 1 << 20  # answers whose servers are kept until somebody asks
 _CLOSED_S = 5.0  # longest wait for connections to close
 
 
@@ -50,8 +54,11 @@ class OpenAIBackend:
         self._batch_size = batch_size
         self.window = batch_size * len(server.urls)
         self._streams = True  # until a server refuses to stream
+        self._served = deque[Served](maxlen=_MOST_SERVED)
+        self._told = False  # that a server names another model
         client = Client(server)
         self._farm = Farm(client, server, card.name, card.weights or "", batch_size)
+        self._reading = Reading(client, card, server)
         self._loop = _Loop(client)
         weakref.finalize(self, self._loop.end)
         self._loop.run(self._farm.open())
@@ -74,7 +81,7 @@ class OpenAIBackend:
         return [canonical_json(body(self._card, self._server, r, digest_url)) for r in requests]
 
     def identity(self) -> dict[str, Any]:
-        """Return the model's identity as its servers state it; weights changed without notice go undetected.
+        """Return the model's identity as its servers state it; what none of them states goes undetected.
 
         If any of several servers may answer, their URLs are not part of it.
         """
@@ -88,9 +95,29 @@ class OpenAIBackend:
             "model": self._card.weights,
             "listed": model.listed,
             **version,
+            **({"states": dict(model.states)} if model.states else {}),
         }
 
+    @property
+    def doubt(self) -> str | None:
+        """Why a cached answer may be one of other weights, in one line; None if the servers tell of these."""
+        if self._farm.model.tells_weights:
+            return None
+        return (
+            f"model {printable(self._card.name)!r}: some answers come from the completion cache, and its "
+            "server does not say which weights it has; if these have changed since, use --no-cache"
+        )
+
+    def served(self) -> list[Served]:
+        """Return which server gave each answer since the last call."""
+        taken: list[Served] = []
+        with suppress(IndexError):  # the loop's thread may add some, and another may take some
+            while True:
+                taken.append(self._served.popleft())
+        return taken
+
     async def _all(self, requests: Sequence[Request]) -> list[Completion]:
+        await self._reading.check(requests)
         together = min(self._batch_size, len(requests))
         # One at a time: if a server refuses to stream, the next request must know.
         if together == 1 and any(request.timed for request in requests):
@@ -103,7 +130,11 @@ class OpenAIBackend:
         if together == 1 and not reply.alone:  # requests of another call ran at the same time
             together = self._batch_size
         seconds = end_s - reply.begun_s if together == 1 else None
-        answer = Said(error=reply.fault) if reply.fault else read(reply.payload, request)
+        if reply.fault:
+            answer = Said(error=self._hinted(reply))
+        else:
+            answer = read(reply.payload, request, self._server.kind)
+        self._note(request, reply, answer)
         first_at_s, tokens = reply.first_at_s, answer.completion_tokens
         if request.answer == "readout":
             first_at_s, tokens = end_s, 1
@@ -125,6 +156,28 @@ class OpenAIBackend:
             token_s=None if seconds is None else per_token_s(seconds, first_s, tokens),
         )
 
+    def _note(self, request: Request, reply: Reply, answer: Said) -> None:
+        """Keep which server gave an answer; say once if it names another model than it was asked for."""
+        model, asked = answer.model, self._card.weights
+        if model not in (None, asked, f"{asked}:latest", (self._farm.model.listed or {}).get("id")):
+            model = printable(model)
+            if not self._told:
+                self._told, url = True, printable(reply.url)
+                self._farm.say(
+                    f"server {url} was asked for {printable(asked)}, and says that {model} answers"
+                )
+        self._served.append(Served(request.id, reply.url, model))
+
+    def _hinted(self, reply: Reply) -> str:
+        """Return a reply's fault; if it names a field that a card can change, say so."""
+        fault = reply.fault or ""
+        named = [f.name for f in fields(Fields) if f.name in fault]
+        if reply.status in (400, 422) and "top_logprobs" in fault:
+            return f"{fault}; set top_logprobs under [server] in its card"
+        if reply.status in (400, 422) and named:
+            return f"{fault}; its card can leave {named[0]} out or rename it: fields under [server]"
+        return fault
+
     async def _reply(self, request: Request, streamed: bool) -> Reply:
         """Ask for a reply. If the server refuses to stream, ask again without, and stream no more."""
         json_body = partial(body, self._card, self._server, request)
@@ -132,7 +185,8 @@ class OpenAIBackend:
         if not streamed or not self._streams or request.answer == "readout":
             return await self._farm.post(decision, json_body)
         reply = await self._farm.post(decision, lambda: {**json_body(), **ASKED})
-        if reply.status in (None, 200) or "stream" not in (reply.fault or "").lower():
+        fault = (reply.fault or "").lower()
+        if reply.status in (None, 200) or fault.startswith(BROKE_OFF) or "stream" not in fault:
             return reply
         self._streams = False
         plain = await self._farm.post(decision, json_body)

@@ -10,39 +10,19 @@ import json
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Coroutine, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from hashlib import blake2b
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
-from harness.backends.openai.http import Client, Reply
-from harness.backends.servers import Kind, Server
-from harness.core.errors import UserError, printable
+from harness.backends.openai.http import COMPLETIONS, Client, Reply
+from harness.backends.openai.statements import Model, stated
+from harness.backends.servers import Server
+from harness.core.errors import Unanswered, UserError, printable
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0  # wait before the first retry, doubled with each; and its limit
 BROKEN = 3  # failures in a row after which a server is set aside
-_PATH = "/chat/completions"
-_LISTED = ("id", "owned_by", "root", "max_model_len")  # no dates, which tell only when a server was started
-# Path of each kind of server's version, beside `/v1`, and its key.
-_VERSION: Mapping[Kind, tuple[str, str]] = {
-    "vllm": ("/version", "version"),
-    "llama-server": ("/props", "build_info"),
-    "ollama": ("/api/version", "version"),
-}
-
-
-class Model(NamedTuple):
-    """A server's statement about its model.
-
-    Attributes:
-        listed: the model's entry in the server's list; None without a list, or if the model is not on it.
-        version: version of the server; None if it does not tell.
-    """
-
-    listed: dict[str, Any] | None = None
-    version: str | None = None
 
 
 @dataclass(eq=False)
@@ -120,12 +100,13 @@ class Farm:
         """Ask every server for its model. One that does not answer is set aside if another does.
 
         Raises:
-            UserError: none answers, one refuses the key, or two have different models.
+            UserError: two have different models.
+            Unanswered: none answers, or one refuses the key.
         """
         models = await asyncio.gather(*(self._look(place) for place in self._places))
         answering = {place: model for place, model in zip(self._places, models, strict=True) if model}
         if not answering:
-            raise UserError(
+            raise Unanswered(
                 f"nobody answers at {self._faults()}; start the server, or fix base_url in the model's card"
             )
         self._first, self.model = next(iter(answering.items()))
@@ -143,7 +124,8 @@ class Farm:
         doubling one.
 
         Raises:
-            UserError: no server is left, or one has come back with another model.
+            UserError: one has come back with another model.
+            Unanswered: no server is left.
         """
         if self._refused:
             raise self._refused
@@ -223,9 +205,11 @@ class Farm:
             place.begun += 1
             nth, first = place.begun, place.busy == 1
             pending.begun_s = perf_counter() if pending.begun_s is None else pending.begun_s
-            reply = await self._client.post(place.url, _PATH, json.dumps(pending.body()).encode())
+            reply = await self._client.post(place.url, COMPLETIONS, json.dumps(pending.body()).encode())
             alone = first and place.begun == nth
-            reply = replace(reply, retries=pending.failed[place], begun_s=pending.begun_s, alone=alone)
+            reply = replace(
+                reply, retries=pending.failed[place], begun_s=pending.begun_s, alone=alone, url=place.url
+            )
             if not reply.again:
                 place.failures = place.pauses = 0
                 break
@@ -258,7 +242,7 @@ class Farm:
         """Send a server no more requests until it answers again, and move its queue to other servers."""
         place.aside = True
         if len(self._places) > 1:
-            self._say(f"server {printable(place.url)} is set aside ({place.fault})")
+            self.say(f"server {printable(place.url)} is set aside ({place.fault})")
         self._run(self._await(place))
         self._queue_again(place)
 
@@ -276,14 +260,13 @@ class Farm:
                 await asyncio.sleep(pause_s(place.pauses))
                 place.pauses += 1
                 model = await self._look(place)
-                if model and all(now is not None for now, was in zip(model, self.model, strict=True) if was):
+                if model and model.covers(self.model):
                     break
                 place.lost += 1
                 if all(p.aside and p.lost > self._server.retries for p in self._places):
                     self._end(
-                        UserError(
-                            f"model {self._name!r}: no server is left: {self._faults()}; start one again, "
-                            "and type the same command to continue"
+                        Unanswered(
+                            f"model {self._name!r}: no server is left: {self._faults()}; start one again"
                         )
                     )
             self._agree(place, model)
@@ -293,7 +276,7 @@ class Farm:
             return
         place.aside, place.lost, place.failures = False, 0, BROKEN - 1  # one more failure sets it aside
         if len(self._places) > 1:
-            self._say(f"server {printable(place.url)} is there again")
+            self.say(f"server {printable(place.url)} is there again")
         self._queue_again(*(p for p in self._places if p.aside))
         self._wake()
 
@@ -305,7 +288,8 @@ class Farm:
     def _faults(self) -> str:
         return "; ".join(f"{printable(place.url)} ({place.fault})" for place in self._places)
 
-    def _say(self, line: str) -> None:
+    def say(self, line: str) -> None:
+        """Print a line about the model on stderr."""
         print(f"harness: model {self._name!r}: {line}", file=sys.stderr)
 
     # -- what they have -------------------------------------------------------------------------------------
@@ -314,33 +298,23 @@ class Farm:
         """Ask a server for its statement about the model; None if it does not answer.
 
         Raises:
-            UserError: it refuses the key.
+            Unanswered: it refuses the key.
         """
         reply = await self._client.get(place.url, place.url + "/models")
         place.fault = reply.fault or ""
         if reply.unreached or (reply.again and self._server.any_may_answer):
             return None
         if reply.status == 401:
-            raise UserError(
+            raise Unanswered(
                 f"model {self._name!r}: its server refuses the key ({reply.fault}); "
                 f"set {self._server.key_env} in the environment"
             )
-        data = reply.payload.get("data") if isinstance(reply.payload, dict) else None
-        models = [entry for entry in data if isinstance(entry, dict)] if isinstance(data, list) else []
-        named = [entry for entry in models if entry.get("id") == self._weights]
-        # A server with one model accepts any name.
-        for entry in named or (models if len(models) == 1 else []):
-            listed = {k: v if type(v) is int else printable(v) for k in _LISTED if (v := entry.get(k))}
-            return Model(listed, await self._version(place))
-        return Model()
+        beside = place.url.removesuffix("/v1")
 
-    async def _version(self, place: _Place) -> str | None:
-        if self._server.kind in _VERSION:
-            path, key = _VERSION[self._server.kind]
-            reply = await self._client.get(place.url, place.url.removesuffix("/v1") + path)
-            with suppress(LookupError, TypeError):
-                return printable(reply.payload[key])
-        return None
+        async def ask(path: str, content: bytes | None) -> Reply:
+            return await self._client.get(place.url, beside + path, content)
+
+        return await stated(self._server.kind, self._weights, reply.payload, ask)
 
     def _agree(self, place: _Place, model: Model) -> None:
         """Raise UserError unless a server has the same model as the first one."""
@@ -351,13 +325,15 @@ class Farm:
                 "tell whether it has the same model as others; fix weights in the card, or what is served"
             )
         if self.model.listed is not None and model != self.model:
-            first = f"server {printable(self._first.url)} has {_shown(self.model)}"
+            first = f"server {printable(self._first.url)} has {_shown(self.model, model)}"
             raise UserError(
-                f"model {self._name!r}: {first}, and server {url} {_shown(model)}; serve the same model, by "
-                "the same version"
+                f"model {self._name!r}: {first}, and server {url} {_shown(model, self.model)}; serve "
+                "the same model, by the same version"
             )
 
 
-def _shown(model: Model) -> str:
-    facts = {**(model.listed or {}), "version": model.version}
+def _shown(model: Model, other: Model) -> str:
+    """Return a statement's name and version, and what else it states otherwise than another, in one line."""
+    differing = {k: v for k, v in model.states.items() if other.states.get(k) != v}
+    facts = {**(model.listed or {}), "version": model.version, **differing}
     return " ".join(f"{key}={printable(value, 80)}" for key, value in facts.items() if value is not None)

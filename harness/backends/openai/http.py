@@ -16,12 +16,14 @@ from urllib.request import getproxies, proxy_bypass
 import aiohttp
 from yarl import URL
 
+from harness.backends.openai.faults import fault_in, may_pass, plain_text, words_of
 from harness.backends.openai.stream import Stream
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable
 
 CONNECT_S = 10.0  # a running server answers sooner
 KEPT_S = 4.0  # time that an idle connection stays open: uvicorn, and so vLLM, closes it after 5
+COMPLETIONS = "/chat/completions"
 MOST_BYTES = 4 * 2**20  # an answer has a few thousand
 SHORTEST_SECRET = 8  # shorter keys are no secrets: many local servers are given `EMPTY`
 _HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
@@ -36,7 +38,7 @@ class Reply:
     Attributes:
         payload: the JSON value; None on a fault.
         fault: why there is no payload; printable and of limited length.
-        status: HTTP status; None without a response.
+        status: HTTP status, or that of an error inside an answer with 200; None without a response.
         unreached: whether there was no connection at all.
         again: whether another attempt may succeed.
         after_s: seconds that the server asks to wait before another attempt.
@@ -44,6 +46,7 @@ class Reply:
         retries: earlier failed attempts at the server that gave this reply.
         begun_s: when the first attempt began, by `time.perf_counter`.
         alone: whether the server had no other request of this program at the time.
+        url: base URL of the server.
     """
 
     payload: Any = None
@@ -56,6 +59,7 @@ class Reply:
     retries: int = 0
     begun_s: float = 0.0
     alone: bool = False
+    url: str = ""
 
 
 class Client:
@@ -84,9 +88,10 @@ class Client:
     async def __aexit__(self, *_: object) -> None:
         await self._session.close()
 
-    async def get(self, base: str, url: str) -> Reply:
-        """Request a URL of a server."""
-        return await self._once("GET", base, url, None, min(CONNECT_S, self._server.timeout_s))
+    async def get(self, base: str, url: str, content: bytes | None = None) -> Reply:
+        """Request what a server states at a URL; with JSON as `content` it is sent that."""
+        method = "GET" if content is None else "POST"
+        return await self._once(method, base, url, content, min(CONNECT_S, self._server.timeout_s))
 
     async def post(self, base: str, path: str, content: bytes) -> Reply:
         """Send JSON to a server."""
@@ -120,24 +125,37 @@ class Client:
                     return Reply(fault=f"the answer is longer than {MOST_BYTES} bytes")
                 if streamed:
                     stream.take(chunk, time.perf_counter())
-        status = response.status
+        status, after_s = response.status, _after_s(response.headers.get("retry-after"))
         if streamed and status == 200:
             if stream.fault:
-                return Reply(fault=self._shown(stream.fault), status=status, again=stream.again)
+                status = stream.code if stream.again and stream.code else status
+                return Reply(
+                    fault=self._shown(stream.fault), status=status, again=stream.again, after_s=after_s
+                )
             # Put together before the key is looked for, since pieces may cut through it.
             payload, _ = self._payload(json.dumps(stream.payload()).encode())
             return Reply(payload, status=status, first_at_s=stream.first_at_s)
         payload, readable = self._payload(bytes(data))
         if status == 200:
-            return Reply(payload, fault=None if readable else "the answer is no JSON", status=status)
+            fault = fault_in(payload if readable else plain_text(data), of_chat=url.endswith(COMPLETIONS))
+            if fault is None:
+                return Reply(payload, fault=None if readable else "the answer is no JSON", status=status)
+            words = self._shown(fault.words)
+            if fault.code is None:
+                return Reply(fault=f"an error with HTTP 200: {words}", status=status)
+            again = may_pass(fault.code)
+            return Reply(
+                fault=f"error {fault.code} with HTTP 200: {words}", status=fault.code, again=again,
+                after_s=after_s,
+            )  # fmt: skip
         if 300 <= status < 400:
             return Reply(fault=f"HTTP {status}: a redirect, which is not followed", status=status)
-        message = _message(payload) if readable else bytes(data).decode("utf-8", "replace")
+        message = words_of(payload) if readable else bytes(data).decode("utf-8", "replace")
         return Reply(
             fault=f"HTTP {status}: {self._shown(message)}",
             status=status,
-            again=status == 429 or status >= 500,
-            after_s=_after_s(response.headers.get("retry-after")),
+            again=may_pass(status),
+            after_s=after_s,
         )
 
     def _payload(self, data: bytes) -> tuple[Any, bool]:
@@ -178,14 +196,6 @@ def _proxy(url: str) -> str | None:
 
 def _described(error: Exception) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-
-
-def _message(payload: Any) -> str:
-    """Return an error's message, which servers put at `error`, `error.message`, `message` or `detail`."""
-    while isinstance(payload, dict):
-        texts = [payload[name] for name in ("error", "message", "detail") if payload.get(name)]
-        payload = texts[0] if texts else json.dumps(payload)
-    return str(payload)
 
 
 def _after_s(text: str | None) -> float | None:

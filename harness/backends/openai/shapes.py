@@ -1,27 +1,27 @@
 """Build the JSON request for an OpenAI-compatible server, and read its answer.
 
-Servers differ in how a constrained answer is asked for. Whatever they promise, `harness.parsing.parse`
-decides whether an answer is valid.
+Whatever a server promises, `harness.parsing.parse` decides whether an answer is valid.
 """
 
-import json
 import math
-import re
 from base64 import b64encode
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from harness.backends.base import FinishReason, Request
 from harness.backends.cards import Card
 from harness.backends.chat import in_parts
-from harness.backends.servers import Kind, Server
-from harness.core.files import canonical_json
+from harness.backends.chat_template import with_system
+from harness.backends.openai.constraint import broken, constraint
+from harness.backends.servers import MOST_LOGPROBS, Kind, Server
+from harness.core.errors import UserError, printable
 from harness.core.image import Image
-from harness.prompts.answer_schema import answer_schema
-from harness.prompts.readout import letters, stated
+from harness.prompts.readout import letters, spelt, stated
 
-TOP = 20  # most log-probabilities that servers give for one token
+THOUGHTS = ("reasoning_content", "reasoning")  # where servers put a thought; some send both, one of them null
+_REMEDY = "use --answer json, or a server that keeps to it; the kind in its card says how it is asked"
+MOST_TOKENS = 10**7  # more than any context; what a server counts beyond is no count
 # Temperature 0 is not enough: by default some servers penalise repetition (llama_cpp.server by 1.1, vLLM by
 # the checkpoint's generation_config.json), and JSON repeats itself.
 _PENALTY: Mapping[Kind, str] = {
@@ -38,7 +38,11 @@ _ALL: Mapping[Kind, Mapping[str, int]] = {
 
 @dataclass(frozen=True)
 class Said:
-    """A server's answer in the fields of a completion; if there is an `error`, the others mean nothing."""
+    """A server's answer in the fields of a completion; if there is an `error`, these mean nothing.
+
+    Attributes:
+        model: the model that the server says has answered; None if it says none.
+    """
 
     text: str = ""
     finish_reason: FinishReason = "error"
@@ -46,6 +50,7 @@ class Said:
     completion_tokens: int | None = None
     label_mass: float | None = None
     error: str | None = None
+    model: str | None = None
 
 
 def data_url(image: Image) -> str:
@@ -61,14 +66,18 @@ def digest_url(image: Image) -> str:
 def body(
     card: Card, server: Server, request: Request, url: Callable[[Image], str] = data_url
 ) -> dict[str, Any]:
-    """Build the JSON request of one chat completion, not streamed; `url` gives the URL of its picture."""
+    """Build the JSON request of one chat completion, not streamed; `url` gives the URL of its picture.
+
+    Raises:
+        UserError: it has a temperature, which the card leaves out.
+    """
     picture = request.image and {"type": "image_url", "image_url": {"url": url(request.image)}}
     json_body: dict[str, Any] = {
         "model": card.weights,
         # Plain text is not sent as parts, since not every server and chat template takes them.
         "messages": [
             in_parts([message], picture)[0] if picture and "image" in message else dict(message)
-            for message in request.messages
+            for message in with_system(request.messages, card.system)
         ],
         "max_tokens": request.max_tokens,
         "temperature": request.temperature or 0,
@@ -82,63 +91,58 @@ def body(
     if card.thinking == "switch":
         json_body["chat_template_kwargs"] = {"enable_thinking": request.thinking}
     if request.answer == "constrained":
-        json_body |= _constraint(server.kind, request)
+        json_body |= constraint(server.kind, request)
     if request.answer == "readout":
-        json_body |= {"max_tokens": 1, "logprobs": True, "top_logprobs": TOP}
-    return json_body
+        json_body |= {"max_tokens": 1, "logprobs": True, "top_logprobs": server.top_logprobs or MOST_LOGPROBS}
+    if server.fields is None:
+        return json_body
+    if request.temperature and server.fields.temperature is False:
+        raise UserError(
+            f"model {printable(card.name)!r}: its card sends no temperature, and {request.temperature:g} is "
+            "asked for; leave --temperature out"
+        )
+    return server.fields.applied(json_body)
 
 
-def _constraint(kind: Kind, request: Request) -> dict[str, Any]:
-    schema = answer_schema(request.role, request.actions, form=request.form)
-    schema = {key: value for key, value in schema.items() if key not in ("$schema", "title")}
-    if "evidence" in schema["properties"]:  # as with local engines, a constrained answer has no free text
-        schema["properties"] = {**schema["properties"], "evidence": {"type": "string", "enum": [""]}}
-    # With a JSON Schema most servers allow numbers of any length, or outside 0..1; two decimals prevent both.
-    if kind == "vllm":
-        return {"structured_outputs": {"regex": _pattern(schema, re.escape)}}
-    if kind in ("llama-server", "llama-cpp-python"):
-        return {"grammar": f"root ::= {_pattern(schema, canonical_json)}"}
-    json_schema = {"name": "answer", "strict": True, "schema": schema}
-    return {"response_format": {"type": "json_schema", "json_schema": json_schema}}
+def read(payload: Any, request: Request, kind: Kind = "generic") -> Said:
+    """Read a chat completion. A malformed one becomes an error, in one sentence.
 
-
-def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:
-    """Write the compact JSON of a schema as a regular expression, or as a rule of llama.cpp's grammar.
-
-    For the parts of an answer the two differ only in how `literal` text is written.
+    So does one that breaks the constraint that this kind of server was sent.
     """
-    if "enum" in schema:
-        return f"({'|'.join(literal(json.dumps(value)) for value in schema['enum'])})"
-    if schema["type"] == "number":
-        return f"({literal('0.')}[0-9][0-9]|{literal('1.00')})"
-    members = [
-        literal(f"{json.dumps(name)}:") + _pattern(value, literal)
-        for name, value in schema["properties"].items()
-    ]
-    return literal("{") + literal(",").join(members) + literal("}")
-
-
-def read(payload: Any, request: Request) -> Said:
-    """Read a chat completion. A malformed one becomes an error, in one sentence."""
     try:
         choice = payload["choices"][0]
         message = choice["message"]
-        content = message["content"]
-        thought = message.get("reasoning_content", message.get("reasoning"))
+        content, thought = message.get("content"), _thought(message)
         finish, usage = choice.get("finish_reason"), payload.get("usage") or {}
         tokens = _count(usage.get("prompt_tokens")), _count(usage.get("completion_tokens"))
+        model = payload.get("model")
     except (LookupError, TypeError, AttributeError):
         return Said(error="the answer is no chat completion")
+    model = model if isinstance(model, str) else None
     if request.answer == "readout":
-        return _read_out(choice, request, *tokens)
-    thought = thought if isinstance(thought, str) else None
+        return replace(_read_out(choice, request, *tokens), model=model)
     if not isinstance(content, str) and not (content is None and thought):
-        kind = "null" if content is None else type(content).__name__
-        return Said(error=f"the answer's content is no text but {kind}")
+        if "content" not in message:
+            return Said(error="the answer is no chat completion", model=model)
+        named = "null" if content is None else type(content).__name__
+        return Said(error=f"the answer's content is no text but {named}", model=model)
     # An answer that a server's content filter cut off counts as cut off.
     finish_reason: FinishReason = "length" if finish in ("length", "content_filter") else "stop"
-    text = _whole(thought, content or "", finish_reason, request.thinking)
-    return Said(text, finish_reason, *tokens)
+    content = content or ""
+    if request.answer == "constrained" and (
+        fault := broken(kind, request, content, ended=finish_reason == "stop")
+    ):
+        error = f"the server did not keep to the constraint that was sent: {fault}; {_REMEDY}"
+        return Said(error=error, model=model)
+    return Said(
+        _whole(thought, content, finish_reason, request.thinking), finish_reason, *tokens, model=model
+    )
+
+
+def _thought(message: Mapping[str, Any]) -> str | None:
+    """Return the thought that a server took out of an answer, from the field that has one."""
+    texts = [text for name in THOUGHTS if isinstance(text := message.get(name), str)]
+    return next(filter(None, texts), texts[0] if texts else None)
 
 
 def _whole(thought: str | None, content: str, finish_reason: FinishReason, asked: bool) -> str:
@@ -158,18 +162,21 @@ def _read_out(
 ) -> Said:
     """Read the letters' probabilities from the list of the likeliest tokens.
 
-    A letter that is not listed is at most as likely as the least likely listed token, and all such letters
-    together have at most the remaining probability; each gets the most that it can have. `label_mass` counts
-    the listed letters only.
+    A letter counts in each of its spellings, with a blank before it or without. One that is not listed is at
+    most as likely as the least likely listed token, and all such letters together have at most the remaining
+    probability; each gets the most that it can have. `label_mass` counts the listed letters only.
     """
     try:
-        listed = [(t["token"], float(t["logprob"])) for t in choice["logprobs"]["content"][0]["top_logprobs"]]
+        listed = [
+            (str(t["token"]), float(t["logprob"])) for t in choice["logprobs"]["content"][0]["top_logprobs"]
+        ]
         p = [math.exp(logprob) for _, logprob in listed]
     except (LookupError, TypeError, ValueError, OverflowError):
         return Said(error="the server gives no log-probabilities")
     names = letters(request.actions)
+    tokens = [spelt(token) for token, _ in listed]
     listed_p = {
-        letter: math.fsum(x for x, (token, _) in zip(p, listed, strict=True) if token == letter)
+        letter: math.fsum(x for x, token in zip(p, tokens, strict=True) if token == letter)
         for letter in names
     }
     mass = math.fsum(listed_p.values())
@@ -177,7 +184,6 @@ def _read_out(
         return Said(error="the server's log-probabilities are none")
     if not mass:
         return Said(error=f"none of the letters {names} is among the {len(p)} likeliest tokens")
-    tokens = {token for token, _ in listed}
     missing = [letter for letter in names if letter not in tokens]
     rest = max(0.0, 1.0 - math.fsum(p))
     shares = [min(min(p), rest / len(missing)) if x in missing else listed_p[x] for x in names]
@@ -185,4 +191,4 @@ def _read_out(
 
 
 def _count(value: Any) -> int | None:
-    return value if type(value) is int and value >= 0 else None
+    return value if type(value) is int and 0 <= value <= MOST_TOKENS else None

@@ -5,11 +5,15 @@ stream raises an exception: an error becomes a fault, in one sentence.
 """
 
 import json
+from contextlib import suppress
 from typing import Any
 
+from harness.backends.openai.faults import Fault, fault_in, may_pass
+from harness.backends.openai.shapes import THOUGHTS
+
 ASKED = {"stream": True, "stream_options": {"include_usage": True}}  # the last piece has the token counts
+BROKE_OFF = "the stream broke off"
 _CUT_OFF = "the stream ends before the answer does"
-_THOUGHTS = ("reasoning_content", "reasoning")
 
 
 class Stream:
@@ -18,12 +22,16 @@ class Stream:
     Attributes:
         fault: why it is no completion, with text of the server of any length; None once it is one.
         again: whether another attempt may succeed.
+        code: the HTTP status that an error in it would have had; None if there is none, or it states none.
     """
 
     def __init__(self) -> None:
         self.fault: str | None = _CUT_OFF
         self.again = True
+        self.code: int | None = None
         self._rest = b""
+        self._kind = b""  # of the event
+        self._model: str | None = None
         self._texts: dict[str, str] = {}
         self._finish: str | None = None
         self._usage: dict[str, int] = {}
@@ -35,12 +43,20 @@ class Stream:
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             field, _, value = line.strip().partition(b":")
+            if field in (b"event", b""):  # an empty line ends an event
+                self._kind = value.strip() if field else b""
             if field == b"data" and self.fault in (None, _CUT_OFF):  # a comment keeps the connection alive
                 self._event(value.strip().decode("utf-8", "replace"), at_s)
 
     def _event(self, text: str, at_s: float) -> None:
         if text == "[DONE]":
             self.fault = None
+            return
+        if self._kind == b"error":
+            error: Any = text
+            with suppress(ValueError, RecursionError):
+                error = json.loads(text)
+            self._break_off(fault_in(error) or fault_in({"error": error}) or Fault(text))
             return
         try:
             self._piece(json.loads(text), at_s)
@@ -50,19 +66,24 @@ class Stream:
             self.fault, self.again = "a piece of the stream is no part of a chat completion", False
 
     def _piece(self, piece: Any, at_s: float) -> None:
-        if error := piece.get("error"):
-            self.fault = f"the stream broke off: {error.get('message') if isinstance(error, dict) else error}"
+        if fault := fault_in(piece):
+            self._break_off(fault)
             return
+        self._model = piece.get("model") or self._model
         self._usage |= {k: v for k, v in (piece.get("usage") or {}).items() if type(v) is int}
         for choice in (piece.get("choices") or [])[:1]:  # the last piece may have token counts and no choice
             delta = choice.get("delta") or {}
-            texts = {name: delta[name] for name in ("content", *_THOUGHTS) if delta.get(name) is not None}
+            texts = {name: delta[name] for name in ("content", *THOUGHTS) if delta.get(name) is not None}
             for name, text in texts.items():
                 self._texts[name] = self._texts.get(name, "") + text
             if any(texts.values()):
                 self._first_at_s, self._last_at_s = self._first_at_s or at_s, at_s
             if choice.get("finish_reason"):
                 self._finish, self.fault = str(choice["finish_reason"]), None
+
+    def _break_off(self, fault: Fault) -> None:
+        self.fault, self.code = f"{BROKE_OFF}: {fault.words}", fault.code
+        self.again = fault.code is None or may_pass(fault.code)
 
     @property
     def first_at_s(self) -> float | None:
@@ -72,4 +93,4 @@ class Stream:
     def payload(self) -> dict[str, Any]:
         """Return the completion as a server would send it in one piece."""
         choice = {"message": {"content": "", **self._texts}, "finish_reason": self._finish}
-        return {"choices": [choice], "usage": self._usage}
+        return {"choices": [choice], "usage": self._usage, "model": self._model}

@@ -156,14 +156,18 @@ class TransformersEngine:
         self.card = card
         self.where = where
         self.eyes = Eyes(card.name, where, card.vision, tokenizer, model) if card.vision else None
-        self.chat = Chat(card.name, tokenizer, self.eyes.image_token if self.eyes else None)
+        self.chat = Chat(card.name, tokenizer, self.eyes.image_token if self.eyes else None, card.system)
         self.model = model
         self.context_tokens: int = (
             card.context_tokens or self.model.config.get_text_config().max_position_embeddings
         )
         listed = self.model.generation_config.eos_token_id or []
-        # A chat model's turn may end with a token that its generation config does not list.
-        ends = {*(listed if isinstance(listed, list) else [listed]), tokenizer.eos_token_id}
+        # A chat model's turn may end with a token that its generation config does not list: the template's.
+        ends = {
+            *(listed if isinstance(listed, list) else [listed]),
+            tokenizer.eos_token_id,
+            *self.chat.ends,
+        }
         self.stops: Sequence[int] = sorted(ends - {None})
         self._reader = Reader(self.model, self.eyes)
 
@@ -190,6 +194,7 @@ class TransformersEngine:
             "dtype": str(self.model.dtype).removeprefix("torch."),
             "device": str(self.model.device),
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
+            **({"system": self.chat.system} if self.chat.system else {}),
         }
 
     @cached_property

@@ -12,11 +12,11 @@ from harness.core.multiplicity import holm, p_of_bootstrap
 from harness.core.paired import SuccessTest, success_test
 from harness.core.statistics import Estimate, known_mean
 from harness.prompts.difference import PromptChange, change, of_swarm
-from harness.prompts.versions import as_it_was
 from harness.report.compare.flips import LOST_BY, DecisionFlip, flips
 from harness.report.compare.pair import Pair
 from harness.runs import percentiles
 from harness.runs.metrics import SUCCESS, difference, metrics_of, p_value
+from harness.runs.sources import prompt_of
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,9 @@ def _prompts(pair: Pair) -> PromptChange | str | None:
     if [prompt["sha256"] for prompt in a] == [prompt["sha256"] for prompt in b]:
         return None
     here = []
-    for name, prompt in zip("AABB", (*a, *b), strict=True):
-        found = as_it_was(prompt["version"], prompt["sha256"])
+    sides = (("A", pair.a, a), ("B", pair.b, b))
+    for name, side, prompt in ((name, side, each) for name, side, of in sides for each in of):
+        found = prompt_of(side.run, prompt)
         if found is None:
             return (
                 f"what differs between the prompts is not known: {name}'s {printable(prompt['version'], 40)} "

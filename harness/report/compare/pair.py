@@ -13,6 +13,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
+from harness.core.places import nameless
 from harness.report.words import facts
 from harness.runs.folder import Run, read
 from harness.runs.metrics import by_episode, metrics_of
@@ -143,5 +144,5 @@ def _side(run: Run) -> Side:
     # Through the class, which gives a setting that the run does not know the value it had then.
     points = [asdict(OperatingPoint.from_dict(condition)) for condition in stated["conditions"]]
     named["condition"] = {point["name"]: point for point in points}
-    settings = {name: str(value) for name, value in facts(named) if value is not None}
+    settings = {name: str(value) for name, value in facts(nameless(named)) if value is not None}
     return Side(run, settings, by_episode(metrics_of(run.world), run.grid, run.decisions, run.episodes))

@@ -33,7 +33,7 @@ def terminal(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
 
 def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterator[str]:
     pair = comparison.pair
-    yield from (f"{name}: {side}" for name, side in words.sides(pair))
+    yield from (f"{name}: {side}" for name, side in words.sides(pair, whole=True))
     yield from words.caveats(pair)
     yield f"paired: {words.paired(pair)}"
     yield words.differing(comparison)
@@ -100,6 +100,11 @@ def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
     runs = " against ".join(printable(words.who(side)) for side in (comparison.pair.b, comparison.pair.a))
     cases = [Case(runs, v.gate, words.judged(v) if v.failed else None) for v in verdicts]
     return test_suite("harness compare", cases)
+
+
+def junit_of_none(gates: Sequence[str], said: str) -> str:
+    """The gates as test cases where they cannot be judged, since a model could not be asked."""
+    return test_suite("harness compare", [Case("harness compare", gate, error=said) for gate in gates])
 
 
 def code(text: str) -> str:

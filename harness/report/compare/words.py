@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from harness.core.errors import printable
 from harness.core.multiplicity import LEVEL
 from harness.prompts.difference import marked
-from harness.report.caveats import no_prompt, unread
+from harness.prompts.versions import as_it_was
+from harness.report.caveats import no_prompt, unanswered, unread
 from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.flips import LOST_BY, DecisionFlip
 from harness.report.compare.gate import Verdict
@@ -105,9 +106,12 @@ def who(side: Side) -> str:
     return f"{variant.model} · prompt {variant.prompt} · {variant.answer}{variant.mix}"
 
 
-def sides(pair: Pair) -> list[tuple[str, str]]:
-    """`A` and `B`, each with its folder and who answered."""
-    return [(name, f"{side.run.path}: {who(side)}") for name, side in (("A", pair.a), ("B", pair.b))]
+def sides(pair: Pair, whole: bool = False) -> list[tuple[str, str]]:
+    """`A` and `B`, each with the name of its folder, or its `whole` path, and who answered."""
+    return [
+        (name, f"{side.run.path if whole else side.run.path.name}: {who(side)}")
+        for name, side in (("A", pair.a), ("B", pair.b))
+    ]
 
 
 def paces(pair: Pair) -> list[str]:
@@ -120,7 +124,7 @@ def caveats(pair: Pair) -> list[str]:
     """What must be said of the runs before their numbers, with the run's letter where it is of one."""
     sides = (("A", pair.a.run), ("B", pair.b.run))
     return [
-        *(f"{name}: {said}" for name, run in sides for said in unread(run.scores)),
+        *(f"{name}: {said}" for name, run in sides for said in (*unanswered(run), *unread(run.scores))),
         *no_prompt(run.manifest for _, run in sides),
     ]
 
@@ -240,8 +244,11 @@ def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
         text = "".join(piece for _, piece in marked(hunk))
         said += [f"    {line.strip()}" for line in text.split("\n") if line.strip()]
     if len(hunks) > most:
+        stated = [side.run.manifest.agent(place)["prompt"] for side in (pair.a, pair.b) for place in (0, 1)]
+        here = all(as_it_was(prompt["version"], prompt["sha256"]) for prompt in stated)
         seen = dict.fromkeys(f"`harness prompt diff {a} {b}`" for a, b in (ego, helper) if a != b)
-        said.append(f"  {len(hunks) - most} more changes: {' and '.join(seen)}")
+        shown = " and ".join(seen) if here and seen else "the page of --html has them"
+        said.append(f"  {len(hunks) - most} more changes: {shown}")
     return said
 
 

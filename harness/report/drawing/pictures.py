@@ -1,7 +1,10 @@
 """What pictures share: the look, and the same bytes every time."""
 
 import io
+import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -58,7 +61,8 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
             FigureCanvasSVG(figure).print_svg(data, metadata=nothing)  # type: ignore[no-untyped-call]
         elif format == "pdf":
             nothing = dict.fromkeys(("CreationDate", "Producer", "Creator"))
-            FigureCanvasPdf(figure).print_pdf(data, metadata=nothing)  # type: ignore[no-untyped-call]
+            with _undated():
+                FigureCanvasPdf(figure).print_pdf(data, metadata=nothing)  # type: ignore[no-untyped-call]
         else:
             figure.set_dpi(dpi)
             FigureCanvasAgg(figure).print_png(data, metadata={"Software": None})  # type: ignore[no-untyped-call]
@@ -66,3 +70,14 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
         write_whole(out, data.getvalue())
     else:
         out.write(data.getvalue())
+
+
+@contextmanager
+def _undated() -> Iterator[None]:
+    """Leave out the date of the environment: Matplotlib reads it, and fails at one that is none."""
+    date = os.environ.pop("SOURCE_DATE_EPOCH", None)
+    try:
+        yield
+    finally:
+        if date is not None:
+            os.environ["SOURCE_DATE_EPOCH"] = date

@@ -70,7 +70,8 @@ function timelineRows(told, chosen, run) {
   let turn = 0;
   for (const a of first(told.answers, point)) {
     const times = run.inference_s[a.role === "ego" ? "ego" : "helper"];
-    const ready = 1000 * (a.took_s ?? times[a.role === "ego" ? 0 : turn++ % times.length]);
+    const usual = a.took_s === undefined ? times[a.role === "ego" ? 0 : turn++ % times.length] : 0;
+    const ready = 1000 * (a.took_s ?? usual); // null where an answer never came
     const m = chosen.messages.find((m) => m.from === sender(a)), name = who(a);
     if (a.role !== "ego" && !m) continue;
     if (ready) rows.push({ who: name, what: "inference", from: 0, to: ready });

@@ -34,6 +34,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from harness.core.errors import UserError, printable
+from harness.core.files import bytes_of
 from harness.report.view import pages
 from harness.report.view.access import Access
 from harness.report.view.folder import PICTURES, own_file, pictures, whole
@@ -215,7 +216,7 @@ class View:
 
 
 def _shown(page: Path) -> Response:
-    return _with_way_back(page.read_text(encoding="utf-8", errors="replace"))
+    return _with_way_back(bytes_of(page, "rows").decode("utf-8", "replace"))
 
 
 def _with_way_back(page: str) -> Response:

@@ -2,15 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
+from harness.core.files import text_of
 from harness.report import suite as suites
 from harness.report.compare import page as comparison
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
+from harness.report.page import TEMPLATES as REPORT_TEMPLATES
 from harness.report.page import environment, render
 from harness.report.runs import gather
 from harness.runs.folder import Run
@@ -88,8 +89,7 @@ def wrong(said: str) -> str:
 
 def style() -> str:
     """The report's style, and the list's own."""
-    report_style = files("harness.report") / "templates" / "style.css"
-    return report_style.read_text(encoding="utf-8") + (TEMPLATES / "list.css").read_text(encoding="utf-8")
+    return text_of(REPORT_TEMPLATES / "style.css") + text_of(TEMPLATES / "list.css")
 
 
 def _page(template: str, **values: Any) -> str:

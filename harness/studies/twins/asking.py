@@ -12,7 +12,7 @@ from harness.backends.base import Backend, Request
 from harness.backends.cache import cached
 from harness.backends.registry import opened
 from harness.core import noise, work
-from harness.core.errors import UserError, printable
+from harness.core.errors import Unanswered, UserError, printable
 from harness.core.files import digest, write_whole
 from harness.core.parallel import Workers, each, spread
 from harness.dataset.load import Dataset, Scene
@@ -21,7 +21,9 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.fusion import messages_of
 from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
+from harness.runs.folder import lines
 from harness.runs.records import Answer
+from harness.runs.unanswered import Tally
 from harness.studies.twins.declared import TWINS, Twin
 from harness.studies.twins.scoring import Pair, distance, held
 
@@ -87,6 +89,8 @@ class Study:
         """Whether this was begun in a folder, stopped there, and nobody is at it."""
         try:
             left = work.begun(out, work.Begun)
+            if work.idle(out):
+                return not work.held(out)
             if left is None or (out / RESULT).exists() or work.held(out):
                 return False
             work.same(out, self.begin(str(left.settings.get("identity"))).settings, left.settings)
@@ -107,7 +111,7 @@ def lack(spec: Spec, twin: Twin) -> str | None:
 
 def ask(
     study: Study, out: Path, progress: Callable[[int], None], cache: Path | None, workers: Workers
-) -> list[Pair]:
+) -> tuple[list[Pair], str]:
     """Ask about decision points and their twins; the same for any workers.
 
     What was stopped there before goes on. The working folder stays until `work.tidy`, which whoever writes
@@ -120,11 +124,19 @@ def ask(
         cache: file of completions kept between runs; None for no cache.
         workers: who asks, each with a backend of its own.
 
+    Returns:
+        The pairs of answers; and how many questions of helpers got none, in words, empty if all did. Their
+        pairs are left out.
+
     Raises:
         UserError: the folder holds something else, the model is not available, or no question has a twin.
+        Unanswered: a question of the ego, or too many of the helpers', got no answer; the folder keeps all
+            others.
     """
     if (out / RESULT).exists():
-        raise UserError(f"--out {printable(out)} has finished twins; choose another folder or delete it")
+        raise UserError(
+            f"--out {printable(out)} already holds finished twins; choose another folder or delete it"
+        )
     [identity] = spread(
         _identity, [study.spec], workers, lambda done: None, lambda of: f"the model {of.ego.card.name}", False
     )
@@ -137,19 +149,25 @@ def ask(
             for number, ids in study.points().items()
         ]
         found: dict[int, list[Pair]] = {}
+        questions = Tally()
 
-        def took(at: int, asked: tuple[list[Pair], bytes]) -> None:
+        def took(at: int, asked: tuple[list[Pair], list[Answer]]) -> None:
             found[at], answers = asked
-            write_whole(_answers_file(place, points[at][0]), answers)
+            questions.add(answers)
+            answered = [answer for answer in answers if answer.error is None]
+            write_whole(_answers_file(place, points[at][0]), lines(answered))
             progress(1)
 
-        # The cache is a file of one machine.
-        asked = partial(_asked, study, cache if isinstance(workers, int) else None)
+        # These are files of one machine.
+        files = (cache, place) if isinstance(workers, int) else (None, None)
+        asked = partial(_asked, study, *files)
         each(asked, points, workers, took, lambda point: f"episode {point[0]}", repeatable=False)
+        if questions.missing:
+            raise Unanswered(str(questions))
         pairs = [pair for at in range(len(points)) for pair in found[at]]
         if not pairs:
             raise UserError(f"--twin: none applies to what was drawn: {study.lacks(study.twins)}")
-        return pairs
+        return pairs, questions.counts()
 
 
 def _identity(spec: Spec) -> str:
@@ -161,15 +179,16 @@ def _answers_file(place: Path, episode: int) -> Path:
 
 
 def _asked(
-    study: Study, cache: Path | None, episode: tuple[int, Sequence[Scene], Mapping[str, Answer]]
-) -> tuple[list[Pair], bytes]:
-    """Ask about the decision points of an episode, then about their twins; with the answers, a line each."""
+    study: Study, cache: Path | None, place: Path | None,
+    episode: tuple[int, Sequence[Scene], Mapping[str, Answer]],
+) -> tuple[list[Pair], list[Answer]]:  # fmt: skip
+    """Ask about the decision points of an episode, then about their twins; return all answers as well."""
     (number, scenes, kept), spec = episode, study.spec
 
     def backend() -> Backend:
         return cached(opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size), spec.ego.card, cache)
 
-    asker = Asker(spec, backend, PAPER, answers=kept)
+    asker = Asker(spec, backend, PAPER, place and _answers_file(place, number), kept)
     twins = [twin for twin in map(TWINS.__getitem__, study.twins) if lack(spec, twin) is None]
     questions = {scene.id: list(requests(spec, [scene])) for scene in scenes}
     # Fusion calls have the helpers' messages, which are there first.
@@ -189,8 +208,12 @@ def _asked(
     known = {request.id for request in first}
     then = {request.id: request for *_, a, b in asked for request in (a, b) if request.id not in known}
     asker.ask(list(then.values()))
-    pairs = [_pair(spec, each, number, asker.answers) for each in asked]
-    return pairs, msgspec.json.Encoder().encode_lines(list(asker.answers.values()))
+    pairs = [
+        _pair(spec, each, number, asker.answers)
+        for each in asked
+        if all(asker.answers[request.id].error is None for request in each[2:])
+    ]
+    return pairs, list(asker.answers.values())
 
 
 def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -> Iterator[Asked]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from harness.backends.base import AnswerMode, Request
 from harness.core import noise
+from harness.core.files import text_of
 from harness.core.image import Image
 from harness.dataset.load import Scene
 from harness.evaluate.spec import Spec
@@ -247,7 +248,7 @@ def paraphrased(spec: Spec, request: Request) -> Request:
 @cache
 def paraphrases() -> dict[str, str]:
     """Other words for sentences."""
-    text = (Path(__file__).parent / "paraphrases.toml").read_text(encoding="utf-8")
+    text = text_of(Path(__file__).parent / "paraphrases.toml", "settings")
     return {str(sentence): str(other) for sentence, other in tomllib.loads(text).items()}
 
 

@@ -26,23 +26,29 @@ EXAMPLES = 3  # of each row
 
 
 def write(
-    study: Study, pairs: Sequence[Pair], rows: Sequence[Row], verdicts: Sequence[Verdict], out: Path
-) -> Path:
-    """Write `pairs.jsonl`, the page, which is returned, and last `twins.json`."""
+    study: Study, pairs: Sequence[Pair], rows: Sequence[Row], verdicts: Sequence[Verdict], out: Path,
+    lost: str = "",
+) -> Path:  # fmt: skip
+    """Write `pairs.jsonl`, the page, which is returned, and last `twins.json`.
+
+    `lost` says how many questions got no answer.
+    """
     lines = [{k: v for k, v in asdict(pair).items() if k != "messages"} for pair in pairs]
     write_whole(out / "pairs.jsonl", b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
     page = environment(TEMPLATES).get_template("twins.html.j2").render(
-        study=study, spec=study.spec, rows=rows, headline=headline(rows), notes=notes(study, rows),
+        study=study, spec=study.spec, rows=rows, headline=headline(rows), notes=notes(study, rows, lost),
         points=decision_points(study), examples=EXAMPLES, verdicts=verdicts, judged=judged, cell=shown,
         difference=difference,
     )  # fmt: skip
     write_whole(out / "index.html", page)
-    content = {"format": FORMAT, **mapping(study, rows, verdicts), "versions": versions()}
+    content = {"format": FORMAT, **mapping(study, rows, verdicts, lost), "versions": versions()}
     write_whole(out / RESULT, msgspec.json.format(msgspec.json.encode(content), indent=1) + b"\n")
     return out / "index.html"
 
 
-def mapping(study: Study, rows: Sequence[Row], verdicts: Sequence[Verdict]) -> dict[str, Any]:
+def mapping(
+    study: Study, rows: Sequence[Row], verdicts: Sequence[Verdict], lost: str = ""
+) -> dict[str, Any]:  # fmt: skip
     """The result as plain values; null where there is no number."""
     table = [
         {
@@ -55,7 +61,7 @@ def mapping(study: Study, rows: Sequence[Row], verdicts: Sequence[Verdict]) -> d
     return {
         **study.spec.ego.settings(), "world": msgspec.to_builtins(study.spec.source.record()),
         "seed": study.seed, "decision_points": decision_points(study), "rows": table,
-        "left_out": missing(study, rows), "gates": gates,
+        "left_out": missing(study, rows), **({"unanswered": lost} if lost else {}), "gates": gates,
     }  # fmt: skip
 
 
@@ -70,7 +76,7 @@ def missing(study: Study, rows: Sequence[Row]) -> dict[str, str]:
     return {n: lack(study.spec, TWINS[n]) or TWINS[n].needs for n in study.twins if n not in had}
 
 
-def notes(study: Study, rows: Sequence[Row]) -> list[str]:
+def notes(study: Study, rows: Sequence[Row], lost: str = "") -> list[str]:
     """What a reader must know besides the rows."""
     who, by_need = printable(study.spec.ego.card.name), dict[str, list[str]]()
     for name, need in missing(study, rows).items():
@@ -78,6 +84,8 @@ def notes(study: Study, rows: Sequence[Row]) -> list[str]:
     said = [
         f"left out, since no question has it: {', '.join(of)} (needs {need})" for need, of in by_need.items()
     ]
+    if lost:
+        said.append(f"no answer to {printable(lost)}; their pairs are left out")
     if not study.spec.ego.can.language_model:
         said.insert(0, f"{who} reads the scene graph and not the text, so this says nothing about the prompt")
     return said

@@ -194,8 +194,20 @@ def numbered(env: Any, kind: Any, action: str) -> Any:
 
 
 def lane_of(v: Any) -> Lane:
-    """Return the lane that a vehicle steers for, in plain types (highway-env may use NumPy's)."""
-    begin, end, number = getattr(v, "target_lane_index", v.lane_index)
+    """Return the lane that a vehicle steers for, in plain types (highway-env may use NumPy's).
+
+    Raises:
+        UserError: it has none.
+    """
+    try:
+        begin, end, number = getattr(v, "target_lane_index", v.lane_index)
+    except TypeError:  # made without a road, its index is NaN
+        x_m, y_m = v.position
+        who = v.spawn.id if hasattr(v, "spawn") else "the ego"
+        raise UserError(
+            f"environment: {who}, a {type(v).__name__} at {x_m:.1f}, {y_m:.1f} m, has no lane; make every "
+            "vehicle with the road, and on one of its lanes"
+        ) from None
     return str(begin), str(end), int(number or 0)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable
 from harness.world.environments import environment
 from harness.world.environments.environment import lane_of, reset
 from harness.world.environments.routes import Routes, routes
@@ -18,6 +18,7 @@ from harness.world.scenario import Parameters as Common
 
 DIALS = ("decisions", "helpers", "time_limit_s", "delay_allowance_s")
 CAREFUL_FIRST = ("SLOWER", "IDLE", "FASTER", "LANE_LEFT", "LANE_RIGHT")
+MOST_HZ = 1000
 AFTER, LIMIT = 2, 5  # decision periods after the last decision: to the goal by cruising, to the time limit
 REACH_M = 500.0  # paths are built up to this distance from the middle of an episode
 BEHIND_M, BEYOND_M = 30.0, 40.0  # watched parts of the ego's ways, behind its start and beyond its goal
@@ -167,6 +168,12 @@ def _goal_m(speed_mps: float, begin_m: float, parameters: Parameters) -> float:
 
 def _parameters(name: str, env: Any, actions: int) -> Parameters:
     hz, decisions_hz = (env.config[f"{kind}_frequency"] for kind in ("simulation", "policy"))
+    for kind, value in (("simulation", hz), ("policy", decisions_hz)):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= MOST_HZ:
+            raise UserError(
+                f"{environment.shown(name)}: {kind}_frequency is {printable(repr(value))}; set a number "
+                f"above 0, at most {MOST_HZ}, in its config"
+            )
     if hz % decisions_hz:
         raise UserError(
             f"{environment.shown(name)}: simulation_frequency {hz:g} is no multiple of policy_frequency "

@@ -4,14 +4,14 @@ Other packages add theirs by an entry point of the group `swarmdrive.scenarios`;
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pkgutil import iter_modules
 from typing import Any
 
-from harness.core.config import value_of
+from harness.core.config import convert, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.world.environments import environment
 from harness.world.environments import scenario as environments
@@ -79,19 +79,26 @@ def is_here(name: str) -> bool:
 
 
 def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
-    """Return a scenario with the parameters of a manifest. Raises UserError if it has other parameters."""
+    """Return a scenario with the parameters that a manifest states.
+
+    Raises UserError if the scenario has other parameters here, or one is of another type or out of bounds.
+    """
     scenario = get(name)
-    try:
-        values: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else type(getattr(scenario.parameters, key))(value)
-            for key, value in parameters.items()
-        }
-        return replace(scenario, parameters=replace(scenario.parameters, **values))
-    except (AttributeError, TypeError, ValueError) as error:
+    here = {field.name: getattr(scenario.parameters, field.name) for field in fields(scenario.parameters)}
+    where = f"scenario {printable(scenario.name, 80)}"
+    if others := [key for key in parameters if key not in here]:
         raise UserError(
-            f"scenario {printable(scenario.name)} has other parameters here ({printable(error)}); "
+            f"{where} has other parameters here (not {printable(others[0])}); "
             "use the version that its manifest names"
-        ) from None
+        )
+    # Numbers in a manifest are decoded as floats.
+    values = {
+        key: int(value)
+        if isinstance(value, float) and type(here[key]) is int and value.is_integer()
+        else value
+        for key, value in parameters.items()
+    }
+    return replace(scenario, parameters=convert({**here, **values}, type(scenario.parameters), where))
 
 
 def restore(name: str, parameters: Parameters) -> Scenario:

@@ -1,0 +1,153 @@
+"""A chat template, which makes a model's prompt of messages. It comes with weights, so from strangers."""
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import Any, Literal
+
+from jinja2 import TemplateError, nodes
+from jinja2.ext import Extension
+from jinja2.parser import Parser
+
+from harness.core.errors import UserError, printable
+from harness.core.templates import Sandbox, TooMuch
+
+Messages = Sequence[Mapping[str, Any]]
+FIRST_USER: Literal["first-user"] = (
+    "first-user"  # a card's `system`: the system text begins the first user turn
+)
+_THOUGHT_ENDS = "</think>"
+_LONGEST_FORM = 100  # characters of a form of dates
+
+
+class Refused(UserError):
+    """A template raised an error about messages."""
+
+
+class ChatTemplate:
+    """A compiled chat template, rendered as transformers does.
+
+    Attributes:
+        text: its Jinja text.
+    """
+
+    def __init__(self, name: str, text: str) -> None:
+        """Compile a template.
+
+        Args:
+            name: name of the model, for messages.
+            text: the template.
+
+        Raises:
+            UserError: it is no Jinja, or too long.
+        """
+        self.text = text
+        self._name = name
+        try:
+            self._compiled = _environment().from_string(text)
+        except TemplateError as error:
+            raise UserError(
+                f"model {printable(name)!r}: its chat template is no Jinja ({printable(error)}); give "
+                "another model, or mend the template"
+            ) from None
+
+    def render(self, messages: Messages, **values: Any) -> str:
+        """Render messages, with the values of further names.
+
+        Raises:
+            Refused: the template refuses the messages; the sentence has no advice yet.
+            UserError: it takes more than it may.
+        """
+        given = {"tools": None, "documents": None, "add_generation_prompt": True, **values}
+        try:
+            return self._compiled.render(messages=messages, **given)
+        except TooMuch as error:
+            raise UserError(
+                f"model {printable(self._name)!r}: its chat template takes {printable(error)} to render; "
+                "give another model, or mend the template"
+            ) from None
+        except Exception as error:  # a template is a program and may fail in any way
+            raise Refused(
+                f"model {printable(self._name)!r}: its chat template refuses the messages "
+                f"({printable(error)})"
+            ) from None
+
+
+def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any], ...]:
+    """Return messages in the way of a card's `system`: `first-user`, or None to leave them as they are."""
+    if way != FIRST_USER or len(messages) < 2 or messages[0]["role"] != "system":
+        return tuple(messages)
+    system, first, *others = messages
+    return ({**first, "content": f"{system['content']}\n\n{first['content']}"}, *others)
+
+
+def unsaid(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
+    """Return the first message whose text does not stand in a prompt, after those before it; None if all do.
+
+    White space around a text does not matter, and thoughts of earlier turns may be left out.
+    """
+    at = 0
+    for message in messages:
+        text = _text(message["content"]).strip()
+        found = prompt.find(text, at)
+        if found < 0 and message["role"] == "assistant":
+            text = text.rpartition(_THOUGHT_ENDS)[2].strip()
+            found = prompt.find(text, at)
+        if found < 0:
+            return message
+        at = found + len(text)
+    return None
+
+
+def needs_first_user(text: str) -> bool:
+    """Whether a template refuses a system message and takes its text in the first user turn."""
+    asked = ({"role": "system", "content": "Be brief."}, {"role": "user", "content": "Where to?"})
+    empty = {"bos_token": "", "eos_token": ""}
+    try:
+        template = ChatTemplate("", text)
+        joined = with_system(asked, FIRST_USER)
+        takes = unsaid(joined, template.render(joined, **empty)) is None
+    except UserError:
+        return False
+    try:
+        template.render(asked, **empty)
+    except UserError:
+        return takes
+    return False
+
+
+def _text(content: Any) -> str:
+    """Return the text of a message's content, which may be a list of parts."""
+    return content if isinstance(content, str) else "".join(part.get("text", "") for part in content)
+
+
+class _Generation(Extension):
+    """The tag `{% generation %}`, which marks a model's turns for training; its content is rendered."""
+
+    tags = {"generation"}  # noqa: RUF012 jinja2 declares it so
+
+    def parse(self, parser: Parser) -> list[nodes.Node]:
+        """Return the content of the block."""
+        next(parser.stream)
+        return parser.parse_statements(("name:endgeneration",), drop_needle=True)
+
+
+def _environment() -> Sandbox:
+    """Build the Jinja environment with the names that templates on the hub expect."""
+
+    def raise_exception(message: str) -> None:
+        raise TemplateError(message)
+
+    def strftime_now(form: str) -> str:
+        if len(form) > _LONGEST_FORM:
+            raise TooMuch(f"a date of {len(form)} characters")
+        return datetime.now().strftime(form)
+
+    built = Sandbox(trim_blocks=True, lstrip_blocks=True, extensions=[_Generation, "jinja2.ext.loopcontrols"])
+    built.add_filter("tojson", _tojson)
+    built.globals |= {"raise_exception": raise_exception, "strftime_now": strftime_now}
+    return built
+
+
+def _tojson(value: Any, **options: Any) -> str:  # Jinja's own filter escapes for HTML
+    return json.dumps(value, **{"ensure_ascii": False, **options})

@@ -1,0 +1,151 @@
+"""The constraint that a server is sent for an answer, and whether the answer keeps to it.
+
+Servers differ in how they are asked, and one that does not know the field drops it and answers freely.
+"""
+
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+from harness.backends.base import Request
+from harness.backends.servers import Kind
+from harness.core.errors import printable
+from harness.core.files import canonical_json
+from harness.prompts.answer_schema import answer_schema
+
+# Kinds that are sent a pattern: compact JSON, members in order, two decimals. With a JSON Schema most servers
+# allow numbers of any length.
+_BY_PATTERN: Mapping[Kind, str] = {"vllm": "regex", "llama-server": "grammar", "llama-cpp-python": "grammar"}
+_DECIMALS = re.compile(r"0\.[0-9][0-9]|1\.00")
+_DECIMALS_BEGUN = re.compile(r"(?:0(?:\.[0-9]?)?|1(?:\.0?)?)?")
+_NUMBER = re.compile(r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?")
+_NUMBER_BEGUN = re.compile(r"-?(?:(?:0|[1-9][0-9]*)(?:\.[0-9]*)?(?:[eE][+-]?[0-9]*)?)?")
+_BLANK = re.compile(r"[ \t\n\r]*")
+_SHOWN = 40  # characters of an answer that an error shows
+
+
+def constraint(kind: Kind, request: Request) -> Mapping[str, Any]:
+    """Return the fields that ask a kind of server for a constrained answer."""
+    return _fields(kind, request.role, request.form, request.actions)
+
+
+def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
+    """Return where an answer breaks the constraint that was sent, in words; None if it keeps to it.
+
+    Args:
+        kind: the kind of server that was asked.
+        request: what was asked.
+        text: the answer, without a thought that the server took out.
+        ended: whether the model ended it; one that was cut off need only be the beginning of what fits.
+    """
+    reader = _Reader(text, compact=kind in _BY_PATTERN)
+    try:
+        reader.value(_schema(request.role, request.form, request.actions))
+        reader.blank()
+        if reader.at == len(text):
+            return None
+    except EOFError:
+        if not ended:
+            return None
+        return f"it ends after {len(text)} characters"
+    except ValueError:
+        pass
+    return f"{printable(repr(text[reader.at : reader.at + _SHOWN]))} after {reader.at} characters"
+
+
+@lru_cache
+def _schema(role: str, form: str, actions: tuple[str, ...]) -> Mapping[str, Any]:
+    schema = answer_schema(role, actions, form=form)
+    schema = {key: value for key, value in schema.items() if key not in ("$schema", "title")}
+    if "evidence" in schema["properties"]:  # as with local engines, a constrained answer has no free text
+        schema["properties"] = {**schema["properties"], "evidence": {"type": "string", "enum": [""]}}
+    return schema
+
+
+@lru_cache
+def _fields(kind: Kind, role: str, form: str, actions: tuple[str, ...]) -> Mapping[str, Any]:
+    schema = _schema(role, form, actions)
+    match _BY_PATTERN.get(kind):
+        case "regex":
+            return {"structured_outputs": {"regex": _pattern(schema, re.escape)}}
+        case "grammar":
+            return {"grammar": f"root ::= {_pattern(schema, canonical_json)}"}
+    json_schema = {"name": "answer", "strict": True, "schema": schema}
+    return {"response_format": {"type": "json_schema", "json_schema": json_schema}}
+
+
+def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:
+    """Write the compact JSON of a schema as a regular expression, or as a rule of llama.cpp's grammar.
+
+    For the parts of an answer the two differ only in how `literal` text is written.
+    """
+    if "enum" in schema:
+        return f"({'|'.join(literal(json.dumps(value)) for value in schema['enum'])})"
+    if schema["type"] == "number":
+        return f"({literal('0.')}[0-9][0-9]|{literal('1.00')})"
+    members = [
+        literal(f"{json.dumps(name)}:") + _pattern(value, literal)
+        for name, value in schema["properties"].items()
+    ]
+    return literal("{") + literal(",").join(members) + literal("}")
+
+
+class _Reader:
+    """Reads a text along a schema: closed objects, whose values are numbers, choices of texts, or objects.
+
+    Neither `re` nor a validator of JSON can say whether a text that was cut off may still become one that
+    fits. Each method raises EOFError if the text ends first, and ValueError if it cannot fit, with `at` the
+    place.
+
+    Attributes:
+        at: number of characters read.
+    """
+
+    def __init__(self, text: str, compact: bool) -> None:
+        self._text, self._compact, self.at = text, compact, 0
+
+    def value(self, schema: Mapping[str, Any]) -> None:
+        self.blank()
+        if "enum" in schema:
+            self._one_of([json.dumps(value) for value in schema["enum"]])
+        elif schema["type"] == "number":
+            self._number(schema["minimum"], schema["maximum"])
+        else:
+            self._object(schema["properties"])
+
+    def blank(self) -> None:
+        if not self._compact and (blank := _BLANK.match(self._text, self.at)):
+            self.at = blank.end()
+
+    def _object(self, properties: Mapping[str, Any]) -> None:
+        missing = {json.dumps(name): value for name, value in properties.items()}
+        self._one_of("{")
+        while missing:
+            name = self._one_of(list(missing)[:1] if self._compact else list(missing))
+            self._one_of(":")
+            self.value(missing.pop(name))
+            self._one_of("," if missing else "}")
+
+    def _one_of(self, options: Sequence[str]) -> str:
+        """Read one of some texts, none of which begins another; a str is one of its characters."""
+        self.blank()
+        for option in options:
+            if self._text.startswith(option, self.at):
+                self.at += len(option)
+                return option
+        rest = self._text[self.at : self.at + max(map(len, options))]
+        if any(option.startswith(rest) for option in options):
+            raise EOFError
+        raise ValueError
+
+    def _number(self, least: float, most: float) -> None:
+        number, begun = (_DECIMALS, _DECIMALS_BEGUN) if self._compact else (_NUMBER, _NUMBER_BEGUN)
+        found = number.match(self._text, self.at)
+        open_ended = not found or not self._compact  # more digits or an exponent may follow
+        if open_ended and begun.fullmatch(self._text, self.at):
+            raise EOFError
+        if not found or not least <= float(found[0]) <= most:
+            raise ValueError
+        self.at = found.end()

@@ -1,0 +1,83 @@
+"""Find the error in what a server says: its words, and its code as if that had been the HTTP status.
+
+Some servers and most routers answer HTTP 200 before they know that they cannot answer.
+"""
+
+import json
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+_WORDS = ("error", "message", "detail")  # where an error or its words stand
+_CODES = ("code", "status", "status_code")
+_REASON = ("metadata", "raw")  # where a router puts the words of the server behind it
+
+
+class Fault(NamedTuple):
+    """An error that a server states.
+
+    Attributes:
+        words: the server's own words, of any length.
+        code: the HTTP status that the error would have had; None if it states none.
+    """
+
+    words: str
+    code: int | None = None
+
+
+def may_pass(status: int) -> bool:
+    """Whether another attempt may succeed after an HTTP status: the server is busy, or has broken down."""
+    return status == 429 or status >= 500
+
+
+def words_of(payload: Any) -> str:
+    """Return an error's words, which servers put at `error`, `error.message`, `message` or `detail`."""
+    reason = None
+    try:
+        while isinstance(payload, dict):
+            metadata = payload.get(_REASON[0])
+            reason = reason or (metadata.get(_REASON[1]) if isinstance(metadata, dict) else None)
+            texts = [payload[name] for name in _WORDS if payload.get(name)]
+            payload = texts[0] if texts else json.dumps(payload)
+        return f"{payload}: {reason}" if isinstance(reason, str) else str(payload)
+    except RecursionError:
+        return "an error that is nested too deeply"
+
+
+def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
+    """Return the error in a JSON value that came with HTTP 200; None if there is none.
+
+    Args:
+        payload: the value, or one event of a stream.
+        of_chat: whether it should be a chat completion. Then a bare text, or words without any choice, are an
+            error as well.
+    """
+    if of_chat and isinstance(payload, str) and payload.strip():
+        return Fault(payload)
+    if not isinstance(payload, dict):
+        return None
+    choices = payload.get("choices")
+    first = choices[0] if isinstance(choices, list) and choices else None
+    for stated in (payload, first):
+        if isinstance(stated, dict) and (error := stated.get("error")):
+            return Fault(words_of({"error": error}), _code(error) or _code(payload))
+    if of_chat and not choices and any(isinstance(payload.get(name), str | list) for name in _WORDS[1:]):
+        return Fault(words_of(payload), _code(payload))
+    return None
+
+
+def plain_text(data: bytes | bytearray) -> str | None:
+    """Return a body that is words of a server; None if it is empty, markup, broken JSON or no text."""
+    with suppress(UnicodeDecodeError):
+        text = " ".join(data.decode().split())
+        return text if text and text.isprintable() and text[0] not in "<{[" else None
+    return None
+
+
+def _code(error: Any) -> int | None:
+    """Return the HTTP status of an error that an error object names, as a number or in digits."""
+    for value in (error.get(name) for name in _CODES) if isinstance(error, dict) else ():
+        if isinstance(value, str) and value.isascii() and value.isdigit() and len(value) == 3:
+            value = int(value)
+        if type(value) is int and 400 <= value <= 599:
+            return value
+    return None

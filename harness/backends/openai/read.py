@@ -1,0 +1,65 @@
+"""What a served model reads: a server that can tell is asked whether every message's text is among it."""
+
+import asyncio
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from harness.backends.base import Request
+from harness.backends.cards import Card
+from harness.backends.chat_template import FIRST_USER, Messages, unsaid
+from harness.backends.openai.http import Client
+from harness.backends.openai.shapes import body, digest_url
+from harness.backends.servers import Server
+from harness.core.errors import UserError, printable
+
+
+class Reading:
+    """Asks a model's servers, before the first answer of each role, what the model reads.
+
+    llama-server renders messages (`/apply-template`), and vLLM counts them (`/tokenize`), without an answer.
+    No other server tells. Prompts with pictures are not asked about.
+    """
+
+    def __init__(self, client: Client, card: Card, server: Server) -> None:
+        self._client, self._card, self._server = client, card, server
+        self._asked: set[str] = set()  # roles
+        self._one = asyncio.Lock()
+
+    async def check(self, requests: Sequence[Request]) -> None:
+        """Ask about the first request of each role. Raises UserError if a text is left out."""
+        if self._server.kind not in ("llama-server", "vllm"):
+            return
+        async with self._one:
+            for request in requests:
+                if request.role not in self._asked and request.image is None:
+                    for base in self._server.urls:
+                        await self._ask(base, body(self._card, self._server, request, digest_url))
+                    self._asked.add(request.role)
+
+    async def _ask(self, base: str, asked: dict[str, Any]) -> None:
+        messages: Messages = asked["messages"]
+        if self._server.kind == "llama-server":
+            prompt = await self._told(base, "/apply-template", "prompt", asked)
+            lacking = unsaid(messages, prompt) if isinstance(prompt, str) else None
+        else:
+            counts = [
+                await self._told(base, "/tokenize", "count", {**asked, "messages": some})
+                for some in (messages, messages[1:])
+            ]
+            grows = not all(type(n) is int for n in counts) or counts[0] > counts[1]
+            lacking = None if grows else messages[0]
+        if lacking is not None:
+            way = "" if self._card.system else f'; or give its card system = "{FIRST_USER}"'
+            raise UserError(
+                f"model {printable(self._card.name)!r}: the chat template at {printable(base)} leaves out or "
+                f"changes the {printable(lacking['role'])}'s text, so the model would not read what it is "
+                f"asked; start the server with the template that the model was trained with{way}"
+            )
+
+    async def _told(self, base: str, path: str, field: str, asked: dict[str, Any]) -> Any:
+        """Return a field of what a server says of messages; None if it does not say."""
+        keys = ("model", "messages", "chat_template_kwargs")
+        content = json.dumps({key: asked[key] for key in keys if key in asked}).encode()
+        reply = await self._client.get(base, base.removesuffix("/v1") + path, content)
+        return reply.payload.get(field) if isinstance(reply.payload, dict) else None

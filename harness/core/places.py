@@ -1,0 +1,70 @@
+"""Leave out of what others read where things lie on this machine, and the keys that stand in addresses."""
+
+import re
+import shlex
+from collections.abc import Mapping
+from pathlib import PurePath, PurePosixPath, PureWindowsPath
+from typing import Any
+from urllib.parse import urlsplit
+
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://[^\s'\"<>]+")
+_PATH = re.compile(
+    r"(?P<address>" + _ADDRESS.pattern + r")|"
+    r"(?<![\w.~\\/-])(?P<path>(?:[A-Za-z]:|~\w*|\.\.)?(?:[\\/]+[^\s\\/'\":,;()<>]+){2,}[\\/]*)"
+)
+_WHOLE = re.compile(r"(?:[A-Za-z]:)?[\\/].+|~\w*[\\/].+|\.\.[\\/].+", re.DOTALL)
+COMMAND = "command"  # key of a value that is a command line
+
+
+def nameless(value: Any, key: str = "") -> Any:
+    """Return a value of JSON with the names of files in place of their absolute paths.
+
+    Addresses lose a user, a password and a query. A path with spaces is found if it is the whole text, or a
+    word of a command line.
+    """
+    if isinstance(value, str):
+        return _command(value) if key == COMMAND else text(value)
+    if isinstance(value, Mapping):
+        return {name: nameless(inner, name) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(nameless(inner) for inner in value)
+    return value
+
+
+def text(value: str) -> str:
+    """Return a text with the names of files in place of their absolute paths; see `nameless`."""
+    if _WHOLE.fullmatch(value) and not _ADDRESS.match(value):
+        return name(value)
+    return _PATH.sub(lambda found: address(found[0]) if found["address"] else name(found[0]), value)
+
+
+def name(path: str) -> str:
+    """Return the last part of a path of any system; the path itself if it has none."""
+    kind: type[PurePath] = PureWindowsPath if "\\" in path or re.match("[A-Za-z]:", path) else PurePosixPath
+    return kind(path).name or path
+
+
+def address(url: str) -> str:
+    """Return an address without its user, password, query and fragment; of a file, its name."""
+    try:
+        parts = urlsplit(url)
+        host = parts.netloc.rpartition("@")[2]
+    except ValueError:
+        return ""
+    return name(parts.path) if parts.scheme == "file" else f"{parts.scheme}://{host}{parts.path}"
+
+
+def _command(line: str) -> str:
+    try:
+        words = shlex.split(line)
+    except ValueError:
+        return text(line)
+    return shlex.join(_word(word) for word in words)
+
+
+def _word(word: str) -> str:
+    """Return a word of a command, such as a path, `replay:PATH`, `PATH,NAME` or `--option=PATH`."""
+    return "".join(
+        f"{part[:7]}{text(part[7:])}" if part.startswith("replay:") else text(part)
+        for part in re.split("([,=])", word)
+    )

@@ -1,0 +1,170 @@
+"""How the process begins and ends: its streams, the signals that stop it, and a want of memory."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from io import TextIOWrapper
+from types import FrameType
+from typing import Any, NoReturn
+
+STOPS = {signal.SIGTERM: "terminated", signal.SIGINT: "interrupted"}
+AGAIN_S = 0.05  # after which a stop that fell where nothing can be raised is raised again
+LEAST_MB = 768  # of address space; with less, libraries end the process in ways that cannot be caught
+# What is said where memory ran out, but by a MemoryError.
+MEMORY = (
+    "failed to map segment", "Cannot allocate memory", "can't start new thread", "Failed to launch worker",
+)  # fmt: skip
+STREAMS = {"stdin": "r", "stdout": "w", "stderr": "w"}  # in the order of their numbers
+
+
+class Stop(KeyboardInterrupt):
+    """SIGTERM or SIGINT, which end a command wherever it is; the argument is the signal's number."""
+
+    @property
+    def said(self) -> str:
+        """What happened, in a word."""
+        return STOPS[self.args[0]]
+
+    @property
+    def code(self) -> int:
+        """The exit code, as shells have it."""
+        return 128 + int(self.args[0])
+
+
+def run(program: Callable[[], object]) -> None:
+    """Run the program so that SIGTERM, SIGINT or a want of memory end it with one line.
+
+    Exit codes are 143, 130 and 2. Where standard input, output or error is closed, nothing is read or
+    written; a character that an encoding lacks is replaced.
+    """
+    _open_streams()
+    if lack := _lack():
+        print(f"harness: {lack}", file=sys.stderr)
+        sys.exit(2)
+    stops = _Stops()
+    try:
+        stops.listen()
+        try:
+            program()
+        finally:
+            stops.over = True
+    except BaseException as error:
+        stops.over = True
+        ended_by_itself = isinstance(error, SystemExit) and not stops.terminated
+        if stops.seen and not ended_by_itself:
+            if not isinstance(error, SystemExit) or error.code != stops.seen.code:  # else it is said already
+                stops.end()
+        elif _lacks_memory(error):
+            print("harness: memory ran out; give this command more, or less to do", file=sys.stderr)
+            sys.exit(2)
+        raise
+    finally:
+        stops.let_go()
+
+
+class _Stops:
+    """The signals that stop this process.
+
+    Attributes:
+        seen: the first that came.
+        over: whether the program has ended, and there is nothing to raise a stop in.
+    """
+
+    def __init__(self) -> None:
+        self.seen: Stop | None = None
+        self.over = False
+        self._process = os.getpid()
+
+    @property
+    def terminated(self) -> bool:
+        """Whether SIGTERM came, which no command takes for its usual end."""
+        return self.seen is not None and self.seen.args[0] == signal.SIGTERM
+
+    def listen(self) -> None:
+        """Raise `Stop` when a signal comes."""
+        for number in STOPS:
+            # A shell has what a script starts in the background ignore Ctrl-C.
+            if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, self._stop)
+        sys.unraisablehook = self._unraisable
+
+    def let_go(self) -> None:
+        """Leave signals to the system, which ends the process by them, as the interpreter is taken down."""
+        for number in STOPS:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, signal.SIG_DFL)
+
+    def end(self) -> NoReturn:
+        """End the process at once. Nothing is lost: whatever is kept survives SIGKILL as well."""
+        assert self.seen
+        with suppress(Exception):
+            sys.stdout.flush()
+        with suppress(OSError):
+            os.write(2, f"harness: {self.seen.said}\n".encode())
+        os._exit(self.seen.code)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() != self._process:  # a child that has just been forked
+            os._exit(128 + number)
+        self.seen = self.seen or Stop(number)
+        if self.over or _imports(frame):  # an import may make another error of it, or none
+            self.end()
+        raise Stop(number)
+
+    def _unraisable(self, what: Any) -> None:
+        """Raise a stop again that fell into a finaliser, from which nothing can be raised."""
+        if not isinstance(what.exc_value, Stop):
+            sys.__unraisablehook__(what)
+            return
+        number = what.exc_value.args[0]
+        signal.signal(signal.SIGALRM, lambda _, frame: self._stop(number, frame))
+        signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+
+
+def _imports(frame: FrameType | None) -> bool:
+    """Whether a module is being imported in a frame or in one that called it."""
+    while frame:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _open_streams() -> None:
+    """Open streams that are closed, so that no other file gets their numbers; write what can be encoded."""
+    for number, (name, mode) in enumerate(STREAMS.items()):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_RDWR)  # it gets the lowest free number
+            setattr(sys, name, open(null, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
+            if null == number:
+                os.set_inheritable(null, True)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
+
+
+def _lack() -> str | None:
+    """What the process lacks to run at all, in a sentence."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        return f"the current folder cannot be read ({error.strerror}); change to one that is there"
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return None
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit >> 20 < LEAST_MB:
+        return (
+            f"the address space is limited to {limit >> 20} MB, and {LEAST_MB} MB are the least; raise it "
+            f"with `ulimit -v {LEAST_MB << 10}`"
+        )
+    return None
+
+
+def _lacks_memory(error: BaseException) -> bool:
+    return isinstance(error, MemoryError) or (
+        isinstance(error, Exception) and any(text in str(error) for text in MEMORY)
+    )

@@ -1,0 +1,48 @@
+"""Which server gave each answer of a run, in a file beside its tables that no comparison reads.
+
+Who answers depends on who was free, so that it stands in no row (decision 0051).
+"""
+
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+
+from harness.backends.base import Served
+from harness.core.files import write_whole
+
+FILE = "servers.jsonl"
+
+
+class _Line(msgspec.Struct):
+    id: str
+    server: str
+    model: str | None = None
+
+
+def lines(served: Iterable[Served]) -> bytes:
+    """Return one line of JSON for each answer."""
+    return msgspec.json.Encoder().encode_lines([_Line(*each) for each in served])
+
+
+def keep(work: Path, served: Iterable[Served] | bytes) -> None:
+    """Append answers, or their lines, to the file in a working folder."""
+    if data := served if isinstance(served, bytes) else lines(served):
+        with (work / FILE).open("ab") as file:
+            file.write(data)
+
+
+def write(out: Path, works: Iterable[Path]) -> None:
+    """Write a run's file from those of working folders; none if no answer came from a server.
+
+    An answer that was asked for twice has the server that gave it last.
+    """
+    last: dict[str, Served] = {}
+    for work in works:
+        for line in (work / FILE).read_bytes().splitlines() if (work / FILE).is_file() else ():
+            with suppress(msgspec.MsgspecError):  # torn, if the run was killed
+                read = msgspec.json.decode(line, type=_Line)
+                last[read.id] = Served(read.id, read.server, read.model)
+    if last:
+        write_whole(out / FILE, lines(last[name] for name in sorted(last)))

@@ -1,0 +1,43 @@
+"""Collect the files that an evaluation is made of, for its run to keep."""
+
+from pathlib import Path
+
+import msgspec
+
+from harness.backends import cards
+from harness.coordination.schedules import SCHEDULES
+from harness.core import resources
+from harness.evaluate.spec import Spec
+from harness.prompts.answer_schema import ROLES, answer_schema
+from harness.radio.profiles import CHANNELS
+
+
+def sources(spec: Spec) -> dict[str, bytes]:
+    """Return the files behind an evaluation by their path in a project, each once, and its answers' schemas.
+
+    What is in no file, such as the card of a hub id or a package's channel, `run.json` has alone.
+    """
+    texts: dict[str, bytes] = {}
+    paths: dict[str, Path | None] = {}
+    for agent in spec.agents:
+        prompt = agent.prompt
+        for name, text in prompt.files.items():
+            texts[f"prompts/{prompt.version}/{name}"] = text.encode()
+        for role in ROLES:
+            schema = msgspec.json.encode(answer_schema(role, spec.actions, form=prompt.helper_answer))
+            texts[f"schemas/{prompt.version}/{role}.json"] = msgspec.json.format(schema, indent=1) + b"\n"
+        card = agent.card.name.partition(":")[0]
+        if card in cards.names() and cards.load(agent.card.name) == agent.card:
+            paths[f"models/{card}.toml"] = resources.find("models", f"{card}.toml")
+    for point in spec.points:
+        if point.profile:
+            paths |= {f"channels/{name}": path for name, path in CHANNELS.files(point.profile).items()}
+        if point.network:
+            file = f"{point.round_trip}.toml"
+            paths[f"networks/{file}"] = resources.find("networks", file)
+        paths[f"schedules/{point.schedule}.toml"] = SCHEDULES.file(point.schedule)
+    if spec.device_profile:
+        file = f"{spec.device_profile.name}.toml"
+        paths[f"devices/{file}"] = resources.find("devices", file)
+    files = {name: path.read_bytes() for name, path in paths.items() if path}
+    return dict(sorted((texts | files).items()))

@@ -1,0 +1,69 @@
+"""Keep what a run was made of: the folder `sources` of a run's folder, laid out as a project is.
+
+It has the files of the prompts, the model cards, the channels and so on that the run used, and the schemas of
+its answers. `run.json` has the digests of the prompts, so that a kept prompt can be checked.
+"""
+
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from harness.core.errors import printable
+from harness.core.formats import SOURCES
+from harness.prompts import versions
+from harness.prompts.versions import Prompt
+from harness.runs.folder import Run
+
+PROMPTS = "prompts"
+
+
+def write(out: Path, files: Mapping[str, bytes], work: Path) -> None:
+    """Write files, by their path within `sources`, to a run's folder in one step.
+
+    They are first written to its folder of unfinished work, with which goes what a killed process left there.
+    """
+    if read(out) == files:
+        return
+    part = work / f".{SOURCES}.{os.getpid()}.part"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    for folder in dict.fromkeys((part / name).parent for name in files):
+        folder.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        (part / name).write_bytes(data)
+    shutil.rmtree(out / SOURCES, ignore_errors=True)
+    os.replace(part, out / SOURCES)
+
+
+def read(out: Path) -> dict[str, bytes]:
+    """Return what `write` wrote to a folder, by path; links are left out."""
+    kept = out / SOURCES
+    files = sorted(path for path in kept.rglob("*") if path.is_file() and not path.is_symlink())
+    return {file.relative_to(kept).as_posix(): file.read_bytes() for file in files}
+
+
+def prompt_of(run: Run, stated: Mapping[str, Any]) -> Prompt | None:
+    """Return a prompt that a run states by `version` and `sha256`, installed or kept by the run.
+
+    None if neither has this digest. What a stranger's run keeps is rendered in the sandbox like any prompt.
+    """
+    version, sha256 = stated["version"], stated["sha256"]
+    if prompt := versions.as_it_was(version, sha256):
+        return prompt
+    kept = run.path / SOURCES / PROMPTS
+    here = os.path.join(os.path.realpath(run.path), SOURCES, PROMPTS)
+    files = [path for folder in kept.glob("*") for path in (folder, *folder.glob("*"))]
+    if any(os.path.realpath(path) != os.path.join(here, path.relative_to(kept)) for path in files):
+        return None  # a link, which no command makes
+    return versions.as_it_was(version, sha256, kept)
+
+
+def lacking(run: Run) -> str | None:
+    """Return, in words, a prompt of the run that is neither here nor kept; None if there is none."""
+    for agent in (run.manifest.agent(0), *run.manifest.helpers):
+        if prompt_of(run, agent["prompt"]) is None:
+            version, sha256 = agent["prompt"]["version"], agent["prompt"]["sha256"]
+            return f"prompt {printable(version, 40)} with sha256 {printable(sha256, 13)} is not here"
+    return None

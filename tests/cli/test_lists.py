@@ -1,0 +1,87 @@
+"""A file that is wrong stands in its list as such; only the command that needs it fails."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from run_on_disk import made_up
+
+Typed = Callable[..., tuple[int, str, str]]
+# What is listed, by which command, what else it must have, and a command that needs the wrong one.
+LISTS = {
+    "channels": (("channel", "list"), "mode4", ("channel", "show", "bad")),
+    "models": (("model", "list"), "proxy", ("eval", "--model", "bad")),
+    "devices": (("device", "list"), "agx-orin", ("device", "show", "bad")),
+}
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """A project in which each file is wrong."""
+    (tmp_path / "swarmdrive.toml").touch()
+    for kind in (*LISTS, "networks", "schedules"):
+        (tmp_path / kind).mkdir()
+        (tmp_path / kind / "bad.toml").write_text("model = [\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize("kind", LISTS)
+def test_a_wrong_file_stands_in_its_list(kind: str, project: Path, harness: Typed) -> None:
+    command, sound, needs = LISTS[kind]
+    code, said, _ = harness(*command)
+    assert code == 0
+    lines = said.splitlines()
+    place = lines.index("bad · wrong")
+    assert f"{kind}/bad.toml" in lines[place + 1]
+    assert any(line.startswith(sound) for line in lines)
+    code, said, _ = harness(*command, "--json")
+    assert code == 0
+    rows = {row["name"]: row for row in json.loads(said)}
+    assert f"{kind}/bad.toml" in rows["bad"]["error"]
+    assert "error" not in rows[sound]
+    code, _, said = harness(*needs)
+    assert (code, said.count("\n")) == (2, 1)
+    assert f"{kind}/bad.toml" in said
+
+
+def test_what_needs_another_file_does_not_fail(project: Path, harness: Typed, small_path: Path) -> None:
+    assert harness("eval", "--dataset", small_path, "--seeds", "0", "--out", "run", "--quiet")[0] == 0
+    for command in (
+        ("sweep", "run", "--over", "reliability", "--grid", "1"),
+        ("sweep", "run", "--over", "loss", "--grid", "0"),
+        ("channel", "crowd"),
+        ("schedule", "compare", "run"),
+    ):
+        code, _, said = harness(*command)
+        assert "bad.toml" not in said, command
+        assert code == 0 or "unknown" in said, said
+
+
+def test_a_wrong_file_of_suites_takes_no_shipped_suite_with_it(project: Path, harness: Typed) -> None:
+    from harness.dataset.suites import named
+
+    (project / "datasets").mkdir()
+    (project / "datasets/suites.toml").write_text("[mine\n")
+    assert named("suite:v2v-safety").datasets
+    code, _, said = harness("eval", "--dataset", "suite:mine")
+    assert (code, "datasets/suites.toml" in said) == (2, True)
+
+
+def test_a_broken_run_takes_no_history_with_it(tmp_path: Path, harness: Typed) -> None:
+    for name in ("good", "bad"):
+        made_up(tmp_path / "reports" / name)
+    (tmp_path / "reports/bad/summary.csv").write_text(
+        (tmp_path / "reports/bad/summary.csv").read_text() + "not,a,row\n"
+    )
+    code, said, _ = harness("history")
+    assert code == 0
+    assert "bad · wrong" in said
+    code, said, _ = harness("history", "--json")
+    *groups, wrong = json.loads(said)
+    assert (code, [run["run"] for group in groups for run in group["runs"]]) == (0, ["good"])
+    assert wrong["run"] == "bad"
+    assert "summary.csv" in wrong["error"]
+    shutil.rmtree(tmp_path / "reports/bad")
+    assert "wrong" not in harness("history")[1]

@@ -1,0 +1,405 @@
+"""What could not be asked is no answer: exit code 3, the server's words, and the same command asks again."""
+
+import json
+from collections.abc import Callable, Iterator
+from itertools import count
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import served
+from misbehaving import Asked, Server, completion, serving
+from run_on_disk import Row, answers_of, made_up
+
+from harness.core import resources, work
+from harness.core.errors import EXIT_CODES
+from harness.evaluate.asking import FIRST, IN_A_ROW
+from harness.runs.unanswered import MOST_LOST, Tally
+
+Typed = Callable[..., tuple[int, str, str]]
+WORDS = 'model "m" not found'
+CARD = """
+engine = "openai"
+description = "d"
+weights = "m"
+[server]
+base_url = "{}"
+retries = 0
+[latency]
+source = "paper"
+basis = "none"
+"""
+
+
+def of_helper(asked: Asked) -> bool:
+    return " help car " in json.dumps(asked.body)
+
+
+def of_fusion(asked: Asked) -> bool:
+    return "MESSAGES id risk" in json.dumps(asked.body)
+
+
+def of_ego(asked: Asked) -> bool:
+    return not of_helper(asked) and not of_fusion(asked)
+
+
+class Play:
+    """Answers by the question alone, but refuses what `refuses` says."""
+
+    def __init__(self) -> None:
+        self.refuses: Callable[[Asked], bool] = lambda asked: False
+        self.bodies: list[str] = []
+
+    def __call__(self, asked: Asked) -> None:
+        self.bodies.append(json.dumps(asked.body, sort_keys=True))
+        if self.refuses(asked):
+            asked.reply({"error": {"message": WORDS}}, 404)
+        else:
+            served.answer(asked)
+
+    def again(self, refuses: Callable[[Asked], bool] = lambda asked: False) -> None:
+        """Forget what was asked, and refuse other questions from now on."""
+        self.refuses, self.bodies = refuses, []
+
+
+def some(of: Callable[[Asked], bool], every: int, most: int = 10**9) -> Callable[[Asked], bool]:
+    """The first of `every` questions of this kind, `most` in all; each is refused as often as it is asked."""
+    counted, refused, seen = count(), set[str](), set[str]()
+
+    def refuses(asked: Asked) -> bool:
+        body = json.dumps(asked.body, sort_keys=True)
+        if body not in seen and of(asked):
+            seen.add(body)
+            if next(counted) % every == 0 and len(refused) < most:
+                refused.add(body)
+        return body in refused
+
+    return refuses
+
+
+@pytest.fixture(scope="module")
+def play() -> Play:
+    return Play()
+
+
+@pytest.fixture(scope="module")
+def there(play: Play) -> Iterator[Server]:
+    with serving(play) as server:
+        yield server
+
+
+@pytest.fixture
+def ask(harness: Typed, play: Play, there: Server, small_path: Path, tmp_path: Path) -> Typed:
+    """The command as typed in a project whose card `mine` names the server; it has a cache of its own."""
+    (tmp_path / resources.MARKER).touch()
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models/mine.toml").write_text(CARD.format(there.url))
+    play.again()
+
+    def typed(command: str, *options: str | Path) -> tuple[int, str, str]:
+        data = () if command == "drive" else ("--dataset", small_path)
+        return harness(command, "--model", "mine", *data, *options)
+
+    return typed
+
+
+EVAL = ("--limit", "2", "--condition", "single-local", "--condition", "6g", "--seeds", "0:1", "--no-cache")
+
+
+def test_a_server_that_refuses_everything_is_asked_little_and_its_words_stand_first(
+    ask: Typed, harness: Typed, play: Play, tmp_path: Path
+) -> None:
+    play.again(lambda asked: True)
+    code, out, err = ask("eval", *EVAL, "--out", "run")
+    assert (code, out) == (3, "")
+    assert err.startswith(
+        f"harness: HTTP 404: {WORDS} ({len(play.bodies)} times): no answer to questions of "
+    )
+    assert "type the same command to continue: harness eval --model mine" in err
+    assert err.count("\n") == 1
+    assert len(play.bodies) == FIRST
+    assert not (tmp_path / "run/run.json").exists()
+
+    assert harness("export", "run", "--junit", "run.xml")[0] == 0
+    suite = ElementTree.parse(tmp_path / "run.xml").getroot()
+    assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["errors"]) == ("1", "0", "1")
+    [error] = suite.iter("error")
+    assert error.attrib["message"].startswith(f"HTTP 404: {WORDS}")
+
+    gate = ("--fail-if", "success_rate < -0.01", "--junit", "gates.xml")
+    code, out, err = harness("compare", "run", "run", *gate)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"harness: HTTP 404: {WORDS}")
+    assert [e.tag for e in ElementTree.parse(tmp_path / "gates.xml").getroot()[0]] == ["error"]
+    code, _, err = harness("export", "run", "--csv")
+    assert code == 2
+    assert f"run is no finished run, since its model could not be asked: HTTP 404: {WORDS}" in err
+
+    play.again()
+    code, _, err = ask("eval", *EVAL, "--out", "run")
+    assert (code, err) == (0, "")
+    assert not (tmp_path / "run/.work").exists()
+
+
+def test_nothing_is_lost_so_that_another_model_or_setting_may_begin_in_the_folder(
+    ask: Typed, play: Play, there: Server, tmp_path: Path
+) -> None:
+    """A server that has pulled the model by now lists it, and so has another identity."""
+    play.again(lambda asked: True)
+    listed, there.listed = there.listed, lambda asked: asked.reply({"data": []})
+    assert ask("eval", *EVAL)[0] == 3
+    [out] = (tmp_path / "reports").iterdir()
+    assert work.idle(out)
+    there.listed = listed
+    play.again()
+    assert ask("eval", *EVAL)[0] == 0
+    assert [path.name for path in (tmp_path / "reports").iterdir()] == [out.name]
+
+
+@pytest.mark.parametrize("role", ["ego", "helpers"])
+def test_the_same_command_asks_only_the_errors_and_makes_the_run_that_had_none(
+    role: str, ask: Typed, play: Play, tmp_path: Path
+) -> None:
+    play.again()
+    assert ask("eval", *EVAL, "--out", "whole")[0] == 0
+    asked = len(play.bodies)
+    refuses = some(of_helper, 10) if role == "helpers" else some(of_ego, 4, 1)
+    play.again(refuses)
+    code, _, err = ask("eval", *EVAL, "--out", "run")
+    assert code == 3
+    assert f"HTTP 404: {WORDS}" in err
+    assert f"questions of {role} " in err
+    before = set(play.bodies)
+    errors = refused(refuses, before)
+    assert errors
+    kept = [row for file in (tmp_path / "run/.work").rglob("*.jsonl") for row in rows_in(file)]
+    assert kept
+    assert not [row for row in kept if row["error"]]
+    play.again()
+    code, _, err = ask("eval", *EVAL, "--out", "run")
+    assert (code, err) == (0, "")
+    assert set(play.bodies) & before == errors
+    if role == "helpers":  # whose errors were found at the end
+        assert len(play.bodies) < asked / 5
+    assert without_batches(tmp_path / "run") == without_batches(tmp_path / "whole")
+    for name in ("episodes.csv", "summary.csv"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def refused(refuses: Callable[[Asked], bool], bodies: set[str]) -> set[str]:
+    """Those of some questions that are refused."""
+    return {body for body in bodies if refuses(Asked("", {}, json.loads(body), 0, None))}
+
+
+def rows_in(file: Path) -> list[Row]:
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+def without_batches(run: Path) -> list[Row]:
+    rows = rows_in(run / "answers.jsonl")
+    return [{k: v for k, v in row.items() if k not in ("batch_size", "seconds", "token_s")} for row in rows]
+
+
+def test_a_few_helpers_without_an_answer_are_lost_messages_that_are_counted_and_shown(
+    ask: Typed, harness: Typed, play: Play, tmp_path: Path
+) -> None:
+    play.again(some(of_helper, 40))
+    device = ("--device-profile", "agx-orin", "--device-model", "qwen3-4b")
+    code, out, err = ask("eval", *EVAL, *device, "--out", "run")
+    assert (code, err) == (0, "")
+    errors = [answer for answer in answers_of(tmp_path / "run") if answer.error]
+    helpers = [answer for answer in answers_of(tmp_path / "run") if answer.role == "helper"]
+    assert 0 < len(errors) < MOST_LOST * len(helpers)
+    assert {(answer.role, answer.status, answer.intent) for answer in errors} == {
+        ("helper", "engine_error", None)
+    }
+    assert f"{len(errors)} of {len(helpers)} questions to helpers got no answer, and count as lost" in out
+    page = (tmp_path / "run/report.html").read_text()
+    assert f"questions of helpers {len(errors)} of {len(helpers)}: each counts as a lost message" in page
+    assert harness("compare", "run", "run", "--fail-if", "success_rate < 0")[0] == 0, "a gate may judge it"
+
+
+def test_a_server_that_breaks_in_the_middle_is_soon_asked_no_more(ask: Typed, play: Play) -> None:
+    play.again(lambda asked: len(play.bodies) > 30)
+    assert ask("eval", *EVAL, "--out", "other")[0] == 3
+    assert len(play.bodies) <= 30 + 3 * IN_A_ROW
+
+
+def test_fusion_calls_count_as_the_egos(ask: Typed, play: Play, tmp_path: Path) -> None:
+    fusion = ("--condition", "6g:consensus=ego-prompt", "--seeds", "0:1", "--limit", "1", "--no-cache")
+    play.again(of_fusion)
+    code, _, err = ask("eval", *fusion, "--out", "run")
+    assert code == 3
+    assert "questions of fusion calls " in err
+    play.again()
+    assert ask("eval", *fusion, "--out", "run")[0] == 0
+    assert len(play.bodies) < len(answers_of(tmp_path / "run"))
+
+
+@pytest.mark.parametrize("role", ["ego", "helpers"])
+def test_a_driven_run_asks_only_the_errors_again(role: str, ask: Typed, play: Play, tmp_path: Path) -> None:
+    options = ("--episodes", "2", "--condition", "6g", "--seeds", "0:1", "--no-cache", "--workers", "1")
+    play.again(some(of_helper, 10) if role == "helpers" else some(of_ego, 5, 1))
+    code, out, err = ask("drive", *options, "--out", "run")
+    assert (code, out) == (3, "")
+    assert f"HTTP 404: {WORDS}" in err
+    before, refuses = set(play.bodies), play.refuses
+    play.again()
+    assert ask("drive", *options, "--out", "run")[0] == 0
+    assert set(play.bodies) & before == refused(refuses, before) != set()
+    assert not [answer for answer in answers_of(tmp_path / "run") if answer.error]
+
+
+def test_a_shard_is_not_done_while_too_many_of_its_questions_have_no_answer(
+    ask: Typed, harness: Typed, play: Play
+) -> None:
+    options = ("--episodes", "2", "--condition", "6g", "--seeds", "0:1", "--workers", "1", "--shard", "1/1")
+    play.again(some(of_helper, 10))
+    assert ask("drive", *options, "--out", "shard")[0] == 3
+    code, _, err = harness("merge", "shard", "--out", "run")
+    assert code == 2
+    assert "shard" in err
+    play.again()
+    assert ask("drive", *options, "--out", "shard")[0] == 0
+    assert harness("merge", "shard", "--out", "run")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("eval", ("--repeats", "2", "--temperature", "0.7", "--limit", "1", "--seeds", "0:1")),
+        ("twins", ("--limit", "1", "--workers", "1", "--twin", "order")),
+        ("grid", ("--prompt", "v1,v2", "--limit", "1", "--seeds", "0:1", "--condition", "6g")),
+    ],
+)
+def test_every_study_ends_the_same_way_and_goes_on(
+    command: str, options: tuple[str, ...], ask: Typed, play: Play, tmp_path: Path
+) -> None:
+    play.again(some(of_ego, 3, 1))
+    code, out, err = ask(command, *options, "--no-cache", "--out", "study")
+    assert (code, out) == (3, "")
+    assert err.startswith(f"harness: HTTP 404: {WORDS}: no answer to questions of ego 1 of ")
+    assert not list((tmp_path / "study").glob("*.html"))
+    before, refuses = set(play.bodies), play.refuses
+    play.again()
+    code, _, err = ask(command, *options, "--no-cache", "--out", "study")
+    assert (code, err) == (0, "")
+    assert set(play.bodies) & before == refused(refuses, before) != set()
+
+
+def test_what_a_study_asks_of_a_runs_model_is_kept_but_for_errors(
+    ask: Typed, harness: Typed, play: Play, tmp_path: Path
+) -> None:
+    assert ask("eval", *EVAL, "--out", "run")[0] == 0
+    play.again(some(of_helper, 4))
+    code, out, err = harness("attribute", "run", "--sample", "3")
+    assert (code, out) == (3, "")
+    assert f"HTTP 404: {WORDS}" in err
+    assert not (tmp_path / "run/attribution.json").exists()
+    before, refuses = set(play.bodies), play.refuses
+    play.again()
+    assert harness("attribute", "run", "--sample", "3")[0] == 0
+    assert set(play.bodies) == refused(refuses, before) != set()
+
+
+# -- runs of older versions, which hold errors of the ego -------------------------------------------------
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    def refuse(row: Row) -> None:
+        row |= {
+            "error": f"HTTP 404: {WORDS}", "raw": "", "finish_reason": "error", "status": "engine_error",
+            "verdict": "failed", "intent": None, "mass": None, "message": None,
+        }  # fmt: skip
+
+    path = made_up(tmp_path / "old", answer=refuse)
+    manifest = json.loads((path / "run.json").read_text())
+    manifest["engine_errors"] = len(answers_of(path))
+    (path / "run.json").write_text(json.dumps(manifest))
+    return path
+
+
+def test_gates_refuse_a_finished_run_that_is_full_of_errors(
+    old: Path, harness: Typed, tmp_path: Path
+) -> None:
+    code, out, err = harness("compare", old, old, "--fail-if", "success_rate < -0.01", "--junit", "gates.xml")
+    assert (code, out) == (2, "")
+    assert err.startswith(f"harness: HTTP 404: {WORDS}")
+    assert [e.tag for e in ElementTree.parse(tmp_path / "gates.xml").getroot()[0]] == ["error"]
+    code, out, _ = harness("compare", old, old)
+    assert code == 0
+    assert "the model could not be asked, so that this is no result" in " ".join(out.split())
+
+
+def test_its_episodes_are_errors_in_junit(old: Path, harness: Typed, tmp_path: Path) -> None:
+    assert harness("export", old, "--junit", "old.xml")[0] == 0
+    suite = ElementTree.parse(tmp_path / "old.xml").getroot()
+    assert suite.attrib["errors"] == suite.attrib["tests"]
+    assert suite.attrib["failures"] == "0"
+    assert not list(suite.iter("failure"))
+    assert {e.attrib["message"] for e in suite.iter("error")} == {
+        f"HTTP 404: {WORDS}: the model could not be asked"
+    }
+
+
+def test_it_is_not_replayed(old: Path, harness: Typed) -> None:
+    code, _, err = harness("eval", "--model", f"replay:{old}", "--out", "again")
+    assert code == 2
+    assert "lacks answers, so nothing replays it: HTTP 404" in err
+
+
+# -- the rule, and what a check of a model ends with ------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("ego", "lost", "missing"),
+    [(0, 0, set()), (1, 0, {"ego"}), (0, 4, set()), (0, 5, {"helper"}), (1, 4, {"ego"})],
+)
+def test_one_of_the_egos_or_five_percent_of_the_helpers(
+    ego: int, lost: int, missing: set[str], old: Path
+) -> None:
+    from msgspec.structs import replace
+
+    answer = replace(answers_of(old)[0], error=None, role="ego")
+    helpers = [replace(answer, role="helper", error="no" if n < lost else None) for n in range(100)]
+    egos = [replace(answer, error="no" if n < ego else None) for n in range(100)]
+    tally = Tally([*egos, *helpers])
+    assert tally.missing == missing
+    assert (f"ego {ego} of 100" in str(tally)) == bool(ego)
+
+
+@pytest.mark.parametrize(
+    ("said", "code"), [(None, 3), ("I would rather not say", 1), ('{"SLOWER": 0.2, "IDLE": 0.8}', 1)]
+)
+def test_a_check_tells_a_model_that_cannot_be_asked_from_one_that_cannot_be_read(
+    said: str | None, code: int, ask: Typed, harness: Typed, there: Server, tmp_path: Path
+) -> None:
+    def answer(asked: Asked) -> None:
+        asked.reply(*((completion(said),) if said else ({"error": {"message": WORDS}}, 404)))
+
+    with serving(answer) as other:
+        (tmp_path / "models/mine.toml").write_text(CARD.format(other.url))
+        ended, out, err = harness("model", "check", "mine")
+    assert ended == code
+    assert out.startswith("model        mine")
+    if said is None:
+        assert err == f"harness: HTTP 404: {WORDS}: no answer of mine in any answer mode\n"
+    (tmp_path / "models/mine.toml").write_text(CARD.format(there.url))
+    assert harness("model", "check", "mine")[0] == 0
+
+
+def test_a_server_that_does_not_listen_could_not_be_asked(ask: Typed, harness: Typed, tmp_path: Path) -> None:
+    (tmp_path / "models/mine.toml").write_text(CARD.format("http://127.0.0.1:9/v1"))
+    code, _, err = harness("model", "check", "mine")
+    assert (code, err.count("\n")) == (3, 1)
+    assert ask("eval", "--out", "run")[0] == 3
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_codes_are_in_the_help_and_on_a_page(harness: Typed) -> None:
+    code, out, _ = harness("--help")
+    assert code == 0
+    for number, meaning in EXIT_CODES.items():
+        assert f"{number} {meaning}" in " ".join(out.split())
+        assert f"| {number} | {meaning}" in (resources.root() / "docs/answers.md").read_text()
