@@ -13,6 +13,7 @@ from starlette.testclient import TestClient
 
 from harness.core.statistics import mean_of
 from harness.dataset.build import build
+from harness.report.view.access import cookie
 from harness.report.view.app import app
 from harness.runs.listing import runs
 from harness.runs.suite import read
@@ -260,7 +261,9 @@ def test_a_broken_suite_is_one_line(evaluated: Harness, families: str) -> None:
 
 
 def test_view_opens_a_suite_with_links_to_its_runs_and_none_whose_files_lead_out(evaluated: Harness) -> None:
-    browser = TestClient(app(Path("reports").absolute()), base_url="http://127.0.0.1")
+    browser = TestClient(
+        app(Path("reports").absolute(), "token"), base_url="http://127.0.0.1", cookies={cookie(80): "token"}
+    )
     page = browser.get("/run", params={"path": DONE.name})
     assert page.status_code == 200
     for family, folder in (("occluded-intersection", "small"), ("parking-exit", "exits")):

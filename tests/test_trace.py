@@ -154,3 +154,12 @@ def test_a_mistake_in_a_profile_is_one_line(tmp_path, parameters, says):
         of_profile(parameters, tmp_path, "mine.toml [parameters]")
     assert says in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("file", ["../secret.csv", "/etc/passwd", "link.csv"])
+def test_a_profile_names_no_file_that_lies_elsewhere(file: str, tmp_path: Path) -> None:
+    (tmp_path / "channels").mkdir()
+    (tmp_path / "secret.csv").write_text("sk-secret,reception\n1,1\n")
+    (tmp_path / "channels/link.csv").symlink_to(tmp_path / "secret.csv")
+    with pytest.raises(UserError, match="lies elsewhere; put it beside the profile"):
+        of_profile({"file": file, "latency_s": 0.01}, tmp_path / "channels", "profile")

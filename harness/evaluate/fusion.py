@@ -94,7 +94,7 @@ def messages_of(
             for change in filter(None, changes.split("&")):
                 message = _rewritten(message, change, actions)
             # No special token of a chat template gets through.
-            message["evidence"] = as_text(message["evidence"])
+            message["evidence"] = as_text(message["evidence"] or "")
             messages.append({"sender": key.removesuffix(BLIND), **message})
     return messages
 

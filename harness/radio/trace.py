@@ -135,6 +135,10 @@ def of_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace
     if not isinstance(parameters.get("file"), str):
         raise UserError(f"{where} has no file; add it, a CSV with distance_m and reception")
     path = folder / parameters["file"]
+    if not path.resolve().is_relative_to(folder.resolve()):  # a profile may come from others
+        raise UserError(
+            f"{where}: file {printable(parameters['file'])!r} lies elsewhere; put it beside the profile"
+        )
     points = read(path)
     table = Table(parameters["file"], sha256_file(path, "text"), points)
     rest = {key: value for key, value in parameters.items() if key != "file"}

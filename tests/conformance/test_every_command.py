@@ -8,11 +8,12 @@ covered if its parameters have names that other commands have; else `PLAIN` asks
 import importlib
 import json
 import pickle
+import secrets
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import uvicorn
@@ -24,8 +25,6 @@ from starlette.testclient import TestClient
 from harness import cli
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
-from harness.report.view import serve
-from harness.world.environments.environment import IMPORTS
 
 Said = tuple[int, str, str]
 SECRET = "sk-canary-0123456789"
@@ -53,8 +52,9 @@ retries = 0
 source = "paper"
 basis = "b"
 """
-TEMPLATE = """{% include "../../secret.txt" ignore missing %}{{ self.__init__.__globals__ }}{{ environ }}
-{{ cycler.__init__.__globals__.os.environ }}{{ task }}"""
+TEMPLATE = """{% block system %}{{ task }}{% endblock %}{% block user %}
+{% include "../../secret.txt" ignore missing %}{{ self.__init__.__globals__ }}{{ environ }}
+{{ cycler.__init__.__globals__.os.environ }}{% endblock %}"""
 TRACE = """description = "d"
 source = "s"
 status = "assumed"
@@ -168,27 +168,35 @@ HOSTILE: dict[str, Sequence[str]] = {
     "helper_prompt": ["evil"], "version": ["evil"], "condition": ["evil"], "env_config": ["evil.json"],
     "against": ["evil.csv"], "tokenizer": ["models/evil-weights"], "base": ["models/evil-weights"],
     "file": ["evil.txt"], "names": ["evil"],
+    "grid model": ["proxy,evil", "proxy,models/evil-weights"], "campaign closed-loop model": ["evil"],
+    "history dataset": [],
     "channel show name": ["evil"], "channel check name": ["evil"], "model check name": ["evil", "mine"],
     "model pull name": ["evil"], "prompt diff a": ["evil"], "prompt diff b": ["evil"],
 }  # fmt: skip
 # What a command needs, and what keeps it short; a folder that it writes is its own each time.
 PLAIN: dict[str, str] = {
-    "run": "reports/served", "runs": "reports/served", "a": "reports/served", "b": "base/run",
+    "run": "reports/served", "runs": "reports/served", "a": "base/run", "b": "base/run",
     "folders": "reports/served", "tune": "reports/served", "folder": "reports", "dataset": "base/dataset",
     "version": "v2", "file": "evil.txt", "episode": "0", "scenario": "occluded-intersection",
     "names": "evil", "scene": "00000-0",
-    "prompt diff a": "v2", "prompt diff b": "v4", "init folder": "new", "dataset build name": "do-not-pass",
+    "prompt diff a": "v2", "prompt diff b": "v4", "init folder": "new",
+    "dataset build name": "occluded-intersection",
     "scenario show name": "do-not-pass", "scenario check name": "do-not-pass",
     "scenario audit name": "do-not-pass", "channel show name": "6g", "channel check name": "mode4",
     "model check name": "proxy", "model pull name": "proxy", "device show name": "laptop-cpu",
-    "device check name": "laptop-cpu", "parity model": "models/evil-weights", "view port": "0",
-    "limit": "1", "episodes": "1", "sweep_episodes": "1", "seeds": "0,1", "workers": "1", "layouts": "100",
-    "sample": "2", "count": "1", "over": "consensus", "grid": "ego-prompt", "attacks": "jump",
-    "rules": "linear", "share": "1/3", "trust condition": "6g", "eval condition": "6g",
-    "drive condition": "6g", "twin": "mirrored", "schedule": "entropy", "samples": "1,1,1,1",
-    "prompts": "1", "window_s": "1",
+    "device check name": "laptop-cpu", "parity model": "models/evil-weights", "port": "0",
+    "limit": "1", "episodes": "1", "seeds": "0:1", "workers": "1", "layouts": "20",
+    "attribute sample": "2", "count": "1", "over": "consensus", "grid": "ego-prompt", "attacks": "jump",
+    "rules": "linear", "share": "1/3", "twin": "mirrored", "schedule": "entropy", "samples": "1,1,1,1",
+    "prompts": "1", "window_s": "1", "out": "written",
+    "video out": "written/video.gif", "dataset show out": "written/scene.svg",
+    "prompt show out": "written.png",
+    "eval workers": "", "scenario audit layouts": "2", "prompt check dataset": "base/dataset",
+    "grid model": "proxy,mine", "trust run": "reports/served", "campaign paper episodes": "10",
+    "sweep_episodes": "10", "schedule learn out": "written.toml", "export out": "written/file",
+    "report out": "written/page.html",
 }  # fmt: skip
-FLAGS = {"env_config": ["--env", "merge-v0"], "dataset build env_config": ["--env", "merge-v0"]}
+ALWAYS = {"export": ["--csv"], "fidelity": ["base/run"], "dataset build": ["--no-audit"]}
 
 
 def change(file: Path, **values: Any) -> None:
@@ -203,25 +211,18 @@ def typed(words: str, command: Any) -> Iterator[list[str]]:
         return table.get(f"{words} {name}", table.get(name))
 
     def line(changed: str = "", to: str = "") -> list[str]:
-        arguments, options = [], []
+        arguments, options = [], list(ALWAYS.get(words, ()))
         for p in parameters:
-            given = to if p.name == changed else value(PLAIN, p.name)
-            if p.name == "out":
-                given = "written" + (".toml" if words == "schedule learn" else "")
-            needed = p.required or p.name == changed or p.name not in HOSTILE
-            if given is None or not needed:
-                if p.required:
-                    pytest.fail(
-                        f"`harness {words}` needs {p.name}: say in PLAIN what, in HOSTILE what is hostile"
-                    )
-                continue
-            if p.param_type_name == "argument":
-                arguments.append(given)
-            else:
-                options += [p.opts[0], given]
-        if changed == "env_config":
-            options += ["--env", "merge-v0"]
-            arguments = []
+            given = to if p.name == changed else value(PLAIN, p.name) or None
+            if p.required and given is None:
+                pytest.fail(f"harness {words} needs {p.name}: give PLAIN a value, and HOSTILE a hostile one")
+            needed = p.required or changed == p.name or f"{words} {p.name}" in PLAIN or p.name not in HOSTILE
+            if given is not None and needed:
+                at = arguments if p.param_type_name == "argument" else options
+                at += [given] if p.param_type_name == "argument" else [p.opts[0], given]
+        if changed == "env_config":  # an environment takes the place of a scenario
+            place = options.index("--scenario") if "--scenario" in options else len(options)
+            arguments, options = [], [*options[:place], *options[place + 2 :], "--env", "merge-v0"]
         return [*words.split(), *arguments, *options]
 
     yield line()
@@ -249,7 +250,7 @@ def theirs() -> Iterator[Server]:
 
 
 def listed(asked: Asked) -> None:
-    asked.handler.server.asked.append(asked)  # type: ignore[attr-defined]
+    asked.handler.server.asked.append(asked)
     asked.reply({"data": [{"id": "m"}]})
 
 
@@ -272,7 +273,8 @@ def test_a_hostile_copy_causes_nothing(
     canary = tmp_path / "canary"
     canary.mkdir()
     (canary / f"{MODULE}.py").write_text(IMPORTED)
-    (tmp_path / "secret.txt").write_text(f"{SECRET},reception\n1,1\n")
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs/secret.txt").write_text(f"distance_m,reception,{SECRET}\n1,0.9,0\n99,0.1,0\n")
     project = tmp_path / "theirs" / "project"
     project.mkdir(parents=True)
     monkeypatch.chdir(project)
@@ -282,9 +284,9 @@ def test_a_hostile_copy_causes_nothing(
     monkeypatch.setenv("OPENAI_API_KEY", f"{SECRET}-of-models")
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    monkeypatch.delenv(IMPORTS, raising=False)
+    monkeypatch.delenv("SWARMDRIVE_IMPORTS", raising=False)
     monkeypatch.setattr(uvicorn.Server, "run", visited)
-    monkeypatch.setattr(serve.secrets, "token_urlsafe", lambda: "token")
+    monkeypatch.setattr(secrets, "token_urlsafe", lambda: "token")
     Strangers(theirs, mine, base)
     theirs.asked.clear()
     for line in typed(words, command):
@@ -305,9 +307,11 @@ def test_a_hostile_copy_causes_nothing(
 
 def visited(self: uvicorn.Server, sockets: Any) -> None:
     """The pages of `harness view` as a browser opens them, in place of a server."""
-    browser = TestClient(self.config.app, base_url="http://127.0.0.1:7654", raise_server_exceptions=False)
+    browser = TestClient(
+        cast("Any", self.config.app), base_url="http://127.0.0.1:7654", raise_server_exceptions=False
+    )
     assert browser.get("/?token=token").status_code == 200
-    for run in RUNS:
-        name = run.removeprefix("reports/")
-        for page in ("run", "report", "compare"):
-            browser.get(f"/{page}", params={"path": [name, "served"][: 1 + (page == "compare")]})
+    for name in ("served", "moved", "named", "driven", "traffic"):
+        browser.get("/run", params={"path": name})
+    for page in ("report", "compare"):
+        browser.get(f"/{page}", params={"path": ["driven", "traffic"]})

@@ -416,3 +416,43 @@ def test_bad_input_is_a_line(harness, tmp_path, arguments, said):
 def test_the_page_shows_the_environment_of_these_tests():
     root = Path(__file__).parents[2]
     assert (root / "tests/my_roads.py").read_text() in (root / "docs/environments.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [
+        ("env:my_roads:breakdown-v0", "my_roads"),
+        ("env:my_roads.inner:breakdown-v0", "my_roads.inner"),
+        ("env:os.path:breakdown-v0", "os.path"),
+        (named("merge-v0", {"observation": {"type": "my_roads.Seen"}}), "my_roads"),
+        (named("merge-v0", {"action": {"kinds": [{"type": "my-roads.Action"}]}}), "my-roads"),
+        (named("merge-v0", {"other_vehicles_type": "highway_environment.Car"}), "highway_environment"),
+    ],
+)
+def test_a_name_that_would_import_a_module_is_refused_unless_it_is_listed(name, module, monkeypatch):
+    monkeypatch.setenv("SWARMDRIVE_IMPORTS", "other,my_road")
+    with pytest.raises(UserError, match=f"would import the module {module}; if you trust it, set SWARM"):
+        reset(name, 0)
+    monkeypatch.setenv("SWARMDRIVE_IMPORTS", f"other, {module.partition('.')[0]}")
+    if name == OWN:
+        reset(name, 0)
+    else:  # something else is wrong with it, now that it may be imported
+        with pytest.raises((UserError, ValueError)) as caught:
+            reset(name, 0)
+        assert "would import" not in str(caught.value)
+
+
+def test_classes_of_highway_env_need_no_listing(monkeypatch):
+    monkeypatch.delenv("SWARMDRIVE_IMPORTS")
+    traffic = {"other_vehicles_type": "highway_env.vehicle.behavior.AggressiveVehicle"}
+    env = reset(named("merge-v0", traffic), 0)
+    assert any(type(v).__name__ == "AggressiveVehicle" for v in env.road.vehicles)
+
+
+def test_what_is_typed_may_be_imported_and_what_a_file_names_may_not(harness, folder, monkeypatch):
+    monkeypatch.delenv("SWARMDRIVE_IMPORTS")
+    assert harness("scenario", "show", OWN)[0] == 0
+    for command in ("check", "rank"):
+        code, _, err = harness("dataset", command, folder)
+        assert (code, err.count("\n")) == (2, 1)
+        assert "set SWARMDRIVE_IMPORTS=my_roads in your environment" in err

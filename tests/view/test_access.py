@@ -23,7 +23,7 @@ def stranger(reports: Path) -> TestClient:
 @pytest.mark.parametrize("page", PAGES)
 @pytest.mark.parametrize("given", ["", "wrong", TOKEN[:-1], TOKEN + "x", TOKEN.upper(), "tök\xe9n"])
 def test_without_the_token_nothing_is_read(page: str, given: str, stranger: TestClient) -> None:
-    sent = {"Cookie": f"{cookie(7654)}={given}".encode("latin-1")}
+    sent = {b"Cookie": f"{cookie(7654)}={given}".encode("latin-1")}
     asked = f"{page}{'&' if '?' in page else '?'}token={given}"
     for answer in (stranger.get(page), stranger.get(page, headers=sent), stranger.get(asked)):
         assert answer.status_code == 403
