@@ -23,7 +23,7 @@ from judging import Tally, counted, dataset, of_session, typed, workshop
 ENTRY = (sys.executable, "-m", "harness")
 SIGNALS = {signal.SIGTERM: 143, signal.SIGINT: 130}
 START_S = 0.6
-BEGUN = "in main"  # of a traceback that begins in the program
+BEGUN = "harness/__main__.py"  # in a traceback that begins in the program
 
 
 @dataclass(frozen=True)
