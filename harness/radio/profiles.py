@@ -91,7 +91,7 @@ class Profiles(FilesAndPlugins[Channel]):
         if name not in self:
             return False
         now, then = self.record(name), msgspec.to_builtins(recorded)
-        defaults = {f.name: f.default for f in fields(self[name]) if f.default is not MISSING}  # type: ignore[arg-type]
+        defaults = {f.name: f.default for f in fields(self[name]) if f.default is not MISSING}
         before = {**msgspec.to_builtins(defaults), **then["parameters"]}
         return bool((now["model"], now["parameters"]) == (then["model"], before))
 
