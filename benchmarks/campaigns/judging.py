@@ -93,7 +93,8 @@ class Running:
         for file in self._said:
             file.seek(0)
             said.append(file.read().decode("utf-8", "replace"))
-        return Ended(self.command, os.waitstatus_to_exitcode(done[1]), *said, done[2].ru_maxrss << 10)
+        output, error = said
+        return Ended(self.command, os.waitstatus_to_exitcode(done[1]), output, error, done[2].ru_maxrss << 10)
 
     def left(self, within_s: float = 5.0) -> list[int]:
         """Processes of its session that are still there so long after it ended; they are then killed."""

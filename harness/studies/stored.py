@@ -178,7 +178,8 @@ class Stored:
         profile = self.run.manifest.device_profile
         if profile is None:
             return np.full(heard.messages.shape, np.nan)
-        return device.radio_j(profile, point, heard.airtime_s, heard.requests + heard.messages)
+        sent = (heard.requests + heard.messages).astype(float)
+        return device.radio_j(profile, point, heard.airtime_s, sent)
 
     @property
     def spec(self) -> Spec:
