@@ -212,6 +212,7 @@ EXCEPT = {
     "training/model.py": "safetensors maps weights that training has just written",
     "report/library.py": "the charting library of an installed package",
     "cli/init.py": "the project that ships",
+    "core/process.py": "the null device",
     "cli/parse.py": "pipes that the shell hands over",
 }
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 from harness.backends.base import Served
-from harness.core.files import write_whole
+from harness.core.files import bytes_of, write_whole
 
 FILE = "servers.jsonl"
 
@@ -40,7 +40,7 @@ def write(out: Path, works: Iterable[Path]) -> None:
     """
     last: dict[str, Served] = {}
     for work in works:
-        for line in (work / FILE).read_bytes().splitlines() if (work / FILE).is_file() else ():
+        for line in bytes_of(work / FILE, "rows").splitlines() if (work / FILE).is_file() else ():
             with suppress(msgspec.MsgspecError):  # torn, if the run was killed
                 read = msgspec.json.decode(line, type=_Line)
                 last[read.id] = Served(read.id, read.server, read.model)

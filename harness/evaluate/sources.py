@@ -7,6 +7,7 @@ import msgspec
 from harness.backends import cards
 from harness.coordination.schedules import SCHEDULES
 from harness.core import resources
+from harness.core.files import bytes_of
 from harness.evaluate.spec import Spec
 from harness.prompts.answer_schema import ROLES, answer_schema
 from harness.radio.profiles import CHANNELS
@@ -39,5 +40,5 @@ def sources(spec: Spec) -> dict[str, bytes]:
     if spec.device_profile:
         file = f"{spec.device_profile.name}.toml"
         paths[f"devices/{file}"] = resources.find("devices", file)
-    files = {name: path.read_bytes() for name, path in paths.items() if path}
+    files = {name: bytes_of(path, "text") for name, path in paths.items() if path}
     return dict(sorted((texts | files).items()))

@@ -16,7 +16,7 @@ from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
 from harness.core.errors import UserError, printable
-from harness.core.files import replacing
+from harness.core.files import opened, replacing
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each
 from harness.core.places import nameless, text
@@ -76,7 +76,7 @@ def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
     """
     if not lacks or not out.is_file():
         return
-    with out.open("rb") as page:
+    with opened(out, "rows") as page:
         stated = re.search(rb'<meta name="lacks" content="([a-z ]*)">', page.read(HEAD))
     lacked = stated[1].decode().split() if stated else []
     for what, why in lacks.items():

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.core.errors import printable
+from harness.core.files import bytes_of
 from harness.core.formats import SOURCES
 from harness.prompts import versions
 from harness.prompts.versions import Prompt
@@ -41,7 +42,7 @@ def read(out: Path) -> dict[str, bytes]:
     """Return what `write` wrote to a folder, by path; links are left out."""
     kept = out / SOURCES
     files = sorted(path for path in kept.rglob("*") if path.is_file() and not path.is_symlink())
-    return {file.relative_to(kept).as_posix(): file.read_bytes() for file in files}
+    return {file.relative_to(kept).as_posix(): bytes_of(file, "text") for file in files}
 
 
 def prompt_of(run: Run, stated: Mapping[str, Any]) -> Prompt | None:

@@ -14,7 +14,7 @@ from harness.backends.engine import Session
 from harness.backends.language_model import LanguageModel
 from harness.backends.weights import fetching, find_checkpoint, held_to_digest, hub_commit
 from harness.core.errors import UserError, printable
-from harness.core.files import digest, sha256_bytes, sha256_file
+from harness.core.files import digest, sha256_bytes, sha256_file, text_of
 from harness.core.image import Image
 
 # Suffixes of the files that decide an answer; a README or a licence does not.
@@ -98,7 +98,7 @@ def _refuse_kernels(card: Card, where: Path) -> None:
     Where the package `kernels` is installed, transformers fetches that repository and runs its code.
     """
     try:
-        rest: list[Any] = [json.loads((where / "config.json").read_bytes())]
+        rest: list[Any] = [json.loads(text_of(where / "config.json", "record"))]
     except (OSError, ValueError, RecursionError):
         return  # transformers says what is wrong
     while rest:
