@@ -76,3 +76,27 @@ def test_a_server_that_drops_the_system_text_answers_nothing(kind: str, tell: Te
 def test_a_card_with_the_system_text_in_the_first_user_turn_is_served() -> None:
     _, texts = asked_of("llama-server", lambda messages: {"prompt": said(users(messages))}, "first-user")
     assert texts == ["hello"] * 4
+
+
+@pytest.mark.parametrize(("counts", "said_once"), [((40, 90), False), ((40, 40), True), ((40, 30), True)])
+def test_it_is_said_once_if_longer_prompts_have_no_more_tokens(
+    counts: tuple[int, int], said_once: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def play(asked: Asked) -> None:
+        if asked.body is None:
+            asked.reply(LISTED)
+            return
+        long = len(asked.body["messages"][1]["content"]) > 100
+        asked.reply({**completion(), "usage": {"prompt_tokens": counts[long], "completion_tokens": 1}})
+
+    longer = (CHAT[0], {"role": "user", "content": "A lorry ahead. " * 10})
+    with serving(play, play) as server:
+        card = cards.load("openai-example")
+        there = replace(card.server, base_url=server.url, retries=0)
+        backend = open_backend(replace(card, weights="m", server=there), batch_size=1)
+        for n, messages in enumerate((CHAT, longer, CHAT, longer)):
+            backend.complete([Request(f"{n}/v1", "ego", messages, ("A",), 9)])
+    told = capsys.readouterr().err.count(
+        f"counts 40 tokens in a prompt of 26 characters and {counts[1]} in one"
+    )
+    assert told == said_once

@@ -56,6 +56,7 @@ class OpenAIBackend:
         self._streams = True  # until a server refuses to stream
         self._served = deque[Served](maxlen=_MOST_SERVED)
         self._told = False  # that a server names another model
+        self._cuts = False  # whether a server was said to cut prompts
         client = Client(server)
         self._farm = Farm(client, server, card.name, card.weights or "", batch_size)
         self._reading = Reading(client, card, server)
@@ -166,7 +167,11 @@ class OpenAIBackend:
                 self._farm.say(
                     f"server {url} was asked for {printable(asked)}, and says that {model} answers"
                 )
-        self._served.append(Served(request.id, reply.url, model))
+        if not answer.error:
+            self._served.append(Served(request.id, reply.url, model))
+        if not self._cuts and (fault := self._reading.fault(request, answer.prompt_tokens)):
+            self._cuts = True
+            self._farm.say(f"server {printable(reply.url)} {fault}")
 
     def _hinted(self, reply: Reply) -> str:
         """Return a reply's fault; if it names a field that a card can change, say so."""

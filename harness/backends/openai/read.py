@@ -13,17 +13,21 @@ from harness.backends.openai.shapes import body, digest_url
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable
 
+LONGER = 1.5  # times as many characters have more tokens
+
 
 class Reading:
     """Asks a model's servers, before the first answer of each role, what the model reads.
 
     llama-server renders messages (`/apply-template`), and vLLM counts them (`/tokenize`), without an answer.
-    No other server tells. Prompts with pictures are not asked about.
+    Of another server only the token counts of its answers are known: `fault` says if they do not grow with
+    the prompts. Prompts with pictures are not asked about.
     """
 
     def __init__(self, client: Client, card: Card, server: Server) -> None:
         self._client, self._card, self._server = client, card, server
         self._asked: set[str] = set()  # roles
+        self._shortest = self._longest = (0, 0)  # characters and tokens of prompts that were answered
         self._one = asyncio.Lock()
 
     async def check(self, requests: Sequence[Request]) -> None:
@@ -36,6 +40,24 @@ class Reading:
                     for base in self._server.urls:
                         await self._ask(base, body(self._card, self._server, request, digest_url))
                     self._asked.add(request.role)
+
+    def fault(self, request: Request, tokens: int | None) -> str | None:
+        """Return what is wrong with a server's count of a prompt's tokens; None if nothing is.
+
+        Some servers cut long prompts to their context in silence, as Ollama does.
+        """
+        if tokens is None or request.image is not None or self._server.kind in ("llama-server", "vllm"):
+            return None
+        here = sum(len(message["content"]) for message in request.messages), tokens
+        self._shortest = min(self._shortest if self._shortest[0] else here, here)
+        self._longest = max(self._longest, here)
+        (few, counted), (many, of_many) = self._shortest, self._longest
+        if many < LONGER * few or of_many > counted:
+            return None
+        return (
+            f"counts {counted} tokens in a prompt of {few} characters and {of_many} in one of {many}; it may "
+            "cut prompts, or count only what it did not have in its cache: look at its context length and log"
+        )
 
     async def _ask(self, base: str, asked: dict[str, Any]) -> None:
         messages: Messages = asked["messages"]
