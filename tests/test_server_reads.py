@@ -92,7 +92,7 @@ def test_it_is_said_once_if_longer_prompts_have_no_more_tokens(
     longer = (CHAT[0], {"role": "user", "content": "A lorry ahead. " * 10})
     with serving(play, play) as server:
         card = cards.load("openai-example")
-        there = replace(card.server, base_url=server.url, retries=0)
+        there = replace(card.server, kind="generic", base_url=server.url, retries=0)
         backend = open_backend(replace(card, weights="m", server=there), batch_size=1)
         for n, messages in enumerate((CHAT, longer, CHAT, longer)):
             backend.complete([Request(f"{n}/v1", "ego", messages, ("A",), 9)])
