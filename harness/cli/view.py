@@ -16,7 +16,7 @@ def command(
 ) -> None:
     """List, open and compare runs and studies in a browser.
 
-    Only this machine is served, and only whoever has the token in the printed address, until Ctrl-C.
+    Only this machine is served, and only to who has the token in the printed address, until Ctrl-C.
     """
     from harness.report.view.serve import serve
     from harness.runs.listing import runs

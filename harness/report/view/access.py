@@ -1,4 +1,4 @@
-"""Who may read the pages: whoever has the token that `harness view` printed, and no other site.
+"""Who may read the pages: only who has the token that `harness view` printed, and no other site.
 
 A machine may have several users, and each can reach its loopback interface; so can every page in a browser.
 The address that is printed holds the token; its answer is a cookie, and the address without it. Requests that

@@ -62,7 +62,7 @@ WAY_BACK = '<p class="way-back"><a href="/">← All runs</a></p>'
 
 
 def app(folder: Path, token: str) -> ASGIApp:
-    """The application for one folder of runs, for whoever has the token."""
+    """The application for one folder of runs, for who has the token."""
     view = View(folder)
     routes = {
         "/": view.index, "/style.css": view.style, "/run": view.run, "/picture": view.picture,
