@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from io import TextIOWrapper
@@ -40,6 +41,7 @@ def run(program: Callable[[], object]) -> None:
     written; a character that an encoding lacks is replaced.
     """
     _open_streams()
+    _leave_out_wrong_date()
     if lack := _lack():
         print(f"harness: {lack}", file=sys.stderr)
         sys.exit(2)
@@ -141,8 +143,17 @@ def _open_streams() -> None:
             if null == number:
                 os.set_inheritable(null, True)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper) and stream.errors == "strict":
+        # In the C locale, Python writes what it could not decode, and fails at any other character.
+        if isinstance(stream, TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
             stream.reconfigure(errors="replace")
+
+
+def _leave_out_wrong_date() -> None:
+    """Take a date that is none out of the environment: NumPy fails at it where SciPy imports all of it."""
+    try:
+        time.gmtime(int(os.environ.get("SOURCE_DATE_EPOCH", "0")))
+    except (ValueError, OverflowError, OSError):
+        del os.environ["SOURCE_DATE_EPOCH"]
 
 
 def _lack() -> str | None:

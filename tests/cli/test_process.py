@@ -75,12 +75,19 @@ def test_a_signal_at_any_moment_of_a_command(tmp_path: Path) -> None:
 # -- consoles and streams -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "ascii:strict"])
-def test_a_console_that_lacks_a_character_gets_another(encoding: str, tmp_path: Path) -> None:
-    done = ended("prompt", "list", cwd=tmp_path, env={"PYTHONIOENCODING": encoding})
+@pytest.mark.parametrize(
+    "env",
+    [
+        *({"PYTHONIOENCODING": encoding} for encoding in ("ascii", "latin-1", "ascii:strict")),
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    ],
+    ids=lambda env: " ".join(env.values()),
+)
+def test_a_console_that_lacks_a_character_gets_another(env: dict[str, str], tmp_path: Path) -> None:
+    done = ended("prompt", "list", cwd=tmp_path, env=env)
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"?" in done.stdout
-    done = ended("ls", "nowhere-…", cwd=tmp_path, env={"PYTHONIOENCODING": encoding})
+    done = ended("ls", "nowhere-…", cwd=tmp_path, env=env)
     assert done.returncode == 2
     assert b"Traceback" not in done.stderr
 
@@ -161,3 +168,13 @@ def test_a_date_of_the_environment_that_is_none(date: str, monkeypatch: pytest.M
             save(Figure(), data := io.BytesIO(), kind)
             written.setdefault(kind, set()).add(data.getvalue())
     assert {kind: len(different) for kind, different in written.items()} == dict.fromkeys(FORMATS, 1)
+
+
+@pytest.mark.parametrize("date", ["garbage", "99999999999999999999"])
+def test_a_run_under_a_date_that_is_none(date: str, tmp_path: Path) -> None:
+    """Some packages read it while they are imported."""
+    done = ended(
+        "eval", "--limit", "1", "--seeds", "0", "--condition", "6g", "--out", "run", "--quiet", cwd=tmp_path,
+        env={"SOURCE_DATE_EPOCH": date},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, b"")
