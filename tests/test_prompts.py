@@ -360,6 +360,16 @@ def test_pins_that_cannot_be_read_are_one_line(copied: Path) -> None:
         prompts.load("v1", copied)
 
 
+def test_a_file_that_is_missing_is_named_once(copied: Path) -> None:
+    file = copied / "v1" / "ego.j2"
+    file.unlink()
+    with pytest.raises(UserError) as said:
+        prompts.load("v1", copied)
+    assert (
+        str(said.value) == f"prompt file {file} cannot be read: No such file or directory; replace the file"
+    )
+
+
 # -- length ---------------------------------------------------------------------------------------------
 
 
