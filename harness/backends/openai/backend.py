@@ -166,7 +166,8 @@ class OpenAIBackend:
                 self._farm.say(
                     f"server {url} was asked for {printable(asked)}, and says that {model} answers"
                 )
-        self._served.append(Served(request.id, reply.url, model))
+        if not answer.error:
+            self._served.append(Served(request.id, reply.url, model))
 
     def _hinted(self, reply: Reply) -> str:
         """Return a reply's fault; if it names a field that a card can change, say so."""
