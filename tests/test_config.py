@@ -120,13 +120,13 @@ def test_what_is_no_toml_is_said_of_the_file(tmp_path: Path) -> None:
             toml(file, "r")
 
 
-def test_a_folder_a_pipe_a_dangling_link_and_a_device_are_no_toml(tmp_path: Path) -> None:
+def test_a_folder_a_pipe_a_dangling_link_and_a_device_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to("nowhere")
     (tmp_path / "device").symlink_to("/dev/zero")
     for name in ("folder", "pipe", "link", "device"):
-        with pytest.raises(UserError, match=r"^r is no TOML: .*; fix the file$"):
+        with pytest.raises(UserError, match=r"^r cannot be read: [^;]*; replace the file$"):
             toml(tmp_path / name, "r")
 
 

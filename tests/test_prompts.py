@@ -247,11 +247,7 @@ def test_a_template_without_a_block_says_which_it_needs(draft: Edit) -> None:
         ("[200, 400]", "[200]", "token_budget = [200]; allowed: array of length 2"),
         ("[200, 400]", "[400, 200]", r"token_budget is [400, 200], wants [least, most]"),
         ("[200, 400]", '["200", 400]', "0 = '200'; allowed: int"),
-        (
-            "ego = 64",
-            "ego = -64",
-            "'ego': -64, 'helper': 128}; allowed: int >= 1",
-        ),
+        ("ego = 64", "ego = -64", "[max_answer_tokens]: ego = -64; allowed: 1 or more"),
         ("ego = 64, ", "", "max_answer_tokens wants exactly ego and helper"),
         ('"distribution"', '"distributions"', "did you mean 'distribution'?"),
     ],
@@ -358,6 +354,16 @@ def test_pins_that_cannot_be_read_are_one_line(copied: Path) -> None:
     (copied / "released.toml").write_text("<<<<<<< HEAD\n", encoding="utf-8")
     with pytest.raises(UserError, match=r"released\.toml is no TOML"):
         prompts.load("v1", copied)
+
+
+def test_a_file_that_is_missing_is_named_once(copied: Path) -> None:
+    file = copied / "v1" / "ego.j2"
+    file.unlink()
+    with pytest.raises(UserError) as said:
+        prompts.load("v1", copied)
+    assert (
+        str(said.value) == f"prompt file {file} cannot be read: No such file or directory; replace the file"
+    )
 
 
 # -- length ---------------------------------------------------------------------------------------------

@@ -135,7 +135,7 @@ def test_a_second_answer_that_cannot_be_read_either_is_the_answer(small: Dataset
 def test_a_second_question_without_an_answer_leaves_the_first_without_one(small: Dataset) -> None:
     ego = f"{all_scenes(small)[0].id}/v1"
     backend = Scripted({ego: BAD, ego + AGAIN: failed(ego, "context overflow")})
-    with pytest.raises(Unanswered, match=r"^context overflow: no answer to questions of ego 1 of 1$"):
+    with pytest.raises(Unanswered, match=r"^context overflow: no answer to 1 of 1 questions to the ego$"):
         asked(with_repair(spec_of(small)), backend, small)
 
 

@@ -137,7 +137,7 @@ def test_prompts_that_are_too_long_for_the_model_got_no_answer(
 ) -> None:
     """The helpers' are: more of them than messages that may be lost."""
     spec = tiny_spec(tiny, load(small_path, limit=1))
-    said = r"^context overflow: \d+ tokens > 700 .*: no answer to questions of helpers \d+ of \d+"
+    said = r"^context overflow: \d+ tokens > 700 .*: no answer to \d+ of \d+ questions to helpers"
     for _ in range(2):
         with pytest.raises(Unanswered, match=said):
             run(spec, tmp_path / "run")

@@ -56,10 +56,10 @@ def _make(out: Path, scenes: Path) -> None:
         Path("swarmdrive.toml").touch()
         prompt("mine", "Mind: ")
         Path("channels").mkdir()
-        Path("measured.csv").write_text(TABLE)
         Path("channels/mine.toml").write_text(PROFILE.format(file="near.csv"))
         Path("channels/near.csv").write_text(TABLE)
-        Path("channels/far.toml").write_text(PROFILE.format(file="../measured.csv"))
+        Path("channels/far.csv").write_text(TABLE)
+        Path("channels/far.toml").write_text(PROFILE.format(file="far.csv"))
         patch.setattr(sys, "argv", ["harness", *EVAL, *OF_RUN, "--out", "reports/run"])
         with pytest.raises(SystemExit) as ended:
             cli.main()

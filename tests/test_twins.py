@@ -390,7 +390,7 @@ def test_what_a_helper_did_not_answer_is_left_out_and_counted(
     pairs, said = asking.ask(study, tmp_path / "out", lambda done: None, None, 1)
     [helper] = [row for row in scoring.rows(pairs, [TWINS["ids"]]) if row.role == "helper"]
     n = helper.invariance_rate.n + 1
-    assert said == f"questions of helpers 1 of {2 * n}"
+    assert said == f"1 of {2 * n} questions to helpers"
     assert (helper.invariance_rate.value, helper.failed_rate.value) == (1.0, 0.0)
     assert lost not in (tmp_path / "out/.work/answers-000000.jsonl").read_text()
 

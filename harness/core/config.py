@@ -67,9 +67,11 @@ def toml(path: Path, where: str) -> dict[str, Any]:
     """
     try:
         return loads(text_of(path, "settings"), where)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = printable(getattr(error, "strerror", None) or error)
-        raise UserError(f"{where} is no TOML: {reason}; fix the file") from None
+    except OSError as error:
+        reason = printable(error.strerror or error)
+        raise UserError(f"{where} cannot be read: {reason}; replace the file") from None
+    except UnicodeDecodeError as error:
+        raise UserError(f"{where} is no TOML: {printable(error)}; fix the file") from None
 
 
 def loads(text: str, where: str) -> dict[str, Any]:

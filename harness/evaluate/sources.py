@@ -4,7 +4,7 @@ from pathlib import Path
 
 import msgspec
 
-from harness.backends import cards
+from harness.backends import cards, devices
 from harness.coordination.schedules import SCHEDULES
 from harness.core import resources
 from harness.core.files import bytes_of
@@ -37,8 +37,8 @@ def sources(spec: Spec) -> dict[str, bytes]:
             file = f"{point.round_trip}.toml"
             paths[f"networks/{file}"] = resources.find("networks", file)
         paths[f"schedules/{point.schedule}.toml"] = SCHEDULES.file(point.schedule)
-    if spec.device_profile:
-        file = f"{spec.device_profile.name}.toml"
-        paths[f"devices/{file}"] = resources.find("devices", file)
+    device = spec.device_profile
+    if device and device.name in resources.names("devices") and devices.load(device.name) == device:
+        paths[f"devices/{device.name}.toml"] = resources.find("devices", f"{device.name}.toml")
     files = {name: bytes_of(path, "text") for name, path in paths.items() if path}
     return dict(sorted((texts | files).items()))

@@ -299,7 +299,8 @@ def _text(file: Path) -> str:
     try:
         return text_of(file)
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"prompt file {printable(file)} cannot be read: {printable(error)}") from None
+        reason = printable(getattr(error, "strerror", None) or error)
+        raise UserError(f"prompt file {printable(file)} cannot be read: {reason}; replace the file") from None
 
 
 def _released(base: Path) -> dict[str, str]:

@@ -11,7 +11,12 @@ from harness.runs.records import Answer, AnswerFacts, Role
 
 MOST_LOST = 0.05  # share of the helpers' questions without an answer that no run has
 WORDS = 3  # different errors that are named
-_WHO: dict[Role, str] = {"ego": "ego", "merge": "fusion calls", "helper": "helpers", "blind": "blind helpers"}
+_WHO: dict[Role, str] = {
+    "ego": "the ego",
+    "merge": "fusion calls",
+    "helper": "helpers",
+    "blind": "blind helpers",
+}
 HELPERS: tuple[Role, ...] = ("helper", "blind")  # whose answers are messages, which may be lost
 
 
@@ -57,8 +62,8 @@ class Tally:
 
     def counts(self) -> str:
         """How many questions got no answer, by role; empty if all did."""
-        counts = [f"{who} {n} of {self.asked[r]}" for r, who in _WHO.items() if (n := self.unanswered[r])]
-        return f"questions of {', '.join(counts)}" if counts else ""
+        counts = [(n, self.asked[r], who) for r, who in _WHO.items() if (n := self.unanswered[r])]
+        return ", ".join(f"{n} of {asked} questions to {who}" for n, asked, who in counts)
 
 
 def tally(run: Run) -> Tally:

@@ -186,7 +186,6 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
     assert "was begun with another seeds" in err
     for wrong in (
         ("trust",),
-        ("trust", "bench/run", "--model", "proxy"),
         ("trust", "bench/run", "--prompt", "v4"),
     ):
         code, _, err = harness(*wrong)

@@ -58,7 +58,9 @@ OF_RUNS = {  # in the place of those above, for what a run's folder holds
     "Cross-Origin-Opener-Policy": "unsafe-none",
 }
 
-WAY_BACK = '<p class="way-back"><a href="/">← All runs</a></p>'
+WAY_BACK = (  # a report's navigation begins at the top of its page and would lie over the link
+    '<style>.way-back + nav { margin-top: 0; }</style>\n<p class="way-back"><a href="/">← All runs</a></p>'
+)
 
 
 def app(folder: Path, token: str) -> ASGIApp:
