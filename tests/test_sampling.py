@@ -205,8 +205,17 @@ def agent_of(model: Path, answer: AnswerMode = "json") -> Agent:
     return Agent(resolve(str(model)), versions.load("v2"), answer)
 
 
-def test_a_replay_asks_on_as_the_run_was_asked(small: Dataset, tiny: Path, tmp_path: Path) -> None:
+def test_a_replay_asks_on_as_the_run_was_asked(
+    small: Dataset, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Another condition leads to decision points that the run did not come to."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "swarmdrive.toml").touch()
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models/tiny.toml").write_text(
+        f'engine = "transformers"\ndescription = "tiny"\nweights = "{tiny}"\nthinking = "{resolve(str(tiny)).thinking}"\n'
+        '[latency]\nsource = "paper"\nbasis = "none"\n'
+    )
     alone, both = (POINTS["single-local"],), (POINTS["single-local"], POINTS["6g"])
     spec = spec_of(small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, points=both)
     stored = run(replace(spec, points=alone), tmp_path / "stored")

@@ -72,18 +72,13 @@ class Profiles(FilesAndPlugins[Channel]):
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
 
     def files(self, name: str) -> dict[str, Path]:
-        """Return a profile's file and the table that it names, by their paths within `channels/`.
-
-        A table that lies outside is given the profile's name.
-        """
+        """Return a profile's file and the table that it names, by their paths within `channels/`."""
         file = self.file(name)
         if file is None:
             return {}
         files, table = {file.name: file}, self.profile(name).parameters.get("file")
-        if isinstance(table, str):
-            inside = os.path.normpath(table)
-            outside = os.path.isabs(inside) or inside.split(os.sep)[0] == os.pardir
-            files[f"{name}.csv" if outside else Path(inside).as_posix()] = file.parent / table
+        if isinstance(table, str):  # it lies beside the profile, as reading it has checked
+            files[Path(os.path.normpath(table)).as_posix()] = file.parent / table
         return files
 
     def unchanged(self, name: str, recorded: Any) -> bool:
