@@ -74,6 +74,7 @@ def test_true_false_and_unknown_can_be_computed_with(frozen: Path) -> None:
     assert 0 < table[table.triggered & ~table.on_time_1.fillna(False)].shape[0] < len(table)
     assert made.answers.seconds.dtype == float  # the proxy takes no time, so that none is known
     assert made.answers.seconds.isna().all()
+    assert made.answers.image_sha256.isna().all()
 
 
 def test_names_stay_text_and_files_stay_whole(frozen: Path) -> None:

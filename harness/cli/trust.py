@@ -10,7 +10,7 @@ from harness.cli import options
 from harness.cli.estimates import WIDTH, echo_json, table
 from harness.cli.progress import bar
 from harness.cli.run import Swarm, file_name
-from harness.core import resources
+from harness.core import resources, work
 from harness.core.errors import UserError, printable
 from harness.core.figures import shown
 
@@ -94,7 +94,8 @@ def command(
         stored = Stored(run, more=progress.more, done=progress, asks=not no_model, models=own)
         draws = options.parse_seeds(seeds) if seeds else stored.seeds
         where = out or run / "trust"
-        bench = run_bench(stored, condition, ways, chosen, parts, draws, where, progress, progress.more)
+        with work.going_on(where):
+            bench = run_bench(stored, condition, ways, chosen, parts, draws, where, progress, progress.more)
     page = write_bench(bench, where)
     if as_json:
         echo_json(plain(bench))

@@ -104,7 +104,7 @@ def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -
         file.write(_line([*plain, *(f"intent_{action}" for action in actions), "message"]))
         for answer in answers:
             values = {
-                **{name: getattr(answer, name) for name in plain},
+                **{name: answer.cell(name) for name in plain},
                 "heard": "+".join(answer.heard), "repairs": " ".join(answer.repairs),
                 "detail": text(answer.detail), "error": answer.error and text(answer.error),
             }  # fmt: skip

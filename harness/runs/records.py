@@ -105,6 +105,10 @@ class Answer(Struct, frozen=True, kw_only=True):
         """The text of the first turn; None without a repair turn."""
         return self.first.raw if self.first else None
 
+    def cell(self, column: str) -> Any:
+        """Return a field or property as tables have it: None where it is unset."""
+        return None if (value := getattr(self, column)) is UNSET else value
+
     @property
     def id(self) -> str:
         """The id of its request: the scene and the answer's key."""

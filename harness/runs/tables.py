@@ -63,7 +63,7 @@ class Tables:
 
         answers, actions = list(self._run.answers), self.config["actions"]
         columns = {
-            name: [getattr(answer, name) for answer in answers]
+            name: [answer.cell(name) for answer in answers]
             for name in (*Answer.__struct_fields__, *TURNS)
             if name not in ("heard", "repairs", "intent", "message", "first")
         }  # fmt: skip

@@ -26,6 +26,7 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json
+from harness.core.formats import SOURCES
 from harness.dataset.load import Scene
 from harness.evaluate import device
 from harness.evaluate.agent import Agent, ImageMode
@@ -39,6 +40,7 @@ from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 from harness.runs.folder import dataset_of, read
 from harness.runs.records import Answer
+from harness.runs.sources import PROMPTS, prompt_of
 from harness.runs.unanswered import tally
 from harness.studies.axes import Setting
 from harness.studies.play import Walked, walk_through
@@ -267,11 +269,21 @@ class Stored:
 
     def _agent(self, stated: Mapping[str, Any]) -> Agent:
         card = convert(stated["model"], Card, f"{printable(self.run.path)}: its model")
-        prompt = versions.load(stated["prompt"]["version"])
+        if (version := stated["prompt"]["version"]) not in versions.names():
+            shown = printable(self.run.path)
+            raise UserError(f"{shown}: prompt {printable(version)} is not here; {self._restore(stated)}")
+        prompt = versions.load(version)
         return Agent(
             card, prompt, cast("AnswerMode", stated["answer"]), stated["thinking"],
             cast("ImageMode", stated.get("image", "own")),
         )  # fmt: skip
+
+    def _restore(self, stated: Mapping[str, Any]) -> str:
+        """What to do if a prompt is not here as it was: a study asks with the user's prompts, not a run's."""
+        if prompt_of(self.run, stated["prompt"]) is None:
+            return "restore it or run again"
+        kept = self.run.path / SOURCES / PROMPTS / stated["prompt"]["version"]
+        return f"copy {printable(kept)} to prompts/, or run again"
 
     def _open(self) -> Backend:
         """This process's backend, opened once: a forked process may not ask its parent's."""
@@ -283,9 +295,9 @@ class Stored:
         spec, shown, manifest = self._asker.spec, printable(self.run.path), self.run.manifest
         for agent, stated in zip(spec.agents, (manifest.agent(0), *manifest.helpers), strict=True):
             if agent.prompt.sha256 != stated["prompt"]["sha256"]:
+                version = agent.prompt.version
                 raise UserError(
-                    f"{shown}: prompt {printable(agent.prompt.version)} has changed since; restore it or run "
-                    "again"
+                    f"{shown}: prompt {printable(version)} has changed since; {self._restore(stated)}"
                 )
         cards = [own(card, self._models, shown, _GIVE_IT) for card in spec.cards]
         opens = partial(open_backend, dtype=spec.dtype, batch_size=spec.batch_size)

@@ -78,6 +78,7 @@ def test_csv_has_every_decision_and_answer(run: Path, harness: Callable[..., Sai
     assert [row["raw"] for row in said] == [answer.raw for answer in answers]
     assert HOSTILE in [row["raw"] for row in said]
     assert {row["heard"] for row in said} == {"", "v2+v4"}
+    assert {row["image_sha256"] for row in said} == {""}
     assert {row["repairs"] for row in said} == {"", "code_fence prose"}
     assert [row["intent_IDLE"] for row in said] == ["1.0" if a.intent else "" for a in answers]
     assert [json.loads(row["message"]) if row["message"] else None for row in said] == [

@@ -39,6 +39,23 @@ def test_who_stops_a_command_hears_that_the_same_one_goes_on(
     assert said.splitlines()[-1] == f"harness: {word}; stopped keeps what is done; {how}"
 
 
+def test_a_stopped_trust_study_says_what_it_keeps(
+    harness: Callable[..., tuple[int, str, str]], small_path: Path, tmp_path: Path
+) -> None:
+    options = ("--dataset", small_path, "--condition", "6g", "--seeds", "0:1", "--out", tmp_path / "run")
+    assert harness("eval", "--model", "proxy", *options)[0] == 0
+    typed = ("trust", "run", "--out", "study")
+    process = started(*typed, cwd=tmp_path)
+    kept = tmp_path / "study/cells.jsonl"
+    while not kept.is_file() and process.poll() is None:
+        time.sleep(0.01)
+    process.terminate()
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 143
+    how = f"type the same command to continue: harness {' '.join(typed)}"
+    assert said.splitlines()[-1] == f"harness: terminated; study keeps what is done; {how}"
+
+
 def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     """No file may grow beyond 1000 bytes, which ends a write as a full disk does."""
     process = started(

@@ -13,6 +13,7 @@ from harness.backends import cards
 from harness.backends.cards import Card, Latency, own
 from harness.backends.servers import Server as Place
 from harness.core.errors import UserError
+from harness.core.resources import folder
 
 Said = tuple[int, str, str]
 GOOD = '{"action_distribution":{"SLOWER":0.70,"IDLE":0.20,"FASTER":0.10},"confidence":0.9,"evidence":"v2"}'
@@ -51,6 +52,27 @@ def run(harness: Callable[..., Said], small_path: Path, monkeypatch: pytest.Monk
 def test_a_study_asks_the_server_of_the_users_card(run: Server, harness: Callable[..., Said]) -> None:
     assert harness(*STUDY)[0] == 0
     assert run.asked
+
+
+@pytest.mark.parametrize("changed", [True, False])
+def test_a_study_names_the_prompt_that_its_run_keeps(
+    changed: bool, run: Server, small_path: Path, harness: Callable[..., Said]
+) -> None:
+    shutil.copytree(folder("prompts") / "v2", "prompts/mine")
+    options = ("--limit", "1", "--seeds", "0:1", "--condition", "6g", "--out", "of-mine")
+    assert harness("eval", "--model", "mine", "--prompt", "mine", "--dataset", small_path, *options)[0] == 0
+    if changed:
+        text = Path("prompts/mine/ego.j2").read_text()
+        Path("prompts/mine/ego.j2").write_text(text.replace("You drive", "You now drive"))
+    else:
+        shutil.rmtree("prompts/mine")
+    study = [word if word != "run" else "of-mine" for word in STUDY]
+    code, _, err = harness(*study)
+    how = "has changed since" if changed else "is not here"
+    copy = "copy of-mine/sources/prompts/mine to prompts/, or run again"
+    assert (code, err) == (2, f"harness: of-mine: prompt mine {how}; {copy}\n")
+    shutil.copytree("of-mine/sources/prompts/mine", "prompts/mine", dirs_exist_ok=True)
+    assert harness(*study)[0] == 0
 
 
 def test_what_the_run_says_of_a_server_changes_nothing(run: Server, harness: Callable[..., Said]) -> None:
