@@ -19,7 +19,7 @@ from harness.backends.base import Completion, Request
 from harness.coordination.coordinate import coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import CLOUD, OperatingPoint, named_point
-from harness.core.errors import UserError
+from harness.core.errors import Unanswered, UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
@@ -168,11 +168,10 @@ def test_another_models_speed_is_said_plainly(counted: Callable[..., folder.Run]
     assert told.decisions["inference_j"].tolist() == [60]
 
 
-def test_an_answer_that_is_an_engines_error_has_no_time(counted: Callable[..., folder.Run]) -> None:
+def test_an_engines_error_is_no_answer_to_be_timed(counted: Callable[..., folder.Run]) -> None:
     broken = Completion("00001-0/v1", "", None, None, "error", None, 1, "it broke")
-    told = counted(ALONE, more={"00001-0/v1": broken})
-    assert np.isnan(told.decisions["latency_ms"]).all()
-    assert np.isnan(told.decisions["inference_j"]).all()
+    with pytest.raises(Unanswered, match="it broke"):
+        counted(ALONE, more={"00001-0/v1": broken})
 
 
 def test_tokens_that_nobody_counted_are_refused(small: Dataset, tmp_path: Path,

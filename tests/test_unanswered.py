@@ -141,6 +141,19 @@ def test_a_server_that_refuses_everything_is_asked_little_and_its_words_stand_fi
     assert not (tmp_path / "run/.work").exists()
 
 
+def test_repeats_that_could_not_be_asked_are_errors_in_junit(
+    ask: Typed, harness: Typed, play: Play, tmp_path: Path
+) -> None:
+    play.again(lambda asked: True)
+    assert ask("eval", *EVAL, "--repeats", "2", "--out", "several")[0] == 3
+    assert harness("export", "several", "--junit", "several.xml")[0] == 0
+    [error] = ElementTree.parse(tmp_path / "several.xml").getroot().iter("error")
+    assert error.attrib["message"].startswith(f"HTTP 404: {WORDS}")
+    code, _, err = harness("compare", "several", "several", "--fail-if", "success_rate < 0")
+    assert code == 2
+    assert err.startswith(f"harness: HTTP 404: {WORDS}")
+
+
 def test_nothing_is_lost_so_that_another_model_or_setting_may_begin_in_the_folder(
     ask: Typed, play: Play, there: Server, tmp_path: Path
 ) -> None:

@@ -64,11 +64,11 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
 
 
 def unanswered(out: Path) -> str | None:
-    """Return why the work in a folder stopped, if its model could not be asked; else None."""
-    try:
-        return printable(text_of(out / WORK / UNANSWERED), MOST_WORDS)
-    except (OSError, ValueError, UserError):
-        return None
+    """Return why the work in a folder, or in one of its runs, stopped if its model could not be asked."""
+    for place in (out, *([] if (out / "run.json").is_file() else sorted(out.glob("*/")))):
+        with suppress(OSError, ValueError, UserError):
+            return printable(text_of(place / WORK / UNANSWERED), MOST_WORDS)
+    return None
 
 
 def idle(out: Path) -> bool:
