@@ -213,7 +213,8 @@ def test_a_replay_asks_on_as_the_run_was_asked(
     (tmp_path / "swarmdrive.toml").touch()
     (tmp_path / "models").mkdir()
     (tmp_path / "models/tiny.toml").write_text(
-        f'engine = "transformers"\ndescription = "tiny"\nweights = "{tiny}"\nthinking = "{resolve(str(tiny)).thinking}"\n'
+        f'engine = "transformers"\ndescription = "tiny"\nweights = "{tiny}"\n'
+        f'thinking = "{resolve(str(tiny)).thinking}"\n'
         '[latency]\nsource = "paper"\nbasis = "none"\n'
     )
     alone, both = (POINTS["single-local"],), (POINTS["single-local"], POINTS["6g"])

@@ -145,7 +145,8 @@ def test_repeats_that_could_not_be_asked_are_errors_in_junit(
     ask: Typed, harness: Typed, play: Play, tmp_path: Path
 ) -> None:
     play.again(lambda asked: True)
-    assert ask("eval", *EVAL, "--repeats", "2", "--out", "several")[0] == 3
+    code, _, err = ask("eval", *EVAL, "--repeats", "2", "--temperature", "1", "--out", "several")
+    assert code == 3, err
     assert harness("export", "several", "--junit", "several.xml")[0] == 0
     [error] = ElementTree.parse(tmp_path / "several.xml").getroot().iter("error")
     assert error.attrib["message"].startswith(f"HTTP 404: {WORDS}")
