@@ -365,7 +365,7 @@ def test_every_array_of_a_batch_has_the_batch_in_front():
         ),
         Draws(rng.random((5, 2, 4, 2)), rng.random((5, 2, 4))),
     )
-    per_helper = {"asked", "delivered", "arrival_s", "on_time", "trust"}
+    per_helper = {"asked", "infers", "delivered", "arrival_s", "on_time", "trust"}
     inner = {"own": (3,), "fused": (3,), "weights": (5,), "state": (0,)} | dict.fromkeys(per_helper, (4,))
     for field in fields(decisions):
         assert getattr(decisions, field.name).shape == (5, 2, *inner.get(field.name, ())), field.name

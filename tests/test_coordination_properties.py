@@ -105,8 +105,9 @@ def test_a_decision_ends_after_the_egos_inference_and_every_arrival(point, case)
 def test_the_order_of_helpers_changes_nothing(point, case, data):
     order = data.draw(st.permutations(range(case[0].valid.shape[1])))
     decision, other = coordinate(point, *case), coordinate(point, *shuffled(case, order))
-    assert_same(decision, other, "asked", "delivered", "arrival_s", "on_time", "weights")
+    assert_same(decision, other, "asked", "infers", "delivered", "arrival_s", "on_time", "weights")
     assert np.array_equal(decision.on_time[:, order], other.on_time)
+    assert np.array_equal(decision.infers[:, order], other.infers)
 
 
 @given(st.sampled_from(COOPERATIVE[:2]), cases(), st.floats(0, 1), st.floats(0, 1))
@@ -128,7 +129,8 @@ def test_a_single_decision_is_a_row_of_the_batch(point, case):
 @given(points, cases())
 def test_a_threshold_above_the_uniform_entropy_is_the_single_local_point(point, case):
     never = replace(point, tau_nats=math.log(case[0].own.shape[-1]) + 1e-9)
-    assert_same(coordinate(never, *case), coordinate(POINTS["single-local"], *case), "loss")
+    # Helpers who might be asked infer from the start.
+    assert_same(coordinate(never, *case), coordinate(POINTS["single-local"], *case), "loss", "infers")
 
 
 @given(cases(), st.floats(0, 1.2), st.floats(0, 1.2))

@@ -23,7 +23,7 @@ from harness.backends.cards import Latency as CardLatency
 from harness.backends.cards import resolve
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.config import LONGEST_S
-from harness.core.errors import UserError
+from harness.core.errors import Unanswered
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate import timing
@@ -168,7 +168,7 @@ def test_a_model_that_fails_has_no_times(small: Dataset) -> None:
         f"{s.id}/v1": Completion(f"{s.id}/v1", "", None, None, "error", 0.1, 1, "no")
         for s in scenes_of(small)
     }
-    with pytest.raises(UserError, match="no answer of swarm-tiny could be timed in 5 scenes; see what"):
+    with pytest.raises(Unanswered, match=r"^no \(5 times\): no answer to 5 of 5 questions to the ego"):
         measured(spec_of(small, LANGUAGE_MODEL), Clock(lines), timing.spread_over(scenes_of(small)))
 
 

@@ -55,13 +55,13 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
 def beside(out: Path) -> Place:
     """Links from a file to the pages in the runs' folders, where there are any.
 
-    A link names no folder of the machine: both lie below the current folder, or the file beside the run.
+    A link names no folder of the machine: both lie below the current folder, or the page below the file.
     """
     here, at = Path.cwd(), out.resolve().parent
 
     def place(run: Run) -> str | None:
         page = run.path.resolve() / "report.html"
-        near = page.parent.parent == at or all(path.is_relative_to(here) for path in (page, at))
+        near = page.is_relative_to(at) or all(path.is_relative_to(here) for path in (page, at))
         return quote(os.path.relpath(page, at)) if near and page.is_file() else None
 
     return place
