@@ -78,7 +78,7 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     typed("report", one, two, "--out", here / "both.html")
     typed("compare", one, two, "--html", here / "pair.html", "--junit", here / "gates.xml",
           "--fail-if", "success_rate < -1")  # fmt: skip
-    typed("compare", one, two, "--html", here.parent.parent / "apart.html")
+    typed("compare", one, two, "--html", here.parent / "elsewhere/apart.html")
     Path("comment.md").write_text(typed("compare", one, two, "--markdown"))
     typed("history", here / "reports", "--html", here / "history.html")
     typed("fidelity", one, here / "reports/driven", "--out", here / "fidelity")
@@ -89,7 +89,7 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     if find_spec("inspect_ai"):
         typed("export", two, "--inspect", here / "log.json")
     assert [str(path) for path in found(here.parent.parent)] == []
-    places = [beside(page)(read(one)) for page in (here / "pair.html", here.parent / "apart.html", one / "x")]
+    places = [beside(page)(read(one)) for page in (here / "pair.html", here.parent / "elsewhere/apart.html", one / "x")]
     assert places == ["reports/one/report.html", None, "report.html"], "pages of one project are linked"
 
 

@@ -106,8 +106,8 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
     ("arguments", "says"),
     [
         (("show", "mode5"), "unknown operating point 'mode5'; did you mean"),
-        (("show", "mode4:density=3"), "did you mean 'density_per_km'?"),
-        (("show", "mode4:density_per_km=-1"), "density_per_km is -1"),
+        (("show", "mode4:density=3"), "did you mean one of density_coupled, density_per_km?"),
+        (("show", "mode4:density_per_km=-1"), "density_per_km = -1.0; allowed: a number from 0 to 10000"),
         (("show", "single-local"), "has no channel; `harness channel list` shows"),
         (("check", "6g"), "loses the same at every distance"),
         (("check", "mode4", "--out", "x.gif"), "known: .pdf, .png, .svg"),
