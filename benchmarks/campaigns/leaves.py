@@ -3,8 +3,9 @@
     python benchmarks/campaigns/leaves.py [--count 5000] [--seed 0] [--kind run] [--memory 1]
 
 A leaf is a value in a JSON, TOML, CSV or Parquet file: of a dataset, its trees and scenes; of a run, frozen
-or driven; of a project's prompts, cards, channels, devices, networks, schedules and suites. It becomes
-another type, sign, size or name, is removed or stands twice. Then a command is typed that reads it. Files are
+or driven, whole or begun; of a suite's; of a project's prompts, cards, channels, devices, networks, schedules
+and suites. It becomes another type, sign, size or name, is removed or stands twice. Then a command is typed
+that reads it. Files are
 drawn with equal odds, and so are the leaves of a file and its commands. A dataset's digests are made anew, so
 that what is read is the leaf and not the digest.
 """
@@ -22,6 +23,8 @@ import random
 import re
 import resource
 import shutil
+import signal
+import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -96,18 +99,20 @@ def main() -> None:
             words = " ".join(map(str, command)).replace(str(here), "")
             tally.add(subject.kind, f"case {n}, {shown} in {subject.file.name}, {words}", faults)
             os.chdir(here)
+            cleared(subject.where)
             for path, data in original.items():
                 path.write_bytes(data)
-            cleared(subject.where)
         print(f"\nlargest: {most / 1e9:.2f} GB", end="")
         tally.end()
 
 
 def cleared(where: Path) -> None:
-    """Delete what a command wrote."""
+    """Delete what a command wrote, and put back what it went on with."""
     for path in (where / "out", where / "out.html"):
         shutil.rmtree(path, ignore_errors=True)
         path.unlink(missing_ok=True)
+    if (where / "stopped").is_dir():
+        shutil.copytree(where / "stopped", where / "out")
 
 
 def load_all() -> None:
@@ -132,6 +137,10 @@ def made(here: Path, kinds: list[str] | None) -> list[Subject]:
         subjects += _dataset(here / "data")
     if not kinds or {"run", "driven"} & set(kinds):
         subjects += _runs(here)
+    if not kinds or "begun" in kinds:
+        subjects += _begun(here / "begun")
+    if not kinds or "suite" in kinds:
+        subjects += _suite(here / "suite")
     found = [subject for subject in subjects if not kinds or subject.kind in kinds]
     typed_in = {(subject.where, command) for subject in found for command in subject.commands}
     for where, command in sorted(typed_in, key=str):  # a sound one ends well, or a fault could hide another
@@ -162,19 +171,8 @@ def _project(project: Path) -> Iterator[Subject]:
     (project / "swarmdrive.toml").write_text("")
     for name, shipped in CHANNELS.items():
         shutil.copy(folder("channels") / f"{shipped}.toml", project / f"channels/{name}.toml")
-        drive = (
-            "eval",
-            "--limit",
-            1,
-            "--seeds",
-            "0",
-            "--model",
-            "cruise",
-            "--condition",
-            name,
-            "--out",
-            "out",
-        )
+        drive = ("eval", "--limit", 1, "--seeds", "0", "--model", "cruise", "--condition", name, "--out",
+                 "out")  # fmt: skip
         yield of("channel", f"channels/{name}.toml", ("channel", "list"), ("channel", "show", name), drive)
     (project / "channels/trace.toml").write_text(
         'model = "trace"\ndescription = "d"\nsource = "s"\nstatus = "measured"\n'
@@ -219,24 +217,9 @@ def _project(project: Path) -> Iterator[Subject]:
     yield of(
         "env-config",
         "config.json",
-        (
-            "drive",
-            "--env",
-            "merge-v0",
-            "--env-config",
-            "config.json",
-            "--episodes",
-            1,
-            "--seeds",
-            "0",
-            "--model",
-            "cruise",
-            "--condition",
-            "6g",
-            "--out",
-            "out",
-        ),
-    )
+        ("drive", "--env", "merge-v0", "--env-config", "config.json", "--episodes", 1, "--seeds", "0",
+         "--model", "cruise", "--condition", "6g", "--out", "out"),
+    )  # fmt: skip
 
 
 def _dataset(where: Path) -> Iterator[Subject]:
@@ -251,6 +234,43 @@ def _dataset(where: Path) -> Iterator[Subject]:
     yield Subject("scene", where / "small/layouts.zip", (check, run), where, names[0])
 
 
+def _begun(where: Path) -> Iterator[Subject]:
+    """A run that was killed, and the same command again."""
+    where.mkdir()
+    os.chdir(where)
+    command = ("eval", "--limit", 20, "--seeds", "0", "--condition", "6g", "--out", "out")
+    running, kept = Running(command), where / "out/.work/answers.jsonl"
+    while not (kept.is_file() and kept.stat().st_size):
+        time.sleep(0.01)
+    os.killpg(running.pid, signal.SIGKILL)
+    running.ended()
+    assert (where / "out/.work/config.json").is_file(), "it was done before it was killed"
+    os.replace(where / "out", where / "stopped")
+    cleared(where)
+    for name in ("config.json", "answers.jsonl"):
+        yield Subject("begun", where / "out/.work" / name, (("ls", "."), command), where)
+
+
+def _suite(where: Path) -> Iterator[Subject]:
+    """A suite's runs."""
+    (where / "all").mkdir(parents=True)
+    (where / "datasets").mkdir(exist_ok=True)
+    (where / "swarmdrive.toml").touch()
+    os.chdir(where)
+    (where / "datasets/suites.toml").write_text(
+        '[mine]\ndescription = "d"\ndatasets = ["occluded-intersection-v2", "do-not-pass-v1"]\n'
+    )
+    ended = typed("eval", "--dataset", "suite:mine", "--limit", 1, "--model", "cruise", "--seeds", "0",
+                  "--condition", "6g", "--out", "all/suite")  # fmt: skip
+    assert ended.code == 0, ended.err
+    shutil.copytree(where / "all/suite", where / "all/other")
+    yield Subject(
+        "suite", where / "all/suite/suite.json",
+        (("ls", "all"), ("history", "all"), ("report", "all/suite", "--out", "out.html"),
+         ("compare", "all/suite/do-not-pass-v1", "all/other/do-not-pass-v1")), where,
+    )  # fmt: skip
+
+
 def _runs(here: Path) -> Iterator[Subject]:
     where = here / "runs"
     (where / "all").mkdir(parents=True)
@@ -259,11 +279,23 @@ def _runs(here: Path) -> Iterator[Subject]:
     conditions = ("--condition", "single-local", "--condition", "6g:attack=liar", "--condition",
                   "mode4:density_per_km=90", "--condition", "cloud:round_trip=5g-city",
                   "--condition", "v2x:schedule=learnt")  # fmt: skip
-    fused = ("sweep", "all/it", "--over", "consensus", "--grid", "ego-prompt")
+    fused = ("sweep", "all/words", "--over", "consensus", "--grid", "ego-prompt")
     for command in (
         ("eval", "--dataset", small, *seeds, *conditions, "--out", "all/it"),
+        (
+            "eval",
+            "--dataset",
+            small,
+            *seeds,
+            "--condition",
+            "6g",
+            "--model",
+            "swarm-tiny",
+            "--out",
+            "all/words",
+        ),
         ("attribute", "all/it", "--sample", 2),
-        (*fused, "--out", "all/it/fused"),
+        (*fused, "--out", "all/words/fused"),
         ("drive", "--episodes", 1, "--first-seed", 0, *conditions[:6], *seeds, "--out", "all/driven"),
     ):
         ended = typed(*command)
@@ -284,11 +316,12 @@ def _runs(here: Path) -> Iterator[Subject]:
          "--out", "out"),
     )  # fmt: skip
     files = ("run.json", "run.json", "run.json", "answers.jsonl", "episodes.csv", "summary.csv",
-             "decisions.parquet",             "attribution.json")  # fmt: skip
+             "decisions.parquet", "attribution.json")  # fmt: skip
     for name in files:
         yield Subject("run", where / "all/it" / name, (*every, *reads), where)
+    told = ("report", "all/words", "--out", "out.html")
     for name in ("more-answers.jsonl", "fused/sweep.json"):
-        yield Subject("run", where / "all/it" / name, (*every, reads[0], (*fused, "--out", "out")), where)
+        yield Subject("run", where / "all/words" / name, (*every, told, (*fused, "--out", "out")), where)
     drives = (
         ("report", "all/driven", "--out", "out.html"), ("compare", "all/driven", "sound/driven"),
         ("fidelity", "sound/it", "all/driven", "--out", "out"),

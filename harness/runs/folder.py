@@ -358,7 +358,7 @@ def ordered(
     """Sort answers by decision point, and there: the ego's, the helpers', blind helpers', fusion calls'.
 
     Those of one kind are in the order of the decision point's `viewers`, where these are known. Answers for a
-    decision point without a decision are left out.
+    decision point without a decision, or by nobody among its viewers, are left out.
     """
 
     def place(answer: Answer) -> tuple[Any, ...]:
@@ -367,7 +367,7 @@ def ordered(
 
     order = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
     reached = (answer for answer in answers if answer.scene in order)
-    return sorted(reached, key=place)
+    return sorted((a for a in reached if a.viewer in viewers.get(a.scene, (a.viewer,))), key=place)
 
 
 def dataset_of(run: Run, given: Path | None = None) -> Dataset:
