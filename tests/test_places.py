@@ -89,7 +89,8 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     if find_spec("inspect_ai"):
         typed("export", two, "--inspect", here / "log.json")
     assert [str(path) for path in found(here.parent.parent)] == []
-    places = [beside(page)(read(one)) for page in (here / "pair.html", here.parent / "elsewhere/apart.html", one / "x")]
+    pages = here / "pair.html", here.parent / "elsewhere/apart.html", one / "x"
+    places = [beside(page)(read(one)) for page in pages]
     assert places == ["reports/one/report.html", None, "report.html"], "pages of one project are linked"
 
 

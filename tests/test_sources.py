@@ -280,3 +280,11 @@ def test_a_command_line_has_names_and_no_folders() -> None:
     line = "harness eval --model 'replay:/home/ada/my run/x' --out=/home/ada/r --server http://a:b@h/v1"
     shown = "harness eval --model replay:x --out=r --server http://h/v1"
     assert nameless({"command": f"{line} --seeds 0,1"}) == {"command": f"{shown} --seeds 0,1"}
+
+
+@pytest.mark.parametrize("piece", ["x", "~", "/", "\\", ".", ":", "a/", "http:", "../", "C:", " /a"])
+def test_a_long_text_is_read_once(piece: str) -> None:
+    """Were it read from each of its characters to its end, this would take hours."""
+    assert len(nameless(f"-{piece * (2_000_000 // len(piece))} at http://a:b@h/v1?k")) > len(
+        "- at http://h/v1"
+    )

@@ -7,7 +7,8 @@ from pathlib import PurePath, PurePosixPath, PureWindowsPath
 from typing import Any
 from urllib.parse import urlsplit
 
-_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://[^\s'\"<>]+")
+# A scheme has a limit, or a long word would be read from each of its letters to its end.
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]{0,30}://[^\s'\"<>]+")
 _PATH = re.compile(
     r"(?P<address>" + _ADDRESS.pattern + r")|"
     r"(?<![\w.~\\/-])(?P<path>(?:[A-Za-z]:|~\w*|\.\.)?(?:[\\/]+[^\s\\/'\":,;()<>]+){2,}[\\/]*)"
