@@ -68,6 +68,9 @@ NOT_RUN = {
     "harness device measure --model swarm-tiny": "needs a meter of energy",
     "harness view": "serves until it is interrupted; tests/view starts it",
     "harness model pull qwen3-4b": "fetches weights from a hub",
+    "harness model pull smollm2-135m": "fetches weights from a registry; tests/test_packages.py does",
+    "harness model check smollm2-135m": "needs those weights",
+    "harness eval --model smollm2-135m --limit 4": "needs those weights",
     "harness model check qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b": "needs those weights",
     "harness eval --model my-served --server http://gpu-1:8000/v1 --server http://gpu-2:8000/v1"

