@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from harness.backends.base import AnswerMode, Role
+from harness.backends.base import AnswerMode, Request, Role
 from harness.backends.cards import Card
 from harness.backends.registry import Capabilities, capabilities
 from harness.core.errors import UserError, printable, unknown
@@ -88,6 +88,14 @@ class Agent:
         """Return the most tokens that an answer may have, the thought included if the model thinks first."""
         answer = self.card.max_new_tokens or self.prompt.max_answer_tokens[role]
         return answer + (self.card.thinking_tokens if self.thinking else 0)
+
+    def blank(self, role: Role, actions: tuple[str, ...]) -> Request:
+        """Return a request in a role, without what differs between such requests."""
+        return Request(
+            id="", messages=(), role=role, actions=actions, max_tokens=self.most_tokens(role),
+            form=self.prompt.helper_answer, answer=self.answer, thinking=self.thinking,
+            reasons_first=role in self.prompt.reasons_first,
+        )  # fmt: skip
 
     def messages(
         self, graph: Mapping[str, Any], actions: tuple[str, ...], words: Mapping[str, str]

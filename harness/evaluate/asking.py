@@ -71,11 +71,7 @@ def _blank(spec: Spec, index: int, role: Role) -> Request:
     sampled: dict[str, Any] = {}
     if agent.samples:
         sampled = {"temperature": spec.temperature, "sample": spec.sampling_seed}
-    return Request(
-        id="", messages=(), role=role, actions=spec.actions, max_tokens=agent.most_tokens(role),
-        form=agent.prompt.helper_answer, answer=agent.answer, thinking=agent.thinking,
-        reasons_first=role in agent.prompt.reasons_first, agent=index, **sampled,
-    )  # fmt: skip
+    return agent.blank(role, spec.actions).alike(agent=index, **sampled)
 
 
 def fusion_request(

@@ -1,0 +1,139 @@
+"""Fixed questions that try a model out: twelve scenes of tune layouts, and pairs that differ in one fact.
+
+`questions.json` has the scenes: of each of twelve layouts the first decision point of the reference drivers
+at which the ego sees one conflict and a helper is near, as `harness dataset build occluded-intersection
+--seed 1000` freezes it. No layout is one of a report.
+"""
+
+import json
+from collections.abc import Mapping
+from copy import deepcopy
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from harness.backends.base import Request, Role
+from harness.core.files import text_of
+from harness.evaluate.agent import Agent
+from harness.prompts import readout
+from harness.world import scenarios
+from harness.world.scenario import Scenario
+
+SCENARIO = "occluded-intersection"
+SOON_S, LATE_S = (
+    0.2,
+    5.0,
+)  # how much later than the ego the other vehicle arrives, in the two halves of a pair
+Fact = Literal["conflict", "gap", "danger", "number"]
+YES_NO = ("YES", "NO")
+_DANGER = (
+    ("A car is about to hit you.", "The road is empty."),
+    ("A child runs onto the road in front of you.", "No one is near the road."),
+    ("The car ahead has stopped and is 3 m away.", "The car ahead is 300 m away and drives off."),
+    ("A truck crosses your lane right now.", "Nothing crosses your lane."),
+)
+_NUMBERS = ((5, 3), (9, 2), (8, 1), (7, 4))
+
+
+class Question(NamedTuple):
+    """A decision point of a tune layout.
+
+    Attributes:
+        layout_seed: seed of the layout.
+        step: number of the decision point in its episode.
+        graphs: what the ego and a helper see, by role.
+    """
+
+    layout_seed: int
+    step: int
+    graphs: Mapping[Role, Mapping[str, Any]]
+
+
+class Pair(NamedTuple):
+    """Two requests that differ in one fact.
+
+    Attributes:
+        fact: the kind of fact.
+        expected: the action that should be likelier with the fact.
+        present: the request with the fact.
+        absent: the request without.
+    """
+
+    fact: Fact
+    expected: str
+    present: Request
+    absent: Request
+
+
+@cache
+def questions() -> tuple[Question, ...]:
+    """Return the twelve questions."""
+    text = text_of(Path(__file__).with_name("questions.json"), "settings")
+    return tuple(Question(**record) for record in json.loads(text))
+
+
+def scenario() -> Scenario:
+    """Return the scenario of the questions."""
+    return scenarios.get(SCENARIO)
+
+
+def requests(agent: Agent, role: Role = "ego") -> list[Request]:
+    """Return the twelve questions as an agent is asked them in a role, at temperature 0."""
+    return [
+        _request(agent, question.graphs[role], f"question-{n}/{role}")
+        for n, question in enumerate(questions())
+    ]
+
+
+def pairs(agent: Agent) -> list[Pair]:
+    """Return the pairs of an agent that reads out: four of each kind of fact.
+
+    In the scenes a conflict is listed or not, or the other vehicle arrives `SOON_S` or `LATE_S` after the
+    ego: SLOWER should be likelier with the conflict, and with the small gap. The other questions are answered
+    YES or NO: whether to brake in danger or without, and whether the first of two numbers is greater.
+    """
+
+    def of_scene(fact: Fact, number: int, present: Mapping[str, Any], absent: Mapping[str, Any]) -> Pair:
+        halves = (("a", present), ("b", absent))
+        return Pair(
+            fact, "SLOWER", *(_request(agent, half, f"{fact}-{number}{end}/ego") for end, half in halves)
+        )
+
+    found = []
+    for n, question in enumerate(questions()[::3]):
+        graph = question.graphs["ego"]
+        found.append(of_scene("conflict", n, graph, {**graph, "conflicts": []}))
+        found.append(of_scene("gap", n, _arriving(graph, SOON_S), _arriving(graph, LATE_S)))
+    for n, (present_text, absent_text) in enumerate(_DANGER):
+        found.append(_plain(agent, "danger", n, f"{present_text} Brake?", f"{absent_text} Brake?"))
+    for n, (large, small) in enumerate(_NUMBERS):
+        texts = (f"Is {a} greater than {b}?" for a, b in ((large, small), (small, large)))
+        found.append(_plain(agent, "number", n, *texts))
+    return found
+
+
+def _request(agent: Agent, graph: Mapping[str, Any], name: str) -> Request:
+    actions, words, here = scenario().actions, scenario().prompt_words, scenario()
+    return agent.blank(graph["role"], actions).alike(
+        id=name, messages=agent.messages(graph, actions, words), view=graph, scenario=here
+    )
+
+
+def _arriving(graph: Mapping[str, Any], later_s: float) -> dict[str, Any]:
+    """Return a graph whose conflict has the other vehicle arrive so much later than the ego."""
+    changed = deepcopy(dict(graph))
+    [conflict] = changed["conflicts"]
+    conflict["other"]["time_s"] = round(conflict["ego"]["time_s"] + later_s, 1)
+    return changed
+
+
+def _plain(agent: Agent, fact: Fact, number: int, present: str, absent: str) -> Pair:
+    """Return a pair of plain questions, which are answered by YES or NO."""
+    halves = [
+        agent.blank("ego", YES_NO).alike(
+            id=f"{fact}-{number}{end}/ego",
+            messages=readout.asked([{"role": "user", "content": text}], YES_NO),
+        )
+        for end, text in (("a", present), ("b", absent))
+    ]
+    return Pair(fact, "YES", *halves)
