@@ -42,6 +42,7 @@ CHANGED: dict[str, Any] = {
     "role": "helper",
     "messages": ({"role": "user", "content": "Another scene"},),
     "actions": ("SLOWER", "IDLE"),
+    "orders": (({"role": "user", "content": "The same in another order"},),),
     "max_tokens": 65,
     "form": "recommendation",
     "answer": "constrained",

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
+Letters = Literal["raw", "cyclic"]
 FinishReason = Literal["stop", "length", "error"]
 AGAIN = "#2"  # suffix of the id of a repair turn's request
 
@@ -29,6 +30,8 @@ class Request:
         id: unique in a run, `<scene>/<viewer>`; a repair turn has the suffix `AGAIN`.
         role: which prompt of the version was rendered, and which schema the answer has.
         messages: chat messages, `{"role": "system" | "user" | "assistant", "content": text}`.
+        orders: of a read-out over cyclic orders, the chat with each further order of the actions behind the
+            letters; empty if the letters are read once.
         actions: meta-action names, in the environment's order.
         max_tokens: most tokens the answer may have.
         form: what the prompt asks a helper for: `distribution`, or `recommendation` with a confidence.
@@ -56,6 +59,7 @@ class Request:
     max_tokens: int
     form: str = "distribution"
     answer: AnswerMode = "json"
+    orders: tuple[tuple[Mapping[str, str], ...], ...] = ()
     thinking: bool = False
     reasons_first: bool = False
     temperature: float = 0.0
@@ -91,7 +95,8 @@ class Completion:
     Attributes:
         request_id: the request's id.
         text: the model's text, unchanged; empty on an error.
-        prompt_tokens: tokens of the prompt; None if the engine has no tokenizer.
+        prompt_tokens: tokens of the prompt; None if the engine has no tokenizer. Of several orders, what they
+            begin with counts once in process, and as often as a server counts it.
         completion_tokens: tokens of the answer; None if the engine has no tokenizer.
         finish_reason: `stop`, `length` (cut off by max_tokens) or `error`.
         seconds: time of this answer if its request ran alone (batch_size 1), else None: the wall time of a
@@ -99,6 +104,9 @@ class Completion:
         batch_size: number of requests that went through the engine together.
         error: the engine's message if finish_reason is `error`.
         label_mass: total probability of the letters in a `readout`; None otherwise.
+        letter_share: how much of a read-out over several orders follows the letter, 0 to 1
+            (`harness.backends.orders`); None otherwise, like the next.
+        follows_letter: whether one letter is the likeliest in every order.
         retries: failed attempts before this one; their time is in `seconds`.
         cached: whether it comes from the cache, in which case it has no seconds.
         slow_s: declared seconds of this answer beyond its card's latency (the slow tail of a proxy).
@@ -121,6 +129,8 @@ class Completion:
     slow_s: float = 0.0
     first_token_s: float | None = None
     token_s: float | None = None
+    letter_share: float | None = None
+    follows_letter: bool | None = None
 
 
 def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None) -> float | None:

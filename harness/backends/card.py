@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
+from harness.backends.base import Letters
 from harness.backends.failures import Failures
 from harness.backends.registry import engines, find, registrations
 from harness.backends.servers import Server
@@ -68,6 +69,8 @@ class Card:
         failures: how often the proxy fails on purpose; None if it never does.
         vision: how the model takes pictures; None if it only reads text.
         projector: name of the GGUF file beside `file` that turns pictures into tokens.
+        letters: `raw` for a model that was trained to answer by the letters in one order; None, or `cyclic`,
+            averages a read-out over their orders, unless `--letters` says otherwise.
         system: `first-user` puts the system text at the beginning of the first user turn, for a chat template
             that has no place for it; None gives it a message of its own.
     """
@@ -94,6 +97,7 @@ class Card:
     vision: Vision | None = None
     projector: str | None = None
     system: System | None = None
+    letters: Letters | None = None
 
     def at(self, urls: tuple[str, ...]) -> "Card":
         """Return the card of a served model with other servers; the card itself if `urls` is empty.
@@ -110,6 +114,7 @@ class Card:
         began has the same settings.
         """
         record = asdict(self)
+        del record["letters"]  # the agent's settings say how its letters are read
         if self.system is None:
             del record["system"]
         if self.server:

@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 
+from harness.backends.base import Letters
 from harness.backends.card import Card, Dtype, Latency, LatencySource, System, Thinking, read
 from harness.backends.registry import engines
 from harness.backends.vision import Vision, of_checkpoint
@@ -28,8 +29,9 @@ _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
 # Keys that decide no answer, or whose effect is in the identity of the opened model.
 _PLACE = ("description", "latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
-          "licence", "projector")  # fmt: skip
+          "licence", "projector", "letters")  # fmt: skip
 _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
+DISTILLED = "training.json"  # stands beside weights that were distilled here
 PROJECTOR = "mmproj-"  # prefix of a projector's GGUF file
 _SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
 _GGUF_TEMPLATE = b"tokenizer.chat_template" + struct.pack("<I", 8)  # the key, and the type of a text
@@ -145,8 +147,9 @@ def _on_the_spot(text: str, engine: str | None) -> Card:
                 f"model {printable(text)!r}: no such run directory; give replay: and the directory of a run"
             )
         return replace(
-            _new_card(f"replay:{run.name}", "replay", str(run), "Answers of a run"), vision=_run_vision(run)
-        )
+            _new_card(f"replay:{run.name}", "replay", str(run), "Answers of a run"), vision=_run_vision(run),
+            letters=_run_letters(run),
+        )  # fmt: skip
     where = _path(text)
     if where is not None and where.is_dir():
         return _of_directory(text, where, engine)
@@ -169,7 +172,9 @@ def _of_directory(text: str, where: Path, engine: str | None) -> Card:
     files = sorted(file for file in where.glob("*.gguf") if not file.name.startswith(PROJECTOR))
     if (where / "config.json").is_file() and engine != "llama-cpp":
         card = _new_card(where.name, "transformers", str(where), "Local directory", _thinking(where))
-        return replace(card, vision=_vision(text, where), system=_system(_template(where)))
+        return replace(
+            card, vision=_vision(text, where), system=_system(_template(where)), letters=_letters(where)
+        )
     if len(files) == 1:
         return _of_file(text, files[0])
     if files:
@@ -191,8 +196,9 @@ def _of_file(text: str, file: Path) -> Card:
     beside = file.with_name(f"{PROJECTOR}{file.name}")
     vision = _vision(text, file.parent) if beside.is_file() else None
     return replace(
-        card, vision=vision, projector=beside.name if vision else None, system=_system(_gguf_template(head))
-    )
+        card, vision=vision, projector=beside.name if vision else None,
+        system=_system(_gguf_template(head)), letters=_letters(file.parent),
+    )  # fmt: skip
 
 
 def _path(text: str) -> Path | None:
@@ -218,6 +224,19 @@ def _run_vision(run: Path) -> Vision | None:
         stated = json.loads(text_of(run / "run.json", "record"))["model"]["vision"]
         return stated and convert(stated, Vision, "vision")
     return None
+
+
+def _run_letters(run: Path) -> Letters:
+    """Return how the letters of a run's read-outs were read."""
+    with suppress(OSError, ValueError, AttributeError, UserError):
+        if json.loads(text_of(run / "run.json", "record")).get("letters") == "cyclic":
+            return "cyclic"
+    return "raw"
+
+
+def _letters(weights: Path) -> Letters | None:
+    """Return `raw` for what was distilled here: its training used one order of the letters."""
+    return "raw" if (weights / DISTILLED).is_file() else None
 
 
 def _vision(text: str, checkpoint: Path) -> Vision | None:

@@ -8,11 +8,12 @@ import math
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 from harness.backends.base import FinishReason, Request, per_token_s
 from harness.backends.drafts import Drafts
-from harness.backends.engine import Engine, Session
+from harness.backends.engine import Engine, Session, common_length
+from harness.backends.orders import averaged
 from harness.backends.sampling import Choice
 from harness.backends.skeleton import Skeleton, finished, parts, tokens_after
 from harness.core.errors import UserError, printable
@@ -31,6 +32,9 @@ class Answer:
         seconds: time of an answer that was asked alone; None in a batch, as are the next two.
         first_token_s: time until its first token was chosen; for a read-out, until it was complete.
         token_s: time for each token chosen after the first (`per_token_s`).
+        letter_share: how much of a read-out over several orders follows the letter; None otherwise, like the
+            next.
+        follows_letter: whether one letter is the likeliest in every order.
     """
 
     text: str
@@ -40,6 +44,8 @@ class Answer:
     seconds: float | None = None
     first_token_s: float | None = None
     token_s: float | None = None
+    letter_share: float | None = None
+    follows_letter: bool | None = None
 
 
 class Decoding:
@@ -64,20 +70,24 @@ class Decoding:
             return 1
         return request.max_tokens
 
-    def answer(self, requests: Sequence[Request], prompts: Sequence[Sequence[int]]) -> list[Answer]:
+    def answer(
+        self, requests: Sequence[Request], prompts: Sequence[Sequence[int]],
+        further: Sequence[Sequence[list[int]]] = (),
+    ) -> list[Answer]:  # fmt: skip
         """Return one answer for each request, in order.
 
         Args:
             requests: requests of one answer mode, for each of which there is `room`.
             prompts: their rendered messages, in tokens.
+            further: of a read-out over several orders, those of each request's other orders, equally many.
         """
         start_s = time.perf_counter()
         choice = Choice(requests, prompts)
-        with closing(self._engine.begin(prompts)) as session:
-            if requests[0].answer == "readout":
-                answers = self._read_out(session, requests)
-            else:
-                mode = self._free if requests[0].answer == "json" else self._constrained
+        if requests[0].answer == "readout":
+            answers = self._read_out(requests, prompts, further)
+        else:
+            mode = self._free if requests[0].answer == "json" else self._constrained
+            with closing(self._engine.begin(prompts)) as session:
                 answers = mode(session, requests, choice)
         end_s = time.perf_counter()
         if len(answers) > 1:
@@ -165,18 +175,34 @@ class Decoding:
             )
         return skeleton
 
-    def _read_out(self, session: Session, requests: Sequence[Request]) -> list[Answer]:
+    def _read_out(
+        self, requests: Sequence[Request], prompts: Sequence[Sequence[int]],
+        further: Sequence[Sequence[list[int]]],
+    ) -> list[Answer]:  # fmt: skip
         # Requests may have different numbers of actions: each column stands for one letter's token.
         spellings = {r.actions: self._letter_tokens(r.actions) for r in requests}
-        letter_tokens = sorted({token for of in spellings.values() for tokens in of for token in tokens})
-        column = {token: j for j, token in enumerate(letter_tokens)}
+        tokens = sorted({token for of in spellings.values() for tokens in of for token in tokens})
+        column = {token: j for j, token in enumerate(tokens)}
+        others = further or [()] * len(prompts)
+        orders = [[list(prompt), *rest] for prompt, rest in zip(prompts, others, strict=True)]
+        if len(orders[0]) == 1:
+            with closing(self._engine.begin(prompts, tokens)) as session:
+                readings = [session.log_probs(tokens)]
+        else:  # what all orders of a question begin with is read once, and then the rest of each
+            shared = [common_length(of) for of in orders]
+            heads = [of[0][:length] for of, length in zip(orders, shared, strict=True)]
+            with closing(self._engine.begin(heads, tokens)) as session:
+                readings = [
+                    session.peek([of[n][length:] for of, length in zip(orders, shared, strict=True)], tokens)
+                    for n in range(len(orders[0]))
+                ]
         answers = []
-        for request, row in zip(requests, session.log_probs(letter_tokens), strict=True):
-            log_p = [[float(row[column[token]]) for token in of] for of in spellings[request.actions]]
-            largest = max(map(max, log_p))
-            weights = [math.fsum(math.exp(x - largest) for x in of) for of in log_p]
-            text = stated(request.actions, weights)
-            answers.append(Answer(text, 1, "stop", min(1.0, math.exp(largest) * sum(weights))))
+        for i, request in enumerate(requests):
+            log_p = [
+                [[float(reading[i][column[token]]) for token in of] for of in spellings[request.actions]]
+                for reading in readings
+            ]
+            answers.append(_read(request.actions, log_p))
         return answers
 
     def _letter_tokens(self, actions: tuple[str, ...]) -> list[list[int]]:
@@ -194,6 +220,16 @@ class Decoding:
                 for (token,), letter in zip(encodings, letters(actions), strict=True)
             ]
         return self._letters[actions]
+
+
+def _read(actions: Sequence[str], log_p: Sequence[Sequence[Sequence[float]]]) -> Answer:
+    """Return a read-out as an answer, from the log-probabilities of each letter's tokens in each order."""
+    if len(log_p) > 1:
+        p = [[math.fsum(map(math.exp, of)) for of in letters_log_p] for letters_log_p in log_p]
+        return Answer(tokens=1, finish_reason="stop", **asdict(averaged(actions, p)))
+    largest = max(map(max, log_p[0]))
+    weights = [math.fsum(math.exp(x - largest) for x in of) for of in log_p[0]]
+    return Answer(stated(actions, weights), 1, "stop", min(1.0, math.exp(largest) * sum(weights)))
 
 
 def _kind(request: Request) -> tuple[str, str, tuple[str, ...]]:

@@ -43,6 +43,14 @@ class Session(Protocol):
         """
         ...
 
+    def peek(self, chunks: Sequence[Sequence[int]], tokens: Sequence[int]) -> Floats:
+        """Return the log-probabilities of some tokens after a chunk, none empty, of each sequence.
+
+        The sequences stay as they are; their own distributions are not defined afterwards. Shape (n,
+        len(tokens)).
+        """
+        ...
+
     def keep(self, places: Sequence[int]) -> None:
         """Keep these sequences only, in this order: n becomes len(places)."""
         ...
@@ -76,8 +84,11 @@ class Engine(Protocol):
         """
         ...
 
-    def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
-        """Read some prompts, none of them empty; their common beginning is computed once."""
+    def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> Session:
+        """Read some prompts, none of them empty; their common beginning is computed once.
+
+        The logits of the tokens in `exact` are computed in float32, whatever the weights' number format.
+        """
         ...
 
     def identity(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from harness.backends.base import Completion, Request
 from harness.backends.decoding import Answer, Decoding
-from harness.backends.engine import Engine
+from harness.backends.engine import Engine, common_length
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 
@@ -18,6 +18,13 @@ class _Prompt(NamedTuple):
     position: int
     request: Request
     ids: list[int]
+    further: tuple[list[int], ...] = ()  # of a read-out's other orders
+
+    @property
+    def read(self) -> int:
+        """Number of tokens that are read: what all orders begin with counts once."""
+        shared = common_length([self.ids, *self.further])
+        return len(self.ids) + sum(len(ids) - shared for ids in self.further)
 
 
 class LanguageModel:
@@ -50,10 +57,12 @@ class LanguageModel:
         for position, request in enumerate(requests):
             ids = self.tokens(request)
             room = self._decoding.room(request)
-            if len(ids) + room > self.engine.context_tokens:
-                done[position] = _failed(request, len(ids), self._overflow(len(ids), room))
+            further = tuple(self.tokens(request.alike(messages=messages)) for messages in request.orders)
+            longest = max(len(ids), *map(len, further), 0)
+            if longest + room > self.engine.context_tokens:
+                done[position] = _failed(request, longest, self._overflow(longest, room))
             else:
-                fitting.append(_Prompt(position, request, ids))
+                fitting.append(_Prompt(position, request, ids, further))
         for batch in self._batches(fitting):
             for prompt, completion in zip(batch, self._answer(batch), strict=True):
                 done[prompt.position] = completion
@@ -92,10 +101,11 @@ class LanguageModel:
         Prompts of one role begin alike, since they have the same system prompt.
         """
 
-        def kind(p: _Prompt) -> tuple[str, str, int, int]:
-            return p.request.answer, p.request.role, p.request.max_tokens, len(p.ids)
+        def kind(p: _Prompt) -> tuple[str, int, str, int, int]:
+            return p.request.answer, len(p.further), p.request.role, p.request.max_tokens, len(p.ids)
 
-        for _, group in groupby(sorted(prompts, key=kind, reverse=True), lambda p: p.request.answer):
+        # A batch has one answer mode, and one number of orders.
+        for _, group in groupby(sorted(prompts, key=kind, reverse=True), lambda p: kind(p)[:2]):
             same_mode = list(group)
             for start in range(0, len(same_mode), self.batch_size):
                 yield same_mode[start : start + self.batch_size]
@@ -122,7 +132,9 @@ class LanguageModel:
     def _try(self, batch: list[_Prompt]) -> list[Completion] | str:
         """Return the completions of a batch, or the engine's error message."""
         try:
-            answers = self._decoding.answer([p.request for p in batch], [p.ids for p in batch])
+            answers = self._decoding.answer(
+                [p.request for p in batch], [p.ids for p in batch], [p.further for p in batch]
+            )
         except Exception as error:  # an engine may fail in any way; its message is data
             return f"{type(error).__name__}: {printable(' '.join(str(error).split()), 200)}"
         return [_completion(p, answer, len(batch)) for p, answer in zip(batch, answers, strict=True)]
@@ -132,7 +144,7 @@ def _completion(prompt: _Prompt, answer: Answer, batch_size: int) -> Completion:
     return Completion(
         request_id=prompt.request.id,
         text=answer.text,
-        prompt_tokens=len(prompt.ids),
+        prompt_tokens=prompt.read,
         completion_tokens=answer.tokens,
         finish_reason=answer.finish_reason,
         seconds=answer.seconds,
@@ -140,6 +152,8 @@ def _completion(prompt: _Prompt, answer: Answer, batch_size: int) -> Completion:
         label_mass=answer.label_mass,
         first_token_s=answer.first_token_s,
         token_s=answer.token_s,
+        letter_share=answer.letter_share,
+        follows_letter=answer.follows_letter,
     )
 
 

@@ -116,6 +116,8 @@ class Replay:
         # The prompt's digest cannot tell: free and constrained answers have the same prompt.
         if agent["answer"] != request.answer:
             raise UserError(f"{shown} was run with --answer {agent['answer']}; replay it with the same")
+        if bool(request.orders) != (agent["answer"] == "readout" and agent["letters"] == "cyclic"):
+            raise UserError(f"{shown} was run with --letters {agent['letters']}; replay it with the same")
         if request.thinking != agent["thinking"]:
             how = "off; leave --thinking out" if request.thinking else "on; add --thinking"
             raise UserError(f"{shown} was run with thinking {how}")
@@ -134,7 +136,7 @@ class Replay:
             request.id, answer.raw, answer.prompt_tokens, answer.completion_tokens,
             answer.finish_reason, answer.seconds, answer.batch_size, answer.error,  # type: ignore[arg-type]
             answer.label_mass, answer.retries, answer.cached, answer.slow_s, answer.first_token_s,
-            answer.token_s,
+            answer.token_s, answer.cell("letter_share"), answer.cell("follows_letter"),
         )  # fmt: skip
         return _turn(whole, answer.first, again) if answer.first else whole
 

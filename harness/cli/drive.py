@@ -58,6 +58,7 @@ def command(
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
     image: options.Image = "own",
+    letters: options.Letters = None,
     helper_model: options.HelperModel = None,
     helper_prompt: options.HelperPrompt = None,
     helper_answer: options.HelperAnswer = None,
@@ -120,7 +121,7 @@ def command(
     options.in_range("--save-video", save_video, 0, driven)
     swarm = Swarm(
         model, engine, prompt, answer, thinking, image,
-        helper_model, helper_prompt, helper_answer, helper_thinking,
+        helper_model, helper_prompt, helper_answer, helper_thinking, letters,
     )  # fmt: skip
     spec = Spec(
         **swarm.agents(source.scenario),

@@ -62,6 +62,7 @@ def command(
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
     image: options.Image = "own",
+    letters: options.Letters = None,
     helper_model: options.HelperModel = None,
     helper_prompt: options.HelperPrompt = None,
     helper_answer: options.HelperAnswer = None,
@@ -119,7 +120,7 @@ def command(
     options.say_all(limit, frozen)
     swarm = Swarm(
         model, engine, prompt, answer, thinking, image,
-        helper_model, helper_prompt, helper_answer, helper_thinking,
+        helper_model, helper_prompt, helper_answer, helper_thinking, letters,
     )  # fmt: skip
     channel_seeds = options.parse_seeds(seeds)
     specs = [

@@ -12,13 +12,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from harness.backends.base import AnswerMode
+    from harness.backends.base import Letters as LettersMode
     from harness.backends.cards import Card
     from harness.coordination.operating_point import OperatingPoint
     from harness.core import parallel, shards
     from harness.dataset.load import Dataset as Frozen  # Dataset is an option here
     from harness.evaluate.agent import ImageMode
 else:  # typer takes any text; what is evaluated says which are allowed
-    AnswerMode = ImageMode = str
+    AnswerMode = ImageMode = LettersMode = str
 
 MOST_SEEDS = 1000
 _RAY = "or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT."
@@ -105,6 +106,13 @@ Answer = Annotated[
     Option(
         help="How the model answers. json: free text with a JSON object. constrained: decoding allows only "
         "what fits the schema. readout: the intent is read from the probabilities of one letter per action."
+    ),
+]
+Letters = Annotated[
+    LettersMode | None,
+    Option(
+        help="How a readout's letters are read. raw: once. cyclic: averaged over as many orders of the list "
+        "as there are actions, so that no letter is preferred. Default: the card's, or cyclic."
     ),
 ]
 Image = Annotated[

@@ -46,7 +46,7 @@ def command(
     scenes = data.scenes(data.courses())
 
     def some(answer: "AnswerMode") -> "list[Request]":
-        agent = Agent(reference, versions.load(prompt), answer)
+        agent = Agent(reference, versions.load(prompt), answer, letters="raw")
         asked = list(requests(Spec(agent, FrozenSource(data), (), (0,)), scenes))
         return asked[:: max(1, len(asked) // prompts)][:prompts]
 

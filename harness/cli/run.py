@@ -17,7 +17,7 @@ from harness.core.figures import interval
 from harness.core.formats import WORK
 
 if TYPE_CHECKING:
-    from harness.backends.base import AnswerMode
+    from harness.backends.base import AnswerMode, Letters
     from harness.evaluate.agent import Agent, ImageMode
     from harness.evaluate.lifecycle import Evaluated
     from harness.evaluate.spec import Spec
@@ -58,6 +58,7 @@ class Swarm:
     helper_prompt: str | None = None
     helper_answer: "AnswerMode | None" = None
     helper_thinking: bool | None = None
+    letters: "Letters | None" = None
 
     def agents(self, scenario: "Scenario") -> "dict[str, Any]":
         """The fields of a `Spec` that say who answers in a scenario: `ego` and `helpers`."""
@@ -67,14 +68,15 @@ class Swarm:
 
         version = self.prompt or scenario.prompt
         card = cards.resolve(self.model, self.engine)
-        ego = Agent(card, versions.load(version), self.answer, self.thinking, self.image)
+        ego = Agent(card, versions.load(version), self.answer, self.thinking, self.image, self.letters)
         models = self.helper_model.split(",") if self.helper_model else []
         prompt, mode = versions.load(self.helper_prompt or version), self.helper_answer or self.answer
         thinks = self.thinking if self.helper_thinking is None else self.helper_thinking
         image = self.image if prompt.image else "own"
         others = [cards.resolve(name.strip()) for name in models] or [card]
         with helper_options({"--answer": self.helper_answer, "--thinking": self.helper_thinking}):
-            helpers = tuple(Agent(other, prompt, mode, thinks, image) for other in others)
+            letters = self.letters if mode == "readout" else None
+            helpers = tuple(Agent(other, prompt, mode, thinks, image, letters) for other in others)
             return {"ego": ego, "helpers": helpers}
 
 

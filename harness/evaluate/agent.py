@@ -1,10 +1,10 @@
 """Describe an agent: the model that answers for a vehicle, and how it is asked."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from harness.backends.base import AnswerMode, Request, Role
+from harness.backends.base import AnswerMode, Letters, Request, Role
 from harness.backends.cards import Card
 from harness.backends.registry import Capabilities, capabilities
 from harness.core.errors import UserError, printable, unknown
@@ -24,6 +24,9 @@ class Agent:
         prompt: the prompt version.
         answer: how the model answers: free `json`, `constrained` to the schema, or a `readout` of letters.
         thinking: whether the model thinks before it answers.
+        letters: how a read-out's letters are read: `raw`, once, or `cyclic`, averaged over as many orders of
+            the list as there are actions; None takes the card's, or else cyclic. Always raw for what is no
+            read-out of a language model.
         image: the picture that an image prompt shows: the viewer's `own`, a `blank` one, one of `another`
             scene, or `none`, which leaves only the text.
     """
@@ -33,9 +36,22 @@ class Agent:
     answer: AnswerMode = "json"
     thinking: bool = False
     image: ImageMode = "own"
+    letters: Letters | None = None
 
     def __post_init__(self) -> None:
         name = printable(self.card.name)
+        if self.letters not in (None, *get_args(Letters)):
+            raise unknown("letters", str(self.letters), get_args(Letters))
+        if not (self.answer == "readout" and self.can.language_model):
+            if self.letters == "cyclic":
+                reason = "is no language model" if self.answer == "readout" else f"answers in {self.answer}"
+                raise UserError(
+                    f"--letters cyclic: {name} {reason}; leave it out, or give a language model and "
+                    "--answer readout"
+                )
+            object.__setattr__(self, "letters", "raw")
+        elif self.letters is None:
+            object.__setattr__(self, "letters", self.card.letters or "cyclic")
         thinks = self.can.thinks == "always" or (self.can.thinks == "card" and self.card.thinking != "none")
         if self.thinking and not thinks:
             raise UserError(f"--thinking: {name} cannot think; leave it out")
@@ -97,12 +113,25 @@ class Agent:
             reasons_first=role in self.prompt.reasons_first,
         )  # fmt: skip
 
-    def messages(
+    def chats(
         self, graph: Mapping[str, Any], actions: tuple[str, ...], words: Mapping[str, str]
-    ) -> tuple[Mapping[str, str], ...]:
-        """Return the chat about a scene graph, in the agent's answer mode."""
+    ) -> dict[str, Any]:
+        """Return the chat about a scene graph in the agent's answer mode, as fields of a request.
+
+        They are the `messages`, and those of the further `orders` of a read-out's letters.
+        """
         rendered = self.rendered(graph, actions, (), words)
-        return in_mode(self.answer, self.prompt, rendered, graph["role"], actions)
+        return self.in_orders(
+            actions, lambda order: in_mode(self.answer, self.prompt, rendered, graph["role"], order)
+        )
+
+    def in_orders(
+        self, actions: tuple[str, ...],
+        chat: Callable[[Sequence[str]], tuple[Mapping[str, str], ...]],
+    ) -> dict[str, Any]:  # fmt: skip
+        """Return a chat in each order of the actions in which letters are read, as fields of a request."""
+        messages, *further = map(chat, readout.cyclic(actions) if self.letters == "cyclic" else [actions])
+        return {"messages": messages, "orders": tuple(further)} if further else {"messages": messages}
 
     def rendered(
         self, graph: Mapping[str, Any], actions: tuple[str, ...], heard: Sequence[Mapping[str, Any]],
@@ -119,6 +148,7 @@ class Agent:
             "thinking": self.thinking,
             "answer": self.answer,
             "image": self.image,
+            **({"letters": "cyclic"} if self.letters == "cyclic" else {}),  # earlier runs read them once
         }
 
 

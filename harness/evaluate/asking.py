@@ -8,11 +8,11 @@ from contextlib import closing
 from functools import cache, partial
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from harness.backends.base import Backend, Completion, Request, Role, Served, served, window
 from harness.coordination.intents import Intents
@@ -33,6 +33,7 @@ from harness.runs.records import Role as RecordedRole
 from harness.runs.unanswered import HELPERS, Tally
 from harness.world.perception.graph import blinded, truth_graph
 
+T = TypeVar("T")
 CHUNK = 64  # fewest requests that are asked, and kept, together
 FIRST = 8  # fewest questions that a server is asked before it has answered any
 IN_A_ROW = CHUNK  # questions without an answer, one after the other, after which nothing more is asked
@@ -55,7 +56,7 @@ def requests(spec: Spec, scenes: Sequence[Scene], blind: bool = False) -> Iterat
                 graph = blinded(graph)
             agent = agents[index]
             yield blank(index, graph["role"]).alike(
-                id=_id(scene, viewer, blind), messages=agent.messages(graph, actions, words),
+                id=_id(scene, viewer, blind), **agent.chats(graph, actions, words),
                 image=picture(spec, index, scene, viewer, blind) if sees else None, view=graph,
                 truth=truth if agent.card.privileged else None, scenario=scenario,
             )  # fmt: skip
@@ -109,12 +110,18 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         seconds=completion.seconds, batch_size=completion.batch_size, label_mass=completion.label_mass,
         retries=completion.retries, cached=completion.cached, slow_s=completion.slow_s,
         first_token_s=completion.first_token_s, token_s=completion.token_s,
+        letter_share=_or_unset(completion.letter_share),
+        follows_letter=_or_unset(completion.follows_letter),
         prompt_sha256=digest(request.messages),
         image_sha256=request.image_sha256 or UNSET,
         status=str(parsed.status), verdict=parsed.verdict,
         repairs=tuple(map(str, parsed.repairs)), intent=parsed.intent, mass=parsed.mass,
         message=parsed.message, detail=parsed.detail,
     )  # fmt: skip
+
+
+def _or_unset(value: T | None) -> T | UnsetType:
+    return UNSET if value is None else value
 
 
 class Asker:

@@ -115,7 +115,7 @@ def pairs(agent: Agent) -> list[Pair]:
 def _request(agent: Agent, graph: Mapping[str, Any], name: str) -> Request:
     actions, words, here = scenario().actions, scenario().prompt_words, scenario()
     return agent.blank(graph["role"], actions).alike(
-        id=name, messages=agent.messages(graph, actions, words), view=graph, scenario=here
+        id=name, view=graph, scenario=here, **agent.chats(graph, actions, words)
     )
 
 
@@ -129,11 +129,10 @@ def _arriving(graph: Mapping[str, Any], later_s: float) -> dict[str, Any]:
 
 def _plain(agent: Agent, fact: Fact, number: int, present: str, absent: str) -> Pair:
     """Return a pair of plain questions, which are answered by YES or NO."""
-    halves = [
-        agent.blank("ego", YES_NO).alike(
-            id=f"{fact}-{number}{end}/ego",
-            messages=readout.asked([{"role": "user", "content": text}], YES_NO),
-        )
-        for end, text in (("a", present), ("b", absent))
-    ]
-    return Pair(fact, "YES", *halves)
+
+    def half(end: str, text: str) -> Request:
+        chat = [{"role": "user", "content": text}]
+        chats = agent.in_orders(YES_NO, lambda order: readout.asked(chat, order))
+        return agent.blank("ego", YES_NO).alike(id=f"{fact}-{number}{end}/ego", **chats)
+
+    return Pair(fact, "YES", half("a", present), half("b", absent))

@@ -1,7 +1,7 @@
 """Hold and check the complete settings of an evaluation: enough to run it again."""
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
 import msgspec
@@ -322,7 +322,7 @@ class Spec:
             ("--model", argument(self.ego.card)), ("--prompt", self.ego.prompt.version),
             *self._helper_options(), *self.source.options(), ("--seeds", seeds),
             *(("--condition", point.name) for point in self.points), ("--answer", self.ego.answer),
-            ("--image", None if self.ego.image == "own" else self.ego.image),
+            ("--image", None if self.ego.image == "own" else self.ego.image), ("--letters", self._letters),
             ("--batch-size", self.batch_size), *(("--server", url) for url in self.servers),
             ("--device", self.device), ("--dtype", self.dtype),
             ("--temperature", self.temperature or None), ("--sampling-seed", self.sampling_seed or None),
@@ -336,6 +336,13 @@ class Spec:
         if self.helpers and helpers_think != self.ego.thinking:
             flags.append("--helper-thinking" if helpers_think else "--no-helper-thinking")
         return ("harness", self.source.command, *parts, *flags)
+
+    @property
+    def _letters(self) -> str | None:
+        """The option that reads the letters as here; None if it is the cards' own choice."""
+        reads = [agent for agent in self.agents if agent.answer == "readout"]
+        own = all(agent.letters == replace(agent, letters=None).letters for agent in reads)
+        return None if own else reads[0].letters
 
     def _helper_options(self) -> list[tuple[str, object]]:
         if not self.helpers:

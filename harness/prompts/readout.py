@@ -23,6 +23,11 @@ def letters(actions: Sequence[str]) -> str:
     return LETTERS[: len(actions)]
 
 
+def cyclic(actions: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return the cyclic orders of the actions: in each, every letter stands for the next action."""
+    return [(*actions[start:], *actions[:start]) for start in range(len(actions))]
+
+
 def spelt(token: str) -> str:
     """Return a token's text without blanks around it: ` A` is another token than `A`, and the same letter."""
     return token.strip(_BLANKS)

@@ -295,7 +295,7 @@ def in_range(name: str, e: Estimate) -> Estimate:
 
     Student's t may go beyond.
     """
-    greatest = 1.0 if name.endswith(("_rate", "_ratio", "_loss", "_mass")) else np.inf
+    greatest = 1.0 if name.endswith(("_rate", "_ratio", "_loss", "_mass", "_share", "_letter")) else np.inf
     low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, greatest))
     return Estimate(e.value, low, high, e.n, e.n_excluded)
 

@@ -60,6 +60,9 @@ class Answer(Struct, frozen=True, kw_only=True):
         detail: one sentence for people.
         first: the answer before a repair turn; unset without one.
         image_sha256: digest of the pixels of the picture in its prompt; unset without one.
+        letter_share: how much of a read-out over several orders of its letters follows the letter, 0 to 1;
+            unset where the letters were read once, like the next.
+        follows_letter: whether one letter is the likeliest in every order.
     """
 
     scene: str
@@ -89,6 +92,8 @@ class Answer(Struct, frozen=True, kw_only=True):
     token_s: float | None = None
     first: FirstTurn | UnsetType = UNSET
     image_sha256: str | UnsetType = UNSET
+    letter_share: float | UnsetType = UNSET
+    follows_letter: bool | UnsetType = UNSET
 
     @property
     def turns(self) -> int:
@@ -139,6 +144,8 @@ class AnswerFacts(Struct, frozen=True):
     first_token_s: float | None = None
     token_s: float | None = None
     first: FirstTurn | UnsetType = UNSET
+    letter_share: float | UnsetType = UNSET
+    follows_letter: bool | UnsetType = UNSET
 
     @property
     def turns(self) -> int:
@@ -556,6 +563,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     thinking: bool
     answer: str
     image: str = "own"
+    letters: Literal["raw", "cyclic"] = "raw"
     batch_size: int
     dtype: str | None
     temperature: float = 0.0
@@ -605,5 +613,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     def agent(self, place: int) -> dict[str, Any]:
         """Return the agent of a scene's viewer at this place, in the form of `helpers`; the ego is at 0."""
         if place and self.helpers:
-            return {"image": "own", "thinking": False, **self.helpers[(place - 1) % len(self.helpers)]}
-        return {k: getattr(self, k) for k in ("model", "prompt", "answer", "thinking", "image")}
+            helper = self.helpers[(place - 1) % len(self.helpers)]
+            return {"image": "own", "letters": "raw", "thinking": False, **helper}
+        names = ("model", "prompt", "answer", "thinking", "image", "letters")
+        return {name: getattr(self, name) for name in names}

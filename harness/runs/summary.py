@@ -6,7 +6,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from msgspec import structs
+from msgspec import UNSET, structs
 
 from harness.core.arrays import Floats
 from harness.core.statistics import (
@@ -150,11 +150,11 @@ def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator
                 estimate = rate_interval(hits.astype(float), np.array(episodes))
                 yield Score.of(ALL, f"valid_{when}_rate_{role}", estimate, "answers")
     for role, (role_answers, episodes) in by_role.items():
-        for what in ("prompt_tokens", "completion_tokens", "label_mass"):
+        for what in ("prompt_tokens", "completion_tokens", "label_mass", "letter_share", "follows_letter"):
             counts = [
                 (value, episode)
                 for answer, episode in zip(role_answers, episodes, strict=True)
-                if (value := getattr(answer, what)) is not None
+                if (value := getattr(answer, what)) is not None and value is not UNSET
             ]
             if counts:
                 values, episode = np.array(counts, dtype=float).T

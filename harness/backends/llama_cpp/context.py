@@ -58,6 +58,17 @@ class LlamaContext:
         if self.tokens.pop(sequence, None) is not None and self._context:
             c.llama_memory_seq_rm(self._memory(), sequence, -1, -1)
 
+    def cut(self, sequence: int, length: int) -> None:
+        """Cut a sequence to its first `length` tokens; a recurrent state is computed again."""
+        tokens = self.tokens[sequence][:length]
+        if self._model.whole_state:
+            self.drop(sequence)
+            self.fork(sequence, sequence, 0)
+            self.extend({sequence: tokens})
+        else:
+            c.llama_memory_seq_rm(self._memory(), sequence, self._ends[sequence][length - 1], -1)
+            self.tokens[sequence], self._ends[sequence] = tokens, self._ends[sequence][:length]
+
     def reserve(self, room: int) -> None:
         """Allocate memory for `room` tokens of each sequence, if there is none yet."""
         if not self._context:

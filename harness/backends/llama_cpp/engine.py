@@ -96,8 +96,10 @@ class LlamaEngine:
             raise ValueError(f"model {self._card.name!r} takes no pictures")
         return self._projector.tokens(image)
 
-    def begin(self, prompts: Sequence[Sequence[int]]) -> "LlamaSession":
+    def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> "LlamaSession":
         """Read some prompts, none of them empty; what several begin with is computed once.
+
+        All logits are float32, `exact` or not.
 
         A beginning is kept for later calls, unless half of it is part of one that is kept already.
         """
@@ -169,6 +171,14 @@ class LlamaEngine:
         """Append tokens to sequences by place; return the logits after each, (len(chunks), vocabulary)."""
         return self._context.extend(chunks)
 
+    def peek(self, chunks: dict[int, Sequence[int]]) -> Logits:
+        """Return the logits after some tokens more of sequences by place, which stay as they are."""
+        lengths = {place: len(self._context.tokens[place]) for place in chunks}
+        logits = self._context.extend(chunks)
+        for place, length in lengths.items():
+            self._context.cut(place, length)
+        return logits
+
     def release(self, places: Sequence[int]) -> None:
         """Drop the sequences at some places, which are free afterwards."""
         for place in places:
@@ -227,12 +237,10 @@ class LlamaSession:
         return best
 
     def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
-        largest = self._logits.max(axis=1, keepdims=True).astype(np.float64)
-        check_logits(largest.ravel().tolist())
-        logits = self._logits - largest
-        total = np.log(np.exp(logits).sum(axis=1, keepdims=True))
-        log_p: Floats = (logits if tokens is None else logits[:, list(tokens)]) - total
-        return log_p
+        return _log_probs(self._logits, tokens)
+
+    def peek(self, chunks: Sequence[Sequence[int]], tokens: Sequence[int]) -> Floats:
+        return _log_probs(self._engine.peek(dict(zip(self._places, chunks, strict=True))), tokens)
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
         rows = [row for row, chunk in enumerate(chunks) if chunk]
@@ -251,3 +259,13 @@ class LlamaSession:
     def close(self) -> None:
         self._engine.release(self._places)
         self._places = []
+
+
+def _log_probs(logits: Logits, tokens: Sequence[int] | None) -> Floats:
+    """Return the log-probabilities of some or all tokens, from logits (n, vocabulary)."""
+    largest = logits.max(axis=1, keepdims=True).astype(np.float64)
+    check_logits(largest.ravel().tolist())
+    reduced = logits - largest
+    total = np.log(np.exp(reduced).sum(axis=1, keepdims=True))
+    log_p: Floats = (reduced if tokens is None else reduced[:, list(tokens)]) - total
+    return log_p

@@ -1,12 +1,13 @@
 """The backend of a model behind any server that speaks OpenAI's chat completions."""
 
 import asyncio
+import json
 import time
 import weakref
 from collections import deque
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from functools import partial
 from threading import Thread, current_thread
 from typing import Any, TypeVar
@@ -18,6 +19,7 @@ from harness.backends.openai.http import Client, Reply
 from harness.backends.openai.read import Reading
 from harness.backends.openai.shapes import Said, body, digest_url, read
 from harness.backends.openai.stream import ASKED, BROKE_OFF
+from harness.backends.orders import averaged
 from harness.backends.servers import Fields, Server
 from harness.core.errors import printable
 from harness.core.files import canonical_json
@@ -126,6 +128,18 @@ class OpenAIBackend:
         return await asyncio.gather(*(self._answer(request, together) for request in requests))
 
     async def _answer(self, request: Request, together: int) -> Completion:
+        if not request.orders:
+            return await self._answer_once(request, together)
+        orders = [request.alike(messages=messages, orders=()) for messages in request.orders]
+        each = [request.alike(orders=()), *orders]
+        # Asked alone, they are asked one after the other: their times add up.
+        if together == 1:
+            return _over_orders(request, [await self._answer_once(order, together) for order in each])
+        return _over_orders(
+            request, await asyncio.gather(*(self._answer_once(order, together) for order in each))
+        )
+
+    async def _answer_once(self, request: Request, together: int) -> Completion:
         reply = await self._reply(request, together == 1 and request.timed)
         end_s = time.perf_counter()
         if together == 1 and not reply.alone:  # requests of another call ran at the same time
@@ -196,6 +210,31 @@ class OpenAIBackend:
         self._streams = False
         plain = await self._farm.post(decision, json_body)
         return replace(plain, retries=reply.retries + 1 + plain.retries, begun_s=reply.begun_s)
+
+
+def _over_orders(request: Request, completions: Sequence[Completion]) -> Completion:
+    """Return the completion of a read-out over several orders; if one failed, that one."""
+    first = completions[0]
+    retries = sum(completion.retries for completion in completions)
+    if failed := next((completion for completion in completions if completion.error), None):
+        return replace(failed, request_id=request.id, retries=retries)
+
+    def total(values: Iterable[Any]) -> Any:
+        known = list(values)
+        return None if None in known else sum(known)
+
+    of_actions = [json.loads(completion.text)["action_distribution"] for completion in completions]
+    # The shares come back as the actions' of the first order: each text names its letters by them.
+    letters_p = [
+        [(completion.label_mass or 1.0) * of[action] for action in request.actions]
+        for completion, of in zip(completions, of_actions, strict=True)
+    ]
+    seconds = total(completion.seconds for completion in completions)
+    return replace(
+        first, prompt_tokens=total(completion.prompt_tokens for completion in completions),
+        seconds=seconds, first_token_s=seconds, retries=retries,
+        **asdict(averaged(request.actions, letters_p)),
+    )  # fmt: skip
 
 
 class _Loop:

@@ -177,9 +177,9 @@ class TransformersEngine:
             raise ValueError(f"{self.card.name} takes no pictures")
         return self.eyes.look(image)
 
-    def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
+    def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> Session:
         """Read some prompts; a beginning shared with each other or with earlier prompts is computed once."""
-        return self._reader.begin(prompts)
+        return self._reader.begin(prompts, exact)
 
     def identity(self) -> dict[str, Any]:
         """Return what decides the answers; a hub checkpoint is named by its commit, others by their files."""

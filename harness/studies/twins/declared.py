@@ -287,19 +287,27 @@ def _closing(text: str, start: int) -> int:
 def permuted_letters(spec: Spec, request: Request) -> Request:
     """Each letter of a read-out stands for the next action, the first for the last."""
     moved = (*request.actions[-1:], *request.actions[:-1])
-    old, new = (readout.question(of) for of in (request.actions, moved))
     letters = readout.letters(moved)
     letter = dict(zip(letters, letters[1:] + letters[:1], strict=True))
-    return replace(
-        # An example's answer is a letter alone.
-        _reworded(request, lambda text: letter.get(text) or text.replace(old, new)),
-        actions=moved,
-    )
+    questions = {
+        readout.question(old): readout.question(new)
+        for old, new in zip(readout.cyclic(request.actions), readout.cyclic(moved), strict=True)
+    }
+
+    def reworded(text: str) -> str:
+        if text in letter:  # an example's answer is a letter alone
+            return letter[text]
+        old = next((question for question in questions if question in text), None)
+        return text.replace(old, questions[old]) if old else text
+
+    return replace(_reworded(request, reworded), actions=moved)
 
 
 def _reworded(request: Request, reworded: Callable[[str], str]) -> Request:
-    messages = tuple({**message, "content": reworded(message["content"])} for message in request.messages)
-    return replace(request, messages=messages)
+    def chat(messages: Sequence[Mapping[str, str]]) -> tuple[Mapping[str, str], ...]:
+        return tuple({**message, "content": reworded(message["content"])} for message in messages)
+
+    return replace(request, messages=chat(request.messages), orders=tuple(map(chat, request.orders)))
 
 
 _DECLARED = (
