@@ -14,6 +14,7 @@ and of the answer's, at the rate of one such product.
 
 import argparse
 import json
+import os
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -63,6 +64,7 @@ def main() -> None:
     import torch
 
     torch.set_num_threads(given.threads)
+    os.environ["OMP_NUM_THREADS"] = str(given.threads)  # of llama.cpp as well
     with tempfile.TemporaryDirectory() as folder:
         model = given.model
         if given.shape:

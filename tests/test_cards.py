@@ -2,6 +2,7 @@
 
 import json
 import re
+import struct
 from pathlib import Path
 
 import pytest
@@ -224,8 +225,6 @@ def test_what_was_said_of_one_engines_weights_says_nothing_of_anothers(shelf: Pa
             ('source = "paper"', 'source = "card"\ninference_s = 0.1'),
             ["[engines.llama-cpp] has no latency; add it"],
         ),
-        (('revision = "v1"', 'file = "b.gguf"'), ["file", "llama-cpp"]),
-        (('revision = "v1"', 'quantisation = "Q4_K_M"'), ["quantisation", "llama-cpp"]),
         (('revision = "v1"', 'sha256 = "abc"'), ["sha256 = 'abc'", "64 digits"]),
         (('revision = "v1"', "gated = 1"), ["gated", "bool"]),
     ],
@@ -242,7 +241,9 @@ def test_a_gguf_file_is_a_model_named_after_it(tmp_path: Path) -> None:
     plain = cards.resolve(str(file))
     assert (plain.name, plain.engine, plain.weights) == ("small-Q8_0", "llama-cpp", str(file.resolve()))
     assert (plain.thinking, plain.latency.source, plain.file) == ("none", "paper", None)
-    file.write_bytes(b"GGUF" + bytes(1000) + b"{% if enable_thinking %}")
+    template, key = b"{% if enable_thinking %}", b"tokenizer.chat_template"
+    said = struct.pack(f"<4sIQQQ{len(key)}sIQ", b"GGUF", 3, 0, 1, len(key), key, 8, len(template)) + template
+    file.write_bytes(said)
     assert cards.resolve(str(file)).thinking == "switch"
 
 

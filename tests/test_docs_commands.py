@@ -71,6 +71,7 @@ NOT_RUN = {
     "harness model pull smollm2-135m": "fetches weights from a registry; tests/test_packages.py does",
     "harness model check smollm2-135m": "needs those weights",
     "harness eval --model smollm2-135m --limit 4": "needs those weights",
+    "harness eval --model smollm2-135m --engine llama-cpp --limit 4": "needs those weights",
     "harness model check qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b": "needs those weights",
     "harness eval --model my-served --server http://gpu-1:8000/v1 --server http://gpu-2:8000/v1"

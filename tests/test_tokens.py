@@ -47,13 +47,14 @@ def gguf(file: Path, pre: str = "qwen2", **left_out: bool) -> Path:
     from gguf import GGUFWriter
     from tokenizers.pre_tokenizers import ByteLevel
 
-    tokens = [*sorted(ByteLevel.alphabet()), "ab", "<|im_end|>"]
+    tokens = [*sorted(ByteLevel.alphabet()), "ab", "ĠĠ", "17", "<|im_end|>"]
     writer = GGUFWriter(file, "qwen2")
+    writer.add_tokenizer_model("gpt2")
     writer.add_tokenizer_pre(pre)
     writer.add_token_list(tokens)
     writer.add_token_types([1] * (len(tokens) - 1) + [3])
     if not left_out.get("merges"):
-        writer.add_token_merges(["a b"])
+        writer.add_token_merges(["a b", "Ġ Ġ", "1 7"])
     writer.write_header_to_file()
     writer.write_kv_data_to_file()
     writer.close()
@@ -68,10 +69,31 @@ def test_a_gguf_file_is_read_as_its_model_reads_it(tmp_path: Path) -> None:
     assert made.decode(made.encode(text).ids) == text
 
 
-def test_a_gguf_file_of_another_kind_or_without_merges_is_one_line(tmp_path: Path) -> None:
-    message = refused(gguf(tmp_path / "llama.gguf", pre="llama-bpe"))
-    assert message.endswith("has the pre-tokeniser llama-bpe; only qwen2 can be read")
+def test_a_gguf_file_that_nobody_knows_or_without_merges_is_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("transformers", reason="needs the transformers extra")
+    message = refused(gguf(tmp_path / "odd.gguf", pre="of-my-own"))
+    assert "has the pre-tokeniser of-my-own, which nobody here knows; give the model's tokenizer" in message
     assert "is no readable tokenizer" in refused(gguf(tmp_path / "bare.gguf", merges=True))
+
+
+@pytest.mark.parametrize(
+    ("pre", "tokens"),
+    [
+        ("smollm", ["a", "ĠĠ", "1", "7", "Ġ", "ab"]),
+        ("gpt-2", ["a", "Ġ", "Ġ", "17", "Ġ", "ab"]),
+        ("llama-bpe", ["a", "Ġ", "Ġ", "17", "Ġ", "ab"]),
+        ("qwen2", ["a", "Ġ", "Ġ", "1", "7", "Ġ", "ab"]),
+    ],
+)
+def test_text_is_split_as_the_file_says(pre: str, tokens: list[str], tmp_path: Path) -> None:
+    made = tokenizer(gguf(tmp_path / "tiny.gguf", pre=pre))
+    assert made.encode("a  17 ab").tokens == tokens
+
+
+def test_the_gguf_file_of_a_model_counts_for_it(tmp_path: Path) -> None:
+    file = gguf(tmp_path / "tiny.gguf")
+    given, own = counter(file), counter(None, resolve(str(file)))
+    assert given(MESSAGES) == own(MESSAGES) == 1 + 5
 
 
 def tokenizer_json(folder: Path) -> Path:

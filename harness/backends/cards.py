@@ -7,7 +7,6 @@ lists. For a directory, a GGUF file, a hub id or `replay:RUN_DIR`, a card is mad
 import json
 import os.path
 import re
-import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
@@ -15,12 +14,13 @@ from pathlib import Path
 
 from harness.backends.base import Letters
 from harness.backends.card import Card, Dtype, Latency, LatencySource, System, Thinking, read
+from harness.backends.gguf import said
 from harness.backends.registry import engines
 from harness.backends.vision import Vision, of_checkpoint
 from harness.core import resources
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import bytes_of, opened, text_of
+from harness.core.files import bytes_of, text_of
 
 __all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", "each_engine", "load",
            "load_all", "names", "own", "resolve"]  # fmt: skip
@@ -34,8 +34,6 @@ _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 DISTILLED = "training.json"  # stands beside weights that were distilled here
 PROJECTOR = "mmproj-"  # prefix of a projector's GGUF file
 _SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
-_GGUF_TEMPLATE = b"tokenizer.chat_template" + struct.pack("<I", 8)  # the key, and the type of a text
-_GGUF_HEAD = 1 << 25  # the first bytes of a GGUF file, with its vocabulary and its template
 
 
 def names() -> list[str]:
@@ -154,7 +152,7 @@ def _on_the_spot(text: str, engine: str | None) -> Card:
     if where is not None and where.is_dir():
         return _of_directory(text, where, engine)
     if where is not None and where.suffix == ".gguf":
-        return _of_file(text, where)
+        return _of_file(text, where, engine)
     if _HUB_ID.fullmatch(text) and not text.endswith(".gguf"):
         return _new_card(text, "transformers", text, "Hub model without a card")
     if "/" in text:
@@ -176,7 +174,7 @@ def _of_directory(text: str, where: Path, engine: str | None) -> Card:
             card, vision=_vision(text, where), system=_system(_template(where)), letters=_letters(where)
         )
     if len(files) == 1:
-        return _of_file(text, files[0])
+        return _of_file(text, files[0], engine)
     if files:
         raise UserError(
             f"model directory {printable(text)!r} holds {len(files)} .gguf files; give one of them"
@@ -187,18 +185,25 @@ def _of_directory(text: str, where: Path, engine: str | None) -> Card:
     )
 
 
-def _of_file(text: str, file: Path) -> Card:
-    """Make the card of a GGUF file, with the projector beside it that has the same name behind its prefix."""
-    with opened(file, "weights") as data:
-        head = data.read(_GGUF_HEAD)
-    thinking: Thinking = "switch" if _SWITCH in head else "none"
-    card = _new_card(file.stem, "llama-cpp", str(file), "Local GGUF file", thinking)
-    beside = file.with_name(f"{PROJECTOR}{file.name}")
-    vision = _vision(text, file.parent) if beside.is_file() else None
-    return replace(
-        card, vision=vision, projector=beside.name if vision else None,
-        system=_system(_gguf_template(head)), letters=_letters(file.parent),
+def _of_file(text: str, file: Path, engine: str | None) -> Card:
+    """Make the card of a GGUF file, of what the file says of itself.
+
+    On llama-cpp the projector beside it goes with it, which has the same name behind its prefix.
+    """
+    told = said(file)
+    thinking: Thinking = "switch" if _SWITCH in (told.template or "").encode() else "none"
+    description = f"Local GGUF file{f': {printable(told.name)}' if told.name else ''}"
+    runs_on = "transformers" if engine == "transformers" else "llama-cpp"
+    card = _new_card(file.stem, runs_on, str(file), description, thinking)
+    card = replace(
+        card, licence=told.licence and printable(told.licence), system=_system(told.template),
+        letters=_letters(file.parent),
     )  # fmt: skip
+    beside = file.with_name(f"{PROJECTOR}{file.name}")
+    if runs_on == "transformers" or not beside.is_file():
+        return card
+    vision = _vision(text, file.parent)
+    return replace(card, vision=vision, projector=beside.name if vision else None)
 
 
 def _path(text: str) -> Path | None:
@@ -269,15 +274,3 @@ def _template(checkpoint: Path) -> str | None:
         template = json.loads(text_of(checkpoint / _TEMPLATE_FILES[1], "record")).get("chat_template")
         return template if isinstance(template, str) else None
     return None
-
-
-def _gguf_template(head: bytes) -> str | None:
-    """Return the chat template in the first bytes of a GGUF file; None if it is not among them.
-
-    A text follows its key, its type and its length.
-    """
-    _, found, rest = head.partition(_GGUF_TEMPLATE)
-    if not found or len(rest) < 8:
-        return None
-    (length,) = struct.unpack_from("<Q", rest)
-    return rest[8 : 8 + length].decode(errors="replace") if length <= len(rest) - 8 else None

@@ -68,6 +68,8 @@ class Registration:
         install: the command that installs them.
         finds: `module:function`, which returns the path of a card's weights, or raises UserError; for an
             engine that has weights.
+        prepares: `module:function`, called with a card whose weights were just fetched; empty if weights are
+            loaded as they lie.
         sees: `module:function`, which returns the number of tokens that a card's image processor makes of a
             picture of the card's size, without loading weights; empty if there is no such way.
     """
@@ -79,6 +81,7 @@ class Registration:
     packages: Mapping[str, str] = field(default_factory=dict)
     install: str = ""
     finds: str = ""
+    prepares: str = ""
     sees: str = ""
 
     @property
@@ -102,11 +105,12 @@ BUILT_IN: Mapping[str, Registration] = {
     "transformers": Registration(
         "harness.backends.transformers.engine:open",
         Capabilities(has_weights=True, samples=True),
-        card_keys=(*_WEIGHTS, "dtype", "vision", "system"),
+        card_keys=(*_WEIGHTS, "dtype", "file", "quantisation", "vision", "system"),
         required_keys=("weights",),
         packages={"torch": "torch", "transformers": "transformers"},
         install=extras.install("transformers"),
-        finds="harness.backends.weights:find_checkpoint",
+        finds="harness.backends.weights:find_weights",
+        prepares="harness.backends.transformers.engine:checkpoint",
         sees="harness.backends.transformers.processor:tokens",
     ),
     "llama-cpp": Registration(

@@ -1,12 +1,15 @@
 """Count the tokens of prompts with a model's own tokenizer, without loading the model."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from harness.backends.cards import Card
+from harness.backends.gguf import metadata
 from harness.core.errors import UserError, printable
+from harness.core.extras import OPTIONAL, without
 from harness.core.files import text_of
 from harness.core.resources import find
 
@@ -15,11 +18,21 @@ QWEN2_SPLIT = (
     r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}"
     r"| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
 )
+_GPT2_SPLIT = r"'s|'t|'re|'ve|'m|'ll|'d| ?\p{L}+| ?\p{N}+| ?[^\s\p{L}\p{N}]+|\s+(?!\S)|\s+"
+# How byte-level vocabularies split text before they merge bytes, one pattern after another, by
+# `tokenizer.ggml.pre`: as llama.cpp does by that name.
+_SPLITS: Mapping[str, tuple[str, ...]] = {
+    "qwen2": (QWEN2_SPLIT,),
+    "gpt-2": (_GPT2_SPLIT,),
+    **dict.fromkeys(("smollm", "starcoder", "refact", "command-r"), (r"\p{N}", _GPT2_SPLIT)),
+    "llama-bpe": (QWEN2_SPLIT.replace(r"|\p{N}|", r"|\p{N}{1,3}|"),),
+}
+_WHOLE_FIRST = ("llama-bpe",)  # a piece that is a token is not merged out of its bytes
 
 
 @lru_cache(maxsize=4)
 def tokenizer(source: Path) -> Any:
-    """Load a `tokenizers.Tokenizer` from a GGUF file (Qwen2 kind), a tokenizer.json, or a folder with one.
+    """Load a `tokenizers.Tokenizer` from a GGUF file, a tokenizer.json, or a folder with one.
 
     A file may have been saved with a longest length or with padding; both are switched off.
 
@@ -39,7 +52,7 @@ def tokenizer(source: Path) -> Any:
         )
     except UserError:
         raise
-    except Exception as error:  # tokenizers and gguf raise bare Exceptions on a broken file
+    except Exception as error:  # tokenizers raises bare Exceptions on a broken file
         raise UserError(f"{printable(file)} is no readable tokenizer: {printable(error)}") from None
 
 
@@ -57,37 +70,51 @@ def token_ids(loaded: Any, text: str) -> list[int]:
 
 
 def _from_gguf(file: Path) -> Any:
-    from gguf import GGUFReader
+    """Build the tokenizer of a GGUF file: a byte-level one of its vocabulary, another by transformers."""
     from tokenizers import AddedToken, models
 
-    reader = GGUFReader(file)
-
-    def texts(key: str) -> list[str]:
-        field = reader.fields[key]
-        return [bytes(field.parts[i]).decode("utf-8") for i in field.data]
-
-    (kind,) = texts("tokenizer.ggml.pre")
-    if kind != "qwen2":
-        raise UserError(f"{printable(file)} has the pre-tokeniser {printable(kind)}; only qwen2 can be read")
-    vocabulary = texts("tokenizer.ggml.tokens")
-    merges = [(left, right) for left, right in (p.split(" ") for p in texts("tokenizer.ggml.merges"))]
-    types = [int(reader.fields["tokenizer.ggml.token_type"].parts[i][0])
-             for i in reader.fields["tokenizer.ggml.token_type"].data]  # fmt: skip
-    built = byte_level(models.BPE(vocab={t: i for i, t in enumerate(vocabulary)}, merges=merges))
+    values = metadata(file, arrays=True)
+    pre = str(values.get("tokenizer.ggml.pre"))
+    if values["tokenizer.ggml.model"] != "gpt2" or pre not in _SPLITS:
+        return _converted(file, values["tokenizer.ggml.model"], pre)
+    vocabulary = values["tokenizer.ggml.tokens"]
+    merges = [(left, right) for left, right in (p.split(" ") for p in values["tokenizer.ggml.merges"])]
+    model = models.BPE(
+        vocab={t: i for i, t in enumerate(vocabulary)}, merges=merges, ignore_merges=pre in _WHOLE_FIRST
+    )
+    built = byte_level(model, _SPLITS[pre])
     # Control tokens, and user-defined tokens that are never split, such as `<think>`.
+    types = values["tokenizer.ggml.token_type"]
     added = [(t, k) for t, k in zip(vocabulary, types, strict=True) if k in (3, 4)]
     built.add_tokens([AddedToken(t, special=k == 3, normalized=False) for t, k in added])
     return built
 
 
-def byte_level(model: Any) -> Any:
-    """Build a `tokenizers.Tokenizer` of a byte-level BPE model that splits text as Qwen2 does."""
+def _converted(file: Path, kind: str, pre: str) -> Any:
+    """Have transformers build a tokenizer. Where it does not know the name, it splits text as GPT-2 does."""
+    try:
+        from transformers.integrations import gguf
+        from transformers.integrations.gguf.gguf_tokenizer_mapping import GGUF_PRE_TOKENIZER_SPLITS
+    except ImportError:
+        raise without(f"the tokenizer of {printable(file)}", *OPTIONAL["transformers"]) from None
+    if kind == "gpt2" and pre not in GGUF_PRE_TOKENIZER_SPLITS:
+        raise UserError(
+            f"{printable(file)} has the pre-tokeniser {printable(pre)}, which nobody here knows; give the "
+            "model's tokenizer.json, or run it on llama-cpp"
+        )
+    architecture, stated, _ = gguf.get_gguf_tokenizer(str(file))
+    built, _ = gguf.convert_gguf_tokenizer(architecture, stated)
+    return built
+
+
+def byte_level(model: Any, splits: Sequence[str] = (QWEN2_SPLIT,)) -> Any:
+    """Build a `tokenizers.Tokenizer` of a byte-level BPE model, which splits text as Qwen2 or by `splits`."""
     from tokenizers import Regex, Tokenizer, decoders, pre_tokenizers
 
     built = Tokenizer(model)
     built.pre_tokenizer = pre_tokenizers.Sequence(
         [
-            pre_tokenizers.Split(Regex(QWEN2_SPLIT), "isolated"),
+            *(pre_tokenizers.Split(Regex(split), "isolated") for split in splits),
             pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
         ]
     )
@@ -100,15 +127,26 @@ def counter(
 ) -> Callable[[Iterable[Mapping[str, str]]], int] | None:
     """Return a function that counts the tokens of chat messages, without those of the chat template.
 
-    It uses the given tokenizer, or else the one beside the model's weights; None if there is neither.
+    It uses the given tokenizer, or else the one with the model's weights; None if there is neither.
     """
     if source is None and card and card.weights:
-        beside = find("models", card.weights)
-        source = beside if (beside / "tokenizer.json").is_file() else None
+        source = _of_weights(card)
     if source is None:
         return None
     loaded = tokenizer(source)
     return lambda messages: sum(len(token_ids(loaded, m["content"])) for m in messages)
+
+
+def _of_weights(card: Card) -> Path | None:
+    """Return the tokenizer with a card's weights: that of a checkpoint, or its GGUF file."""
+    from harness.backends.weights import find_gguf, is_gguf
+
+    beside = find("models", card.weights or "")
+    if (beside / "tokenizer.json").is_file():
+        return beside
+    with suppress(UserError):  # it is not here
+        return find_gguf(card) if is_gguf(card) else None
+    return None
 
 
 def spread_of(counts: Sequence[int]) -> dict[str, float]:

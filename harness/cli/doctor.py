@@ -75,6 +75,7 @@ def look(gpu: bool) -> dict[str, Any]:
     from harness.backends.cache import default_file
     from harness.backends.counters import counters
     from harness.backends.transformers.engine import gpus
+    from harness.core.cores import usable
     from harness.core.versions import versions
 
     models: list[dict[str, Any]] = []
@@ -86,7 +87,7 @@ def look(gpu: bool) -> dict[str, Any]:
     cache = default_file()
     return {
         "versions": versions(PACKAGES),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": usable(),
         "memory_gib": _memory_gib(),
         "gpu": gpus() if gpu else _smi_gpus(),
         "meters": [meter.name for meter in counters()],

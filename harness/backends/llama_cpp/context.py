@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.backends.engine import common_length
-from harness.backends.llama_cpp.model import LlamaModel, last_error, threads
+from harness.backends.llama_cpp.model import LlamaModel, last_error
 from harness.backends.llama_cpp.projector import Projector, Run, text_run
+from harness.core.cores import threads
 
 Ints = NDArray[np.int32]
 Logits = NDArray[np.float32]

@@ -5,7 +5,6 @@ process.
 """
 
 import ctypes
-import os
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -135,11 +134,3 @@ def build() -> dict[str, str]:
     """Return the version and CPU features of llama.cpp, which move an answer's last digits."""
     features: bytes = c.llama_print_system_info()
     return {"llama_cpp_python": version("llama-cpp-python"), "system": features.decode().strip(" |")}
-
-
-def threads() -> int:
-    """Return the number of threads: OMP_NUM_THREADS, as for any other engine, or else one a core."""
-    asked = os.environ.get("OMP_NUM_THREADS", "")
-    if asked.isdigit() and int(asked):
-        return int(asked)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.backends.engine import picture_of, picture_tokens
-from harness.backends.llama_cpp.model import LlamaModel, keep_errors, last_error, threads
+from harness.backends.llama_cpp.model import LlamaModel, keep_errors, last_error
 from harness.backends.vision import Vision
+from harness.core.cores import threads
 from harness.core.errors import UserError, printable
 from harness.core.image import Image
 

@@ -12,7 +12,8 @@ from harness.backends.cards import Card, Dtype
 from harness.backends.chat import Chat
 from harness.backends.engine import Session
 from harness.backends.language_model import LanguageModel
-from harness.backends.weights import fetching, find_checkpoint, held_to_digest, hub_commit
+from harness.backends.weights import fetching, find_checkpoint, find_gguf, held_to_digest, hub_commit, is_gguf
+from harness.core.cores import threads
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_bytes, sha256_file, text_of
 from harness.core.image import Image
@@ -32,9 +33,31 @@ def open(
     dtype = dtype or card.dtype
     if dtype not in get_args(Dtype):
         raise UserError(f"dtype {printable(dtype)!r}; allowed: {', '.join(get_args(Dtype))}")
-    where = find_checkpoint(card)
-    tokenizer, model = load(card, where, dtype=dtype, device=device_of(device))
+    import torch
+
+    where, device = checkpoint(card), device_of(device)
+    torch.set_num_threads(min(threads(), torch.get_num_threads()))  # fewer may have been asked for
+    tokenizer, model = load(card, where, dtype=dtype, device=device)
     return LanguageModel(TransformersEngine(card, where, tokenizer, model), batch_size)
+
+
+def checkpoint(card: Card) -> Path:
+    """Return the directory of a card's checkpoint, held to the card's digest; a GGUF file is unpacked.
+
+    Raises:
+        UserError: the weights are not found, are not what the card says, or cannot be unpacked.
+    """
+    if not is_gguf(card):
+        where = find_checkpoint(card)
+        held_to_digest(card, where / "model.safetensors")
+        return where
+    from harness.backends.transformers.unpack import unpacked
+
+    if card.vision:
+        raise UserError(
+            f"model {printable(card.name)!r}: a GGUF file takes no pictures on transformers; use llama-cpp"
+        )
+    return unpacked(card, held_to_digest(card, find_gguf(card)))
 
 
 def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]:
@@ -45,7 +68,6 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
     """
     import transformers
 
-    held_to_digest(card, where / "model.safetensors")
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     _refuse_kernels(card, where)
@@ -194,6 +216,7 @@ class TransformersEngine:
             "dtype": str(self.model.dtype).removeprefix("torch."),
             "device": str(self.model.device),
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
+            **({"gguf_sha256": self._gguf_sha256} if is_gguf(self.card) else {}),
             **({"system": self.chat.system} if self.chat.system else {}),
         }
 
@@ -202,3 +225,7 @@ class TransformersEngine:
         """Digest of the files that decide the answers, by name and content."""
         files = sorted(p for p in self.where.iterdir() if p.is_file() and p.suffix in _HASHED)
         return digest({path.name: sha256_file(path) for path in files})
+
+    @cached_property
+    def _gguf_sha256(self) -> str:
+        return sha256_file(find_gguf(self.card))

@@ -1,0 +1,122 @@
+"""What a GGUF file says of itself: the keys and values before its weights.
+
+The layout is that of https://github.com/ggml-org/ggml/blob/master/docs/gguf.md, versions 2 and 3.
+"""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness.core.files import opened
+
+LONGEST = 1 << 26  # bytes of keys and values that are read: a vocabulary of 256 000 tokens needs a third
+_NUMBERS = {0: "B", 1: "b", 2: "H", 3: "h", 4: "I", 5: "i", 6: "f", 7: "?", 10: "Q", 11: "q", 12: "d"}
+_TEXT, _ARRAY = 8, 9
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a file says of its model; None or empty where it does not.
+
+    Attributes:
+        name: the model's name.
+        licence: SPDX id of its licence, or its name, as the file writes it.
+        context_tokens: the longest sequence that it was trained for.
+        template: its chat template.
+    """
+
+    name: str | None = None
+    licence: str | None = None
+    context_tokens: int | None = None
+    template: str | None = None
+
+
+def said(file: Path) -> Said:
+    """Return what a file says of its model; nothing if it cannot be read, which opening it reports."""
+    try:
+        values = metadata(file)
+    except (OSError, ValueError):
+        return Said()
+
+    def text(key: str) -> str | None:
+        value = values.get(key)
+        return value if isinstance(value, str) else None
+
+    context = values.get(f"{values.get('general.architecture')}.context_length")
+    return Said(
+        text("general.name"), text("general.license"), context if isinstance(context, int) else None,
+        text("tokenizer.chat_template"),
+    )  # fmt: skip
+
+
+def metadata(file: Path, arrays: bool = False) -> Mapping[str, Any]:
+    """Read the keys and values of a file.
+
+    Args:
+        file: the GGUF file.
+        arrays: also return arrays, which are otherwise skipped.
+
+    Raises:
+        OSError: it cannot be opened.
+        ValueError: it is no GGUF file, or its keys and values are longer than `LONGEST`.
+    """
+    with opened(file, "weights") as data:
+        head = data.read(LONGEST)
+    magic, version, _, count = _unpacked("<4sIQQ", head, 0)
+    if magic != b"GGUF" or version not in (2, 3):
+        raise ValueError("no GGUF file of version 2 or 3")
+    at = struct.calcsize("<4sIQQ")
+    values: dict[str, Any] = {}
+    for _ in range(count):
+        key, at = _text(head, at)
+        (kind,) = _unpacked("<I", head, at)
+        value, at = _value(head, at + 4, kind, arrays)
+        if value is not None:
+            values[key] = value
+    return values
+
+
+def _value(head: bytes, at: int, kind: int, arrays: bool) -> tuple[Any, int]:
+    """Return a value and where the next begins; None for an array that is skipped."""
+    if kind == _TEXT:
+        return _text(head, at)
+    if kind != _ARRAY:
+        (number,) = _unpacked(f"<{_number(kind)}", head, at)
+        return number, at + struct.calcsize(f"<{_number(kind)}")
+    of, count = _unpacked("<IQ", head, at)
+    at += 12
+    if of == _TEXT:
+        texts = []
+        for _ in range(count):  # each has eight bytes at least, so that a false count ends with the bytes
+            if arrays:
+                text, at = _text(head, at)
+                texts.append(text)
+            else:
+                at += 8 + _unpacked("<Q", head, at)[0]
+        return texts if arrays else None, at
+    size = struct.calcsize(f"<{_number(of)}") * count
+    if at + size > len(head):
+        raise ValueError("an array is longer than the file")
+    return list(struct.unpack_from(f"<{count}{_number(of)}", head, at)) if arrays else None, at + size
+
+
+def _text(head: bytes, at: int) -> tuple[str, int]:
+    (length,) = _unpacked("<Q", head, at)
+    at += 8
+    if at + length > len(head):
+        raise ValueError("a text is longer than the file")
+    return head[at : at + length].decode(errors="replace"), at + length
+
+
+def _number(kind: int) -> str:
+    if kind not in _NUMBERS:
+        raise ValueError(f"a value has the kind {kind}")
+    return _NUMBERS[kind]
+
+
+def _unpacked(form: str, head: bytes, at: int) -> tuple[Any, ...]:
+    if at + struct.calcsize(form) > len(head):
+        raise ValueError("it ends before its keys and values do")
+    return struct.unpack_from(form, head, at)

@@ -1,0 +1,111 @@
+"""A GGUF file as a checkpoint that transformers loads: its weights as float32, made once and kept.
+
+The file is read in Python and numpy. Its tokenizer is `harness.backends.tokens`' own, which splits text as
+llama.cpp does.
+"""
+
+import io
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import redirect_stderr
+from pathlib import Path
+from typing import Any
+from warnings import catch_warnings, simplefilter
+
+from harness.backends.cards import Card
+from harness.backends.gguf import metadata
+from harness.backends.tokens import tokenizer
+from harness.core import kept
+from harness.core.errors import UserError, printable
+from harness.core.files import alone, digest, sha256_file, write_whole
+
+_PATIENCE_S = 3600.0  # for another process that unpacks the same file
+_SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
+
+
+def unpacked(card: Card, file: Path) -> Path:
+    """Return the checkpoint of a GGUF file, which is made if it is not kept.
+
+    Raises:
+        UserError: the file has no tokenizer or chat template, transformers does not know its architecture, or
+            the checkpoint cannot be written.
+    """
+    from transformers import __version__
+
+    made_by = [__version__, kept.code_sha256("backends/transformers/unpack.py", "backends/tokens.py")]
+    to = kept.folder() / "checkpoints" / digest([sha256_file(file), *made_by])[:16]
+    shown = f"model {printable(card.name)!r} in {printable(file)}"
+    try:
+        to.parent.mkdir(parents=True, exist_ok=True)
+        with alone(to.with_name(f".{to.name}.lock"), _PATIENCE_S):
+            if not to.is_dir():
+                part = to.with_name(f".{to.name}.part")
+                shutil.rmtree(part, ignore_errors=True)  # of a process that was killed
+                try:
+                    _unpack(file, part, shown)
+                    os.replace(part, to)
+                finally:
+                    shutil.rmtree(part, ignore_errors=True)
+    except OSError as error:
+        raise UserError(
+            f"{shown}: its checkpoint cannot be written: {printable(error)}; it takes 4 bytes a weight in "
+            f"{printable(to.parent)}; SWARMDRIVE_CACHE names another folder"
+        ) from None
+    return to
+
+
+def _unpack(file: Path, to: Path, shown: str) -> None:
+    import torch
+    import transformers
+
+    try:
+        values = metadata(file, arrays=True)
+    except ValueError as error:
+        raise UserError(f"{shown} does not load: {error}; copy or download the file again") from None
+    if not isinstance(values.get("tokenizer.chat_template"), str):
+        raise UserError(f"{shown} has no chat template; give the GGUF file of its instruct version")
+    words = tokenizer(file)
+    transformers.utils.logging.set_verbosity_error()
+    transformers.utils.logging.disable_progress_bar()
+    try:
+        # What is wrong is reported below; a bar of its own would stand in the middle of ours.
+        with catch_warnings(), redirect_stderr(io.StringIO()):
+            simplefilter("ignore")
+            model, report = transformers.AutoModelForCausalLM.from_pretrained(
+                file.parent, gguf_file=file.name, dtype=torch.float32, output_loading_info=True,
+                local_files_only=True, trust_remote_code=False,
+            )  # fmt: skip
+    except OSError as error:
+        if error.errno is not None:  # the disk; others are transformers' own words
+            raise
+        raise _unloadable(shown, error) from error
+    except Exception as error:  # a broken file surfaces as any of a dozen exception types
+        raise _unloadable(shown, error) from error
+    if report["missing_keys"]:
+        absent = sorted(report["missing_keys"])
+        raise UserError(
+            f"{shown} lacks {len(absent)} of its weights ({printable(absent[0])}); download the file again, "
+            "or run it on llama-cpp"
+        )
+    model.hf_quantizer = None
+    if hasattr(model.config, "quantization_config"):
+        del model.config.quantization_config
+    model.save_pretrained(to)
+    words.save(str(to / "tokenizer.json"))
+    settings = {"tokenizer_class": "PreTrainedTokenizerFast", "clean_up_tokenization_spaces": False,
+                "chat_template": values["tokenizer.chat_template"], **_specials(values)}  # fmt: skip
+    write_whole(to / "tokenizer_config.json", json.dumps(settings, indent=1))
+
+
+def _specials(values: Mapping[str, Any]) -> dict[str, str]:
+    """Return the texts of special tokens, such as `bos_token`."""
+    ids = {name: values.get(f"tokenizer.ggml.{key}_token_id") for name, key in _SPECIALS.items()}
+    tokens = values["tokenizer.ggml.tokens"]
+    return {f"{name}_token": tokens[number] for name, number in ids.items() if number is not None}
+
+
+def _unloadable(shown: str, error: Exception) -> UserError:
+    reason = printable(" ".join(str(error).split()), 200)
+    return UserError(f"{shown} does not load with transformers: {reason}; run it on llama-cpp")
