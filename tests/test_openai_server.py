@@ -99,7 +99,7 @@ def some(data: Dataset, answer: AnswerMode, prompt: str = "v2", max_tokens: int 
     spec = spec_of(data, "openai-example", prompt=prompt, answer=answer)
     asked = list(requests(spec, scenes_of(data)))[:8]
     # The server tells its template nothing about thinking, which opens no thought and closes none.
-    return [replace(r, max_tokens=max_tokens, thinking=True) for r in asked]
+    return [replace(r, max_tokens=max_tokens, thinking=True, orders=()) for r in asked]
 
 
 def in_process(gguf: Path, asked: list[Request]) -> list[Completion]:

@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, cast, get_args
 
 import typer
+from msgspec import to_builtins
 
 from harness.cli import options
 from harness.cli.estimates import echo_json, echo_wrong
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from harness.backends.base import AnswerMode, Completion, Request
     from harness.backends.cards import Card
     from harness.backends.checkup import Checkup
+    from harness.backends.findings import Findings
     from harness.evaluate.spec import Spec
 
 app = typer.Typer(help="List models, download one, or test one before a run.", no_args_is_help=True)
@@ -96,8 +98,10 @@ def check(
 ) -> None:
     """Load a model, show its prompt and time one answer.
 
-    It does so in each answer mode. A model that takes pictures is also asked with a picture and with a blank
-    one. Exit code 1 if no answer can be read, or if it ignores the picture; 3 if it answers in no mode.
+    It does so in each answer mode. Twelve fixed questions, and pairs of questions that differ in one fact,
+    show whether its read-outs follow the letter and whether it reads the scene; later pages say so. A model
+    that takes pictures is also asked with a picture and with a blank one. Exit code 1 if no answer can be
+    read, or if it ignores the picture; 3 if it answers in no mode.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities
@@ -112,15 +116,20 @@ def check(
                 f"{card.name}: engine {card.engine} is model-free: no weights, no tokens, nothing to load"
             )
         return
-    spec, seen = _seen(card, thinking, device, dtype)
+    spec, seen, found = _seen(card, thinking, device, dtype)
     if as_json:
         typer.echo(
             json.dumps(
-                {**head, "model_free": False, "thinking_asked": spec.ego.thinking, **asdict(seen)}, indent=2
+                {
+                    **head, "model_free": False, "thinking_asked": spec.ego.thinking, **asdict(seen),
+                    "findings": found and {**to_builtins(found), "reads_scene": found.reads_scene},
+                },
+                indent=2,
             )
-        )
+        )  # fmt: skip
     else:
         _show(spec, seen)
+        _show_findings(found)
     every = [*seen.answers.values(), *(seen.looks.answers.values() if seen.looks else ())]
     errors = [answer.error for answer in every if answer.error is not None]
     if len(errors) == len(every):
@@ -157,13 +166,18 @@ def _blind(card: "Card", fault: str) -> str:
     return f"{who} {printable(fault, 300)}; {remedy}"
 
 
-def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -> "tuple[Spec, Checkup]":
+def _seen(
+    card: "Card", thinking: bool, device: str | None, dtype: str | None
+) -> "tuple[Spec, Checkup, Findings | None]":
+    """Check a model, examine it if it answers by letters, and keep what was found."""
+    from harness.backends import findings
     from harness.backends.base import AnswerMode, Rendering
     from harness.backends.checkup import check as look
     from harness.backends.registry import open_backend
     from harness.dataset import load
     from harness.evaluate.agent import Agent
     from harness.evaluate.asking import requests
+    from harness.evaluate.examine import COUNT, examine
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.prompts import versions as prompts
@@ -186,7 +200,17 @@ def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -
     ]  # fmt: skip
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
     with bar(f"asking {printable(card.name, 30)}", len(asked) + 2 * len(shown)) as progress:
-        return spec, look(cast("Rendering", backend), asked, shown, progress)
+        seen = look(cast("Rendering", backend), asked, shown, progress)
+    read_out = seen.answers.get("readout")
+    if read_out is None or read_out.error is not None or (seen.looks and seen.looks.fault):
+        return spec, seen, None
+    with bar(f"examining {printable(card.name, 30)}", COUNT) as progress:
+        found = examine(backend, ego, progress)
+    if isinstance(found, str):
+        typer.echo(f"harness: the fixed questions got no answer: {printable(found, 300)}", err=True)
+        return spec, seen, None
+    findings.keep(seen.identity, found)
+    return spec, seen, found
 
 
 def _show(spec: "Spec", seen: "Checkup") -> None:
@@ -220,6 +244,20 @@ def _show(spec: "Spec", seen: "Checkup") -> None:
         _show_answers(seen.looks.answers)
         typer.echo("picture      a blank one in its place")
         _show_answers(seen.looks.blank)
+
+
+def _show_findings(found: "Findings | None") -> None:
+    if found is None:
+        return
+    typer.echo(
+        f"letters      {100 * found.letter_share:.0f} % of a read-out follows the letter; the likeliest "
+        f"action does in {found.follows_letter} of {found.n} questions; mass on the letters "
+        f"{found.label_mass:.2f}"
+    )
+    shown = ", ".join(f"{pair.fact} {pair.moved} of {pair.n} ({pair.mean:+.3f})" for pair in found.pairs)
+    typer.echo(f"pairs        letters {found.letters}; one fact changed, and the answer moved: {shown}")
+    for sentence in found.sentences():
+        typer.echo(f"             {sentence}")
 
 
 def _show_answers(answers: "Mapping[AnswerMode, Completion]") -> None:

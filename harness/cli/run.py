@@ -215,6 +215,17 @@ def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Seque
         text.print(note)
 
 
+def of_letter(figures: "Mapping[tuple[str, str], Score]", role: str) -> str | None:
+    """How much of a role's read-outs over cyclic orders follows the letter; None without such orders."""
+    share, follows = (figures.get(("all", f"{what}_{role}")) for what in ("letter_share", "follows_letter"))
+    if share is None or follows is None:
+        return None
+    hits = round((follows.value or 0) * follows.n)
+    return (
+        f"{100 * (share.value or 0):.0f} % follows the letter, the likeliest action in {hits} of {follows.n}"
+    )
+
+
 def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: str = "") -> Iterator[str]:
     """Where a run's times come from and how its answers were read; `means` says what shares are means of."""
     from harness.report.words import energy, pace
@@ -240,6 +251,9 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: st
         if shares[0] is not None:
             values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
             yield f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}{means}"
+        if (mass := figures.get(("all", f"label_mass_{role}"))) is not None:
+            read = of_letter(figures, role) or "letters read once"
+            yield f"{role} read-outs: {read}; mass on the letters {mass.value or 0:.2f}{means}"
         for when in ("at_first", "after_repair"):
             if turn := figures.get(("all", f"valid_{when}_rate_{role}")):
                 share = Column("", turn.metric, 100, interval=True).cell(turn)

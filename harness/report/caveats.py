@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+from harness.backends import findings
 from harness.backends.registry import find
 from harness.coordination.operating_point import pairs
 from harness.core.errors import printable
@@ -30,7 +31,8 @@ _CONTROLS = {
 
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
     """Sentences for a run's headline; none for a language model whose answers could be read."""
-    first = [*unread(scores), *no_prompt([manifest]), *moved_system(manifest)]
+    first = [*unread(scores), *no_prompt([manifest]), *findings_of(manifest), *moved_system(manifest)]
+    first += by_letter(scores)
     return [*first, *beyond_sources(manifest), *on_device(manifest)]
 
 
@@ -80,6 +82,8 @@ def of_run(run: Run) -> Iterator[str]:
         if names := [c["name"] for c in run.manifest.conditions if c.get("messages") == control]:
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
     yield from lost_at_once(run)
+    yield from findings_of(run.manifest)
+    yield from by_letter(run.scores)
     yield from moved_system(run.manifest)
     yield from beyond_sources(run.manifest)
     yield from on_device(run.manifest)
@@ -89,6 +93,31 @@ def of_run(run: Run) -> Iterator[str]:
             f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
             "closed-loop success may differ. harness fidelity compares the two."
         )
+
+
+def findings_of(manifest: Manifest) -> Iterator[str]:
+    """What `harness model check` found here of the language models of a run."""
+    helpers = manifest.identity.get("helpers")
+    identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
+    agents = [manifest.agent(0), *manifest.helpers]
+    for agent, identity in zip(agents, identities, strict=False):
+        if isinstance(identity, Mapping) and (found := findings.recall(identity)):
+            for sentence in found.sentences():
+                yield f"{printable(str(agent['model']['name']), 30)}: {sentence}"
+
+
+def by_letter(scores: Sequence[Score]) -> Iterator[str]:
+    """Whose read-outs follow the letter more than all else, where they were read over cyclic orders."""
+    of = {s.metric: s for s in scores if s.condition == ALL}
+    for role, (whose, _) in _FAILED.items():
+        share, follows = of.get(f"letter_share_{role}"), of.get(f"follows_letter_{role}")
+        if share and follows and (share.value or 0.0) > findings.MOST:
+            hits = round((follows.value or 0.0) * follows.n)
+            yield (
+                f"{100 * (share.value or 0.0):.0f} % of what {whose} read-outs say follows the letter and "
+                f"not the action: one letter is the likeliest in every order in {hits} of {follows.n}. The "
+                "average over the orders cancels that, and adds no judgement."
+            )
 
 
 def lost_at_once(run: Run) -> Iterator[str]:

@@ -47,7 +47,8 @@ FROZEN = {
         "eval", *PLAYED, "--limit", "4", "--seeds", "0:2", *conditions(*PAPER, EGO_PROMPT),
     ],
     "frozen-tiny-readout": [
-        "eval", *PLAYED, "--limit", "4", "--seeds", "0:2", "--answer", "readout", *conditions(*PAPER),
+        "eval", *PLAYED, "--limit", "4", "--seeds", "0:2", "--answer", "readout", "--letters", "raw",
+        *conditions(*PAPER),
     ],
 }  # fmt: skip
 CLOSED = {

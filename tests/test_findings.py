@@ -1,0 +1,111 @@
+"""What a model check finds out, where it is kept, and which pages say it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from evaluating import run as made
+from evaluating import spec_of
+
+from harness.backends import cards, findings
+from harness.backends.base import Completion, Request
+from harness.backends.findings import Findings, Moved
+from harness.core import kept
+from harness.dataset.load import Dataset
+from harness.evaluate.agent import Agent
+from harness.evaluate.examine import COUNT, examine
+from harness.prompts import versions
+from harness.report.caveats import by_letter, caveats
+from harness.runs.records import Score
+
+CARD = cards.resolve("qwen3-0.6b")
+AGENT = Agent(CARD, versions.load("v2"))
+
+
+class Model:
+    """Reads out as a rule says: `p` gives the likelihood of SLOWER or YES from the text of a question."""
+
+    def __init__(self, p: Any) -> None:
+        self.p, self.asked = p, 0
+
+    def complete(self, requests: Any) -> list[Completion]:
+        return [self._answer(request) for request in requests]
+
+    def _answer(self, request: Request) -> Completion:
+        self.asked += 1
+        first, *others = request.actions
+        p = self.p(request.messages[-1]["content"])
+        text = json.dumps({"action_distribution": {first: p, **{a: (1 - p) / len(others) for a in others}}})
+        more: dict[str, Any] = {"letter_share": 0.97, "follows_letter": True} if request.orders else {}
+        return Completion(request.id, text, 9, 1, "stop", 0.1, 1, label_mass=0.2, **more)
+
+
+def examined(p: Any) -> Findings:
+    model = Model(p)
+    found = examine(model, AGENT)  # type: ignore[arg-type]
+    assert isinstance(found, Findings)
+    assert model.asked == COUNT
+    return found
+
+
+def test_a_model_that_brakes_for_a_listed_conflict_reads_the_scene() -> None:
+    found = examined(lambda text: 0.2 if "none in sight" in text else 0.8)
+    assert {pair.fact: pair.moved for pair in found.pairs} == {
+        "conflict": 4, "gap": 0, "danger": 0, "number": 0,
+    }  # fmt: skip
+    assert found.reads_scene
+    assert (found.n, found.letter_share, found.follows_letter, found.label_mass) == (12, 0.97, 12, 0.2)
+    assert [s.partition(" follows")[0] for s in found.sentences()] == ["its likeliest action"]
+
+
+def test_a_model_that_answers_ever_the_same_does_not_read_the_scene() -> None:
+    first, *_ = examined(lambda text: 0.5).sentences()
+    assert first.startswith("it does not read the scene: a conflict put in or taken out, or a gap")
+    assert "in 0 of 8 pairs" in first
+
+
+def test_a_question_without_an_answer_finds_nothing() -> None:
+    class Broken(Model):
+        def _answer(self, request: Request) -> Completion:
+            return Completion(request.id, "", None, None, "error", None, 1, "out of memory")
+
+    assert examine(Broken(None), AGENT) == "out of memory"  # type: ignore[arg-type]
+
+
+def test_findings_are_kept_by_identity_and_a_damaged_file_is_none() -> None:
+    found = Findings("v2", "cyclic", 12, 0.9, 12, 0.2, (Moved("gap", 4, 0, 0.001),))
+    findings.keep({"engine": "e", "weights": "w"}, found)
+    assert findings.recall({"engine": "e", "weights": "w", "helpers": [{}]}) == found
+    assert findings.recall({"engine": "e", "weights": "other"}) is None
+    [file] = (kept.folder() / "findings").iterdir()
+    file.write_text("{")
+    assert findings.recall({"engine": "e", "weights": "w"}) is None
+    file.unlink()
+
+
+def test_a_run_of_a_checked_model_says_so_and_a_raw_one_no_share_of_letters(
+    small: Dataset, tmp_path: Path
+) -> None:
+    done = made(spec_of(small), tmp_path / "run")
+    assert not any("read the scene" in sentence for sentence in caveats(done.manifest, done.scores))
+    findings.keep(done.manifest.identity, Findings("v2", "raw", 12, 1.0, 12, 1.0, (Moved("gap", 4, 0, 0.0),)))
+    said = [s for s in caveats(done.manifest, done.scores) if "read the scene" in s]
+    assert len(said) == 1
+    assert said[0].startswith("proxy: it does not read the scene")
+    for file in (kept.folder() / "findings").iterdir():
+        file.unlink()
+    assert not list(by_letter(done.scores))
+
+
+@pytest.mark.parametrize(("share", "says"), [(0.97, True), (0.3, False)])
+def test_a_page_says_whose_read_outs_follow_the_letter(share: float, says: bool) -> None:
+    scores = [
+        Score("all", f"{name}_ego", value, None, None, 40, 0, "answers")
+        for name, value in (("letter_share", share), ("follows_letter", 0.95))
+    ]
+    said = list(by_letter(scores))
+    assert len(said) == says
+    if says:
+        assert said[0].startswith("97 % of what the ego's read-outs say follows the letter")
+        assert "in 38 of 40" in said[0]
