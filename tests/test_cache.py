@@ -349,3 +349,20 @@ def test_engines_without_a_language_model_are_not_cached(small: Dataset, tmp_pat
         evaluate(spec_of(small, model), tmp_path / model, lambda done: None, file)
     assert not file.exists()
     assert isinstance(cached(Talker(), cards.load("openai-example"), file), Cached)
+
+
+@pytest.mark.parametrize(("dtype", "asked_again"), [("float32", False), ("bfloat16", True), ("Q4_1", True)])
+def test_a_batch_size_is_part_of_a_question_unless_weights_are_float32(
+    dtype: str, asked_again: bool, file: Path
+) -> None:
+    class Rounded(Talker):
+        batch_size = 8
+
+        def identity(self) -> dict[str, Any]:
+            return {**super().identity(), "dtype": dtype}
+
+    Cached(Rounded(), file).complete([BASE])
+    single = Rounded()
+    single.batch_size = 1
+    assert [c.cached for c in Cached(single, file).complete([BASE])] == [not asked_again]
+    assert [c.cached for c in Cached(Rounded(), file).complete([BASE])] == [True]

@@ -37,6 +37,7 @@ NOT_IN_KEY = {
 # Fields of a completion that describe one request's handling and not the answer.
 _NOT_KEPT = ("request_id", "seconds", "first_token_s", "token_s", "error", "retries", "cached")
 _KEPT = tuple(f.name for f in fields(Completion) if f.name not in _NOT_KEPT)
+_EXACT = ("float32", "F32")  # number formats in which a batch changes no answer
 _WAIT_S = 30.0  # longest wait for another process that is writing
 _AT_ONCE = 500  # keys in one query; SQLite has a limit
 _TABLE = "CREATE TABLE IF NOT EXISTS completions (key TEXT PRIMARY KEY, answer TEXT NOT NULL) WITHOUT ROWID"
@@ -49,15 +50,16 @@ def default_file() -> Path:
     return kept.folder() / "completions.sqlite"
 
 
-def key(identity: Mapping[str, Any], prompt: str, request: Request) -> str:
+def key(identity: Mapping[str, Any], prompt: str, request: Request, batch_size: int | None = None) -> str:
     """Return the hex digest of all that decides an answer; it reveals no prompt and no secret.
 
-    The batch size is left out: in float32 other requests in a batch change no answer. In 16 bits they may
-    move one by rounding, with or without a cache; the identity holds the number format.
+    With float32 weights other requests in a batch change no answer, and `batch_size` is None. With quantised
+    and 16-bit weights they move it by rounding: the batch size is part of the key.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
     asked["image"] = request.image_sha256
-    return digest({"identity": identity, "prompt": prompt, "asked": asked, "code": kept.code_sha256(*_CODE)})
+    parts = {"identity": identity, "prompt": prompt, "asked": asked, "code": kept.code_sha256(*_CODE)}
+    return digest(parts if batch_size is None else {**parts, "batch_size": batch_size})
 
 
 class CompletionFile:
@@ -128,6 +130,8 @@ class Cached:
     def __init__(self, backend: Rendering, file: Path) -> None:
         self.backend = backend
         self._identity = backend.identity()
+        exact = self._identity.get("dtype") in _EXACT
+        self._batch_size: int | None = None if exact else getattr(backend, "batch_size", None)
         self._file: CompletionFile | None = CompletionFile(file)
         self.window = window(backend)
         self._doubt = doubt(backend)
@@ -135,7 +139,7 @@ class Cached:
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """Return one completion per request, in order; the backend answers those that are not cached."""
         prompts = self.backend.rendered(requests)
-        keys = [key(self._identity, p, r) for p, r in zip(prompts, requests, strict=True)]
+        keys = [key(self._identity, p, r, self._batch_size) for p, r in zip(prompts, requests, strict=True)]
         known = self._try(lambda file: file.find(keys)) or {}
         if known and self._doubt:
             _say_once(f"harness: {self._doubt}", digest(self._identity))

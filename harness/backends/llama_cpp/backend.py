@@ -31,9 +31,11 @@ class LlamaBackend(Child):
 
     Attributes:
         chat: its tokenizer and chat template.
+        batch_size: most requests that go through the engine together.
     """
 
     def __init__(self, card: Card, file: Path, device: str | None, batch_size: int) -> None:
+        self.batch_size = batch_size
         super().__init__(
             card.name, "harness.backends.llama_cpp.engine:open_here", card, file, device, batch_size
         )
