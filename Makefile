@@ -10,12 +10,20 @@ LLAMA_CPP := env -u SOURCE_DATE_EPOCH CMAKE_ARGS="-DMTMD_VIDEO=OFF -DGGML_NATIVE
 SEES := $(BIN)/python -c "import llama_cpp.mtmd_cpp" 2>/dev/null || $(LLAMA_CPP) \
 	$(PYTHON) requirements.py rebuild llama-cpp-python $(BIN)/python
 
-.PHONY: eval test check light browser docs bench clean
+# What `make real` asks a published model, and on how many layouts.
+REAL_PROMPT ?= v4
+REAL_LIMIT ?= 2
+
+.PHONY: eval real test check light browser docs bench clean
 
 eval: .venv/base ## a rule at once; then build llama.cpp, and evaluate the default language model with a report
 	$(BIN)/harness eval --model proxy
 	$(MAKE) --no-print-directory .venv/llama-cpp
 	$(BIN)/harness eval --model swarm-tiny --prompt v2
+
+real: .venv/dev ## fetch a published model, SmolLM2 with 135 million weights, and evaluate it with a report
+	$(BIN)/harness model pull smollm2-135m
+	$(BIN)/harness eval --model smollm2-135m --prompt $(REAL_PROMPT) --limit $(REAL_LIMIT)
 
 test: check browser ## every check and every test
 	$(BIN)/python -m pytest -n 2 --dist worksteal
