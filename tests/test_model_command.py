@@ -249,6 +249,14 @@ def answers_all_alike(asked: Asked) -> None:
     asked.reply(made)
 
 
+def counts(asked: Asked) -> None:
+    """One that reads texts, and says how many characters a prompt has."""
+    letters = "logprobs" in asked.body
+    said = read_out(("A", -0.5), ("B", -1.5), ("C", -2.0)) if letters else completion(ANSWER % (70, 10))
+    size = sum(len(message["content"]) for message in asked.body["messages"])
+    asked.reply({**said, "usage": {"prompt_tokens": size, "completion_tokens": 1}})
+
+
 def refuses(asked: Asked) -> None:
     if pictures_of(asked.body):
         asked.reply({"error": {"message": "image input is not supported"}}, 400)
@@ -300,12 +308,16 @@ def test_a_model_of_texts_is_asked_no_picture(
     harness(monkeypatch, capsys, "init", "mine")
     monkeypatch.chdir("mine")
     texts = re.sub(r"\[vision\].*?(?=\[latency)", "", SERVED, flags=re.S)
-    with serving(ignores) as there:
+    with serving(counts) as there:
         Path("models/served.toml").write_text(texts.format(url=there.url))
         code, out, err = harness(monkeypatch, capsys, "model", "check", "served")
     assert (code, err) == (0, "")
     assert "picture" not in out
-    assert len(there.asked) == 2 * 3
+    # Letter A is the likeliest whatever it stands for.
+    assert "letters      100 % of a read-out follows the letter; the likeliest action does in 12 of 12" in out
+    assert "it does not read the scene" in out
+    examined = 3 * (12 + 2 * 8) + 2 * (2 * 8)  # three orders of the actions, two of yes and no
+    assert len(there.asked) == 2 * 3 + examined
 
 
 def test_a_checkpoint_that_sees_is_shown_a_picture_and_a_blank_one(
