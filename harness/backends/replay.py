@@ -75,8 +75,10 @@ class Replay:
         manifest, shown = self._run.manifest, printable(self._run.path)
         agent = manifest.agent(0 if role == "ego" else 1)
         for request in requests:
-            # A run answers the first step of each of its episodes; only blind answers may be missing.
-            first_step = _step(request.id) == "0" and not request.id.endswith(BLIND)
+            # A run answers the first step of each of its episodes; only blind answers may be missing, and
+            # those of helpers that no condition asked.
+            unasked = role == "helper" and manifest.ask == "used"
+            first_step = _step(request.id) == "0" and not unasked and not request.id.endswith(BLIND)
             again = request.id.endswith(AGAIN)  # a changed parser may ask for a repair that the run did not
             foreign = first_step or _episode(request.id) not in self._episodes or "+" in request.id
             if (foreign and not again) or (role == "helper" and len(manifest.helpers) > 1):

@@ -63,6 +63,7 @@ def command(
     helper_prompt: options.HelperPrompt = None,
     helper_answer: options.HelperAnswer = None,
     helper_thinking: options.HelperThinking = None,
+    ask: options.Ask = "all",
     batch_size: options.BatchSize = 8,
     server: options.Servers = None,
     workers: options.ModelWorkers = "2",
@@ -136,6 +137,7 @@ def command(
         device_profile=devices.load(device_profile) if device_profile else None,
         device_model=device_model,
         tags=tuple(dict.fromkeys(tag or ())),
+        ask=ask,
     )
     silent = as_json or quiet
     if part and out:

@@ -75,6 +75,7 @@ def command(
         help="Evaluate this many times, 2 to 100, each with the next sampling seed; needs a --temperature "
         "above 0.",
     ),
+    ask: options.Ask = "all",
     batch_size: options.BatchSize = 8,
     workers: options.RuleWorkers = None,
     server: options.Servers = None,
@@ -139,6 +140,7 @@ def command(
             device_profile=devices.load(device_profile) if device_profile else None,
             device_model=device_model,
             tags=tuple(dict.fromkeys(tag or ())),
+            ask=ask,
         )
         for each in frozen
     ]

@@ -218,6 +218,13 @@ DeviceModel = Annotated[
 ]
 Temperature = Annotated[float, Option(help="Sampling temperature, 0 to 2; 0 is greedy decoding.")]
 SamplingSeed = Annotated[int, Option(help="Seed of the sampling; needs a --temperature above 0.")]
+Ask = Annotated[
+    str,
+    Option(
+        help="Which helpers answer. used: those whose answer some condition uses. all: every helper in every "
+        "scene, which gives the same decisions and lets other conditions be scored later without the model."
+    ),
+]
 NoCache = Annotated[
     bool, Option("--no-cache", help="Ask the model again, even for answers that an earlier run stored.")
 ]

@@ -29,13 +29,14 @@ import numpy as np
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import FUSION, OperatingPoint
 from harness.coordination.schedules import SCHEDULES
-from harness.coordination.scheduling import Known, chosen
+from harness.coordination.scheduling import NEVER, Known, chosen
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints, any_of, count_of
 from harness.core.errors import UserError, printable
 from harness.core.statistics import known_mean
 from harness.radio.channel import Channel, Draws, Links, Physical
 from harness.radio.roadside import Consulted, by_unit
+from harness.radio.wrapped import innermost
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,28 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         on_time=outcome.fused & (arrival_s <= point.window_s),
         exchange_s=np.minimum(request_s[..., 0] + outcome.acts_s, waits_until_s),
     )
+
+
+def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
+    """Return the helpers whose answers decide what happens, `(..., H)`; an unasked one counts as valid.
+
+    Once none of them is unasked, the answers of all others change nothing. They are the helpers that are
+    asked; those in the radius, too, if the channel's load or the schedule depends on who would answer; and
+    all that are present under an attack, which may use what any of them intends now or later.
+    """
+    nobody = np.zeros(intents.range_m.shape, dtype=bool)
+    if point.profile is None or point.max_helpers == 0 or point.schedule == NEVER:
+        return nobody
+    if point.attack:
+        return nobody | np.isfinite(intents.range_m)
+    known = _base_knowledge(point, intents)[1]
+    if getattr(SCHEDULES[point.schedule], "by_presence", True):
+        return known.may_ask
+    worth = _worth(point, known, intents, draws)
+    asked = chosen(worth, point.asks_above, known.may_ask, intents.range_m, point.max_helpers)
+    channel = innermost(point.channel)
+    loaded = getattr(channel, "density_coupled", not isinstance(channel, Physical)) or point.helper_rounds
+    return any_of(asked)[..., None] & known.may_ask if loaded else asked
 
 
 def _infers(point: OperatingPoint, intents: Intents, asked: Bools) -> Bools:

@@ -32,6 +32,8 @@ class Intents:
             voice.
         outlook: what the ego sees and what helpers would add, if a schedule needs it; else None.
         claims: what helpers claim about themselves, if a rule or an attack needs it; else None.
+        unasked: whether the helper's model was not asked yet, `(..., H)`; until then it counts as valid. None
+            if the models of all were.
     """
 
     own: Floats
@@ -46,6 +48,7 @@ class Intents:
     voice_of: Ints | None = None
     outlook: Outlook | None = None
     claims: Claims | None = None
+    unasked: Bools | None = None
 
     def take(self, at: Any) -> "Intents":
         """Return the decisions at these indices of the leading dimension."""
@@ -56,6 +59,13 @@ class Intents:
             claims=self.claims and self.claims.take(at),
             **{name: array[at] for name, array in self.arrays().items()},
         )
+
+    def replaced(self, at: Ints, other: "Intents") -> "Intents":
+        """Return the same with the decisions `other` at these indices; places and claims stay."""
+        arrays = {name: array.copy() for name, array in self.arrays().items()}
+        for name, values in other.arrays().items():
+            arrays[name][at] = values
+        return replace(self, **arrays)
 
     @classmethod
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":

@@ -88,11 +88,17 @@ class Schedule(Protocol):
 
 @dataclass(frozen=True)
 class Formula:
-    """A schedule that is one function of `Known`."""
+    """A schedule that is one function of `Known`.
+
+    Attributes:
+        by_presence: whether what one helper is worth depends on which others may be asked. That of a schedule
+            that does not say may.
+    """
 
     formula: Callable[[Known], Floats]
     threshold: float | None = None
     needs: tuple[str, ...] = ()
+    by_presence: bool = False
 
     def worth(self, known: Known) -> Floats:
         """Apply the function."""
@@ -157,7 +163,7 @@ FORMULAS = {
     "always": Formula(always),
     "margin": Formula(margin, 0.5),
     "risk": Formula(risk, 0.35, ("outlook",)),
-    "deadline": Formula(deadline, 0.35, ("in_time",)),
+    "deadline": Formula(deadline, 0.35, ("in_time",), by_presence=True),
     "coverage": Formula(coverage, 0.1, ("outlook",)),
     "random": Formula(random, 0.5, ("lot",)),
 }

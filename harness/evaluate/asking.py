@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Collection, Container, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cache, partial
+from itertools import compress, repeat
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,7 +18,7 @@ from msgspec import UNSET, UnsetType
 from harness.backends.base import Backend, Completion, Request, Role, Served, served, window
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
-from harness.core.arrays import Ints
+from harness.core.arrays import Bools, Ints
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.files import bytes_of, canonical_bytes, digest
 from harness.dataset.load import Scene
@@ -38,18 +39,25 @@ CHUNK = 64  # fewest requests that are asked, and kept, together
 FIRST = 8  # fewest questions that a server is asked before it has answered any
 IN_A_ROW = CHUNK  # questions without an answer, one after the other, after which nothing more is asked
 MORE_FOLLOWS = b" \n"  # ends every kept line but the last of its chunk, so that a torn chunk can be told
+EGO = (0,)
+Places = Sequence[Collection[int]]  # of the viewers of each scene, the ego at 0
 SYNC_S = 1.0  # kept answers reach the disk this often; if power fails, those since are asked again
 
 
-def requests(spec: Spec, scenes: Sequence[Scene], blind: bool = False) -> Iterator[Request]:
-    """Yield the requests of scenes, the ego's first; with `blind` only those of blind helpers."""
+def requests(
+    spec: Spec, scenes: Sequence[Scene], blind: bool = False, places: Places | None = None
+) -> Iterator[Request]:
+    """Yield the requests of scenes, the ego's first; with `blind` only those of blind helpers.
+
+    With `places`, only those of the viewers at these places of each scene, the ego at 0.
+    """
     agents, actions, scenario, words = spec.agents, spec.actions, spec.scenario, spec.scenario.prompt_words
     privileged, sees = any(agent.card.privileged for agent in agents), any(agent.sees for agent in agents)
     blank = cache(partial(_blank, spec))
-    for scene in scenes:
+    for scene, asked in zip(scenes, places or repeat(None), strict=False):
         truth = truth_graph(scenario, scene.state) if privileged else None
         for place, viewer in enumerate(spec.viewers(scene)):
-            if blind and not place:
+            if (blind and not place) or (asked is not None and place not in asked):
                 continue
             graph, index = scene.record["graphs"][viewer], spec.agent(place)
             if blind:
@@ -60,6 +68,12 @@ def requests(spec: Spec, scenes: Sequence[Scene], blind: bool = False) -> Iterat
                 image=picture(spec, index, scene, viewer, blind) if sees else None, view=graph,
                 truth=truth if agent.card.privileged else None, scenario=scenario,
             )  # fmt: skip
+
+
+def wanted_in(moments: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Places]:
+    """Return the moments where a helper is wanted, (n, H), and the places of those helpers in each."""
+    rows = np.flatnonzero(wanted.any(axis=1)).tolist()
+    return [moments[n] for n in rows], [(1 + np.flatnonzero(wanted[n])).tolist() for n in rows]
 
 
 def _id(scene: Scene, viewer: str, blind: bool) -> str:
@@ -275,36 +289,61 @@ class Asker:
         completions = backend.complete(list(repairs.values())) if repairs else []
         for place, completion in zip(repairs, completions, strict=True):
             answers[place] = repair.together(answers[place], answer_of(chunk[place], completion))
+        if len(self.spec.helpers) > 1 and not self.spec.asks_all:  # its place would not say whose it is
+            for place, request in enumerate(chunk):
+                if request.agent:
+                    answers[place] = msgspec.structs.replace(answers[place], agent=request.agent)
         return {request.id: answer for request, answer in zip(chunk, answers, strict=True)}
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
         """Return what every viewer intends; NaN if it has no request or its answer failed."""
-        if any(self._lacking(moments, self.answers)):
-            self.answer(list(requests(self.spec, self._not_given(moments))))
+        self._ask_at(moments, None if self.spec.asks_all else [EGO] * len(moments))
+        return self.laid_out(moments)
+
+    def whole(self, moments: Sequence[Scene]) -> Intents:
+        """Return what every viewer intends, all of whom are asked."""
+        self._ask_at(moments)
         return self.laid_out(moments)
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
         """Return intents where helpers are shown nothing; NaN for those of moments not in `at`."""
-        blind_moments = [moments[n] for n in at.tolist()]
-        if any(self._lacking(blind_moments, self.answers, blind=True)):
-            self.answer(list(requests(self.spec, self._not_given(blind_moments, blind=True), blind=True)))
+        if self.spec.asks_all:
+            self._ask_at([moments[n] for n in at.tolist()], blind=True)
         return self.laid_out(moments, blind=True)
 
-    def lacks(self, moments: Sequence[Scene], blind: bool = False) -> list[bool]:
-        """For each moment, whether a viewer's answer is missing; with `blind`, a blind helper's."""
-        return list(self._lacking(moments, self.answers, blind))
+    def helpers(self, moments: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
+        """Ask the helpers wanted, (n, H), and return the intents of the moments where any is wanted."""
+        scenes, places = wanted_in(moments, wanted)
+        self._ask_at(scenes, places, blind)
+        return self.laid_out(scenes, blind, 1 + wanted.shape[1])
 
-    def _not_given(self, moments: Sequence[Scene], blind: bool = False) -> list[Scene]:
-        """Return the moments whose answers were not all given; only their prompts are rendered."""
-        lacks = self._lacking(moments, self._given, blind)
-        return [scene for scene, lacking in zip(moments, lacks, strict=True) if lacking]
+    def lacks(
+        self, moments: Sequence[Scene], blind: bool = False, places: Places | None = None
+    ) -> list[bool]:
+        """For each moment, whether an answer of these viewers is missing; with `blind`, a blind helper's."""
+        return list(self._lacking(moments, self.answers, blind, places))
+
+    def _ask_at(self, moments: Sequence[Scene], places: Places | None = None, blind: bool = False) -> None:
+        """Ask what is missing of the viewers at these places of each moment; None for all of them."""
+        if not any(self._lacking(moments, self.answers, blind, places)):
+            return
+        # Only the prompts of moments whose answers were not all given are rendered.
+        lacks = list(self._lacking(moments, self._given, blind, places))
+        scenes = list(compress(moments, lacks))
+        asked = None if places is None else list(compress(places, lacks))
+        self.answer(list(requests(self.spec, scenes, blind, asked)))
 
     def _lacking(
-        self, moments: Sequence[Scene], available: Container[str], blind: bool = False
-    ) -> Iterator[bool]:
-        for scene in moments:
-            viewers = self.spec.viewers(scene)[blind:]
-            yield any(_id(scene, viewer, blind) not in available for viewer in viewers)
+        self, moments: Sequence[Scene], available: Container[str], blind: bool = False,
+        places: Places | None = None,
+    ) -> Iterator[bool]:  # fmt: skip
+        for scene, asked in zip(moments, places or repeat(None), strict=False):
+            viewers = enumerate(self.spec.viewers(scene))
+            yield any(
+                _id(scene, viewer, blind) not in available
+                for place, viewer in viewers
+                if place >= blind and (asked is None or place in asked)
+            )
 
     def laid_out(self, moments: Sequence[Scene], blind: bool = False, width: int = 1) -> Intents:
         """Return the answers so far as arrays of at least `width` vehicles; NaN without an intent."""
@@ -313,10 +352,11 @@ class Asker:
         ]
         width = max(width, *map(len, answers))
         unknown = (math.nan,) * len(self.spec.actions)
-        p, distances_m, ranges_m, bits = [], [], [], []
+        p, distances_m, ranges_m, bits, unasked = [], [], [], [], []
         for scene, row in zip(moments, answers, strict=True):
             record, (ego, *helpers) = scene.record, scene.viewers
             absent = width - len(row)
+            unasked.append([*[answer is None for answer in row[1:]], *[False] * absent])
             row += [None] * absent
             p.append([answer.intent or unknown if answer else unknown for answer in row])
             distance_m, range_m = record["distance_m"], record["range_m"]
@@ -328,10 +368,11 @@ class Asker:
         intents = np.array(p, dtype=float)
         valid = ~np.isnan(intents[:, 1:]).any(axis=-1)
         shape = len(moments), width - 1
+        not_yet = None if self.spec.asks_all else np.array(unasked, dtype=bool).reshape(shape)
         return Intents(
-            intents[:, 0], intents[:, 1:], valid, np.array(distances_m, dtype=float),
-            np.array(ranges_m, dtype=float).reshape(shape), np.array(bits, dtype=float).reshape(shape),
-            inference_s(self.latency, answers),
+            intents[:, 0], intents[:, 1:], valid if not_yet is None else valid | not_yet,
+            np.array(distances_m, dtype=float), np.array(ranges_m, dtype=float).reshape(shape),
+            np.array(bits, dtype=float).reshape(shape), inference_s(self.latency, answers), unasked=not_yet,
         )  # fmt: skip
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:

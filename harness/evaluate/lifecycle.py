@@ -17,6 +17,8 @@ from harness.evaluate.spec import Spec
 from harness.runs import folder
 from harness.runs.records import Latency, Manifest, Score
 
+ABSENT = {"ask": "all"}  # settings that older runs lack, and what they did
+
 
 class Begun(work.Begun, frozen=True, kw_only=True):
     """The record that a run begins with, and keeps when it resumes.
@@ -130,4 +132,4 @@ def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
     The dataset's path is left out, since its folder may move between two commands.
     """
     world = {f"{key} of the world": value for key, value in settings["world"].items() if key != "path"}
-    return {**{key: value for key, value in settings.items() if key != "world"}, **world}
+    return {**ABSENT, **{key: value for key, value in settings.items() if key != "world"}, **world}

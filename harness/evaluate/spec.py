@@ -23,6 +23,7 @@ from harness.world.scenario import Scenario
 
 TAG_CHARACTERS = 40
 HOTTEST = 2.0
+ASKS = ("used", "all")  # what --ask takes, the default first
 
 
 class Source(Protocol):
@@ -90,6 +91,8 @@ class Spec:
             follows from its own tokens. None for no profile.
         device_model: the model whose row of the profile times all answers; None for each agent's own row.
         tags: words by which to find the run; they change nothing in it.
+        ask: `used` asks a helper only when a condition uses its answer; `all` asks every helper in every
+            scene, which gives the same decisions.
     """
 
     ego: Agent
@@ -107,6 +110,7 @@ class Spec:
     device_profile: Device | None = None
     device_model: str | None = None
     tags: tuple[str, ...] = ()
+    ask: str = "all"
 
     def __post_init__(self) -> None:
         if all(agent == self.ego for agent in self.helpers):
@@ -121,6 +125,8 @@ class Spec:
                     f"--tag {printable(tag)!r}: give 1 to {TAG_CHARACTERS} printable characters, "
                     "with no space at either end"
                 )
+        if self.ask not in ASKS:
+            raise UserError(f"--ask {printable(self.ask)}: give {' or '.join(ASKS)}")
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
         self._check_servers()
@@ -281,6 +287,11 @@ class Spec:
         return self.source.scenario
 
     @property
+    def asks_all(self) -> bool:
+        """Whether the answers of all are asked at once; with a device profile the joules of all count."""
+        return self.ask == "all" or self.ego_alone or self.device_profile is not None
+
+    @property
     def ego_alone(self) -> bool:
         """Whether the model answers only for the ego, as a driver does."""
         return not self.ego.can.asks_helpers
@@ -305,6 +316,7 @@ class Spec:
                 if (sha256 := SCHEDULES.file_sha256(name))
             },
             "seeds": list(self.seeds),
+            "ask": self.ask,
             "batch_size": self.batch_size,
             "dtype": self.dtype,
             "temperature": self.temperature,
@@ -328,7 +340,8 @@ class Spec:
             ("--temperature", self.temperature or None), ("--sampling-seed", self.sampling_seed or None),
             ("--latency", self.latency),
             ("--device-profile", self.device_profile and self.device_profile.name),
-            ("--device-model", self.device_model), *(("--tag", tag) for tag in self.tags),
+            ("--device-model", self.device_model), ("--ask", None if self.ask == ASKS[0] else self.ask),
+            *(("--tag", tag) for tag in self.tags),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         flags = ["--thinking"] if self.ego.thinking else []

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from harness.coordination.claims import Claims
 from harness.coordination.coordinate import Coordination, Fusion, FusionCall, fuse
-from harness.coordination.exchange import Exchange, exchange
+from harness.coordination.exchange import Exchange, exchange, needed
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.scheduling import Outlook
@@ -141,11 +141,15 @@ class Ask(Protocol[AskedMoment]):
     """The source of intents: it asks the agents."""
 
     def __call__(self, moments: Sequence[AskedMoment]) -> Intents:
-        """Return what every vehicle intends in these moments, (n, ...)."""
+        """Return what every vehicle intends in these moments, (n, ...); helpers may be `unasked`."""
         ...
 
     def blind(self, moments: Sequence[AskedMoment], at: Ints) -> Intents:
         """Return the same where helpers are shown nothing, (n, ...); only the moments `at` need values."""
+        ...
+
+    def helpers(self, moments: Sequence[AskedMoment], wanted: Bools, blind: bool = False) -> Intents:
+        """Ask the helpers wanted, (n, H), and return the intents of the moments where any is wanted."""
         ...
 
     def fusion_call(self, moments: Sequence[AskedMoment], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
@@ -171,6 +175,7 @@ def walk(
             intents = replace(intents, claims=world.claims())
         asked_blind = [of_point.at for point, of_point in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(asked_blind))) if asked_blind else None
+        intents, blind = _asked(ask, moments, due, intents, blind)
         said = {
             point: attackers[point].said(
                 heard(point, intents, blind, of_point),
@@ -194,6 +199,33 @@ def walk(
         world.step(decided)
 
 
+def _asked(
+    ask: Ask[Moment], moments: Sequence[Moment], due: Mapping[OperatingPoint, Due], intents: Intents,
+    blind: Intents | None,
+) -> tuple[Intents, Intents | None]:  # fmt: skip
+    """Ask the helpers whose answers some condition uses, and return the intents, sighted and blind.
+
+    An answer may fail, and another helper is asked in its place; so this may take several turns.
+    """
+    while True:
+        wanted = {each: np.zeros(intents.range_m.shape, dtype=bool) for each in (False, True)}
+        for point, due_here in due.items():
+            here = heard(point, intents, blind, due_here)
+            if here.unasked is not None and here.unasked.any():
+                decision, helper = np.nonzero(here.unasked & needed(point, here, due_here.draws))
+                moment = due_here.at[_sources(point, due_here)[decision]]
+                wanted[point.asks_blind][moment, helper] = True
+        if not (wanted[False].any() or wanted[True].any()):
+            return intents, blind
+        if wanted[False].any():
+            at = np.flatnonzero(wanted[False].any(axis=1))
+            intents = intents.replaced(at, ask.helpers(moments, wanted[False]))
+        if wanted[True].any():
+            assert blind is not None
+            at = np.flatnonzero(wanted[True].any(axis=1))
+            blind = blind.replaced(at, ask.helpers(moments, wanted[True], blind=True))
+
+
 def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: Due) -> Intents:
     """Return the intents that each decision works with; a control replaces those of the helpers.
 
@@ -206,18 +238,31 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
     if point.asks_blind:
         assert blind is not None
         said = blind.take(due.at)
-        return replace(own, helpers=said.helpers, valid=said.valid, payload_bits=said.payload_bits)
+        return _saying(own, said, said.valid)
     if point.messages != "shuffled":
         return own
+    other = _sources(point, due)
+    said, alone = own.take(other), other == np.arange(len(other))
+    return _saying(own, said, said.valid & ~alone[:, None])
+
+
+def _saying(own: Intents, said: Intents, valid: Bools) -> Intents:
+    return replace(
+        own, helpers=said.helpers, valid=valid, payload_bits=said.payload_bits, unasked=said.unasked
+    )
+
+
+def _sources(point: OperatingPoint, due: Due) -> Ints:
+    """Return the decision whose helpers each decision hears, (n,): its own, but where they are shuffled."""
+    if point.messages != "shuffled":
+        return np.arange(len(due.at))
     order = np.lexsort((due.episode, due.seed))
     following = np.roll(order, -1)
     starts = np.flatnonzero(np.diff(due.seed[order], prepend=due.seed[order[0]] - 1))
     following[np.roll(starts, -1) - 1] = order[starts]  # the last of a seed hears its first
     other = np.empty_like(order)
     other[order] = following
-    said, alone = own.take(other), other == np.arange(len(other))
-    valid = said.valid & ~alone[:, None]
-    return replace(own, helpers=said.helpers, valid=valid, payload_bits=said.payload_bits)
+    return other
 
 
 class Memory:

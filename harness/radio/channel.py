@@ -251,7 +251,7 @@ class Channel(Protocol):
 class Physical(Channel, Protocol):
     """A channel whose losses follow from the vehicles' positions and what stands between them.
 
-    Only such a channel reads `Links.site` and the draws of trips.
+    Only such a channel reads `Links.site` and the draws of trips. It does not read `Links.in_radius`.
     """
 
     @property

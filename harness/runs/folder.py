@@ -174,6 +174,8 @@ class Run:
         """Return the place of an answer's viewer, the ego at 0; also 0 if one agent answers for all."""
         if answer.role in ("ego", "merge") or not self.manifest.helpers:
             return 0
+        if answer.agent is not msgspec.UNSET:
+            return answer.agent
         # The answers of a scene are in the order of its viewers, the ego first.
         viewers = [other.viewer for other in self.answers_by_scene[answer.scene] if not other.heard]
         return viewers.index(answer.viewer)

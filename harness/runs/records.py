@@ -63,6 +63,7 @@ class Answer(Struct, frozen=True, kw_only=True):
         letter_share: how much of a read-out over several orders of its letters follows the letter, 0 to 1;
             unset where the letters were read once, like the next.
         follows_letter: whether one letter is the likeliest in every order.
+        agent: which of several helper models answered, from 1; unset where the place among all answers says.
     """
 
     scene: str
@@ -94,6 +95,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     image_sha256: str | UnsetType = UNSET
     letter_share: float | UnsetType = UNSET
     follows_letter: bool | UnsetType = UNSET
+    agent: int | UnsetType = UNSET
 
     @property
     def turns(self) -> int:
@@ -560,6 +562,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     networks: dict[str, dict[str, Any]] = {}
     schedules: dict[str, str] = {}
     seeds: tuple[int, ...]
+    ask: Literal["used", "all"] = "all"
     thinking: bool
     answer: str
     image: str = "own"

@@ -166,6 +166,10 @@ class CalibratedWorld:
         """Nobody is asked blindly: no point of the study has it."""
         raise NotImplementedError
 
+    def helpers(self, moments: Sequence[int], wanted: Bools, blind: bool = False) -> Intents:
+        """Nobody is asked later: the intents of all are drawn."""
+        raise NotImplementedError
+
     def fusion_call(self, moments: Sequence[int], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         """Nobody calls: no point of the study has its model fuse."""
         raise NotImplementedError

@@ -191,7 +191,7 @@ def _level(stored: Stored, point: OperatingPoint, seeds: Ints, at: Ints, sets: B
     dataset, forest = stored.dataset, stored.dataset.forest
     scenario, shape = dataset.scenario, (len(seeds), len(at))
     scenes = dataset.scenes([forest.ids[n] for n in at.tolist()])
-    intents = replace(stored(scenes), outlook=outlook(scenario.road(), scenes))
+    intents = replace(stored.whole(scenes), outlook=outlook(scenario.road(), scenes))
     if isinstance(point.channel, Physical):
         moments = [(scene.state, scene.viewers) for scene in scenes]
         units = [point.unit] if point.unit else []

@@ -30,7 +30,7 @@ from harness.core.formats import SOURCES
 from harness.dataset.load import Scene
 from harness.evaluate import device
 from harness.evaluate.agent import Agent, ImageMode
-from harness.evaluate.asking import Asker
+from harness.evaluate.asking import EGO, Asker, wanted_in
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
@@ -207,36 +207,74 @@ class Stored:
         self._asker.settle()
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
-        """What every vehicle intends. Where the run has no answer its model is asked."""
+        """What every vehicle intends. Where the run has no answer of an ego its model is asked."""
         with self._writing():
             return self._asker(moments)
+
+    def whole(self, moments: Sequence[Scene]) -> Intents:
+        """What every vehicle intends. Where the run has no answer its model is asked."""
+        with self._writing():
+            return self._asker.whole(moments)
+
+    def helpers(self, moments: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
+        """What vehicles intend where a helper is wanted; the model is asked for what the run has not."""
+        scenes, places = wanted_in(moments, wanted)
+        if not self._asks and any(self._asker.lacks(scenes, blind, places)):
+            raise UserError(
+                f"--no-model: {printable(self.run.path)} lacks answers of helpers that it did not ask; leave "
+                "it out, or make the run again with --ask all"
+            )
+        with self._writing():
+            return self._asker.helpers(moments, wanted, blind)
 
     def intents(self, moments: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
         """What every vehicle intends; where its model is not asked, walks without an answer are left out."""
         new = [scene for scene in moments if scene.id not in self._row]
-        if any(self._asker.lacks(new)):
+        if any(self._asker.lacks(new, places=[EGO] * len(new))):
             if self._asks:
                 return self(moments)
-            lacks = np.array(self._asker.lacks(moments))
-            self.left_out |= {scene.id for scene, left in zip(moments, lacks, strict=True) if left}
-            leave_out(lacks)
+            self._leave_out(moments, self._asker.lacks(moments, places=[EGO] * len(moments)), leave_out)
             return self._asker.laid_out(moments)
         if new:
-            more = self._asker.laid_out(new, width=self.vehicles)
-            self._laid_out = Intents.joined([self._laid_out, more]) if self._laid_out else more
-            self._row |= {scene.id: len(self._row) + n for n, scene in enumerate(new)}
+            self._lay_out(new)
+        return self._there(moments, max(len(scene.viewers) for scene in moments) - 1)
+
+    def helpers_of(
+        self, moments: Sequence[Scene], wanted: Bools, leave_out: Callable[[Bools], None]
+    ) -> Intents:
+        """The same once these helpers, (n, H), were asked; where they cannot be, walks are left out."""
+        scenes, places = wanted_in(moments, wanted)
+        lacks = self._asker.lacks(scenes, places=places)
+        if any(lacks) and not self._asks:
+            without = {scene.id for scene, lacking in zip(scenes, lacks, strict=True) if lacking}
+            self._leave_out(moments, [scene.id in without for scene in moments], leave_out)
+            there = self._asker.laid_out(scenes, width=1 + wanted.shape[1])
+            return replace(there, unasked=None if there.unasked is None else np.zeros_like(there.unasked))
+        if any(lacks):
+            self.helpers(moments, wanted)
+            self._lay_out([scene for scene, lacking in zip(scenes, lacks, strict=True) if lacking])
+        return self._there(scenes, wanted.shape[1])
+
+    def _leave_out(
+        self, moments: Sequence[Scene], lacks: Sequence[bool], leave_out: Callable[[Bools], None]
+    ) -> None:
+        self.left_out |= {scene.id for scene, left in zip(moments, lacks, strict=True) if left}
+        leave_out(np.array(lacks))
+
+    def _lay_out(self, scenes: Sequence[Scene]) -> None:
+        """Keep the intents in these scenes as arrays."""
+        more = self._asker.laid_out(scenes, width=self.vehicles)
+        before = 0 if self._laid_out is None else len(self._laid_out.own)
+        self._laid_out = Intents.joined([self._laid_out, more]) if self._laid_out else more
+        self._row |= {scene.id: before + n for n, scene in enumerate(scenes)}
+
+    def _there(self, scenes: Sequence[Scene], helpers: int) -> Intents:
+        """The intents in scenes that were laid out."""
         assert self._laid_out is not None
-        there = self._laid_out.take([self._row[scene.id] for scene in moments])
-        return there.of_first(max(len(scene.viewers) for scene in moments) - 1)
+        return self._laid_out.take([self._row[scene.id] for scene in scenes]).of_first(helpers)
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
-        """The same where helpers are shown nothing; what the run has not is asked, and kept in it."""
-        wanted = [moments[n] for n in at.tolist()]
-        if not self._asks and any(self._asker.lacks(wanted, blind=True)):
-            raise UserError(
-                f"--no-model: {printable(self.run.path)} lacks answers of helpers that are shown nothing, "
-                "which messages=blind needs; leave it out"
-            )
+        """The same where helpers are shown nothing, as far as the run has answers or asks them all."""
         with self._writing():
             return self._asker.blind(moments, at)
 
@@ -264,7 +302,7 @@ class Stored:
         return Spec(
             ego, FrozenSource(self.dataset), (), manifest.seeds, tuple(helpers),
             batch_size=manifest.batch_size, dtype=manifest.dtype,
-            temperature=manifest.temperature, sampling_seed=manifest.sampling_seed,
+            temperature=manifest.temperature, sampling_seed=manifest.sampling_seed, ask="used",
         )  # fmt: skip
 
     def _agent(self, stated: Mapping[str, Any]) -> Agent:
@@ -323,6 +361,11 @@ class _Nearest:
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
         return self._of(self._stored.blind(moments, at))
+
+    def helpers(self, moments: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
+        if blind:
+            return self._of(self._stored.helpers(moments, wanted, blind))
+        return self._of(self._stored.helpers_of(moments, wanted, self._leave_out))
 
     def _of(self, intents: Intents) -> Intents:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)

@@ -1,0 +1,103 @@
+"""Asking only the helpers whose answers are used: the same decisions as asking all, with fewer questions."""
+
+from pathlib import Path
+
+import pytest
+
+from harness.backends import cards
+from harness.backends.base import Backend, Request
+from harness.backends.registry import open_backend
+from harness.coordination.operating_point import named_point
+from harness.dataset import load
+from harness.dataset.select import Selection
+from harness.evaluate.agent import Agent
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.live_world import LiveSource
+from harness.evaluate.run import evaluate
+from harness.evaluate.spec import Source, Spec
+from harness.prompts import versions
+from harness.runs.folder import read
+
+# Some ask nobody, few, those who are there, by who is there, again where an answer fails, or what helpers
+# intended before; and some hear other helpers, or blind ones.
+POINTS = (
+    "single-local", "v2x", "v2x:max_helpers=1", "v2x:helper_rounds=true", "6g:schedule=deadline",
+    "6g:schedule=coverage,max_helpers=1", "6g:schedule=random", "v2x:attack=stale", "v2x:attack=sybil",
+    "v2x:messages=blind", "6g:density_coupled=true,max_helpers=1", "v2x:schedule=never",
+)  # fmt: skip
+TABLES = ("decisions.parquet", "episodes.csv")
+
+
+def spec(source: Source, ask: str, names: tuple[str, ...] = POINTS, model: str = "proxy") -> Spec:
+    agent = Agent(cards.resolve(model), versions.load(source.scenario.prompt))
+    return Spec(agent, source, tuple(map(named_point, names)), (0, 1), ask=ask)
+
+
+def frozen(episodes: int = 8) -> FrozenSource:
+    selection = Selection(episodes, None, None, None, 0)
+    return FrozenSource(selection.of(load.load(load.find("occluded-intersection-v2"), episodes)), selection)
+
+
+def tables(folder: Path) -> list[bytes]:
+    return [(folder / name).read_bytes() for name in TABLES]
+
+
+def n_answers(folder: Path) -> int:
+    return len(read(folder).answers)
+
+
+@pytest.mark.parametrize("source", [frozen(), LiveSource(1_000_000, 4)], ids=["frozen", "closed loop"])
+def test_decisions_are_those_of_asking_all(source: Source, tmp_path: Path) -> None:
+    names = POINTS if source.kind == "closed-loop" else (*POINTS, "v2x:messages=shuffled")
+    for ask in ("all", "used"):
+        evaluate(spec(source, ask, names), tmp_path / ask, lambda done: None)
+    assert tables(tmp_path / "used") == tables(tmp_path / "all")
+    assert n_answers(tmp_path / "used") < n_answers(tmp_path / "all")
+
+
+@pytest.mark.parametrize("name", ["single-local", "v2x:schedule=never", "v2x:max_helpers=0"])
+def test_nobody_asks_so_no_helper_answers(name: str, tmp_path: Path) -> None:
+    evaluate(spec(frozen(4), "used", (name,)), tmp_path / "run", lambda done: None)
+    assert {answer.role for answer in read(tmp_path / "run").answers} == {"ego"}
+
+
+def test_workers_change_no_byte(tmp_path: Path) -> None:
+    source = LiveSource(1_000_000, 18)
+    for workers in (1, 2):
+        evaluate(spec(source, "used", ("v2x",)), tmp_path / str(workers), lambda done: None, workers=workers)
+    names = [*TABLES, "answers.jsonl"]
+    one, two = ([(tmp_path / w / name).read_bytes() for name in names] for w in "12")
+    assert one == two
+
+
+class Stops(Exception):
+    pass
+
+
+def test_a_stopped_run_asks_the_same_in_the_same_batches(tmp_path: Path) -> None:
+    batches: dict[str, list[tuple[str, ...]]] = {}
+
+    def opening(into: str, most: int):
+        def opens(card: cards.Card, **options: object) -> Backend:
+            backend = open_backend(card, **options)  # type: ignore[arg-type]
+            complete = backend.complete
+
+            def counted(requests: list[Request]):
+                if len(batches.setdefault(into, [])) == most:
+                    raise Stops
+                batches[into].append(tuple(request.id for request in requests))
+                return complete(requests)
+
+            backend.complete = counted  # type: ignore[method-assign,assignment]
+            return backend
+
+        return opens
+
+    wanted = spec(frozen(30), "used", ("v2x:max_helpers=1", "6g"))
+    evaluate(wanted, tmp_path / "whole", lambda done: None, opens=opening("whole", -1))
+    with pytest.raises(Stops):
+        evaluate(wanted, tmp_path / "stopped", lambda done: None, opens=opening("stopped", 3))
+    evaluate(wanted, tmp_path / "stopped", lambda done: None, opens=opening("resumed", -1))
+    assert batches["stopped"] + batches["resumed"] == batches["whole"]
+    for name in (*TABLES, "answers.jsonl"):
+        assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
