@@ -220,9 +220,11 @@ class Stored:
         """What vehicles intend where a helper is wanted; the model is asked for what the run has not."""
         scenes, places = wanted_in(moments, wanted)
         if not self._asks and any(self._asker.lacks(scenes, blind, places)):
+            lacks = "that are shown nothing, which messages=blind needs" if blind else "that it did not ask"
+            remedy = "" if blind else ", or make the run again with --ask all"
             raise UserError(
-                f"--no-model: {printable(self.run.path)} lacks answers of helpers that it did not ask; leave "
-                "it out, or make the run again with --ask all"
+                f"--no-model: {printable(self.run.path)} lacks answers of helpers {lacks}; "
+                f"leave it out{remedy}"
             )
         with self._writing():
             return self._asker.helpers(moments, wanted, blind)
