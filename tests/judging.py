@@ -15,6 +15,8 @@ from harness.prompts.answer_schema import answer_schema
 # Whether a shared machine is slow today is no property of the parser.
 unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
+# Texts that prompts write in the place of a helper's evidence.
+PLACEHOLDERS = ("max 12 words", "Max. 12 words.", "one short sentence", "<evidence>", "...", "string")
 ROLES = st.sampled_from(["ego", "helper"])
 
 VALIDATORS = {
@@ -41,12 +43,14 @@ def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def judged_strict(text: str, role: str) -> bool:
-    """A judge that shares no code with the parser: the standard library's JSON, jsonschema, and a sum."""
+    """A judge that shares no code with the parser: JSON, jsonschema, the placeholders, and a sum."""
     try:
         value = json.loads(text, object_pairs_hook=_no_key_twice)
     except (ValueError, RecursionError):
         return False
     if not VALIDATORS[role].is_valid(value):
+        return False
+    if value.get("evidence") in PLACEHOLDERS:
         return False
     if "action_distribution" not in value:
         return math.isfinite(value["confidence"])

@@ -15,9 +15,12 @@ def test_a_completion_gives_what_its_name_says(case: Case) -> None:
     expected = case.expected
     assert list(parsed.repairs) == expected.get("repairs", [])
     if parsed.verdict == "failed":
+        assert parsed.faults[0] is case.status
+        assert list(parsed.faults) == expected.get("faults", list(parsed.faults))
         assert parsed.intent is None
         assert parsed.message is None
     else:
+        assert parsed.faults == ()
         assert sum(parsed.intent) == pytest.approx(1, abs=1e-12)
         assert set(parsed.message or ()) == (set(MESSAGE) if case.asked["role"] == "helper" else set())
     if "intent" in expected:

@@ -8,7 +8,7 @@ import pytest
 from corpus import ACTIONS, CASES
 from hypothesis import given
 from hypothesis import strategies as st
-from judging import ROLES, hundredths, judged_strict, unhurried
+from judging import PLACEHOLDERS, ROLES, hundredths, judged_strict, unhurried
 
 from harness.parsing.parse import Repair, Status, _unmended, parse
 from harness.parsing.strict import fitting
@@ -31,7 +31,13 @@ ANSWERS = st.fixed_dictionaries(
     {},
     optional={
         "action_distribution": OBJECTS,
-        "evidence": st.one_of(st.text(min_size=195, max_size=205), st.text(), st.none(), st.integers()),
+        "evidence": st.one_of(
+            st.sampled_from(PLACEHOLDERS),
+            st.text(min_size=195, max_size=205),
+            st.text(),
+            st.none(),
+            st.integers(),
+        ),
         "risk": st.sampled_from(["low", "medium", "high", "High", "none", None, 1, []]),
         "recommended_maneuver": st.one_of(st.sampled_from([*ACTIONS, "idle", "STOP", None]), OBJECTS),
         "confidence": NUMBERS,
@@ -51,7 +57,10 @@ def test_strict_is_what_the_published_schema_and_the_sum_say_of_any_object(value
 @unhurried
 @given(
     st.fixed_dictionaries(
-        {"evidence": st.text(max_size=205), "risk": st.sampled_from(["low", "high", "High"])},
+        {
+            "evidence": st.text(max_size=205) | st.sampled_from(PLACEHOLDERS),
+            "risk": st.sampled_from(["low", "high", "High"]),
+        },
         optional={
             "action_distribution": hundredths(),
             "recommended_maneuver": st.sampled_from([*ACTIONS, "idle"]),
@@ -112,7 +121,8 @@ def test_the_quick_reading_of_the_corpus_is_the_slow_one_or_none(case: Any) -> N
 
 
 @pytest.mark.parametrize(
-    "evidence", ["", "v6: left", "a\\u003ab", "\t", "\x7f", "\x00", "\ud83d", "é" * 200, "é" * 201]
+    "evidence",
+    ["", "v6: left", "a\\u003ab", "max 12 words", "\t", "\x7f", "\x00", "\ud83d", "é" * 200, "é" * 201],
 )
 @pytest.mark.parametrize("again", ["", '"evidence":"b",', '"evidence":"b:c",', '"risk":"low",'])
 def test_the_quick_reading_is_not_deceived_by_a_key_given_twice(evidence: str, again: str) -> None:

@@ -1,5 +1,6 @@
 """Read an answer-shaped object in each role: an intent, and a helper's message."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,7 +9,7 @@ from msgspec.structs import replace
 
 from harness.core.errors import printable
 from harness.parsing import values
-from harness.parsing.status import Failure, Repair, Status
+from harness.parsing.status import Failure, Repair, Status, joined, noted
 from harness.prompts.answer_schema import EVIDENCE_CHARS, RISKS
 
 FIELDS = {
@@ -34,8 +35,18 @@ class Answer(Struct, frozen=True):
         return replace(self, repairs=self.repairs - repairs)
 
 
-def read(members: dict[str, Any], so_far: frozenset[Repair], role: str, actions: Sequence[str]) -> Answer:
-    """Read an answer-shaped object. Raises `Failure` with one of the statuses for values."""
+def read(
+    members: dict[str, Any],
+    so_far: frozenset[Repair],
+    role: str,
+    actions: Sequence[str],
+    divides: bool = False,
+) -> Answer:
+    """Read an answer-shaped object; with `divides`, any sum above 0 is divided out.
+
+    Raises:
+        Failure: statuses for values, all that are true of it.
+    """
     if values.is_schema(members):
         raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")
     repairs = set(so_far)
@@ -50,15 +61,34 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], role: str, actions:
         repairs.add(Repair.EXTRA_FIELD)
 
     if role == "helper":
-        return _helper(fields, actions, repairs)
-    intent, mass = values.distribution(fields.get("action_distribution"), actions, repairs)
+        return _helper(fields, actions, repairs, divides)
+    intent, mass = values.distribution(fields.get("action_distribution"), actions, repairs, divides)
     return Answer(intent, mass, None, frozenset(repairs))
 
 
-def _helper(fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair]) -> Answer:
-    mass: float | None = None
+def _helper(fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair], divides: bool) -> Answer:
+    failures: list[Failure] = []
+    with noted(failures):
+        intent, mass, maneuver, confidence = _judgement(fields, actions, repairs, divides)
+    with noted(failures):
+        risk = _risk(fields.get("risk"), repairs)
+    evidence = _evidence(fields.get("evidence"), repairs)
+    if failures and Repair.EVIDENCE_ECHO in repairs:
+        failures.append(Failure(Status.SCHEMA_ECHO, "the evidence is the prompt's placeholder for it"))
+    if failures:
+        raise joined(failures)
+    message = {
+        "evidence": evidence, "risk": risk, "recommended_maneuver": maneuver, "confidence": confidence,
+    }  # fmt: skip
+    return Answer(intent, mass, message, frozenset(repairs))
+
+
+def _judgement(
+    fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair], divides: bool
+) -> tuple[values.Intent, float | None, str, float]:
+    """Return the intent, its sum as stated, the maneuver and its confidence, in whichever form they stand."""
     if "action_distribution" in fields:
-        intent, mass = values.distribution(fields["action_distribution"], actions, repairs)
+        intent, mass = values.distribution(fields["action_distribution"], actions, repairs, divides)
         confidence = max(intent)
         maneuver = actions[intent.index(confidence)]
         if "recommended_maneuver" in fields or "confidence" in fields:
@@ -67,20 +97,23 @@ def _helper(fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair]
             if intent[actions.index(maneuver)] < confidence:
                 detail = "the recommended maneuver is not the distribution's most probable action"
                 raise Failure(Status.CONFLICTING_ANSWERS, detail)
+        return intent, mass, maneuver, confidence
+    failures: list[Failure] = []
+    if "recommended_maneuver" in fields:
+        with noted(failures):
+            maneuver = _maneuver(fields["recommended_maneuver"], actions, repairs)
     else:
-        for name in ("recommended_maneuver", "confidence"):
-            if name not in fields:
-                raise Failure(Status.MISSING_ACTION, f"no {name} and no distribution")
-        maneuver = _maneuver(fields["recommended_maneuver"], actions, repairs)
-        confidence = _confidence(fields["confidence"], repairs)
-        intent = recommended(maneuver, confidence, actions)
-    message = {
-        "evidence": _evidence(fields.get("evidence"), repairs),
-        "risk": _risk(fields.get("risk"), repairs),
-        "recommended_maneuver": maneuver,
-        "confidence": confidence,
-    }
-    return Answer(intent, mass, message, frozenset(repairs))
+        failures.append(Failure(Status.MISSING_ACTION, "no recommended_maneuver and no distribution"))
+    if "confidence" in fields:
+        with noted(failures):
+            confidence = _confidence(fields["confidence"], repairs)
+    elif failures:
+        failures.append(Failure(Status.MISSING_ACTION, "no confidence and no distribution"))
+    else:
+        failures.append(Failure(Status.LABEL_ONLY, f"only {maneuver} is recommended, without a confidence"))
+    if failures:
+        raise joined(failures)
+    return recommended(maneuver, confidence, actions), None, maneuver, confidence
 
 
 def recommended(maneuver: str, confidence: float, actions: Sequence[str]) -> values.Intent:
@@ -94,7 +127,7 @@ def recommended(maneuver: str, confidence: float, actions: Sequence[str]) -> val
 def _maneuver(value: object, actions: Sequence[str], repairs: set[Repair]) -> str:
     if not isinstance(value, str):
         raise Failure(Status.UNKNOWN_ACTION, "the recommended maneuver is no action's name")
-    if "|" in value or values.is_placeholder(value):
+    if _lists(value, actions) or values.is_placeholder(value):
         raise Failure(Status.SCHEMA_ECHO, "the schema's choice of actions came back instead of one action")
     name = values.match(value, actions)
     if name is None:
@@ -102,6 +135,12 @@ def _maneuver(value: object, actions: Sequence[str], repairs: set[Repair]) -> st
     if name != value:
         repairs.add(Repair.KEY_CASE)
     return name
+
+
+def _lists(value: str, options: Sequence[str]) -> bool:
+    """Whether a text lists all options instead of choosing one: low|medium|high, low or medium or high."""
+    listed = all(re.search(rf"\b{re.escape(option)}\b", value) for option in options)
+    return "|" in value or (listed and len(options) > 1)
 
 
 def _confidence(value: object, repairs: set[Repair]) -> float:
@@ -117,6 +156,9 @@ def _evidence(value: object, repairs: set[Repair]) -> str | None:
     if not isinstance(value, str):
         repairs.add(Repair.MISSING_EVIDENCE)
         return None
+    if values.is_placeholder_text(value):
+        repairs.add(Repair.EVIDENCE_ECHO)
+        return None
     if len(value) > EVIDENCE_CHARS:
         repairs.add(Repair.EVIDENCE_CUT)
     # A lone surrogate is legal JSON ("\ud83d") and cannot be written to any file.
@@ -124,7 +166,7 @@ def _evidence(value: object, repairs: set[Repair]) -> str | None:
 
 
 def _risk(value: object, repairs: set[Repair]) -> str | None:
-    if isinstance(value, str) and "|" in value:
+    if isinstance(value, str) and (_lists(value, RISKS) or values.is_placeholder(value)):
         raise Failure(Status.SCHEMA_ECHO, "the schema's choice of risks came back instead of one risk")
     level = values.match(value, RISKS) if isinstance(value, str) else None
     if level is None:

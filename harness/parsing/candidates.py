@@ -228,7 +228,12 @@ def _no_candidate(text: str, has_object: bool, actions: tuple[str, ...]) -> Fail
     """Return the failure that explains why a text has no candidate."""
     lone = text.strip("".join(_STRAY) + "!?# \t\r\n").casefold()
     # A name that is not in the text at all needs no look at what surrounds it.
-    named = [a for a in actions if (a in text and re.search(_whole_word(a), text)) or lone == a.casefold()]
+    named = [
+        a for a in actions
+        if (a in text and re.search(_whole_word(a), text))
+        or lone == a.casefold()
+        or (has_object and f'"{a.casefold()}"' in text.casefold())
+    ]  # fmt: skip
     if len(named) == 1:
         return Failure(Status.LABEL_ONLY, f"only {named[0]} is named, without probabilities")
     if has_object:

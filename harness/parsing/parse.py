@@ -15,7 +15,7 @@ from harness.parsing import candidates, reasoning
 from harness.parsing.answer import Answer, read
 from harness.parsing.candidates import Candidate, whole
 from harness.parsing.mend import unreadable
-from harness.parsing.status import Failure, Repair, Status
+from harness.parsing.status import Failure, Repair, Status, noted
 from harness.parsing.strict import fitting
 from harness.prompts.answer_schema import ROLES
 
@@ -47,6 +47,7 @@ class Parsed(Struct, frozen=True):
             maneuver is the most probable action (the first of equals) and the confidence its probability.
         reasoning: the thought, or None; the whole text if the thought was never closed.
         detail: one sentence for people, safe to print.
+        faults: if failed, all that is wrong with it, the status first.
     """
 
     status: Status
@@ -56,6 +57,7 @@ class Parsed(Struct, frozen=True):
     message: dict[str, Any] | None = None
     reasoning: str | None = None
     detail: str = ""
+    faults: tuple[Status, ...] = ()
 
     @property
     def verdict(self) -> Literal["strict", "recovered", "failed"]:
@@ -72,6 +74,7 @@ def parse(
     actions: Sequence[str],
     thinking: bool = False,
     reasons_first: bool = False,
+    divides: bool = False,
     finish_reason: str = "stop",
     error: str | None = None,
 ) -> Parsed:
@@ -87,6 +90,7 @@ def parse(
         thinking: whether the text must hold a closed thought: the model was asked to think, and the engine
             did not take the thought out of the text.
         reasons_first: whether the prompt asked for reasons before the answer; then prose there is no repair.
+        divides: whether a sum that is off 1 by more than rounding is divided out, unless it is 0.
         finish_reason: the engine's finish reason; `length` means that the token limit cut the text off.
         error: the engine's message if it failed.
 
@@ -97,7 +101,7 @@ def parse(
         raise errors.unknown("role", role, ROLES)
     if error is not None or finish_reason == "error":
         message = errors.printable(error or "no message", 80)
-        return Parsed(Status.ENGINE_ERROR, detail=f"the engine failed: {message}")
+        return _failed(Failure(Status.ENGINE_ERROR, f"the engine failed: {message}"), None)
     actions = tuple(actions)
     thought: str | None = None
     try:
@@ -107,13 +111,13 @@ def parse(
             thought_leads = text.rstrip().endswith(rest.strip())
             answer = _strict(rest, role, actions) if thought_leads else None
             if answer is None:
-                answer = _recovered(rest, role, actions, finish_reason == "length", reasons_first)
+                answer = _recovered(rest, role, actions, finish_reason == "length", reasons_first, divides)
             if (thought and not thinking) or not thought_leads:
                 answer = answer.mended(Repair.THINK_BLOCK)
     except Failure as failure:
         if failure.status is Status.TRUNCATED_REASONING:
             thought = text.strip()
-        return Parsed(failure.status, mass=failure.mass, reasoning=thought or None, detail=failure.detail)
+        return _failed(failure, thought or None)
     repairs = tuple(repair for repair in Repair if repair in answer.repairs) if answer.repairs else ()
     return Parsed(
         Status.RECOVERED if repairs else Status.STRICT,
@@ -123,6 +127,12 @@ def parse(
         answer.message,
         thought or None,
         f"read after {len(repairs)} repair(s): {', '.join(repairs)}" if repairs else "fits the schema",
+    )
+
+
+def _failed(failure: Failure, thought: str | None) -> Parsed:
+    return Parsed(
+        failure.status, mass=failure.mass, reasoning=thought, detail=failure.detail, faults=failure.faults
     )
 
 
@@ -157,7 +167,9 @@ def _unmended(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
     return None if answer.repairs else answer
 
 
-def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool) -> Answer:
+def _recovered(
+    text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool, divides: bool
+) -> Answer:
     text, special = _SPECIAL.subn(" ", text)
     # A narrow space between a number and its unit is good typography in prose, so reasons may have one.
     zero_width = _INVISIBLE.search(text, text.find("{") if reasons_first else 0)
@@ -166,30 +178,43 @@ def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool, reason
     if not text.strip():
         raise Failure(Status.EMPTY, "there is no answer in the text")
     objects = candidates.candidates(text, role, actions, cut, reasons_first)
-    answer = _choose(objects, role, actions)
+    answer = _choose(objects, role, actions, divides)
     if special:
         answer = answer.mended(Repair.SPECIAL_TOKENS)
     return answer.mended(Repair.INVISIBLE_CHARACTERS) if zero_width else answer
 
 
-def _choose(objects: list[Candidate], role: str, actions: tuple[str, ...]) -> Answer:
+def _choose(objects: list[Candidate], role: str, actions: tuple[str, ...], divides: bool) -> Answer:
     """Return the one answer among the candidates; an echo of the template is not a second answer."""
     answers: list[Answer] = []
     failures: list[Failure] = []
     for candidate in objects:
-        try:
-            answer = read(candidate.members, candidate.repairs, role, actions)
+        with noted(failures):
+            answer = read(candidate.members, candidate.repairs, role, actions, divides)
             answers.append(answer.without(candidate.lost) if candidate.lost else answer)
-        except Failure as failure:
-            failures.append(failure)
     serious = [failure for failure in failures if failure.status is not Status.SCHEMA_ECHO]
     if not answers:
-        if any(Repair.JSON_REPAIR in candidate.repairs for candidate in objects):
-            raise unreadable()  # an error in a guessed object need not be one of the text
-        raise (serious or failures)[-1]
+        raise _none_read(objects, failures, serious)
     last = answers[-1]
     agree = all(abs(p - q) <= _SAME for a in answers for p, q in zip(a.intent, last.intent, strict=True))
     if serious or not agree:
         count = len(answers) + len(serious)
-        raise Failure(Status.CONFLICTING_ANSWERS, f"{count} answers stand in the text and they differ")
+        faults = _distinct([Status.CONFLICTING_ANSWERS, *(f for one in serious for f in one.faults)])
+        detail = f"{count} answers stand in the text and they differ"
+        raise Failure(Status.CONFLICTING_ANSWERS, detail, faults=faults)
     return last.mended(Repair.REPEATED_ANSWER) if len(answers) > 1 else last
+
+
+def _none_read(
+    objects: Sequence[Candidate], failures: Sequence[Failure], serious: Sequence[Failure]
+) -> Failure:
+    """Return the failure of candidates of which none is an answer."""
+    last, faults = (serious or failures)[-1], [fault for one in failures for fault in one.faults]
+    if any(Repair.JSON_REPAIR in candidate.repairs for candidate in objects):
+        # An error in a guessed object need not be one of the text; that it was copied shows in its words.
+        last, faults = unreadable(), [fault for fault in faults if fault is Status.SCHEMA_ECHO]
+    return Failure(last.status, last.detail, last.mass, _distinct([last.status, *faults]))
+
+
+def _distinct(faults: Sequence[Status]) -> tuple[Status, ...]:
+    return tuple(dict.fromkeys(faults))

@@ -1,5 +1,7 @@
-"""Define the outcomes of parsing a completion: its status, and the repairs that it took."""
+"""Define the outcomes of parsing a completion: its status, its faults, and the repairs that it took."""
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from enum import StrEnum
 from typing import Self
 
@@ -34,14 +36,17 @@ class Status(_Documented):
         "The thought was never closed, so nothing in it is an answer.",
     )
     SYNTAX = "syntax", "A JSON object was meant, but it cannot be read without guessing."
-    SCHEMA_ECHO = "schema_echo", "The schema or the template's placeholders came back, not numbers."
+    SCHEMA_ECHO = "schema_echo", "The schema or the prompt's placeholders came back instead of an answer."
     DUPLICATE_KEY = "duplicate_key", "An object has the same key twice."
     MISSING_ACTION = "missing_action", "An action, the maneuver or its confidence is not given."
     UNKNOWN_ACTION = "unknown_action", "Something that is no action of the scenario is chosen or has mass."
     NON_NUMERIC = "non_numeric", "A probability is no number: a word, an expression, true, null, a list."
     NON_FINITE = "non_finite", "A probability is NaN, infinite, or overflows (1e400)."
     OUT_OF_RANGE = "out_of_range", "A probability lies outside 0..1 and the whole does not read as percent."
-    BAD_SUM = "bad_sum", "The probabilities differ from a sum of 1 by more than rounding (0.025)."
+    BAD_SUM = (
+        "bad_sum",
+        "The probabilities differ from a sum of 1 by more than rounding (0.025), or all are zero.",
+    )
     CONFLICTING_ANSWERS = "conflicting_answers", "Several answers stand in the text and they differ."
     ENGINE_ERROR = "engine_error", "The engine failed; there is no completion to judge."
 
@@ -80,8 +85,10 @@ class Repair(_Documented):
     EXTRA_ZERO_KEY = "extra_zero_key", "A key that is no action of the scenario had probability zero."
     EXTRA_FIELD = "extra_field", "A field that the schema does not have was dropped."
     RENORMALISED = "renormalised", "The sum was off 1 by rounding (0.001 to 0.025) and was divided out."
+    DIVIDED = "divided", "The sum was off 1 by more than rounding and was divided out, as was declared."
     BOTH_FORMS = "both_forms", "A helper gave a distribution and a maneuver that agrees with it."
     MISSING_EVIDENCE = "missing_evidence", "A helper gave no evidence text."
+    EVIDENCE_ECHO = "evidence_echo", "A helper's evidence was the prompt's placeholder, and was dropped."
     EVIDENCE_CUT = "evidence_cut", "A helper's evidence was cut at 200 characters."
     MISSING_RISK = "missing_risk", "A helper gave no risk of low, medium or high."
 
@@ -92,11 +99,35 @@ class Failure(Exception):
     Attributes:
         status: the reason.
         detail: one sentence for people, safe to print.
-        mass: the sum of the probabilities, if the sum is the reason.
+        mass: the sum of the probabilities, if the sum is a reason.
+        faults: all reasons, the status first.
     """
 
-    def __init__(self, status: Status, detail: str, mass: float | None = None) -> None:
+    def __init__(
+        self, status: Status, detail: str, mass: float | None = None, faults: tuple[Status, ...] = ()
+    ) -> None:
         super().__init__(detail)
         self.status = status
         self.detail = detail
         self.mass = mass
+        self.faults = faults or (status,)
+
+
+@contextmanager
+def noted(failures: list[Failure]) -> Iterator[None]:
+    """Keep a failure of one part of an answer, so that the other parts are read as well."""
+    try:
+        yield
+    except Failure as failure:
+        failures.append(failure)
+
+
+def joined(failures: Sequence[Failure]) -> Failure:
+    """Return a failure with the faults of all.
+
+    The first one leads, but an echo goes before it: what was copied from the prompt was never meant.
+    """
+    first = min(failures, key=lambda failure: failure.status is not Status.SCHEMA_ECHO)
+    faults = dict.fromkeys([first.status, *(fault for failure in failures for fault in failure.faults)])
+    mass = next((failure.mass for failure in failures if failure.mass is not None), None)
+    return Failure(first.status, first.detail, mass, tuple(faults))

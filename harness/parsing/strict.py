@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from harness.parsing.answer import Answer, recommended
-from harness.parsing.values import EXACT
+from harness.parsing.values import EXACT, is_placeholder_text
 from harness.prompts.answer_schema import EVIDENCE_CHARS, RISKS
 
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -25,7 +25,7 @@ def fitting(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
             continue
         evidence = answer.evidence if role == "helper" else ""
         # The decoder silently takes the last of two equal keys, so the colons are counted: one for each key.
-        if "\\" in text or text.count(":") != colons + evidence.count(":"):
+        if "\\" in text or text.count(":") != colons + evidence.count(":") or is_placeholder_text(evidence):
             return None
         return _answer(answer, role, actions)
     return None

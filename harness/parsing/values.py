@@ -12,15 +12,23 @@ from typing import Any
 
 from harness.core.errors import printable
 from harness.parsing.relaxed import Repeated
-from harness.parsing.status import Failure, Repair, Status
+from harness.parsing.status import Failure, Repair, Status, joined, noted
 
 EXACT = 0.001 + 1e-9  # the slack admits 0.333 * 3, whose binary sum is slightly below 0.999
 ROUNDED = 0.025 + 1e-9
+_LARGEST = 1e9  # of the numbers whose sum is worth saying; larger ones may overflow
 
 _NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?")
 _NON_FINITE = re.compile(r"[-+]?(?:nan|inf|infinity)", re.IGNORECASE)
 _PLACEHOLDER = re.compile(
-    r"p\d*|p_\w+|prob(?:ability)?\w*|number|float|value|x|<.*>|\.{2,}|…|0(?:\.0)?\s*(?:\.\.|-|–|to)\s*1(?:\.0)?",
+    r"p\d*|p_\w+|prob(?:ability)?\w*|(?:number|float|value|x)(?: from)?|<.*>|\.{2,}|…"
+    r"|(?:(?:a )?number (?:from|between) )?0(?:\.0)?\s*(?:\.\.|-|–|to|and)\s*1(?:\.0)?",
+    re.IGNORECASE,
+)
+# What a prompt writes in the place of words: how many, or what kind of text.
+_WORDS = re.compile(
+    r"(?:at most|max(?:imum)?(?: of)?|up to|under|in)\.? \d+ (?:words?|characters?)"
+    r"|(?:one|a) short sentence|text|string|<.*>|\.{2,}|…",
     re.IGNORECASE,
 )
 
@@ -60,42 +68,69 @@ def sort_fields(
     return fields, rest
 
 
-def distribution(value: object, actions: Sequence[str], repairs: set[Repair]) -> tuple[Intent, float]:
+def distribution(
+    value: object, actions: Sequence[str], repairs: set[Repair], divides: bool
+) -> tuple[Intent, float]:
     """Return the intent in the order of `actions`, summing to 1, and the sum as stated.
 
     Args:
         value: the value in the place of the distribution.
         actions: meta-action names.
         repairs: receives the repairs.
+        divides: whether any sum above 0 is divided out.
 
     Raises:
-        Failure: one of the statuses for values.
+        Failure: statuses for values, all that are true of it.
     """
     if not isinstance(value, dict):
         raise _no_distribution(value, actions)
     fields, rest = sort_fields(value, actions, repairs)
+    failures: list[Failure] = []
     if any(key.startswith("<") for key in rest) or any(is_placeholder(v) for v in fields.values()):
-        raise Failure(Status.SCHEMA_ECHO, "the template's placeholders came back instead of numbers")
+        failures.append(
+            Failure(Status.SCHEMA_ECHO, "the template's placeholders came back instead of numbers")
+        )
     for key, extra in rest.items():
         if isinstance(extra, str) and not _NUMBER.match(extra.strip()):
             repairs.add(Repair.EXTRA_FIELD)
         elif (type(extra) is float and extra == 0.0) or extra in ("0", "0%", "0.0"):
             repairs.add(Repair.EXTRA_ZERO_KEY)
-        else:
-            raise Failure(Status.UNKNOWN_ACTION, f"{printable(key, 40)!r} is no action of the scenario")
-    missing = [action for action in actions if action not in fields]
-    if missing:
-        raise Failure(Status.MISSING_ACTION, f"no probability for {', '.join(missing)}")
-    numbers = _in_unit([number(a, fields[a], repairs) for a in actions], repairs)
+        elif not key.startswith("<"):
+            detail = f"{printable(key, 40)!r} is no action of the scenario"
+            failures.append(Failure(Status.UNKNOWN_ACTION, detail))
+    if missing := [action for action in actions if action not in fields]:
+        failures.append(Failure(Status.MISSING_ACTION, f"no probability for {', '.join(missing)}"))
+    stated = []
+    for action in [action for action in actions if action in fields]:
+        with noted(failures):
+            stated.append(number(action, fields[action], repairs))
+    if failures:
+        raise joined(failures)
+    numbers = _in_unit(stated, repairs)
     for action, probability in zip(actions, numbers, strict=True):
-        check_range(action, probability)
-    mass = math.fsum(numbers)
-    # The sum is the only check on what json_repair read, so it must be exact.
-    if abs(mass - 1) > (EXACT if Repair.JSON_REPAIR in repairs else ROUNDED):
-        raise Failure(Status.BAD_SUM, f"the probabilities sum to {mass:.4g}, not 1", mass)
-    if abs(mass - 1) > EXACT:
-        repairs.add(Repair.RENORMALISED)
+        with noted(failures):
+            check_range(action, probability)
+    mass = math.nan
+    if max(map(abs, numbers)) <= _LARGEST:
+        mass = math.fsum(numbers)
+        with noted(failures):
+            _check_sum(mass, repairs, divides)
+    if failures:
+        raise joined(failures)
     return tuple(abs(p) / mass for p in numbers), mass
+
+
+def _check_sum(mass: float, repairs: set[Repair], divides: bool) -> None:
+    # The sum is the only check on what json_repair read, so it must be exact.
+    guessed = Repair.JSON_REPAIR in repairs
+    if abs(mass - 1) <= EXACT:
+        return
+    if abs(mass - 1) <= ROUNDED and not guessed:
+        repairs.add(Repair.RENORMALISED)
+    elif divides and mass > 0 and not guessed:
+        repairs.add(Repair.DIVIDED)
+    else:
+        raise Failure(Status.BAD_SUM, f"the probabilities sum to {mass:.4g}, not 1", mass)
 
 
 def number(name: str, value: object, repairs: set[Repair]) -> tuple[float, bool]:
@@ -142,6 +177,13 @@ def check_range(name: str, value: float) -> None:
 def is_placeholder(value: object) -> bool:
     """Whether a text is a prompt's placeholder for a number: p1, <number>, 0..1."""
     return isinstance(value, str) and bool(_PLACEHOLDER.fullmatch(value.strip()))
+
+
+def is_placeholder_text(value: object) -> bool:
+    """Whether a text is a prompt's placeholder for words: max 12 words, <text>."""
+    return isinstance(value, str) and bool(
+        _WORDS.fullmatch(value.strip().strip(".").strip() or value.strip())
+    )
 
 
 def is_schema(value: object) -> bool:
