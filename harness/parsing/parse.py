@@ -34,6 +34,10 @@ _SPACES = r"\x0b\x0c\x1c-\x1f\x85\xa0\u1680\u2000-\u200a\u2028\u2029\u202f\u205f
 _INVISIBLE = re.compile(rf"[{_NO_WIDTH}{_SPACES}]")
 _NO_WIDTHS, _SPACE = re.compile(rf"[{_NO_WIDTH}]+"), re.compile(rf"[{_SPACES}]")
 
+# Where no value could be read, the words still show what was copied.
+_UNREAD = (Status.NO_JSON, Status.SYNTAX, Status.TRUNCATED_JSON)
+_ECHO = re.compile(r"\blow ?\| ?medium\b|[\"']\s*:\s*[\"']?p\d?[\"']?\s*[,}]|[\"']max 12 words[\"']")
+
 
 class Parsed(Struct, frozen=True):
     """The result of parsing one completion.
@@ -115,6 +119,8 @@ def parse(
             if (thought and not thinking) or not thought_leads:
                 answer = answer.mended(Repair.THINK_BLOCK)
     except Failure as failure:
+        if failure.status in _UNREAD and _ECHO.search(text):
+            failure.faults += (Status.SCHEMA_ECHO,)
         if failure.status is Status.TRUNCATED_REASONING:
             thought = text.strip()
         return _failed(failure, thought or None)
