@@ -101,3 +101,9 @@ def test_a_stopped_run_asks_the_same_in_the_same_batches(tmp_path: Path) -> None
     assert batches["stopped"] + batches["resumed"] == batches["whole"]
     for name in (*TABLES, "answers.jsonl"):
         assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+@pytest.mark.parametrize("ask", ["all", "used"])
+def test_the_command_that_repeats_a_run_asks_alike(ask: str) -> None:
+    words = " ".join(spec(frozen(2), ask).words())
+    assert ("--ask used" in words) == (ask == "used")

@@ -23,7 +23,7 @@ from harness.world.scenario import Scenario
 
 TAG_CHARACTERS = 40
 HOTTEST = 2.0
-ASKS = ("used", "all")  # what --ask takes, the default first
+ASKS = ("all", "used")  # what --ask takes, the default first
 
 
 class Source(Protocol):
