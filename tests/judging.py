@@ -20,7 +20,13 @@ PLACEHOLDERS = ("max 12 words", "Max. 12 words.", "one short sentence", "<eviden
 ROLES = st.sampled_from(["ego", "helper"])
 
 VALIDATORS = {
-    role: jsonschema.Draft202012Validator(answer_schema(role, ACTIONS)) for role in ("ego", "helper")
+    role: jsonschema.Draft202012Validator(
+        {"oneOf": [answer_schema(role, ACTIONS, form=form) for form in forms]}
+    )
+    for role, forms in {
+        "ego": ("distribution", "maneuver"),
+        "helper": ("distribution", "recommendation"),
+    }.items()
 }
 
 

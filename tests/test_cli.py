@@ -103,12 +103,12 @@ def one_line(said: Said) -> str:
         (["--verbose"], "No such option: --verbose"),
         (["prompt", "shwo"], "No such command 'shwo'"),
         (["prompt", "show", "v2"], "Missing option '--scene'"),
-        (["prompt", "show", "v9", "--scene", "00000-0"], "unknown prompt 'v9'"),
+        (["prompt", "show", "v99", "--scene", "00000-0"], "unknown prompt 'v99'"),
         (["prompt", "show", "v2", "--scene", "99999-9"], "unknown scene '99999-9'"),
         (["prompt", "show", "v2", "--scene", "00000-0", "--viewer", "v77"], "unknown viewer 'v77'"),
         (["prompt", "check", "v2", "--tokenizer", "absent.gguf"], "no tokenizer at absent.gguf"),
         (["prompt", "lock", "v2"], "prompt v2 is released already; copy it to a new version"),
-        (["prompt", "lock", "v9"], "unknown prompt 'v9'"),
+        (["prompt", "lock", "v99"], "unknown prompt 'v99'"),
         (["prompt", "show", "v2", "--viewer"], "Option '--viewer' requires an argument"),
         (["model", "check"], "Missing argument 'name'"),
     ],
@@ -195,7 +195,19 @@ def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, sm
 
 def test_what_says_json_is_json(harness: Harness, small_path: Path) -> None:
     listed = json.loads(harness("prompt", "list", "--json").out)
-    assert [p["version"] for p in listed] == ["paper", "v1", "v2", "v3", "v4", "v5", "v6", "v7", "v8"]
+    assert [p["version"] for p in listed] == [
+        "paper",
+        "v1",
+        "v10",
+        "v2",
+        "v3",
+        "v4",
+        "v5",
+        "v6",
+        "v7",
+        "v8",
+        "v9",
+    ]
     args = ("prompt", "show", "v2", "--scene", "00001-0", "--dataset", small_path)
     shown = json.loads(harness(*args, "--json").out)
     assert list(shown) == ["v1", "v2", "v3", "v4"]
@@ -224,7 +236,7 @@ def test_the_version_is_printed(harness: Harness) -> None:
 
 def test_people_read_the_same_in_eighty_columns(harness: Harness, small_path: Path) -> None:
     said = harness("prompt", "list")
-    versions = ["paper", "v1", "v2", "v3", "v4", "v5", "v6", "v7", "v8"]
+    versions = ["paper", "v1", "v10", "v2", "v3", "v4", "v5", "v6", "v7", "v8", "v9"]
     assert [line.split()[:2] for line in said.out.splitlines()] == [[v, "released"] for v in versions]
     assert max(map(len, said.out.splitlines())) <= 80
     said = harness("prompt", "show", "v2", "--scene", "00001-0", "--viewer", "v1", "--dataset", small_path)

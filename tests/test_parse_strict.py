@@ -40,6 +40,7 @@ ANSWERS = st.fixed_dictionaries(
         ),
         "risk": st.sampled_from(["low", "medium", "high", "High", "none", None, 1, []]),
         "recommended_maneuver": st.one_of(st.sampled_from([*ACTIONS, "idle", "STOP", None]), OBJECTS),
+        "maneuver": st.one_of(st.sampled_from([*ACTIONS, "idle", "STOP", None]), OBJECTS),
         "confidence": NUMBERS,
         "note": NUMBERS,
     },

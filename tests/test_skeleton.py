@@ -231,3 +231,11 @@ def test_a_tokenizer_that_cannot_tell_labels_apart_is_refused() -> None:
     blind: Any = Encoder("blind", lambda text: [min(ord(c), 128) for c in text])
     with pytest.raises(UserError, match=r"'blind'.*tell the choices.*--answer json"):
         Skeleton(blind, "helper", "recommendation", ("é", "è"))
+
+
+def test_an_ego_may_be_asked_for_one_action_and_a_confidence() -> None:
+    pieces = parts("ego", "maneuver", ("SLOWER", "IDLE"))
+    assert pieces == ['{"maneuver":"', ("SLOWER", "IDLE"), '","confidence":0.', TWO_DIGITS, "}"]
+    text = finished("ego", "maneuver", ("SLOWER", "IDLE"), [1, 70])
+    jsonschema.validate(json.loads(text), answer_schema("ego", ("SLOWER", "IDLE"), form="maneuver"))
+    assert parse(text, role="ego", actions=("SLOWER", "IDLE")).intent == pytest.approx((0.3, 0.7))

@@ -53,7 +53,19 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, t
         return done.stdout
 
     prompts = json.loads(harness("prompt", "list", "--json"))
-    assert [p["version"] for p in prompts] == ["paper", "v1", "v2", "v3", "v4", "v5", "v6", "v7", "v8"]
+    assert [p["version"] for p in prompts] == [
+        "paper",
+        "v1",
+        "v10",
+        "v2",
+        "v3",
+        "v4",
+        "v5",
+        "v6",
+        "v7",
+        "v8",
+        "v9",
+    ]
     assert all(p["released"] for p in prompts)
     lacks = {m["name"]: m["missing"] for m in json.loads(harness("model", "list", "--json"))}
     assert (lacks["proxy"], lacks["qwen3-4b"]) == (None, "torch")

@@ -34,7 +34,8 @@ class Request:
             letters; empty if the letters are read once.
         actions: meta-action names, in the environment's order.
         max_tokens: most tokens the answer may have.
-        form: what the prompt asks a helper for: `distribution`, or `recommendation` with a confidence.
+        form: what the prompt asks for (`Prompt.form`): `distribution`, `recommendation` with a confidence,
+            or an ego's `maneuver` with a confidence.
         answer: how the model answers. `json`: it writes freely. `constrained`: it fills in numbers and
             choices of a fixed text. `readout`: the messages ask for one letter (see
             `harness.prompts.readout`), and the letters' probabilities are the answer.

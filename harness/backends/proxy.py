@@ -89,10 +89,13 @@ def _told(request: Request, view: Mapping[str, Any], intent: dict[str, float]) -
     """Return the text of an answer."""
     if request.role == "ego":
         body: dict[str, Any] = {"action_distribution": intent}
+        if request.form == "maneuver":
+            best = max(intent, key=intent.__getitem__)
+            body = {"maneuver": best, "confidence": intent[best]}
     else:
         body = _message(view, intent, request.form)
-    if request.form == "recommendation":
-        return f"{_reason(view)} {canonical_json(body)}"  # such a prompt asks for its reasons first
+    if request.reasons_first:
+        return f"{_reason(view)} {canonical_json(body)}"
     return canonical_json(body)
 
 

@@ -32,9 +32,9 @@ def parts(role: str, form: str, actions: Sequence[str]) -> list[Part]:
     if role == "helper":
         text, opening = ['{"evidence":"","risk":"', RISKS], '",'
     names = tuple(canonical_json(action) for action in actions)
-    if role == "helper" and form == "recommendation":
+    if key := maneuver_key(role, form):
         bare = tuple(name[1:-1] for name in names)
-        return [*text, f'{opening}"recommended_maneuver":"', bare, '","confidence":0.', TWO_DIGITS, "}"]
+        return [*text, f'{opening}"{key}":"', bare, '","confidence":0.', TWO_DIGITS, "}"]
     opening += '"action_distribution":{'
     for name in names:
         text += [f"{opening}{name}:0.", TWO_DIGITS]
@@ -42,19 +42,26 @@ def parts(role: str, form: str, actions: Sequence[str]) -> list[Part]:
     return [*text, "}}"]
 
 
+def maneuver_key(role: str, form: str) -> str | None:
+    """Return the key of the action that a form of answer names; None if the form is a distribution."""
+    return {("helper", "recommendation"): "recommended_maneuver", ("ego", "maneuver"): "maneuver"}.get(
+        (role, form)
+    )
+
+
 def finished(role: str, form: str, actions: Sequence[str], chosen: Sequence[int]) -> str:
     """Write the answer as text that is valid under the schema: two decimals, and a distribution sums to 1.
 
     Args:
         role: `ego` or `helper`.
-        form: the form that a helper is asked for.
+        form: the form that is asked for.
         actions: meta-action names.
         chosen: the place of the chosen option for each choice of `parts`. Digits that are all zero say
             nothing about any action, so they become the uniform distribution.
     """
     body: dict[str, object] = {"evidence": "", "risk": RISKS[chosen[0]]} if role == "helper" else {}
-    if role == "helper" and form == "recommendation":
-        body |= {"recommended_maneuver": actions[chosen[1]], "confidence": chosen[2] / 100}
+    if key := maneuver_key(role, form):
+        body |= {key: actions[chosen[-2]], "confidence": chosen[-1] / 100}
         return canonical_json(body)
     digits = chosen[-len(actions) :]
     digits = digits if any(digits) else [1] * len(actions)

@@ -109,7 +109,7 @@ class Agent:
         """Return a request in a role, without what differs between such requests."""
         return Request(
             id="", messages=(), role=role, actions=actions, max_tokens=self.most_tokens(role),
-            form=self.prompt.helper_answer, answer=self.answer, thinking=self.thinking,
+            form=self.prompt.form(role), answer=self.answer, thinking=self.thinking,
             reasons_first=role in self.prompt.reasons_first,
         )  # fmt: skip
 
@@ -138,7 +138,8 @@ class Agent:
         words: Mapping[str, str],
     ) -> tuple[Mapping[str, str], ...]:  # fmt: skip
         """Return the chat about a scene graph and the messages heard, before the answer mode changes it."""
-        return shown(self.image, self.prompt.render(graph, actions, heard, words))
+        letter = self.answer == "readout"
+        return shown(self.image, self.prompt.render(graph, actions, heard, words, letter))
 
     def settings(self) -> dict[str, Any]:
         """Return everything that decides its answers, as plain values."""

@@ -13,9 +13,12 @@ from harness.parsing.status import Failure, Repair, Status, joined, noted
 from harness.prompts.answer_schema import EVIDENCE_CHARS, RISKS
 
 FIELDS = {
-    "ego": ("action_distribution",),
+    "ego": ("maneuver", "confidence", "action_distribution"),
     "helper": ("evidence", "risk", "recommended_maneuver", "confidence", "action_distribution"),
 }
+
+# Keys that make an object an answer; an ego that states a confidence alone has said nothing yet.
+MARKS = {"ego": ("maneuver", "action_distribution"), "helper": FIELDS["helper"]}
 
 
 class Answer(Struct, frozen=True):
@@ -52,7 +55,7 @@ def read(
     repairs = set(so_far)
     fields, rest = values.sort_fields(members, FIELDS[role], repairs)
     has_loose_actions = any(values.match(key, actions) for key in rest)
-    if has_loose_actions and ("action_distribution" in fields or "recommended_maneuver" in fields):
+    if has_loose_actions and fields.keys() & {"action_distribution", "recommended_maneuver", "maneuver"}:
         raise Failure(Status.CONFLICTING_ANSWERS, "actions stand both inside and outside the answer's fields")
     if has_loose_actions:
         repairs.add(Repair.UNWRAPPED)
@@ -62,14 +65,19 @@ def read(
 
     if role == "helper":
         return _helper(fields, actions, repairs, divides)
-    intent, mass = values.distribution(fields.get("action_distribution"), actions, repairs, divides)
+    if "maneuver" in fields:
+        intent, mass, *_ = _judgement(fields, "maneuver", actions, repairs, divides)
+    else:
+        intent, mass = values.distribution(fields.get("action_distribution"), actions, repairs, divides)
     return Answer(intent, mass, None, frozenset(repairs))
 
 
 def _helper(fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair], divides: bool) -> Answer:
     failures: list[Failure] = []
     with noted(failures):
-        intent, mass, maneuver, confidence = _judgement(fields, actions, repairs, divides)
+        intent, mass, maneuver, confidence = _judgement(
+            fields, "recommended_maneuver", actions, repairs, divides
+        )
     with noted(failures):
         risk = _risk(fields.get("risk"), repairs)
     evidence = _evidence(fields.get("evidence"), repairs)
@@ -84,33 +92,33 @@ def _helper(fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair]
 
 
 def _judgement(
-    fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair], divides: bool
+    fields: dict[str, Any], key: str, actions: Sequence[str], repairs: set[Repair], divides: bool
 ) -> tuple[values.Intent, float | None, str, float]:
     """Return the intent, its sum as stated, the maneuver and its confidence, in whichever form they stand."""
     if "action_distribution" in fields:
         intent, mass = values.distribution(fields["action_distribution"], actions, repairs, divides)
         confidence = max(intent)
         maneuver = actions[intent.index(confidence)]
-        if "recommended_maneuver" in fields or "confidence" in fields:
+        if key in fields or "confidence" in fields:
             repairs.add(Repair.BOTH_FORMS)
-            maneuver = _maneuver(fields.get("recommended_maneuver", maneuver), actions, repairs)
+            maneuver = _maneuver(fields.get(key, maneuver), actions, repairs)
             if intent[actions.index(maneuver)] < confidence:
-                detail = "the recommended maneuver is not the distribution's most probable action"
+                detail = f"the {key.replace('_', ' ')} is not the distribution's most probable action"
                 raise Failure(Status.CONFLICTING_ANSWERS, detail)
         return intent, mass, maneuver, confidence
     failures: list[Failure] = []
-    if "recommended_maneuver" in fields:
+    if key in fields:
         with noted(failures):
-            maneuver = _maneuver(fields["recommended_maneuver"], actions, repairs)
+            maneuver = _maneuver(fields[key], actions, repairs)
     else:
-        failures.append(Failure(Status.MISSING_ACTION, "no recommended_maneuver and no distribution"))
+        failures.append(Failure(Status.MISSING_ACTION, f"no {key} and no distribution"))
     if "confidence" in fields:
         with noted(failures):
             confidence = _confidence(fields["confidence"], repairs)
     elif failures:
         failures.append(Failure(Status.MISSING_ACTION, "no confidence and no distribution"))
     else:
-        failures.append(Failure(Status.LABEL_ONLY, f"only {maneuver} is recommended, without a confidence"))
+        failures.append(Failure(Status.LABEL_ONLY, f"only {maneuver} is named, without a confidence"))
     if failures:
         raise joined(failures)
     return recommended(maneuver, confidence, actions), None, maneuver, confidence

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from harness.parsing import mend, relaxed
-from harness.parsing.answer import FIELDS
+from harness.parsing.answer import FIELDS, MARKS
 from harness.parsing.status import Failure, Repair, Status
 from harness.parsing.values import is_schema, match
 
@@ -182,7 +182,7 @@ def _objects(text: str, cut: bool) -> _Objects:
 
 
 def _shaped(value: object, role: str, actions: tuple[str, ...]) -> bool:
-    return isinstance(value, dict) and any(match(key, FIELDS[role] + actions) for key in value)
+    return isinstance(value, dict) and any(match(key, MARKS[role] + actions) for key in value)
 
 
 def _answers(

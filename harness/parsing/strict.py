@@ -42,7 +42,8 @@ def _answer(answer: Any, role: str, actions: tuple[str, ...]) -> Answer | None:
         confidence = max(intent)
         maneuver = actions[intent.index(confidence)]
     else:
-        maneuver, confidence = answer.recommended_maneuver, abs(answer.confidence)
+        maneuver = answer.maneuver if role == "ego" else answer.recommended_maneuver
+        confidence = abs(answer.confidence)
         intent = recommended(maneuver, confidence, actions)
     if role == "ego":
         return Answer(intent, mass, None, frozenset())
@@ -65,11 +66,10 @@ def _forms(role: str, actions: tuple[str, ...]) -> tuple[tuple[msgspec.json.Deco
     distribution: list[tuple[str, Any]] = [("action_distribution", shares)]
     evidence = Annotated[str, msgspec.Meta(max_length=EVIDENCE_CHARS)]
     report: list[tuple[str, Any]] = [("evidence", evidence), ("risk", Literal[RISKS])]
-    recommendation: list[tuple[str, Any]] = [
-        ("recommended_maneuver", Literal[actions]),
-        ("confidence", Share),
-    ]
-    forms = [distribution] if role == "ego" else [report + distribution, report + recommendation]
+    confidence: tuple[str, Any] = ("confidence", Share)
+    maneuver: list[tuple[str, Any]] = [("maneuver", Literal[actions]), confidence]
+    recommendation: list[tuple[str, Any]] = [("recommended_maneuver", Literal[actions]), confidence]
+    forms = [distribution, maneuver] if role == "ego" else [report + distribution, report + recommendation]
     return tuple(
         (
             msgspec.json.Decoder(msgspec.defstruct("Form", form, forbid_unknown_fields=True)),

@@ -20,13 +20,14 @@ def answer_schema(
     """Return the JSON Schema (draft 2020-12) of one role's answer.
 
     A helper answers in one of two forms: a recommended maneuver with a confidence (prompt v1) or a
-    distribution (prompt v2).
+    distribution (prompt v2). So does an ego: a distribution, or a maneuver with a confidence (prompt v9).
 
     Args:
         role: `ego` or `helper`.
         actions: meta-action names, in the environment's order.
         scenario: named in the title only.
-        form: the form that a helper is asked for, `recommendation` or `distribution`; None allows both.
+        form: the form that is asked for: `recommendation` or `distribution` of a helper, where None allows
+            both; `maneuver` of an ego, and a distribution by any other.
 
     Raises:
         UserError: unknown role.
@@ -41,7 +42,8 @@ def answer_schema(
     title = f"{role} answer" + (f", {scenario}" if scenario else "")
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title}
     if role == "ego":
-        return head | _closed(distribution)
+        maneuver = {"maneuver": _choice(actions), "confidence": probability}
+        return head | _closed(maneuver if form == "maneuver" else distribution)
     if role == "helper":
         forms = {
             "recommendation": _closed(report | recommendation),

@@ -19,8 +19,8 @@ WORD = re.compile(r"\n|[^\S\n]*\S+|[^\S\n]+")  # a word with the space before it
 CONTEXT = 8  # words shown before and after a change
 MARKS: Mapping[Kind, tuple[str, str]] = {"same": ("", ""), "removed": ("[-", "-]"), "added": ("{+", "+}")}
 SETTINGS = (
-    "helper_answer", "reasons_first", "max_answer_tokens", "max_objects", "max_conflicts", "token_budget",
-    "examples", "repair_turn",
+    "ego_answer", "helper_answer", "reasons_first", "max_answer_tokens", "max_objects", "max_conflicts",
+    "token_budget", "examples", "repair_turn",
 )  # fmt: skip
 
 

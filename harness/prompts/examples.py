@@ -36,14 +36,18 @@ class Examples(Struct, frozen=True):
     """The examples of a version by role, in the order in which they are shown.
 
     Attributes:
-        scenario: the scenario that they come from, and the only one in which they may be shown.
+        scenario: the scenario that they come from, and the only one in which they may be shown, unless
+            `everywhere`.
         ego: examples with a question to the ego.
         helper: examples with a question to a helper.
+        everywhere: whether they may be shown in every scenario, since neither their text nor their answers
+            depend on it.
     """
 
     scenario: str
     ego: tuple[Example, ...] = ()
     helper: tuple[Example, ...] = ()
+    everywhere: bool = False
 
     def of(self, role: str) -> tuple[Example, ...]:
         """Return the examples of a role."""
@@ -56,10 +60,10 @@ class Examples(Struct, frozen=True):
 
     def __str__(self) -> str:
         listed = ", ".join(map(str, sorted(self.seeds)))
+        where = self.scenario + (", for every scenario" if self.everywhere else "")
         pinned = sha256_bytes(text_of(self).encode())[:8]
         return (
-            f"{len(self.ego)} ego, {len(self.helper)} helper, {self.scenario}, layout seeds {listed}, "
-            f"sha256 {pinned}"
+            f"{len(self.ego)} ego, {len(self.helper)} helper, {where}, layout seeds {listed}, sha256 {pinned}"
         )
 
 
@@ -102,6 +106,8 @@ def _check(example: Example, role: str, what: str) -> None:
 def text_of(examples: Examples) -> str:
     """Return the text of the file, with one example a line."""
     lines = [f'{{"scenario": {_json(examples.scenario)}']
+    if examples.everywhere:
+        lines.append('"everywhere": true')
     for role in ("ego", "helper"):
         items = ",\n".join(map(_json, examples.of(role)))
         lines.append(f'"{role}": [\n{items}\n]')

@@ -1,8 +1,9 @@
 """Prompt versions: templates that turn a scene graph into chat messages.
 
 A version is a folder `prompts/<version>/` with `ego.j2`, `helper.j2` (each with the blocks `system` and
-`user`, and `repair` for a repair turn) and `prompt.toml`; it may have examples, `examples.json`. Released
-versions are pinned by digest in `prompts/released.toml`: a changed text is a new version.
+`user`; `question` for what ends every question unless a letter is asked for, and `repair` for a repair turn)
+and `prompt.toml`; it may have examples, `examples.json`. Released versions are pinned by digest in
+`prompts/released.toml`: a changed text is a new version.
 """
 
 import os
@@ -53,6 +54,7 @@ class Prompt:
         known_failures: failures that it is known to provoke.
         max_conflicts: most conflicts in the variable `conflicts`, the soonest first; None for all.
         reasons_first: roles that are asked for reasons before the answer; the parser then allows such text.
+        ego_answer: what the ego is asked for: `distribution`, or `maneuver`, one action and a confidence.
         texts: template text by role.
         examples: earlier turns of the chat, from one scenario; None without any.
         image: picture before the user's text: what the viewer's `camera` sees; None if there is none.
@@ -71,6 +73,7 @@ class Prompt:
     known_failures: str
     texts: Mapping[str, str]
     reasons_first: tuple[Literal["ego", "helper"], ...] = ()
+    ego_answer: Literal["distribution", "maneuver"] = "distribution"
     max_conflicts: Count | None = None
     examples: Examples | None = None
     image: Literal["camera"] | None = None
@@ -107,6 +110,10 @@ class Prompt:
         """Roles whose template has a block `repair`: an unreadable answer is asked for once more."""
         return tuple(role for role in ROLES if "repair" in self._templates[role].blocks)
 
+    def form(self, role: str) -> str:
+        """Return the form of a role's answer, as `answer_schema` takes it."""
+        return "maneuver" if role == "ego" and self.ego_answer == "maneuver" else self.helper_answer
+
     def repair(self, role: str, error: str, actions: tuple[str, ...], words: Mapping[str, str]) -> str:
         """Render the message to a viewer whose answer could not be read, for the reason `error`."""
         variables = {"error": error, "actions": actions, "words": words}
@@ -121,6 +128,7 @@ class Prompt:
         actions: tuple[str, ...],
         messages: Sequence[Mapping[str, Any]] = (),
         words: Mapping[str, str] = NO_WORDS,
+        letter: bool = False,
     ) -> tuple[dict[str, str], ...]:
         """Render the chat messages for one viewer's scene graph, exactly as a model is sent them.
 
@@ -133,25 +141,26 @@ class Prompt:
             messages: helpers' messages to the ego, with `sender`, `evidence`, `risk`, `intent`,
                 `recommended_maneuver` and `confidence`.
             words: texts by which the scenario describes itself, by name.
+            letter: whether a letter is asked for in place of the block `question` (`readout.asked`).
         """
-        system, user = self._render_graph(graph, actions, messages, words, "system", "user")
-        turns = self._turns(graph["role"], actions, words)
+        system, user = self._render_graph(graph, actions, messages, words, letter, "system", "user")
+        turns = self._turns(graph["role"], actions, words, letter)
         question = {"role": "user", "content": user} | ({"image": self.image} if self.image else {})
         return ({"role": "system", "content": system}, *turns, question)
 
     def _turns(
-        self, role: str, actions: tuple[str, ...], words: Mapping[str, str]
+        self, role: str, actions: tuple[str, ...], words: Mapping[str, str], letter: bool
     ) -> tuple[dict[str, str], ...]:
         """Return a role's examples as turns of the chat; they are the same for every question."""
         if self.examples is None:
             return ()
-        key = role, actions, *words.items()
+        key = role, actions, letter, *words.items()
         if key not in self._kept_turns:
             self._kept_turns[key] = tuple(
                 {"role": part, "content": text}
                 for example in self.examples.of(role)
                 for part, text in (
-                    ("user", *self._render_graph(example.graph, actions, (), words, "user")),
+                    ("user", *self._render_graph(example.graph, actions, (), words, letter, "user")),
                     ("assistant", example.answer),
                 )
             )
@@ -163,9 +172,9 @@ class Prompt:
 
     def _render_graph(
         self, graph: Graph, actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]],
-        words: Mapping[str, str], *blocks: str,
+        words: Mapping[str, str], letter: bool, *blocks: str,
     ) -> list[str]:  # fmt: skip
-        """Render some blocks of a template for a scene graph."""
+        """Render some blocks of a template for a scene graph, the last of which ends with the question."""
         objects = shown(graph, self.max_objects - bool(messages))
         variables = {
             "graph": graph,
@@ -181,7 +190,10 @@ class Prompt:
             "it needs the blocks system and user, and may use graph, actions, objects, more, conflicts, "
             "messages, words"
         )
-        return self._rendered(graph["role"], variables, blocks, needs)
+        if letter or "question" not in self._templates[graph["role"]].blocks:
+            return self._rendered(graph["role"], variables, blocks, needs)
+        *others, user, question = self._rendered(graph["role"], variables, (*blocks, "question"), needs)
+        return [*others, f"{user}\n{question}"]
 
     def _rendered(
         self, role: str, variables: Mapping[str, Any], blocks: Sequence[str], needs: str
@@ -232,7 +244,7 @@ def unfit(prompt: Prompt, scenario: Scenario) -> str | None:
     """Return why a version may not be used in a scenario; None if it may."""
     if prompt.version in OF_A_CROSSING and scenario.prompt not in OF_A_CROSSING:
         return f"speaks of a crossing, which {scenario.name} is not"
-    if prompt.examples and prompt.examples.scenario != scenario.name:
+    if prompt.examples and not prompt.examples.everywhere and prompt.examples.scenario != scenario.name:
         return f"has examples of {printable(prompt.examples.scenario)}, which {scenario.name} is not"
     return None
 

@@ -61,7 +61,9 @@ def prompts_of(run: Run) -> Sent | None:
         if prompt.version in failed:  # it would take as long again
             return ()
         try:
-            messages = shown(agent.get("image", "own"), prompt.render(graph, run.actions, heard, words))
+            letter = agent["answer"] == "readout"
+            rendered = prompt.render(graph, run.actions, heard, words, letter)
+            messages = shown(agent.get("image", "own"), rendered)
             return in_mode(agent["answer"], prompt, messages, graph["role"], run.actions)
         except UserError:  # a stranger's, which no run can have used
             failed.add(prompt.version)

@@ -80,11 +80,13 @@ def answer(
     said = message(view, intent, actions, named)
     numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, said["intent"], strict=True))
     body = f'"action_distribution":{{{numbers}}}'
+    best, confidence = said["recommended_maneuver"], f'"confidence":{said["confidence"]:.2f}'
+    if prompt.form(view["role"]) == "maneuver":
+        body = f'"maneuver":"{best}",{confidence}'
     if view["role"] == "helper":
         if prompt.helper_answer == "recommendation":
-            best = said["recommended_maneuver"]
-            body = f'"recommended_maneuver":"{best}","confidence":{said["confidence"]:.2f}'
+            body = f'"recommended_maneuver":"{best}",{confidence}'
         reported = "" if bare else said["evidence"]
         body = f'"evidence":{canonical_json(reported)},"risk":"{said["risk"]}",{body}'
-    reasons_first = prompt.helper_answer == "recommendation" and not bare
+    reasons_first = view["role"] in prompt.reasons_first and not bare
     return f"{said['evidence']}. {{{body}}}" if reasons_first else f"{{{body}}}"

@@ -62,7 +62,7 @@ def examples(
             else:
                 passed += 1
         seed += 1
-    return Examples(scenario.name, *(tuple(shown[role]) for role in ROLES))
+    return Examples(scenario.name, ego=tuple(shown["ego"]), helper=tuple(shown["helper"]))
 
 
 def _pick(
