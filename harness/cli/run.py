@@ -195,7 +195,7 @@ def as_mapping(done: "Evaluated") -> dict[str, Any]:
 
 def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str]) -> None:
     """Print a run's table, a row a condition, with what it was run on and what to know about it."""
-    from harness.report.caveats import caveats, lost_at_once
+    from harness.report.caveats import causes, caveats, lost_at_once
     from harness.runs.folder import read
 
     m = done.manifest
@@ -205,7 +205,8 @@ def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Seque
     text.print(f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · {scenes}")
     if m.helpers:
         text.print(f"helpers: {printable(m.variant.helpers)}")
-    for caveat in (*caveats(m, done.scores), *lost_at_once(read(done.out))):
+    run = read(done.out)
+    for caveat in (*caveats(m, done.scores), *causes(run), *lost_at_once(run)):
         text.print(caveat)
     table(
         ("condition", *(column.head for column in columns)),

@@ -1,12 +1,14 @@
 """What must be said before a run's numbers: that its answers were not read, or that it read no prompt."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from harness.backends import findings
 from harness.backends.registry import find
 from harness.coordination.operating_point import pairs
 from harness.core.errors import printable
+from harness.parsing.status import Status
 from harness.radio.profiles import outside
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
@@ -55,6 +57,22 @@ def unread(scores: Sequence[Score]) -> Iterator[str]:
         if score is not None and score.value is not None and score.value >= UNREAD:
             share = "None" if score.value == 1 else f"Only {100 * (1 - score.value):.1f} %"
             yield f"{share} of {whose} {score.n} answers could be read: {instead}."
+
+
+def causes(run: Run) -> Iterator[str]:
+    """How many of each role's answers could not be read, and the commonest cause of it."""
+    meanings = {str(status): status.meaning for status in Status}
+    rates = {role: run.score(ALL, f"failed_rate_{role}") for role in _FAILED}
+    for role in [role for role, rate in rates.items() if rate and rate.value]:
+        answers = [a for a in run.answers if a.role == role and a.error is None]
+        failed = Counter(a.status for a in answers if a.verdict == "failed")
+        for status, count in failed.most_common(1):
+            meaning = meanings.get(status, "it is not said").rstrip(".")
+            yield (
+                f"{failed.total()} of {_FAILED[role][0]} {len(answers)} answers could not be read. The "
+                f"commonest cause, {count} of {failed.total()}: {meaning[0].lower()}{meaning[1:]} "
+                f"({printable(status, 30)})."
+            )
 
 
 def unanswered(run: Run) -> Iterator[str]:

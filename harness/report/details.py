@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from markupsafe import Markup
+from msgspec import UNSET
 
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
@@ -35,8 +36,8 @@ Sent = Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]]
 Prompts = Callable[[Run], Sent | None]
 GOOD, SLOW, BAD, BLAMELESS = "s", "d", "u", "n"
 KEPT = (
-    "role", "raw", "finish_reason", "error", "status", "verdict", "repairs", "detail", "intent", "mass",
-    "message", "prompt_tokens", "completion_tokens", "seconds", "label_mass", "retries", "cached",
+    "role", "raw", "finish_reason", "error", "status", "verdict", "faults", "repairs", "detail", "intent",
+    "mass", "message", "prompt_tokens", "completion_tokens", "seconds", "label_mass", "retries", "cached",
     "first_raw", "first_status",
 )  # fmt: skip
 # The same for all decisions of a scene, or known from its outcomes.
@@ -157,7 +158,7 @@ class Details:
             shown = {
                 key: v
                 for key in KEPT
-                if (v := getattr(answer, key)) is not None and v is not False and v != ()
+                if (v := getattr(answer, key)) is not None and v is not False and v is not UNSET and v != ()
             }
             shown |= {key: text(shown[key]) for key in ("error", "detail") if key in shown}
             asked = None

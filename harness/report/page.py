@@ -118,7 +118,7 @@ def _pieces(
         *caveats.said(by_name, caveats.unanswered),
         *caveats.said(by_name, lambda run: caveats.unread(run.scores)),
     ]
-    others = caveats.said(by_name, caveats.of_run)
+    others = [*caveats.said(by_name, caveats.causes), *caveats.said(by_name, caveats.of_run)]
     return environment().get_template("page.html.j2").generate(
         runs=runs,
         title=runs.names[0] if alone else f"{len(runs.names)} runs",

@@ -64,6 +64,7 @@ class Answer(Struct, frozen=True, kw_only=True):
             unset where the letters were read once, like the next.
         follows_letter: whether one letter is the likeliest in every order.
         agent: which of several helper models answered, from 1; unset where the place among all answers says.
+        faults: all that is wrong with a failed answer, the status first; unset where that is the only fault.
     """
 
     scene: str
@@ -96,6 +97,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     letter_share: float | UnsetType = UNSET
     follows_letter: bool | UnsetType = UNSET
     agent: int | UnsetType = UNSET
+    faults: tuple[str, ...] | UnsetType = UNSET
 
     @property
     def turns(self) -> int:
@@ -114,7 +116,9 @@ class Answer(Struct, frozen=True, kw_only=True):
 
     def cell(self, column: str) -> Any:
         """Return a field or property as tables have it: None where it is unset."""
-        return None if (value := getattr(self, column)) is UNSET else value
+        if (value := getattr(self, column)) is UNSET:
+            return None
+        return " ".join(value) if column == "faults" else value
 
     @property
     def id(self) -> str:

@@ -48,7 +48,7 @@ function answerSection(answer, detail, actions, meanings, leftOut) {
   const sent = answer.prompt == null ? null : detail.prompts[answer.prompt];
   const message = Object.entries(answer.message ?? {});
   return h("section", { class: "answer" },
-    h("h4", {}, [who(answer), answer.agent].filter(Boolean).join(", "), [answer.status, ...(answer.repairs ?? [])].map((word) =>
+    h("h4", {}, [who(answer), answer.agent].filter(Boolean).join(", "), [...(answer.faults ?? [answer.status]), ...(answer.repairs ?? [])].map((word) =>
       [" ", h("span", { class: "tag", title: meanings[word] }, word)])),
     h("p", { class: "quiet" }, facts),
     h("div", { class: "pair" },
