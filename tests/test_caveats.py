@@ -100,7 +100,7 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     assert said.index(UNREAD) < said.index("condition")
     assert "mute reads no prompt: it decides by the scene graph, whatever v2 says." in said
     assert "None of the helpers' 72 answers could be read: they send no message." in said
-    cause = "24 of the ego's 24 answers could not be read. The commonest cause, 24 of 24: a probability is NaN"
+    cause = "24 of the ego's 24 answers could not be read. The commonest cause, 24 of 24: a probability"
     assert said.index(cause) < said.index("condition")
     page = unescape(Path("reports/mute/report.html").read_text())
     assert page.index(cause) < page.index("Under 6g, mute clears")
