@@ -1,5 +1,6 @@
 """A run killed at any moment and resumed has the bytes of one that never was."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from harness.backends.base import Backend, Completion, Request
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.core.files import alone
+from harness.core.formats import CONFIG
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import MORE_FOLLOWS, read_kept
 from harness.evaluate.latency import PAPER
@@ -182,6 +184,19 @@ def test_other_settings_are_refused_by_name_and_change_nothing(
     with pytest.raises(UserError, match=f"was begun with another {named}; repeat its settings"):
         run(spec_of(small, **other), out)
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+@pytest.mark.parametrize("world", [None, [], "frozen"])
+def test_a_begun_run_whose_world_is_damaged_is_another_run(
+    world: Any, answers: bytes, small: Dataset, tmp_path: Path
+) -> None:
+    out = unfinished(spec_of(small), tmp_path / "run", answers[:5000])
+    file = out / ".work" / CONFIG
+    begun = json.loads(file.read_text())
+    begun["settings"]["world"] = world
+    file.write_text(json.dumps(begun))
+    with pytest.raises(UserError, match=r"was begun with another .* of the world"):
+        run(spec_of(small), out)
 
 
 def test_a_run_that_was_stopped_while_it_tidied_up_asks_and_writes_nothing(

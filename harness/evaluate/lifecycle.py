@@ -129,7 +129,10 @@ def finished_with(settings: Mapping[str, Any], out: Path) -> Evaluated:
 def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings by the names that an error gives them.
 
-    The dataset's path is left out, since its folder may move between two commands.
+    The dataset's path is left out, since its folder may move between two commands. A world that is no
+    table, as in a damaged record, is another world.
     """
-    world = {f"{key} of the world": value for key, value in settings["world"].items() if key != "path"}
+    of = settings.get("world")
+    table = of if isinstance(of, Mapping) else {"kind": of}
+    world = {f"{key} of the world": value for key, value in table.items() if key != "path"}
     return {**ABSENT, **{key: value for key, value in settings.items() if key != "world"}, **world}
