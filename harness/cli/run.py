@@ -196,6 +196,7 @@ def as_mapping(done: "Evaluated") -> dict[str, Any]:
 def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str]) -> None:
     """Print a run's table, a row a condition, with what it was run on and what to know about it."""
     from harness.report.caveats import causes, caveats, lost_at_once
+    from harness.report.constancy import ignores_input
     from harness.runs.folder import read
 
     m = done.manifest
@@ -206,7 +207,7 @@ def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Seque
     if m.helpers:
         text.print(f"helpers: {printable(m.variant.helpers)}")
     run = read(done.out)
-    for caveat in (*caveats(m, done.scores), *causes(run), *lost_at_once(run)):
+    for caveat in (*caveats(m, done.scores), *ignores_input(run), *causes(run), *lost_at_once(run)):
         text.print(caveat)
     table(
         ("condition", *(column.head for column in columns)),

@@ -98,6 +98,7 @@ def _mapping(done: "SuiteRun", lines: "Sequence[Line]") -> dict[str, Any]:
 def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     """Print success, gains and the reference drivers, each a table of families."""
     from harness.report import caveats
+    from harness.report.constancy import ignores_input
     from harness.report.suite import seeds_of
     from harness.runs.summary import BASELINE
 
@@ -105,6 +106,7 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     text.print(f"{printable(m.model, 30)} · prompt {m.prompt} · {m.answer} · suite {printable(done.name)}")
     for said in (
         *caveats.said(done.runs, lambda run: caveats.unread(run.scores)),
+        *caveats.said(done.runs, ignores_input),
         *caveats.no_prompt(run.manifest for run in done.runs.values()),
     ):
         text.print(said)

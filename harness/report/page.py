@@ -23,6 +23,7 @@ from harness.core.places import nameless, text
 from harness.parsing.parse import Repair, Status
 from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
+from harness.report.constancy import ignores_input
 from harness.report.decisions import Decisions
 from harness.report.details import Part, Prompts, prompts_of
 from harness.report.drawing import colours
@@ -118,7 +119,11 @@ def _pieces(
         *caveats.said(by_name, caveats.unanswered),
         *caveats.said(by_name, lambda run: caveats.unread(run.scores)),
     ]
-    others = [*caveats.said(by_name, caveats.causes), *caveats.said(by_name, caveats.of_run)]
+    others = [
+        sentence
+        for of in (ignores_input, caveats.causes, caveats.of_run)
+        for sentence in caveats.said(by_name, of)
+    ]
     return environment().get_template("page.html.j2").generate(
         runs=runs,
         title=runs.names[0] if alone else f"{len(runs.names)} runs",

@@ -12,6 +12,7 @@ from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
 from harness.report import caveats, words
 from harness.report.compare.page import Place, beside
+from harness.report.constancy import ignores_input
 from harness.report.drawing import colours
 from harness.report.page import environment, save
 from harness.runs.folder import Run, dataset_of
@@ -123,6 +124,7 @@ def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> s
             ],
             "warnings": [
                 *caveats.no_prompt(run.manifest for run in suite.runs.values()),
+                *caveats.said(suite.runs, ignores_input),
                 *caveats.said(suite.runs, caveats.of_run),
             ],
             "headline": words.headline(suite),
