@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -51,7 +52,9 @@ def unlike(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def compared(folder: Path, data: Dataset) -> dict[str, Finding]:
     spec = spec_of(data, str(folder))
     asked = list(requests(spec, scenes_of(data)))[:PROMPTS]
-    letters = list(requests(spec_of(data, str(folder), answer="readout"), scenes_of(data)))[:PROMPTS]
+    read_out = spec_of(data, str(folder), answer="readout")
+    raw = replace(read_out, ego=replace(read_out.ego, letters="raw"))  # as the command asks
+    letters = list(requests(raw, scenes_of(data)))[:PROMPTS]
     passes: list[int] = []
     found = compare(spec.ego.card, cards.resolve(str(folder), "llama-cpp"), asked, letters, passes.append)
     assert passes == [1] * PASSES

@@ -64,7 +64,10 @@ def graphs(draw: st.DrawFn, role: str | None = None) -> dict[str, Any]:
 
 
 def request(graph: dict[str, Any], form: str = "distribution") -> Request:
-    return Request("s/v1", graph["role"], (), ACTIONS, 64, form, view=graph, scenario=SCENARIO)
+    return Request(
+        "s/v1", graph["role"], (), ACTIONS, 64, form, reasons_first=form == "recommendation", view=graph,
+        scenario=SCENARIO,
+    )  # fmt: skip
 
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])

@@ -208,7 +208,7 @@ READERS = {
 EXCEPT = {
     "core/files.py": "the reader itself",
     "backends/counters.py": "counters of the kernel, below /sys",
-    "backends/tokens.py": "gguf maps weights, which are checked first",
+    "backends/packages.py": "an archive that the reader has opened",
     "training/model.py": "safetensors maps weights that training has just written",
     "report/library.py": "the charting library of an installed package",
     "cli/init.py": "the project that ships",

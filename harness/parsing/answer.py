@@ -68,6 +68,8 @@ def read(
     if "maneuver" in fields:
         intent, mass, *_ = _judgement(fields, "maneuver", actions, repairs, divides)
     else:
+        if "confidence" in fields:
+            repairs.add(Repair.EXTRA_FIELD)
         intent, mass = values.distribution(fields.get("action_distribution"), actions, repairs, divides)
     return Answer(intent, mass, None, frozenset(repairs))
 

@@ -24,8 +24,11 @@ def test_it_tells_every_viewer_the_actions_and_the_form_of_the_answer(version: s
     prompt = prompts.load(version)
     assert prompt.helper_answer in ("distribution", "recommendation")
     for graph in scenes_of(small)[0].record["graphs"].values():
-        system = prompt.render(graph, small.actions, (), small.scenario.prompt_words)[0]["content"]
-        form = "distribution" if graph["role"] == "ego" else prompt.helper_answer
-        assert ("action_distribution" in system) == (form == "distribution")
-        assert ("recommended_maneuver" in system) == (form == "recommendation")
-        assert all(action in system for action in small.actions)
+        chat = prompt.render(graph, small.actions, (), small.scenario.prompt_words)
+        text = chat[0]["content"] + chat[-1]["content"]
+        ego = "maneuver" if prompt.ego_answer == "maneuver" else "distribution"
+        form = ego if graph["role"] == "ego" else prompt.helper_answer
+        assert ("action_distribution" in text) == (form == "distribution")
+        assert ("recommended_maneuver" in text) == (form == "recommendation")
+        assert ('"maneuver"' in text) == (form == "maneuver")
+        assert all(action in text for action in small.actions)
