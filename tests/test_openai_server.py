@@ -165,7 +165,9 @@ def test_a_whole_run_holds_the_answers_and_not_the_key(card: Card, data: Dataset
     done = run(spec, tmp_path / "run")
     answers = answers_of(tmp_path / "run")
     assert {a.error for a in answers} == {None}
-    assert {a.status for a in answers} <= {"strict", "bad_sum"}
+    assert {a.status for a in answers} <= {"strict", "recovered", "bad_sum"}
+    assert {repair for a in answers for repair in a.repairs} <= {"renormalised", "divided"}
+    assert all(a.mass == 0 for a in answers if a.status == "bad_sum")
     assert all(a.seconds > 0 and a.prompt_tokens > 0 and a.completion_tokens > 0 for a in answers)
     assert done.manifest.latency == PAPER
     assert done.manifest.answer_times["ego"].n == len({a.scene for a in answers})

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from hypothesis import strategies as st
 from harness.backends.skeleton import TWO_DIGITS, Skeleton, finished, parts, tokens_after
 from harness.backends.tokens import tokenizer
 from harness.core.errors import UserError
-from harness.parsing.parse import parse
+from harness.parsing.parse import Status, parse
 from harness.prompts.answer_schema import answer_schema
 
 THREE = ("SLOWER", "IDLE", "FASTER")
@@ -54,11 +53,6 @@ def chat(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     import tiny_qwen3
 
     return of(tiny_qwen3.build(tmp_path_factory.mktemp("tiny")))
-
-
-def filled(role: str, form: str, actions: tuple[str, ...], chosen: list[int]) -> str:
-    places = iter(chosen)
-    return "".join(p if isinstance(p, str) else p[next(places)] for p in parts(role, form, actions))
 
 
 def played(skeleton: Skeleton, choose: Callable[[list[int]], int]) -> tuple[list[int], list[list[int]], Any]:
@@ -104,44 +98,56 @@ def test_a_helper_says_its_risk_first_and_has_no_words_for_evidence() -> None:
 
 
 @pytest.mark.parametrize(
-    ("digits", "text"),
+    ("digits", "text", "intent", "repairs"),
     [
-        ([70, 20, 10], '{"FASTER":0.1,"IDLE":0.2,"SLOWER":0.7}'),
-        ([99, 0, 0], '{"FASTER":0.0,"IDLE":0.0,"SLOWER":1.0}'),  # 1.00 cannot be written, but meant
-        ([99, 99, 99], '{"FASTER":0.33,"IDLE":0.33,"SLOWER":0.34}'),
-        ([0, 0, 0], '{"FASTER":0.33,"IDLE":0.33,"SLOWER":0.34}'),  # nothing said: uniform
-        ([1, 1, 0], '{"FASTER":0.0,"IDLE":0.5,"SLOWER":0.5}'),
+        ([70, 20, 10], '"SLOWER":0.70,"IDLE":0.20,"FASTER":0.10', (0.7, 0.2, 0.1), []),
+        (
+            [99, 0, 0],
+            '"SLOWER":0.99,"IDLE":0.00,"FASTER":0.00',
+            (1, 0, 0),
+            ["renormalised"],
+        ),  # 1.00 was meant
+        ([99, 99, 99], '"SLOWER":0.99,"IDLE":0.99,"FASTER":0.99', (1 / 3, 1 / 3, 1 / 3), ["divided"]),
+        ([1, 1, 0], '"SLOWER":0.01,"IDLE":0.01,"FASTER":0.00', (0.5, 0.5, 0), ["divided"]),
+        ([0, 0, 0], '"SLOWER":0.00,"IDLE":0.00,"FASTER":0.00', None, []),  # nothing said
     ],
 )
-def test_the_digits_sum_is_divided_out(digits: list[int], text: str) -> None:
-    assert finished("ego", "distribution", THREE, digits) == f'{{"action_distribution":{text}}}'
+def test_the_digits_are_kept_and_their_sum_is_divided_out_when_they_are_read(
+    digits: list[int], text: str, intent: tuple[float, ...] | None, repairs: list[str]
+) -> None:
+    written = finished("ego", "distribution", THREE, digits)
+    assert written == f'{{"action_distribution":{{{text}}}}}'
+    parsed = parse(written, role="ego", actions=THREE, divides=True)
+    assert parsed.intent == (None if intent is None else pytest.approx(intent))
+    assert list(parsed.repairs) == repairs
+    assert (parsed.status is Status.BAD_SUM) == (intent is None)
 
 
 def test_a_recommendation_keeps_its_confidence() -> None:
     assert finished("helper", "recommendation", THREE, [2, 1, 7]) == (
-        '{"confidence":0.07,"evidence":"","recommended_maneuver":"IDLE","risk":"high"}'
+        '{"evidence":"","risk":"high","recommended_maneuver":"IDLE","confidence":0.07}'
     )
 
 
 @given(st.data(), st.sampled_from(KINDS), st.sampled_from([THREE, FIVE, ("GO", 'say "x"\\')]))
-def test_every_filling_is_a_strict_answer_under_the_schema(
+def test_every_filling_fits_the_schema_and_is_read_as_it_stands(
     data: st.DataObject, kind: tuple[str, str], actions: tuple[str, ...]
 ) -> None:
     role, form = kind
     options = [p for p in parts(role, form, actions) if not isinstance(p, str)]
     chosen = [data.draw(st.integers(0, len(option) - 1)) for option in options]
     text = finished(role, form, actions, chosen)
-    parsed = parse(text, role=role, actions=actions)
-    assert parsed.verdict == "strict", parsed.detail
-    # What the model wrote, before the sum is divided out, fits the published schema as well.
-    for written in (text, filled(role, form, actions, chosen)):
-        jsonschema.validate(json.loads(written), answer_schema(role, actions))
-    if form == "distribution" or role == "ego":
-        digits = chosen[-len(actions) :]
-        order = sorted(range(len(actions)), key=digits.__getitem__)
-        assert parsed.intent is not None
-        for low, high in pairwise(order):
-            assert parsed.intent[low] <= parsed.intent[high] + 0.01 + 1e-9
+    jsonschema.validate(json.loads(text), answer_schema(role, actions))
+    parsed = parse(text, role=role, actions=actions, divides=True)
+    if form != "distribution" and role == "helper":
+        assert parsed.status is Status.STRICT
+        return
+    digits = chosen[-len(actions) :]
+    assert {*parsed.repairs} <= {"renormalised", "divided"}
+    assert parsed.mass == pytest.approx(sum(digits) / 100)
+    assert (parsed.intent is None) == (not any(digits))
+    if parsed.intent is not None:
+        assert parsed.intent == pytest.approx(tuple(n / sum(digits) for n in digits))
 
 
 # -- the walk -----------------------------------------------------------------------------------------
@@ -155,7 +161,7 @@ def test_the_tokens_are_those_of_the_whole_text(
 ) -> None:
     skeleton = Skeleton(chat, *kind, actions)
     ids, choices, chosen = played(skeleton, random.choice)
-    whole = chat.encode(filled(*kind, actions, chosen))
+    whole = chat.encode(finished(*kind, actions, chosen))
     assert ids == whole[: len(ids)], "another cut than the tokenizer's own"
     assert skeleton.count(chosen) == len(whole) <= skeleton.most_tokens
     assert all(among == sorted(set(among)) and len(among) > 1 for among in choices)

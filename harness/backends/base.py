@@ -72,6 +72,11 @@ class Request:
     truth: Mapping[str, Any] | None = None
     scenario: "Scenario | None" = None
 
+    @property
+    def divides(self) -> bool:
+        """Whether the sum of the answer's probabilities is divided out, however far it is off 1."""
+        return self.answer == "constrained"
+
     def alike(self, **changes: Any) -> "Request":
         """Return the request with other values in some fields, in a third of the time of `replace`."""
         request = object.__new__(Request)

@@ -1,8 +1,8 @@
 """The fixed text of a constrained answer, in which the model fills in digits and choices.
 
 The text is compact JSON that always fits the answer schema. A probability is `0.` and two digits, so 1.00
-cannot be written, and the digits need not sum to 1: `finished` divides by their sum. A helper's evidence is
-empty, since there is no free text.
+cannot be written, and the digits need not sum to 1: `harness.parsing` divides by their sum, as it does with
+what a server wrote. A helper's evidence is empty, since there is no free text.
 
 The model is never asked for fixed text. A choice is made token by token, and the model decides only where the
 remaining options differ in their next token (LANE_LEFT and LANE_RIGHT share two in Qwen's vocabulary).
@@ -15,7 +15,6 @@ from typing import NamedTuple
 from harness.backends.chat import Chat
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json
-from harness.core.rounding import rounded
 from harness.prompts.answer_schema import RISKS
 
 Part = str | tuple[str, ...]
@@ -50,23 +49,9 @@ def maneuver_key(role: str, form: str) -> str | None:
 
 
 def finished(role: str, form: str, actions: Sequence[str], chosen: Sequence[int]) -> str:
-    """Write the answer as text that is valid under the schema: two decimals, and a distribution sums to 1.
-
-    Args:
-        role: `ego` or `helper`.
-        form: the form that is asked for.
-        actions: meta-action names.
-        chosen: the place of the chosen option for each choice of `parts`. Digits that are all zero say
-            nothing about any action, so they become the uniform distribution.
-    """
-    body: dict[str, object] = {"evidence": "", "risk": RISKS[chosen[0]]} if role == "helper" else {}
-    if key := maneuver_key(role, form):
-        body |= {key: actions[chosen[-2]], "confidence": chosen[-1] / 100}
-        return canonical_json(body)
-    digits = chosen[-len(actions) :]
-    digits = digits if any(digits) else [1] * len(actions)
-    p = rounded([n / sum(digits) for n in digits])
-    return canonical_json(body | {"action_distribution": dict(zip(actions, p, strict=True))})
+    """Return the text of an answer as it was filled in; `chosen` has the place of each choice's option."""
+    places = iter(chosen)
+    return "".join(p if isinstance(p, str) else p[next(places)] for p in parts(role, form, actions))
 
 
 def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:

@@ -152,9 +152,9 @@ def _usable(spec: "Spec", seen: "Checkup") -> bool:
         parse(
             answer.text, role="ego", actions=spec.actions, thinking=ego.thinking,
             reasons_first="ego" in ego.prompt.reasons_first, finish_reason=answer.finish_reason,
-            error=answer.error,
+            divides=mode == "constrained", error=answer.error,
         ).intent
-        for answer in seen.answers.values()
+        for mode, answer in seen.answers.items()
     )  # fmt: skip
 
 

@@ -114,7 +114,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
     parsed = parse(
         # A read-out is a bare distribution, even a helper's.
         raw, role="ego" if request.answer == "readout" else request.role, actions=request.actions,
-        thinking=request.thinking, reasons_first=request.reasons_first,
+        thinking=request.thinking, reasons_first=request.reasons_first, divides=request.divides,
         finish_reason=completion.finish_reason, error=completion.error,
     )  # fmt: skip
     return Answer(
