@@ -12,7 +12,7 @@ SEES := $(BIN)/python -c "import llama_cpp.mtmd_cpp" 2>/dev/null || $(LLAMA_CPP)
 
 # What `make real` asks a published model, and on how many layouts.
 REAL_PROMPT ?= v10
-REAL_LIMIT ?= 2
+REAL_LIMIT ?= 5
 
 .PHONY: eval real test check light browser docs bench clean
 
