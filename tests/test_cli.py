@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from evaluating import run, spec_of, with_ego
+from shipped import PROMPTS
 from tokenizers import Tokenizer, models
 
 from harness import __version__, cli
@@ -195,19 +196,7 @@ def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, sm
 
 def test_what_says_json_is_json(harness: Harness, small_path: Path) -> None:
     listed = json.loads(harness("prompt", "list", "--json").out)
-    assert [p["version"] for p in listed] == [
-        "paper",
-        "v1",
-        "v10",
-        "v2",
-        "v3",
-        "v4",
-        "v5",
-        "v6",
-        "v7",
-        "v8",
-        "v9",
-    ]
+    assert [p["version"] for p in listed] == PROMPTS
     args = ("prompt", "show", "v2", "--scene", "00001-0", "--dataset", small_path)
     shown = json.loads(harness(*args, "--json").out)
     assert list(shown) == ["v1", "v2", "v3", "v4"]
@@ -236,7 +225,7 @@ def test_the_version_is_printed(harness: Harness) -> None:
 
 def test_people_read_the_same_in_eighty_columns(harness: Harness, small_path: Path) -> None:
     said = harness("prompt", "list")
-    versions = ["paper", "v1", "v10", "v2", "v3", "v4", "v5", "v6", "v7", "v8", "v9"]
+    versions = PROMPTS
     assert [line.split()[:2] for line in said.out.splitlines()] == [[v, "released"] for v in versions]
     assert max(map(len, said.out.splitlines())) <= 80
     said = harness("prompt", "show", "v2", "--scene", "00001-0", "--viewer", "v1", "--dataset", small_path)

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from shipped import PROMPTS
 
 ROOT = Path(__file__).parent.parent
 
@@ -53,19 +54,7 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, t
         return done.stdout
 
     prompts = json.loads(harness("prompt", "list", "--json"))
-    assert [p["version"] for p in prompts] == [
-        "paper",
-        "v1",
-        "v10",
-        "v2",
-        "v3",
-        "v4",
-        "v5",
-        "v6",
-        "v7",
-        "v8",
-        "v9",
-    ]
+    assert [p["version"] for p in prompts] == PROMPTS
     assert all(p["released"] for p in prompts)
     lacks = {m["name"]: m["missing"] for m in json.loads(harness("model", "list", "--json"))}
     assert (lacks["proxy"], lacks["qwen3-4b"]) == (None, "torch")

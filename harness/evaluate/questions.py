@@ -20,10 +20,8 @@ from harness.world import scenarios
 from harness.world.scenario import Scenario
 
 SCENARIO = "occluded-intersection"
-SOON_S, LATE_S = (
-    0.2,
-    5.0,
-)  # how much later than the ego the other vehicle arrives, in the two halves of a pair
+# How much later than the ego the other vehicle arrives, in the two halves of a pair.
+SOON_S, LATE_S = 0.2, 5.0
 Fact = Literal["conflict", "gap", "danger", "number"]
 YES_NO = ("YES", "NO")
 _DANGER = (
