@@ -39,7 +39,7 @@ def test_a_question_is_as_the_dataset_freezes_it(tmp_path: Path) -> None:
 
 
 def test_a_pair_differs_in_one_line() -> None:
-    pairs = questions.pairs(AGENT)
+    pairs = [*questions.scene_pairs(AGENT), *questions.plain_pairs(AGENT)]
     assert {fact: sum(p.fact == fact for p in pairs) for fact in {p.fact for p in pairs}} == {
         "conflict": 4, "gap": 4, "danger": 4, "number": 4,
     }  # fmt: skip

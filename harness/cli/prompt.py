@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from harness.cli import options, pictures
+from harness.cli import options, pictures, trial
 from harness.cli.estimates import console, echo_json
 from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
@@ -35,11 +35,11 @@ Tokenizer = Annotated[
         "Qwen2."
     ),
 ]
-Model = Annotated[
+Asked = Annotated[
     str | None,
     typer.Option(
-        help="Image prompts only: model whose picture size and picture tokens to use. "
-        f"Default: {pictures.MODEL}."
+        help="Model to ask; of an image prompt, the model whose picture size and picture tokens to use. "
+        f"Default: nobody is asked, and {pictures.MODEL}'s pictures."
     ),
 ]
 
@@ -174,7 +174,10 @@ def check(
     version: Version,
     dataset: options.Dataset = resources.DATASET,
     tokenizer: Tokenizer = None,
-    model: Model = None,
+    model: Asked = None,
+    engine: options.Engine = None,
+    device: options.Device = None,
+    dtype: options.Dtype = None,
     as_json: options.Json = False,
 ) -> None:
     """Render every prompt of every scene and count its tokens. Exit code 1 if one is outside the budget.
@@ -183,6 +186,11 @@ def check(
     repair turn is counted with the longest answer that a role may give. A picture counts as many tokens as
     the model's card says; the exit code is also 1 if the model's own image processor is installed and makes
     another number.
+
+    With --model, the model is asked twelve fixed questions in each role, and pairs of scenes that differ in
+    one fact. What it does with the prompt is said in words: whether it copies placeholders or examples, sums
+    wrongly, runs to the limit, follows the letter of a read-out, ignores the scene. The questions are of tune
+    layouts. An image prompt is not asked.
     """
     from harness.backends.tokens import counter, spread_of
     from harness.dataset import load
@@ -194,8 +202,7 @@ def check(
     words = data.scenario.prompt_words
     scenes = data.scenes(data.courses())
     taker = pictures.taker(prompt, model, checked=True)
-    if taker is None and model:
-        raise UserError(f"--model: prompt {version} shows no picture; leave it out")
+    asks = trial.asks(prompt, model, engine) if model and taker is None else None
     if difference := taker and taker.difference:
         typer.echo(difference)
         raise typer.Exit(1)
@@ -232,10 +239,11 @@ def check(
                 render(scene, ego, dense[:n])
             progress(1)
     stats = {role: spread_of(n) for role, n in sizes.items() if n}
+    tried = trial.tried(prompt, asks, device, dtype, as_json) if asks else None
     if as_json:
         figures = {"version": version, "budget": [least, most], "tokens": stats, "outside": outside}
         seen = {"picture": {**taker.as_mapping(), "checked": taker.checked}} if taker else {}
-        echo_json({**figures, **seen}, indent=None)
+        echo_json({**figures, **seen, **(trial.as_mapping(*tried) if tried else {})}, indent=None)
     else:
         typer.echo(
             f"{version}: renders for every viewer of {len(scenes)} scenes; budget {least} to {most} tokens"
@@ -254,6 +262,8 @@ def check(
             heard = f" with messages of {o['messages']}" if o["messages"] else ""
             repair = " with a repair turn" if o["call"] == REPAIR else ""
             typer.echo(f"scene {o['scene']} viewer {o['viewer']}{heard}{repair}: {o['tokens']} tokens")
+        if tried:
+            trial.show(*tried)
     if outside:
         raise typer.Exit(1)
 

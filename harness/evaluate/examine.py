@@ -1,16 +1,16 @@
 """Ask a model the fixed questions, and find out what its read-outs follow: the letter, or the scene."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from statistics import fmean
 
-from harness.backends.base import Backend, Completion
+from harness.backends.base import Backend, Completion, Request
 from harness.backends.findings import Findings, Moved
 from harness.core.errors import UserError
 from harness.evaluate import questions
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import answer_of
-from harness.evaluate.questions import Pair
+from harness.evaluate.questions import Fact, Pair
 
 LEAST_MOVED = 0.05  # by how much the expected action becomes likelier where a fact counts
 COUNT = 12 + 2 * 16  # requests that an examination asks
@@ -27,7 +27,7 @@ def examine(
         What was found, or why a question got no answer.
     """
     reader = replace(agent, answer="readout", letters=agent.letters if agent.answer == "readout" else None)
-    pairs = questions.pairs(reader)
+    pairs = [*questions.scene_pairs(reader), *questions.plain_pairs(reader)]
     asked = [
         *questions.requests(replace(reader, letters="cyclic")),
         *(half for pair in pairs for half in (pair.present, pair.absent)),
@@ -42,9 +42,6 @@ def examine(
             return done[-1].error
         progress(1)
     of_letters, rest = done[: -2 * len(pairs)], iter(done[-2 * len(pairs) :])
-    changes = [
-        (pair.fact, _likelihood(pair, next(rest), 0) - _likelihood(pair, next(rest), 1)) for pair in pairs
-    ]
     return Findings(
         prompt=agent.prompt.version,
         letters=str(reader.letters),
@@ -52,20 +49,31 @@ def examine(
         letter_share=round(fmean(c.letter_share or 0.0 for c in of_letters), 4),
         follows_letter=sum(bool(c.follows_letter) for c in of_letters),
         label_mass=round(fmean(c.label_mass or 0.0 for c in of_letters), 4),
-        pairs=tuple(
-            _moved(fact, [change for of, change in changes if of == fact])
-            for fact in dict.fromkeys(pair.fact for pair in pairs)
-        ),
+        pairs=moved(pairs, rest),
     )
 
 
-def _moved(fact: str, changes: Sequence[float]) -> Moved:
-    moved = sum(change >= LEAST_MOVED for change in changes)
-    return Moved(fact, len(changes), moved, round(fmean(changes), 4))
+def moved(pairs: Sequence[Pair], completions: Iterator[Completion]) -> tuple[Moved, ...]:
+    """Return by fact how the answers to some pairs moved, of the pairs of which both halves can be read.
+
+    Args:
+        pairs: the pairs.
+        completions: the answers, two a pair: with the fact, and without.
+    """
+    changes: dict[Fact, list[float]] = {}
+    for pair in pairs:
+        likely = [_likelihood(pair, half, next(completions)) for half in (pair.present, pair.absent)]
+        readable = [p for p in likely if p is not None]
+        of_fact = changes.setdefault(pair.fact, [])
+        if len(readable) == len(likely):
+            of_fact.append(readable[0] - readable[1])
+    return tuple(
+        Moved(fact, len(all_), sum(c >= LEAST_MOVED for c in all_), round(fmean(all_), 4) if all_ else 0.0)
+        for fact, all_ in changes.items()
+    )
 
 
-def _likelihood(pair: Pair, completion: Completion, half: int) -> float:
-    """Return how likely the expected action is in one half of a pair."""
-    request = (pair.present, pair.absent)[half]
-    intent = answer_of(request, completion).intent
-    return intent[request.actions.index(pair.expected)] if intent else 0.0
+def _likelihood(pair: Pair, half: Request, completion: Completion) -> float | None:
+    """Return how likely the expected action is in one half of a pair; None if that cannot be read."""
+    intent = answer_of(half, completion).intent
+    return intent[half.actions.index(pair.expected)] if intent else None

@@ -83,31 +83,40 @@ def requests(agent: Agent, role: Role = "ego") -> list[Request]:
     ]
 
 
-def pairs(agent: Agent) -> list[Pair]:
-    """Return the pairs of an agent that reads out: four of each kind of fact.
+def scene_pairs(agent: Agent) -> list[Pair]:
+    """Return the pairs of scenes as an agent is asked them as the ego: four of each kind of fact.
 
-    In the scenes a conflict is listed or not, or the other vehicle arrives `SOON_S` or `LATE_S` after the
-    ego: SLOWER should be likelier with the conflict, and with the small gap. The other questions are answered
-    YES or NO: whether to brake in danger or without, and whether the first of two numbers is greater.
+    A conflict is listed or not, or the other vehicle arrives `SOON_S` or `LATE_S` after the ego: SLOWER
+    should be likelier with the conflict, and with the small gap.
     """
 
-    def of_scene(fact: Fact, number: int, present: Mapping[str, Any], absent: Mapping[str, Any]) -> Pair:
+    def pair(fact: Fact, number: int, present: Mapping[str, Any], absent: Mapping[str, Any]) -> Pair:
         halves = (("a", present), ("b", absent))
         return Pair(
             fact, "SLOWER", *(_request(agent, half, f"{fact}-{number}{end}/ego") for end, half in halves)
         )
 
-    found = []
+    every = []
     for n, question in enumerate(questions()[::3]):
         graph = question.graphs["ego"]
-        found.append(of_scene("conflict", n, graph, {**graph, "conflicts": []}))
-        found.append(of_scene("gap", n, _arriving(graph, SOON_S), _arriving(graph, LATE_S)))
+        every.append(pair("conflict", n, graph, {**graph, "conflicts": []}))
+        every.append(pair("gap", n, _arriving(graph, SOON_S), _arriving(graph, LATE_S)))
+    return every
+
+
+def plain_pairs(agent: Agent) -> list[Pair]:
+    """Return the pairs of plain questions to an agent that reads out: four of each kind of fact.
+
+    They are answered YES or NO: whether to brake in danger or without, and whether the first of two numbers
+    is greater.
+    """
+    every = []
     for n, (present_text, absent_text) in enumerate(_DANGER):
-        found.append(_plain(agent, "danger", n, f"{present_text} Brake?", f"{absent_text} Brake?"))
+        every.append(_plain(agent, "danger", n, f"{present_text} Brake?", f"{absent_text} Brake?"))
     for n, (large, small) in enumerate(_NUMBERS):
         texts = (f"Is {a} greater than {b}?" for a, b in ((large, small), (small, large)))
-        found.append(_plain(agent, "number", n, *texts))
-    return found
+        every.append(_plain(agent, "number", n, *texts))
+    return every
 
 
 def _request(agent: Agent, graph: Mapping[str, Any], name: str) -> Request:

@@ -169,7 +169,7 @@ def test_a_processor_that_is_here_is_asked_and_a_difference_ends_with_one(
         (("show", "v7", "--scene", "00001-0", "--model", "qwen3-4b"), "--model qwen3-4b: prompt v7 shows a "
          "picture, and this model reads texts alone (its card has no [vision]); give another"),
         (("check", "v8", "--model", "proxy"), "--model proxy: prompt v8 shows a picture"),
-        (("check", "v2", "--model", "qwen3-vl-2b"), "--model: prompt v2 shows no picture; leave it out"),
+        (("check", "v2", "--model", "proxy"), "--model proxy: it reads no prompt; give a language model"),
         (("show", "v2", "--scene", "00001-0", "--out", "x"), "--out: prompt v2 shows no picture"),
     ],
 )  # fmt: skip

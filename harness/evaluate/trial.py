@@ -1,0 +1,157 @@
+"""Ask a model the fixed questions in words, and count what its answers do with the prompt."""
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from msgspec import Struct
+
+from harness.backends.base import Backend, Completion, Request, Role
+from harness.backends.findings import Moved
+from harness.core.errors import Unanswered, printable
+from harness.evaluate import questions
+from harness.evaluate.agent import Agent
+from harness.evaluate.asking import answer_of
+from harness.evaluate.examine import moved
+from harness.parsing.status import Repair, Status
+from harness.runs.records import Answer
+
+ROLES: tuple[Role, ...] = ("ego", "helper")
+COUNT = len(ROLES) * 12 + 2 * 8  # requests of a trial
+CHUNK = 8  # requests that are asked together
+
+
+class Answers(Struct, frozen=True):
+    """What one role's answers to the fixed questions are like.
+
+    Attributes:
+        role: the role.
+        n: number of questions.
+        readable: answers that say what to do.
+        strict: answers that need no repair.
+        distinct: answers that differ in their text.
+        action: the commonest likeliest action of the readable ones; None without any.
+        action_count: in how many of them it is the likeliest.
+        example_copies: answers that are one of the prompt's examples' answers.
+        placeholder_copies: answers that copy a placeholder of the prompt.
+        bad_sums: answers whose numbers do not sum to one.
+        at_limit: answers that ran to the limit of tokens.
+        faults: how many answers have each fault for which they cannot be read, by status; an answer may have
+            several.
+        sample: the first text of the commonest kind.
+    """
+
+    role: Role
+    n: int
+    readable: int
+    strict: int
+    distinct: int
+    action: str | None
+    action_count: int
+    example_copies: int
+    placeholder_copies: int
+    bad_sums: int
+    at_limit: int
+    faults: dict[str, int]
+    sample: str
+
+    def sentences(self) -> Iterator[str]:
+        """Yield what the role's answers do with the prompt, the most telling first."""
+        causes = {
+            "copy a placeholder of the prompt": self.placeholder_copies,
+            "are word for word the answer of an example": self.example_copies,
+            "state numbers that do not sum to one": self.bad_sums,
+            "run to the limit of tokens": self.at_limit,
+        }
+        known, meanings = {Status.SCHEMA_ECHO, Status.BAD_SUM}, {str(s): s.meaning for s in Status}
+        for status, count in self.faults.items():
+            if status not in known:
+                meaning = meanings[status].rstrip(".")
+                causes[f"cannot be read: {meaning[0].lower()}{meaning[1:]} ({status})"] = count
+        for what, count in sorted(causes.items(), key=lambda cause: -cause[1]):
+            if count:
+                yield f"{count} of {self.n} answers {what}"
+        if self.distinct == 1 and self.n > 1:
+            yield f"all {self.n} answers are the same text, whatever is asked"
+        elif self.action_count == self.readable > 1:
+            yield f"{self.action} is the likeliest action in all {self.readable} readable answers"
+
+
+class Trial(Struct, frozen=True):
+    """What a model does with a prompt.
+
+    Attributes:
+        model: name of the model.
+        prompt: the prompt version.
+        roles: each role's answers.
+        pairs: how the ego's answers moved in pairs of scenes that differ in one fact.
+    """
+
+    model: str
+    prompt: str
+    roles: tuple[Answers, ...]
+    pairs: tuple[Moved, ...]
+
+
+def try_out(backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None) -> Trial:
+    """Ask a model the fixed questions in both roles, and the ego the pairs of scenes; `COUNT` requests.
+
+    Raises:
+        Unanswered: a question got no answer.
+    """
+    pairs = questions.scene_pairs(agent)
+    by_role = {role: questions.requests(agent, role) for role in ROLES}
+    halves = [half for pair in pairs for half in (pair.present, pair.absent)]
+    everything = [*by_role["ego"], *by_role["helper"], *halves]
+    completions: list[Completion] = []
+    for start in range(0, len(everything), CHUNK):
+        chunk = everything[start : start + CHUNK]
+        completions += backend.complete(chunk)
+        for completion in completions[start:]:
+            if completion.error is not None:
+                raise Unanswered(f"{printable(completion.error, 300)}: a fixed question got no answer")
+        progress(len(chunk))
+    rest = iter(completions)
+    roles = tuple(
+        _answers(agent, role, [(request, next(rest)) for request in by_role[role]]) for role in ROLES
+    )
+    return Trial(agent.card.name, agent.prompt.version, roles, moved(pairs, rest))
+
+
+def _answers(agent: Agent, role: Role, asked: Sequence[tuple[Request, Completion]]) -> Answers:
+    answers = [answer_of(request, completion) for request, completion in asked]
+    examples = [_value(e.answer) for e in agent.prompt.examples.of(role)] if agent.prompt.examples else []
+    intents = [answer.intent for answer in answers if answer.intent]
+    likeliest = Counter(asked[0][0].actions[intent.index(max(intent))] for intent in intents)
+    action = max(likeliest, key=likeliest.__getitem__, default=None)
+    faults = Counter(fault for answer in answers for fault in faults_of(answer))
+    texts = Counter(answer.raw.strip() for answer in answers)
+    return Answers(
+        role=role, n=len(answers), readable=len(intents),
+        strict=sum(answer.status == Status.STRICT for answer in answers), distinct=len(texts),
+        action=action, action_count=max(likeliest.values(), default=0),
+        example_copies=sum(_value(answer.raw.strip()) in examples for answer in answers),
+        placeholder_copies=sum(_echoes(answer) for answer in answers),
+        bad_sums=faults[Status.BAD_SUM], at_limit=sum(a.finish_reason == "length" for a in answers),
+        faults=dict(faults.most_common()), sample=texts.most_common(1)[0][0],
+    )  # fmt: skip
+
+
+def faults_of(answer: Answer) -> tuple[str, ...]:
+    """Return all faults of an answer that cannot be read, the first first; none of one that can."""
+    if answer.intent:
+        return ()
+    return answer.faults or (answer.status,)
+
+
+def _echoes(answer: Answer) -> bool:
+    return Status.SCHEMA_ECHO in faults_of(answer) or Repair.EVIDENCE_ECHO in answer.repairs
+
+
+def _value(text: str) -> Any:
+    """Return the value of a JSON text, so that spaces do not count; the text where it is none."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
