@@ -201,7 +201,7 @@ def test_parity_is_measured_with_pictures_too(tiny: Path, theirs: Any) -> None:
         [question(n, image, how) for n, image in enumerate((A, B))] for how in ("json", "readout")
     )
     compared = compare(theirs.engine.card, card_of(tiny), asked, letters, lambda done: None)
-    found = {finding.what: finding for finding in compared}
+    found = {finding.what: finding for finding in compared.findings}
     assert found["F32: token ids equal"].measured == 1.0
     assert 1e-6 < found["F32: largest difference of a logit"].measured < ROUNDED
     assert found["F32: largest difference of a read-out"].measured < ROUNDED

@@ -1,4 +1,4 @@
-"""`harness parity` on a tiny Qwen3: a GGUF file of the same weights, and one of others."""
+"""`harness parity`: a tiny Qwen3 beside a GGUF file of its weights or of others, and a Llama's GGUF file."""
 
 import json
 import shutil
@@ -11,6 +11,7 @@ pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
 
+import tiny_llama
 import tiny_qwen3
 import torch
 import transformers
@@ -58,8 +59,11 @@ def compared(folder: Path, data: Dataset) -> dict[str, Finding]:
     passes: list[int] = []
     found = compare(spec.ego.card, cards.resolve(str(folder), "llama-cpp"), asked, letters, passes.append)
     assert passes == [1] * PASSES
-    assert {finding.n for finding in found} == {PROMPTS}
-    return {finding.what: finding for finding in found}
+    assert found.left_out is None
+    # Tokens are those of the questions for JSON and of those for a letter.
+    counts = {f.what: 2 * PROMPTS if "token ids" in f.what else PROMPTS for f in found.findings}
+    assert counts == {f.what: f.n for f in found.findings}
+    return {finding.what: finding for finding in found.findings}
 
 
 def test_the_engines_agree_on_the_same_weights(tiny: Path, small: Dataset) -> None:
@@ -103,3 +107,48 @@ def test_a_version_with_examples_is_compared_too(tiny: Path, small_path: Path) -
     said = CliRunner().invoke(app, [*arguments, "--json"])
     assert said.exception is None or isinstance(said.exception, SystemExit)
     assert len(json.loads(said.stdout)["findings"]) == 10
+
+
+@pytest.fixture(scope="module")
+def llama(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A GGUF file alone, of an architecture that is not exported."""
+    return tiny_llama.build(tmp_path_factory.mktemp("llama") / "tiny.gguf", "Q8_0", context=4096)
+
+
+def test_another_architecture_is_compared_but_for_its_export(
+    llama: Path, small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path))
+    here, there = (cards.resolve(str(llama), engine) for engine in ("transformers", "llama-cpp"))
+    of = {}
+    for answer in ("json", "readout"):
+        spec = spec_of(small, str(llama), answer=answer)
+        raw = replace(spec, ego=replace(spec.ego, card=here, letters="raw"))
+        of[answer] = [replace(request, max_tokens=8) for request in list(requests(raw, scenes_of(small)))[:2]]
+    passes: list[int] = []
+    found = compare(here, there, of["json"], of["readout"], passes.append)
+    assert sum(passes) == PASSES
+    assert "LlamaForCausalLM" in (found.left_out or "")
+    measured = {finding.what: finding.measured for finding in found.findings}
+    assert list(measured) == [
+        "GGUF: token ids equal", "GGUF: largest difference of a logit", "GGUF: greedy text equal",
+        "GGUF: largest difference of a read-out", "transformers: text equal in reversed batches of 8",
+    ]  # fmt: skip
+    assert measured["GGUF: token ids equal"] == 1.0
+    assert 0 < measured["GGUF: largest difference of a logit"] < 0.1  # llama.cpp rounds what it multiplies
+
+
+def test_read_outs_alone_need_no_text_and_what_was_left_out_is_said(
+    llama: Path, small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path))
+    arguments = ["parity", str(llama), "--dataset", str(small_path), "--prompts", "3", "--read-outs"]
+    said = CliRunner().invoke(app, arguments)
+    assert said.exit_code == 0, said.output
+    *found, left_out, verdict = said.stdout.splitlines()
+    assert [line[:25].split(":")[0] for line in found] == ["ok   GGUF"] * 2
+    assert left_out.startswith("left out: the same weights in F32 on llama.cpp: checkpoint ")
+    assert verdict == "the engines agree: 3 prompts; measured, and what is allowed"
+    report = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
+    assert "LlamaForCausalLM" in report["left_out"]
+    assert [finding["n"] for finding in report["findings"]] == [3, 3]

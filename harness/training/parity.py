@@ -1,16 +1,15 @@
 """Parity: one model through two engines. The same prompts, compared token by token.
 
 transformers in float32 is the reference. llama.cpp is held to it twice: with the very same float32 weights,
-exported on the spot, and with the GGUF file that the model's card names.
+exported on the spot where the architecture can be, and with the GGUF file that the model's card names.
 """
 
-import json
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -20,10 +19,9 @@ from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp import backend as llama_backend
 from harness.backends.llama_cpp.backend import LlamaBackend
 from harness.backends.transformers import engine as transformers_engine
-from harness.backends.weights import find_checkpoint
+from harness.backends.transformers.engine import TransformersEngine
 from harness.core.arrays import Floats
-from harness.core.errors import Unanswered, printable
-from harness.core.files import text_of
+from harness.core.errors import Unanswered, UserError, printable
 from harness.parsing.parse import parse
 from harness.training.gguf_export import export, projector_of
 
@@ -59,13 +57,26 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class Comparison:
+    """What was compared, and what could not be.
+
+    Attributes:
+        findings: everything compared.
+        left_out: why llama.cpp was not held to the same float32 weights; None if it was.
+    """
+
+    findings: tuple[Finding, ...]
+    left_out: str | None
+
+
+@dataclass(frozen=True)
 class Outputs:
     """The outputs of one engine, a prompt at a time.
 
     Attributes:
-        tokens: token ids of the text of each json prompt.
-        logits: log-probabilities of the whole vocabulary after each, (n, V).
-        texts: greedy answers.
+        tokens: token ids of the text of each prompt, of those for JSON first.
+        logits: log-probabilities of the whole vocabulary after each json prompt, (n, V).
+        texts: greedy answers to the json prompts.
         readouts: distributions read out, (n, A).
     """
 
@@ -78,67 +89,81 @@ class Outputs:
 def compare(
     reference: Card, gguf: Card, asked: Sequence[Request], letters: Sequence[Request],
     progress: Callable[[int], None],
-) -> list[Finding]:  # fmt: skip
-    """Hold a GGUF card's model against a checkpoint card's.
+) -> Comparison:  # fmt: skip
+    """Hold a GGUF card's model against the same model on transformers.
 
     Args:
-        reference: a card on transformers.
+        reference: a card on transformers: of a checkpoint, or of a GGUF file, which is unpacked.
         gguf: a card on llama-cpp.
-        asked: requests for JSON.
+        asked: requests for JSON; empty to compare read-outs alone.
         letters: requests for a read-out.
-        progress: called with 1 after each of `PASSES` passes over the prompts.
+        progress: called with 1 after each of `PASSES` passes over the prompts, or with those left out.
 
     Raises:
-        UserError: weights that are not there or do not load; a checkpoint that no GGUF can hold.
+        UserError: weights that are not there or do not load.
     """
-    where = find_checkpoint(reference)
-    config = json.loads(text_of(where / "config.json", "record"))
-    rows = int(config.get("text_config", config)["vocab_size"])  # padding included
     most_logit = SEEN if reference.vision else MOST_LOGIT
     plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")
-    expected = _outputs(plain(batch_size=1), asked, letters, rows)
+    first = plain(batch_size=1)
+    model = cast(TransformersEngine, first.engine).model
+    rows = model.get_input_embeddings().num_embeddings  # padding included
+    expected = _outputs(first, asked, letters, rows)
     progress(1)
-    ids = [r.id for r in asked]
+    json_ids, letter_ids = [r.id for r in asked], [r.id for r in letters]
     findings: list[Finding] = []
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "f32.gguf"
-        export(where, file, "F32")
-        beside = projector_of(file).name if gguf.projector else None
-        same = replace(gguf, weights=str(file), file=None, revision=None, sha256=None, projector=beside)
-        exact = partial(llama_backend.open, same, device="cpu")
-        shipped = partial(llama_backend.open, gguf, device="cpu")
+        file, left_out, exact = Path(folder) / "f32.gguf", None, None
+        engines = [(gguf.quantisation or "GGUF", partial(llama_backend.open, gguf, device="cpu"))]
+        try:
+            export(transformers_engine.checkpoint(reference), file, "F32")
+        except UserError as error:
+            left_out = str(error)
+        else:
+            beside = projector_of(file).name if gguf.projector else None
+            same = replace(gguf, weights=str(file), file=None, revision=None, sha256=None, projector=beside)
+            exact = partial(llama_backend.open, same, device="cpu")
+            engines.insert(0, ("F32", exact))
         alone: list[tuple[str, Callable[..., Backend], list[str]]] = [("transformers", plain, expected.texts)]
-        for label, engine in (("F32", exact), (gguf.quantisation or "GGUF", shipped)):
+        for label, engine in engines:
             other = _outputs(engine(batch_size=1), asked, letters, rows)
             if engine is exact:
-                alone.append(("llama.cpp F32", exact, other.texts))
-            logit = np.abs(expected.logits - other.logits).max(axis=1)
+                alone.append(("llama.cpp F32", engine, other.texts))
+            ids = json_ids + letter_ids
+            findings.append(_equal(f"{label}: token ids equal", 1.0, ids, expected.tokens, other.tokens))
+            if asked:
+                logit = np.abs(expected.logits - other.logits).max(axis=1)
+                most = most_logit.get(label)
+                findings += [
+                    _near(f"{label}: largest difference of a logit", most, json_ids, logit),
+                    _equal(f"{label}: greedy text equal", LEAST_TEXTS, json_ids, expected.texts, other.texts),
+                ]
             readout = np.abs(expected.readouts - other.readouts).max(axis=1)
-            findings += [
-                _equal(f"{label}: token ids equal", 1.0, ids, expected.tokens, other.tokens),
-                _near(f"{label}: largest difference of a logit", most_logit.get(label), ids, logit),
-                _equal(f"{label}: greedy text equal", LEAST_TEXTS, ids, expected.texts, other.texts),
-                _near(f"{label}: largest difference of a read-out", MOST_READOUT, ids, readout),
-            ]
+            what = f"{label}: largest difference of a read-out"
+            findings.append(_near(what, MOST_READOUT, letter_ids, readout))
             progress(1)
-        for label, opened, texts in alone:
+        for label, opened, texts in alone if asked else ():
             what = f"{label}: text equal in reversed batches of {BATCH}"
             together = _texts(opened(batch_size=BATCH), asked[::-1])[::-1]
-            findings.append(_equal(what, 1.0, ids, texts, together))
+            findings.append(_equal(what, 1.0, json_ids, texts, together))
             progress(1)
-    return findings
+    if spared := PASSES - 1 - len(engines) - (len(alone) if asked else 0):
+        progress(spared)
+    return Comparison(tuple(findings), left_out)
 
 
 def _outputs(
     backend: LanguageModel | LlamaBackend, asked: Sequence[Request], letters: Sequence[Request], rows: int
 ) -> Outputs:
-    tokens = [backend.chat.encode(backend.chat.render(r.messages, thinking=r.thinking)) for r in asked]
-    logits = np.concatenate([backend.next_log_probs([r], rows) for r in asked])
+    tokens = [
+        backend.chat.encode(backend.chat.render(r.messages, thinking=r.thinking)) for r in (*asked, *letters)
+    ]
+    logits = [backend.next_log_probs([r], rows) for r in asked]
     readouts = [
         parse(text, role="ego", actions=r.actions).intent or [np.nan] * len(r.actions)
         for r, text in zip(letters, _texts(backend, letters), strict=True)
     ]
-    return Outputs(tokens, logits, _texts(backend, asked), np.array(readouts))
+    together = np.concatenate(logits) if logits else np.empty((0, rows))
+    return Outputs(tokens, together, _texts(backend, asked), np.array(readouts))
 
 
 def _texts(backend: Backend, asked: Sequence[Request]) -> list[str]:
