@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import cache
 from typing import Any
 
 import jsonschema
@@ -10,7 +11,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from harness.parsing.parse import Parsed, parse
-from harness.prompts.answer_schema import answer_schema
+from harness.prompts.answer_schema import Shape, answer_schema
 
 # Whether a shared machine is slow today is no property of the parser.
 unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -19,15 +20,10 @@ unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow]
 PLACEHOLDERS = ("max 12 words", "Max. 12 words.", "one short sentence", "<evidence>", "...", "string")
 ROLES = st.sampled_from(["ego", "helper"])
 
-VALIDATORS = {
-    role: jsonschema.Draft202012Validator(
-        {"oneOf": [answer_schema(role, ACTIONS, form=form) for form in forms]}
-    )
-    for role, forms in {
-        "ego": ("distribution", "maneuver"),
-        "helper": ("distribution", "recommendation"),
-    }.items()
-}
+
+@cache
+def validator(shape: Shape) -> Any:
+    return jsonschema.Draft202012Validator(answer_schema(shape.role, shape.actions, form=shape.form))
 
 
 @st.composite
@@ -48,13 +44,13 @@ def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
-def judged_strict(text: str, role: str) -> bool:
+def judged_strict(text: str, shape: Shape) -> bool:
     """A judge that shares no code with the parser: JSON, jsonschema, the placeholders, and a sum."""
     try:
         value = json.loads(text, object_pairs_hook=_no_key_twice)
     except (ValueError, RecursionError):
         return False
-    if not VALIDATORS[role].is_valid(value):
+    if not validator(shape).is_valid(value):
         return False
     if value.get("evidence") in PLACEHOLDERS:
         return False

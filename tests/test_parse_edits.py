@@ -2,11 +2,13 @@
 
 import json
 
+from corpus import ACTIONS
 from hypothesis import given
 from hypothesis import strategies as st
 from judging import ego, hundredths, judged_strict, unhurried
 
 from harness.parsing.parse import Status
+from harness.prompts.answer_schema import Shape
 
 # The sum is the checksum. One edited character changes a distribution in hundredths by 0.01 or more, or by a
 # third decimal, which is at most 0.009. So a changed intent is never exact, but for that decimal's 0.001.
@@ -37,7 +39,7 @@ def test_one_edited_character_never_changes_an_intent_unseen(
         if parsed.intent is None:
             continue
         if parsed.status is Status.STRICT:
-            assert judged_strict(mutant, "ego")
+            assert judged_strict(mutant, Shape("ego", ACTIONS))
         change = max(abs(p - q) for p, q in zip(parsed.intent, original, strict=True))
         assert change <= (0.026 if "renormalised" in parsed.repairs else 0.0011), mutant
 

@@ -12,6 +12,7 @@ from judging import PLACEHOLDERS, ROLES, hundredths, judged_strict, unhurried
 
 from harness.parsing.parse import Repair, Status, _unmended, parse
 from harness.parsing.strict import fitting
+from harness.prompts.answer_schema import FORMS, Shape
 
 NAMES = st.lists(
     st.from_regex(r"[A-Z]{2,6}(_[A-Z]{2,6})?", fullmatch=True), min_size=2, max_size=6, unique=True
@@ -47,12 +48,15 @@ ANSWERS = st.fixed_dictionaries(
 )
 
 
+SHAPES = st.sampled_from([Shape(role, ACTIONS, form) for role in FORMS for form in (None, *FORMS[role])])
+
+
 @unhurried
-@given(ANSWERS, ROLES)
-def test_strict_is_what_the_published_schema_and_the_sum_say_of_any_object(value: Any, role: str) -> None:
+@given(ANSWERS, SHAPES)
+def test_strict_is_what_the_published_schema_and_the_sum_say_of_any_object(value: Any, shape: Shape) -> None:
     text = json.dumps(value)
-    strict = parse(text, role=role, actions=ACTIONS).status is Status.STRICT
-    assert strict == judged_strict(text, role)
+    strict = parse(text, **shape._asdict()).status is Status.STRICT
+    assert strict == judged_strict(text, shape)
 
 
 @unhurried
@@ -67,14 +71,18 @@ def test_strict_is_what_the_published_schema_and_the_sum_say_of_any_object(value
             "recommended_maneuver": st.sampled_from([*ACTIONS, "idle"]),
             "confidence": st.one_of(st.floats(0, 1), NUMBERS),
         },
-    )
+    ),
+    SHAPES,
 )
-def test_strict_is_what_the_published_schema_says_of_near_valid_helper_messages(value: Any) -> None:
+def test_strict_is_what_the_published_schema_says_of_near_valid_messages(value: Any, shape: Shape) -> None:
+    if shape.role == "ego":
+        value = {key.removeprefix("recommended_"): v for key, v in value.items() if key not in REPORT}
     text = json.dumps(value)
-    strict = parse(text, role="helper", actions=ACTIONS).status is Status.STRICT
-    assert strict == judged_strict(text, "helper")
+    strict = parse(text, **shape._asdict()).status is Status.STRICT
+    assert strict == judged_strict(text, shape)
 
 
+REPORT = ("evidence", "risk")
 ONLY_JSON = [c for c in CASES if not c.asked.get("thinking") and not c.asked.get("reasons_first")]
 
 
@@ -83,7 +91,9 @@ def test_strict_is_what_the_published_schema_and_the_sum_say_of_the_corpus(case:
     if case.status is Status.ENGINE_ERROR:
         return  # not judged by its text
     text = case.text.removeprefix("<think>\n\n</think>")
-    assert (case.status is Status.STRICT) == judged_strict(text, case.asked["role"])
+    assert (case.status is Status.STRICT) == judged_strict(
+        text, Shape(case.asked["role"], ACTIONS, case.asked.get("form"))
+    )
 
 
 PROSE = st.text(st.characters(exclude_characters="{｛<＜[&\\`~", codec="utf-8"), max_size=60)
@@ -105,20 +115,21 @@ def test_reasons_that_were_asked_for_change_nothing_of_a_verdict(reasons: str, v
 
 
 @unhurried
-@given(ANSWERS, ROLES, st.data())
-def test_the_quick_reading_is_the_slow_one_or_none(value: Any, role: str, data: st.DataObject) -> None:
+@given(ANSWERS, SHAPES, st.data())
+def test_the_quick_reading_is_the_slow_one_or_none(value: Any, shape: Shape, data: st.DataObject) -> None:
     text = json.dumps(value, ensure_ascii=data.draw(st.booleans()))
     at = data.draw(st.integers(0, len(text)))
     added = data.draw(
         st.sampled_from(["", " ", ",", '"risk":"low",', "\\u003a", ":", "0", "1e0", "\n", "\ufeff"])
     )
-    check_readings_agree(text[:at] + added + text[at:], role)
+    check_readings_agree(text[:at] + added + text[at:], shape)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
 def test_the_quick_reading_of_the_corpus_is_the_slow_one_or_none(case: Any) -> None:
-    for role in ("ego", "helper"):
-        check_readings_agree(case.text, role)
+    for role, forms in FORMS.items():
+        for form in (None, *forms):
+            check_readings_agree(case.text, Shape(role, ACTIONS, form))
 
 
 @pytest.mark.parametrize(
@@ -128,14 +139,16 @@ def test_the_quick_reading_of_the_corpus_is_the_slow_one_or_none(case: Any) -> N
 @pytest.mark.parametrize("again", ["", '"evidence":"b",', '"evidence":"b:c",', '"risk":"low",'])
 def test_the_quick_reading_is_not_deceived_by_a_key_given_twice(evidence: str, again: str) -> None:
     text = f'{{{again}"evidence":"{evidence}","risk":"high","recommended_maneuver":"IDLE","confidence":1}}'
-    check_readings_agree(text, "helper")
-    quick = fitting(text, "helper", ACTIONS)
+    shape = Shape("helper", ACTIONS)
+    check_readings_agree(text, shape)
+    quick = fitting(text, shape)
     assert (quick is not None) == (again == "" and evidence in ("", "v6: left", "\x7f", "é" * 200))
 
 
-def check_readings_agree(text: str, role: str) -> None:
-    quick = fitting(text, role, ACTIONS)
-    assert quick is None or quick == _unmended(text, role, ACTIONS)
+def check_readings_agree(text: str, shape: Shape) -> None:
+    """The quick reading is that of the slow one, which asks jsonschema."""
+    quick = fitting(text, shape)
+    assert quick is None or quick == _unmended(text, shape)
 
 
 @unhurried

@@ -324,10 +324,10 @@ def test_reasons_before_the_answer_are_a_repair_only_if_the_prompt_did_not_ask(
     spec = spec_of(small, prompt=version)
     scene = scenes_of(small)[0]
     ego = 'The truck hides the left.\n{"action_distribution": {"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}}'
-    helper = (
-        'A car comes from the left.\n{"evidence": "car", "risk": "high", "recommended_maneuver": "SLOWER", '
-        '"confidence": 0.8}'
-    )
+    judged = '"recommended_maneuver": "SLOWER", "confidence": 0.8'
+    if spec.ego.prompt.helper_answer == "distribution":
+        judged = ego.partition("{")[2][:-1]
+    helper = f'A car comes from the left.\n{{"evidence": "car", "risk": "high", {judged}}}'
     told = {}
     for request in requests(spec, [scene]):
         said = Completion(request.id, ego if request.role == "ego" else helper, None, None, "stop", None, 1)

@@ -14,7 +14,7 @@ from harness.backends.skeleton import TWO_DIGITS, Skeleton, finished, parts, tok
 from harness.backends.tokens import tokenizer
 from harness.core.errors import UserError
 from harness.parsing.parse import Status, parse
-from harness.prompts.answer_schema import answer_schema
+from harness.prompts.answer_schema import Shape, answer_schema
 
 THREE = ("SLOWER", "IDLE", "FASTER")
 FIVE = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
@@ -73,8 +73,7 @@ def played(skeleton: Skeleton, choose: Callable[[list[int]], int]) -> tuple[list
 
 
 def test_the_egos_text_is_a_distribution_with_two_digits_an_action() -> None:
-    assert parts("ego", "recommendation", THREE) == parts("ego", "distribution", THREE)
-    assert parts("ego", "distribution", THREE) == [
+    assert parts(Shape("ego", THREE, "distribution")) == [
         '{"action_distribution":{"SLOWER":0.', TWO_DIGITS,
         ',"IDLE":0.', TWO_DIGITS,
         ',"FASTER":0.', TWO_DIGITS,
@@ -83,13 +82,13 @@ def test_the_egos_text_is_a_distribution_with_two_digits_an_action() -> None:
 
 
 def test_a_helper_says_its_risk_first_and_has_no_words_for_evidence() -> None:
-    assert parts("helper", "distribution", ("GO", "STOP")) == [
+    assert parts(Shape("helper", ("GO", "STOP"), "distribution")) == [
         '{"evidence":"","risk":"', ("low", "medium", "high"),
         '","action_distribution":{"GO":0.', TWO_DIGITS,
         ',"STOP":0.', TWO_DIGITS,
         "}}",
     ]  # fmt: skip
-    assert parts("helper", "recommendation", ("GO", "STOP")) == [
+    assert parts(Shape("helper", ("GO", "STOP"), "recommendation")) == [
         '{"evidence":"","risk":"', ("low", "medium", "high"),
         '","recommended_maneuver":"', ("GO", "STOP"),
         '","confidence":0.', TWO_DIGITS,
@@ -115,7 +114,7 @@ def test_a_helper_says_its_risk_first_and_has_no_words_for_evidence() -> None:
 def test_the_digits_are_kept_and_their_sum_is_divided_out_when_they_are_read(
     digits: list[int], text: str, intent: tuple[float, ...] | None, repairs: list[str]
 ) -> None:
-    written = finished("ego", "distribution", THREE, digits)
+    written = finished(Shape("ego", THREE, "distribution"), digits)
     assert written == f'{{"action_distribution":{{{text}}}}}'
     parsed = parse(written, role="ego", actions=THREE, divides=True)
     assert parsed.intent == (None if intent is None else pytest.approx(intent))
@@ -124,7 +123,7 @@ def test_the_digits_are_kept_and_their_sum_is_divided_out_when_they_are_read(
 
 
 def test_a_recommendation_keeps_its_confidence() -> None:
-    assert finished("helper", "recommendation", THREE, [2, 1, 7]) == (
+    assert finished(Shape("helper", THREE, "recommendation"), [2, 1, 7]) == (
         '{"evidence":"","risk":"high","recommended_maneuver":"IDLE","confidence":0.07}'
     )
 
@@ -134,9 +133,9 @@ def test_every_filling_fits_the_schema_and_is_read_as_it_stands(
     data: st.DataObject, kind: tuple[str, str], actions: tuple[str, ...]
 ) -> None:
     role, form = kind
-    options = [p for p in parts(role, form, actions) if not isinstance(p, str)]
+    options = [p for p in parts(Shape(role, actions, form)) if not isinstance(p, str)]
     chosen = [data.draw(st.integers(0, len(option) - 1)) for option in options]
-    text = finished(role, form, actions, chosen)
+    text = finished(Shape(role, actions, form), chosen)
     jsonschema.validate(json.loads(text), answer_schema(role, actions))
     parsed = parse(text, role=role, actions=actions, divides=True)
     if form != "distribution" and role == "helper":
@@ -159,16 +158,16 @@ def test_every_filling_fits_the_schema_and_is_read_as_it_stands(
 def test_the_tokens_are_those_of_the_whole_text(
     chat: Any, kind: tuple[str, str], actions: tuple[str, ...], random: Any
 ) -> None:
-    skeleton = Skeleton(chat, *kind, actions)
+    skeleton = Skeleton(chat, Shape(kind[0], actions, kind[1]))
     ids, choices, chosen = played(skeleton, random.choice)
-    whole = chat.encode(finished(*kind, actions, chosen))
+    whole = chat.encode(finished(Shape(kind[0], actions, kind[1]), chosen))
     assert ids == whole[: len(ids)], "another cut than the tokenizer's own"
     assert skeleton.count(chosen) == len(whole) <= skeleton.most_tokens
     assert all(among == sorted(set(among)) and len(among) > 1 for among in choices)
 
 
 def test_labels_that_begin_alike_are_decided_where_they_part() -> None:
-    skeleton = Skeleton(CHARACTERS, "helper", "recommendation", ("LANE_LEFT", "LANE_RIGHT", "IDLE"))
+    skeleton = Skeleton(CHARACTERS, Shape("helper", ("LANE_LEFT", "LANE_RIGHT", "IDLE"), "recommendation"))
     said = iter("hLR07")
     ids, choices, chosen = played(skeleton, lambda among: ord(next(said)))
     assert ["".join(map(chr, among)) for among in choices] == [
@@ -190,7 +189,7 @@ def test_in_qwens_vocabulary_the_lanes_share_two_tokens_and_are_one_decision() -
     left, right = qwen.encode("LANE_LEFT"), qwen.encode("LANE_RIGHT")
     assert left[:2] == right[:2]
     assert len(left) == len(right) == 3
-    skeleton = Skeleton(qwen, "helper", "recommendation", ("LANE_LEFT", "LANE_RIGHT"))
+    skeleton = Skeleton(qwen, Shape("helper", ("LANE_LEFT", "LANE_RIGHT"), "recommendation"))
     _, choices, chosen = played(skeleton, max)
     assert choices[1] == sorted([left[2], right[2]])
     assert chosen[1] == (0 if left[2] > right[2] else 1)
@@ -199,7 +198,7 @@ def test_in_qwens_vocabulary_the_lanes_share_two_tokens_and_are_one_decision() -
 @pytest.mark.parametrize(("said", "maneuver"), [('l"07', "SLOW"), ("lE07", "SLOWER")])
 def test_a_label_that_is_another_ones_beginning_ends_with_its_quote(said: str, maneuver: str) -> None:
     actions = ("SLOWER", "SLOW")
-    skeleton = Skeleton(CHARACTERS, "helper", "recommendation", actions)
+    skeleton = Skeleton(CHARACTERS, Shape("helper", actions, "recommendation"))
     tokens = iter(said)
     ids, choices, chosen = played(skeleton, lambda among: ord(next(tokens)))
     assert "".join(map(chr, choices[1])) == '"E'
@@ -218,7 +217,7 @@ def test_a_tokenizer_that_merges_digits_is_asked_for_both_at_once() -> None:
         return ids
 
     merging: Any = Encoder("merging", pairs)
-    _, choices, chosen = played(Skeleton(merging, "ego", "distribution", ("GO",)), max)
+    _, choices, chosen = played(Skeleton(merging, Shape("ego", ("GO",), "distribution")), max)
     assert choices == [[100000 + n for n in range(100)]]
     assert chosen == [99]
 
@@ -236,12 +235,12 @@ def test_where_a_token_spans_the_cut_the_text_alone_is_taken() -> None:
 def test_a_tokenizer_that_cannot_tell_labels_apart_is_refused() -> None:
     blind: Any = Encoder("blind", lambda text: [min(ord(c), 128) for c in text])
     with pytest.raises(UserError, match=r"'blind'.*tell the choices.*--answer json"):
-        Skeleton(blind, "helper", "recommendation", ("é", "è"))
+        Skeleton(blind, Shape("helper", ("é", "è"), "recommendation"))
 
 
 def test_an_ego_may_be_asked_for_one_action_and_a_confidence() -> None:
-    pieces = parts("ego", "maneuver", ("SLOWER", "IDLE"))
+    pieces = parts(Shape("ego", ("SLOWER", "IDLE"), "maneuver"))
     assert pieces == ['{"maneuver":"', ("SLOWER", "IDLE"), '","confidence":0.', TWO_DIGITS, "}"]
-    text = finished("ego", "maneuver", ("SLOWER", "IDLE"), [1, 70])
+    text = finished(Shape("ego", ("SLOWER", "IDLE"), "maneuver"), [1, 70])
     jsonschema.validate(json.loads(text), answer_schema("ego", ("SLOWER", "IDLE"), form="maneuver"))
     assert parse(text, role="ego", actions=("SLOWER", "IDLE")).intent == pytest.approx((0.3, 0.7))

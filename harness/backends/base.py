@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from harness.core.files import canonical_json
 from harness.core.image import Image
+from harness.prompts.answer_schema import Shape
 
 if TYPE_CHECKING:
     from harness.runs.records import Latency
@@ -34,8 +35,7 @@ class Request:
             letters; empty if the letters are read once.
         actions: meta-action names, in the environment's order.
         max_tokens: most tokens the answer may have.
-        form: what the prompt asks for (`Prompt.form`): `distribution`, `recommendation` with a confidence,
-            or an ego's `maneuver` with a confidence.
+        form: what the prompt asks for (`Prompt.form`).
         answer: how the model answers. `json`: it writes freely. `constrained`: it fills in numbers and
             choices of a fixed text. `readout`: the messages ask for one letter (see
             `harness.prompts.readout`), and the letters' probabilities are the answer.
@@ -71,6 +71,13 @@ class Request:
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None
     scenario: "Scenario | None" = None
+
+    @property
+    def shape(self) -> Shape:
+        """What the JSON of its answer is to be; a read-out is a bare distribution, even a helper's."""
+        if self.answer == "readout":
+            return Shape("ego", self.actions, "distribution")
+        return Shape(self.role, self.actions, self.form)
 
     @property
     def divides(self) -> bool:

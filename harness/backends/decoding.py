@@ -17,6 +17,7 @@ from harness.backends.orders import averaged
 from harness.backends.sampling import Choice
 from harness.backends.skeleton import Skeleton, finished, parts, tokens_after
 from harness.core.errors import UserError, printable
+from harness.prompts.answer_schema import Shape
 from harness.prompts.readout import letters, stated
 
 
@@ -54,7 +55,7 @@ class Decoding:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._chat = engine.chat
-        self._skeletons: dict[tuple[str, str, tuple[str, ...]], Skeleton] = {}
+        self._skeletons: dict[Shape, Skeleton] = {}
         self._letters: dict[tuple[str, ...], list[list[int]]] = {}
 
     def room(self, request: Request) -> int:
@@ -114,12 +115,12 @@ class Decoding:
     def _drafts(self, requests: Sequence[Request]) -> Drafts:
         """Return guesses that know the fixed text of what each kind of request asks for."""
         drafts = Drafts(self._chat)
-        for kind in {_kind(request) for request in requests}:
+        for shape in {request.shape for request in requests}:
             for option in (0, -1):  # two fillings, so that what differs is not guessed
-                text = "".join(part if isinstance(part, str) else part[option] for part in parts(*kind))
+                text = "".join(part if isinstance(part, str) else part[option] for part in parts(shape))
                 tokens = tokens_after(self._chat, "\n", text)
                 for end in range(1, len(tokens) + 1):
-                    drafts.learn(kind, tokens[:end])
+                    drafts.learn(shape, tokens[:end])
         return drafts
 
     def _follow(
@@ -128,8 +129,8 @@ class Decoding:
         """Append the last token of each answer to the session, and to both what is guessed rightly."""
         guesses = []
         for request, tokens in written.values():
-            drafts.learn(_kind(request), tokens)
-            guesses.append(drafts.after(_kind(request), tokens, request.max_tokens - len(tokens) - 1))
+            drafts.learn(request.shape, tokens)
+            guesses.append(drafts.after(request.shape, tokens, request.max_tokens - len(tokens) - 1))
         width = sorted(map(len, guesses))[len(guesses) // 2]  # no wider than half of the answers fill
         guesses = [guess[:width] for guess in guesses]
         counts = session.follow([tokens[-1:] for _, tokens in written.values()], guesses)
@@ -159,15 +160,15 @@ class Decoding:
                     chosen[i] = end.value
             live = _narrow(session, live, [i not in chosen for i in live])
         return [
-            Answer(finished(r.role, r.form, r.actions, chosen[i]), self._skeleton(r).count(chosen[i]), "stop")
+            Answer(finished(r.shape, chosen[i]), self._skeleton(r).count(chosen[i]), "stop")
             for i, r in enumerate(requests)
         ]
 
     def _skeleton(self, request: Request) -> Skeleton:
-        key = _kind(request)
-        if key not in self._skeletons:
-            self._skeletons[key] = Skeleton(self._chat, *key)
-        skeleton = self._skeletons[key]
+        shape = request.shape
+        if shape not in self._skeletons:
+            self._skeletons[shape] = Skeleton(self._chat, shape)
+        skeleton = self._skeletons[shape]
         if skeleton.most_tokens > request.max_tokens:
             raise UserError(
                 f"model {printable(self._chat.name)!r}: a constrained {request.role} answer takes "
@@ -230,11 +231,6 @@ def _read(actions: Sequence[str], log_p: Sequence[Sequence[Sequence[float]]]) ->
     largest = max(map(max, log_p[0]))
     weights = [math.fsum(math.exp(x - largest) for x in of) for of in log_p[0]]
     return Answer(stated(actions, weights), 1, "stop", min(1.0, math.exp(largest) * sum(weights)))
-
-
-def _kind(request: Request) -> tuple[str, str, tuple[str, ...]]:
-    """Return what decides the text that a request asks for, as `parts` takes it."""
-    return request.role, request.form, request.actions
 
 
 def _narrow(session: Session, live: list[int], unfinished: list[bool]) -> list[int]:

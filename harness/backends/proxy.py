@@ -87,13 +87,16 @@ def _answers(requests: Sequence[Request]) -> list[str]:
 
 def _told(request: Request, view: Mapping[str, Any], intent: dict[str, float]) -> str:
     """Return the text of an answer."""
-    if request.role == "ego":
-        body: dict[str, Any] = {"action_distribution": intent}
-        if request.form == "maneuver":
-            best = max(intent, key=intent.__getitem__)
-            body = {"maneuver": best, "confidence": intent[best]}
+    best = max(intent, key=intent.__getitem__)
+    body: dict[str, Any] = {}
+    if request.role == "helper":
+        unsure = intent["SLOWER"] > (LEAST_DOUBT + MOST_DOUBT) / 2
+        risk = "high" if best == "SLOWER" else "medium" if unsure else "low"
+        body = {"evidence": _reason(view), "risk": risk}
+    if key := request.shape.named:
+        body |= {key: best, "confidence": intent[best]}
     else:
-        body = _message(view, intent, request.form)
+        body["action_distribution"] = intent
     if request.reasons_first:
         return f"{_reason(view)} {canonical_json(body)}"
     return canonical_json(body)
@@ -118,16 +121,6 @@ def _hedged(actions: Sequence[str], planned: str, view: Mapping[str, Any]) -> di
     else:
         shares[planned] = rest - sum(shares.values())
     return dict(zip(actions, rounded([shares.get(a, braking) for a in actions]), strict=True))
-
-
-def _message(view: Mapping[str, Any], intent: dict[str, float], form: str) -> dict[str, Any]:
-    best = max(intent, key=intent.__getitem__)
-    unsure = intent["SLOWER"] > (LEAST_DOUBT + MOST_DOUBT) / 2
-    risk = "high" if best == "SLOWER" else "medium" if unsure else "low"
-    message: dict[str, Any] = {"evidence": _reason(view), "risk": risk}
-    if form == "recommendation":
-        return {**message, "recommended_maneuver": best, "confidence": intent[best]}
-    return {**message, "action_distribution": intent}
 
 
 def _reason(view: Mapping[str, Any]) -> str:

@@ -15,23 +15,23 @@ from typing import NamedTuple
 from harness.backends.chat import Chat
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json
-from harness.prompts.answer_schema import RISKS
+from harness.prompts.answer_schema import RISKS, Shape
 
 Part = str | tuple[str, ...]
 TWO_DIGITS = tuple(f"{n:02d}" for n in range(100))
 
 
-def parts(role: str, form: str, actions: Sequence[str]) -> list[Part]:
+def parts(shape: Shape) -> list[Part]:
     """Return the text in parts: fixed strings, and tuples of options, each between two strings.
 
     Parts begin and end only beside letters and digits, where tokenizers split as well.
     """
     text: list[Part] = []
     opening = "{"
-    if role == "helper":
+    if shape.role == "helper":
         text, opening = ['{"evidence":"","risk":"', RISKS], '",'
-    names = tuple(canonical_json(action) for action in actions)
-    if key := maneuver_key(role, form):
+    names = tuple(canonical_json(action) for action in shape.actions)
+    if key := shape.named:
         bare = tuple(name[1:-1] for name in names)
         return [*text, f'{opening}"{key}":"', bare, '","confidence":0.', TWO_DIGITS, "}"]
     opening += '"action_distribution":{'
@@ -41,17 +41,10 @@ def parts(role: str, form: str, actions: Sequence[str]) -> list[Part]:
     return [*text, "}}"]
 
 
-def maneuver_key(role: str, form: str) -> str | None:
-    """Return the key of the action that a form of answer names; None if the form is a distribution."""
-    return {("helper", "recommendation"): "recommended_maneuver", ("ego", "maneuver"): "maneuver"}.get(
-        (role, form)
-    )
-
-
-def finished(role: str, form: str, actions: Sequence[str], chosen: Sequence[int]) -> str:
+def finished(shape: Shape, chosen: Sequence[int]) -> str:
     """Return the text of an answer as it was filled in; `chosen` has the place of each choice's option."""
     places = iter(chosen)
-    return "".join(p if isinstance(p, str) else p[next(places)] for p in parts(role, form, actions))
+    return "".join(p if isinstance(p, str) else p[next(places)] for p in parts(shape))
 
 
 def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
@@ -82,10 +75,10 @@ class Skeleton:
         most_tokens: length of its longest filling.
     """
 
-    def __init__(self, chat: Chat, role: str, form: str, actions: Sequence[str]) -> None:
+    def __init__(self, chat: Chat, shape: Shape) -> None:
         self._literals: list[tuple[int, ...]] = []
         self._choices: list[list[tuple[int, ...]]] = []
-        pieces = parts(role, form, actions)
+        pieces = parts(shape)
         before = "\n"  # an answer follows a line break in every known chat template
         for piece in pieces:
             if isinstance(piece, str):

@@ -178,7 +178,9 @@ def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[s
     likeliest = []
     for number, example in enumerate(prompt.examples.of(role) if prompt.examples else (), 1):
         first = role in prompt.reasons_first
-        parsed = parse(example.answer, role=role, actions=actions, reasons_first=first)
+        parsed = parse(
+            example.answer, role=role, actions=actions, form=prompt.form(role), reasons_first=first
+        )
         if parsed.status is not Status.STRICT or parsed.intent is None:
             raise UserError(
                 f"prompt {prompt.version} examples.json: the answer of {role} example {number} is not as a "

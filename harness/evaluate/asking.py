@@ -112,8 +112,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
     viewer, *heard = viewers.split("+")
     role: RecordedRole = "merge" if heard else "blind" if viewer.endswith(BLIND) else request.role
     parsed = parse(
-        # A read-out is a bare distribution, even a helper's.
-        raw, role="ego" if request.answer == "readout" else request.role, actions=request.actions,
+        raw, **request.shape._asdict(),
         thinking=request.thinking, reasons_first=request.reasons_first, divides=request.divides,
         finish_reason=completion.finish_reason, error=completion.error,
     )  # fmt: skip

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from harness.core.errors import printable
 from harness.parsing import values
 from harness.parsing.status import Failure, Repair, Status, joined, noted
-from harness.prompts.answer_schema import EVIDENCE_CHARS, RISKS
+from harness.prompts.answer_schema import EVIDENCE_CHARS, RISKS, Shape
 
 FIELDS = {
     "ego": ("maneuver", "confidence", "action_distribution"),
@@ -38,13 +38,7 @@ class Answer(Struct, frozen=True):
         return replace(self, repairs=self.repairs - repairs)
 
 
-def read(
-    members: dict[str, Any],
-    so_far: frozenset[Repair],
-    role: str,
-    actions: Sequence[str],
-    divides: bool = False,
-) -> Answer:
+def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divides: bool = False) -> Answer:
     """Read an answer-shaped object; with `divides`, any sum above 0 is divided out.
 
     Raises:
@@ -52,8 +46,8 @@ def read(
     """
     if values.is_schema(members):
         raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")
-    repairs = set(so_far)
-    fields, rest = values.sort_fields(members, FIELDS[role], repairs)
+    actions, repairs = shape.actions, set(so_far)
+    fields, rest = values.sort_fields(members, FIELDS[shape.role], repairs)
     has_loose_actions = any(values.match(key, actions) for key in rest)
     if has_loose_actions and fields.keys() & {"action_distribution", "recommended_maneuver", "maneuver"}:
         raise Failure(Status.CONFLICTING_ANSWERS, "actions stand both inside and outside the answer's fields")
@@ -63,15 +57,25 @@ def read(
     elif rest:
         repairs.add(Repair.EXTRA_FIELD)
 
-    if role == "helper":
+    if _is_other_form(fields, shape):
+        repairs.add(Repair.OTHER_FORM)
+    if shape.role == "helper":
         return _helper(fields, actions, repairs, divides)
     if "maneuver" in fields:
-        intent, mass, *_ = _judgement(fields, "maneuver", actions, repairs, divides)
+        intent, mass, maneuver, _ = _judgement(fields, "maneuver", actions, repairs, divides)
+        if Repair.OTHER_FORM in repairs and mass is None:
+            detail = f"only {maneuver} is named, with a confidence; a distribution was asked for"
+            raise Failure(Status.LABEL_ONLY, detail)
     else:
         if "confidence" in fields:
             repairs.add(Repair.EXTRA_FIELD)
         intent, mass = values.distribution(fields.get("action_distribution"), actions, repairs, divides)
     return Answer(intent, mass, None, frozenset(repairs))
+
+
+def _is_other_form(fields: dict[str, Any], shape: Shape) -> bool:
+    """Whether the answer has another form than the one that was asked for."""
+    return bool(shape.form) and ("action_distribution" in fields) == (shape.form != "distribution")
 
 
 def _helper(fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair], divides: bool) -> Answer:

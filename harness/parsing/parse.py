@@ -15,9 +15,10 @@ from harness.parsing import candidates, reasoning
 from harness.parsing.answer import Answer, read
 from harness.parsing.candidates import Candidate, whole
 from harness.parsing.mend import unreadable
+from harness.parsing.schema import fits
 from harness.parsing.status import Failure, Repair, Status, noted
 from harness.parsing.strict import fitting
-from harness.prompts.answer_schema import ROLES
+from harness.prompts.answer_schema import ROLES, Shape
 
 __all__ = ["Parsed", "Repair", "Status", "parse", "spans"]
 
@@ -76,6 +77,7 @@ def parse(
     *,
     role: str,
     actions: Sequence[str],
+    form: str | None = None,
     thinking: bool = False,
     reasons_first: bool = False,
     divides: bool = False,
@@ -91,6 +93,7 @@ def parse(
         text: the completion as it came.
         role: `ego` or `helper`.
         actions: meta-action names, in the environment's order.
+        form: the form that was asked for; None if any of the role's `FORMS` will do.
         thinking: whether the text must hold a closed thought: the model was asked to think, and the engine
             did not take the thought out of the text.
         reasons_first: whether the prompt asked for reasons before the answer; then prose there is no repair.
@@ -106,16 +109,16 @@ def parse(
     if error is not None or finish_reason == "error":
         message = errors.printable(error or "no message", 80)
         return _failed(Failure(Status.ENGINE_ERROR, f"the engine failed: {message}"), None)
-    actions = tuple(actions)
+    shape = Shape(role, tuple(actions), form)
     thought: str | None = None
     try:
-        answer = None if thinking else _strict(text, role, actions)
+        answer = None if thinking else _strict(text, shape)
         if answer is None:
             thought, rest = reasoning.split(text, thinking) if text.strip() else (None, "")
             thought_leads = text.rstrip().endswith(rest.strip())
-            answer = _strict(rest, role, actions) if thought_leads else None
+            answer = _strict(rest, shape) if thought_leads else None
             if answer is None:
-                answer = _recovered(rest, role, actions, finish_reason == "length", reasons_first, divides)
+                answer = _recovered(rest, shape, finish_reason == "length", reasons_first, divides)
             if (thought and not thinking) or not thought_leads:
                 answer = answer.mended(Repair.THINK_BLOCK)
     except Failure as failure:
@@ -157,25 +160,23 @@ def spans(text: str, role: str, actions: Sequence[str], thinking: bool = False) 
     return [(start + a, start + b) for a, b in candidates.spans(rest, role, tuple(actions))]
 
 
-def _strict(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
-    """Return the answer if the text is nothing else and needs no repair."""
-    return fitting(text, role, actions) or _unmended(text, role, actions)
+def _strict(text: str, shape: Shape) -> Answer | None:
+    """Return the answer if the text is nothing else, fits the schema and needs no repair."""
+    return fitting(text, shape) or _unmended(text, shape)
 
 
-def _unmended(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
-    candidate = whole(text, role, actions)
+def _unmended(text: str, shape: Shape) -> Answer | None:
+    candidate = whole(text, shape.role, shape.actions)
     if candidate is None:
         return None
     try:
-        answer = read(candidate.members, candidate.repairs, role, actions)
+        answer = read(candidate.members, candidate.repairs, shape)
     except Failure:
         return None
-    return None if answer.repairs else answer
+    return None if answer.repairs or not fits(candidate.members, shape) else answer
 
 
-def _recovered(
-    text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool, divides: bool
-) -> Answer:
+def _recovered(text: str, shape: Shape, cut: bool, reasons_first: bool, divides: bool) -> Answer:
     text, special = _SPECIAL.subn(" ", text)
     # A narrow space between a number and its unit is good typography in prose, so reasons may have one.
     zero_width = _INVISIBLE.search(text, text.find("{") if reasons_first else 0)
@@ -183,20 +184,20 @@ def _recovered(
         text = _SPACE.sub(" ", _NO_WIDTHS.sub("", text))
     if not text.strip():
         raise Failure(Status.EMPTY, "there is no answer in the text")
-    objects = candidates.candidates(text, role, actions, cut, reasons_first)
-    answer = _choose(objects, role, actions, divides)
+    objects = candidates.candidates(text, shape.role, shape.actions, cut, reasons_first)
+    answer = _choose(objects, shape, divides)
     if special:
         answer = answer.mended(Repair.SPECIAL_TOKENS)
     return answer.mended(Repair.INVISIBLE_CHARACTERS) if zero_width else answer
 
 
-def _choose(objects: list[Candidate], role: str, actions: tuple[str, ...], divides: bool) -> Answer:
+def _choose(objects: list[Candidate], shape: Shape, divides: bool) -> Answer:
     """Return the one answer among the candidates; an echo of the template is not a second answer."""
     answers: list[Answer] = []
     failures: list[Failure] = []
     for candidate in objects:
         with noted(failures):
-            answer = read(candidate.members, candidate.repairs, role, actions, divides)
+            answer = read(candidate.members, candidate.repairs, shape, divides)
             answers.append(answer.without(candidate.lost) if candidate.lost else answer)
     serious = [failure for failure in failures if failure.status is not Status.SCHEMA_ECHO]
     if not answers:

@@ -29,7 +29,7 @@ class Status(_Documented):
     RECOVERED = "recovered", "One unambiguous answer stands in the text, and the repairs name what was wrong."
     EMPTY = "empty", "There is nothing but white space, special tokens or a closed thought."
     NO_JSON = "no_json", "There is no JSON object, and not exactly one action is named."
-    LABEL_ONLY = "label_only", "One action is named and nothing says how probable it is."
+    LABEL_ONLY = "label_only", "One action is named and nothing says how probable each action is."
     TRUNCATED_JSON = "truncated_json", "The text ends inside a JSON value."
     TRUNCATED_REASONING = (
         "truncated_reasoning",
@@ -86,6 +86,10 @@ class Repair(_Documented):
     EXTRA_FIELD = "extra_field", "A field that the schema does not have was dropped."
     RENORMALISED = "renormalised", "The sum was off 1 by rounding (0.001 to 0.025) and was divided out."
     DIVIDED = "divided", "The sum was off 1 by more than rounding and was divided out, as was declared."
+    OTHER_FORM = (
+        "other_form",
+        "One action with a confidence was given where a distribution was asked for, or the reverse.",
+    )
     BOTH_FORMS = "both_forms", "A helper gave a distribution and a maneuver that agrees with it."
     MISSING_EVIDENCE = "missing_evidence", "A helper gave no evidence text."
     EVIDENCE_ECHO = "evidence_echo", "A helper's evidence was the prompt's placeholder, and was dropped."

@@ -22,13 +22,13 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, sha256_bytes, text_of, write_whole
 from harness.core.resources import entries, find
 from harness.core.templates import TooMuch
+from harness.prompts.answer_schema import ROLES as ROLES
 from harness.prompts.examples import EXAMPLES, Examples
 from harness.prompts.examples import read as read_examples
 from harness.prompts.template import Template
 from harness.world.scenario import Scenario
 
 Graph = Mapping[str, Any]
-ROLES = ("ego", "helper")
 FILES = ("ego.j2", "helper.j2", "prompt.toml")
 NO_WORDS: Mapping[str, str] = MappingProxyType({})
 # Digest of v1, which asks for reasons first and was released before prompt.toml could say so.
@@ -111,8 +111,8 @@ class Prompt:
         return tuple(role for role in ROLES if "repair" in self._templates[role].blocks)
 
     def form(self, role: str) -> str:
-        """Return the form of a role's answer, as `answer_schema` takes it."""
-        return "maneuver" if role == "ego" and self.ego_answer == "maneuver" else self.helper_answer
+        """Return the form of a role's answer, one of its `FORMS`."""
+        return self.ego_answer if role == "ego" else self.helper_answer
 
     def repair(self, role: str, error: str, actions: tuple[str, ...], words: Mapping[str, str]) -> str:
         """Render the message to a viewer whose answer could not be read, for the reason `error`."""

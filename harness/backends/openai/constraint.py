@@ -13,7 +13,7 @@ from harness.backends.base import Request
 from harness.backends.servers import Kind
 from harness.core.errors import printable
 from harness.core.files import canonical_json
-from harness.prompts.answer_schema import answer_schema
+from harness.prompts.answer_schema import Shape, answer_schema
 
 # Kinds that are sent a pattern: compact JSON, members in order, two decimals. With a JSON Schema most servers
 # allow numbers of any length.
@@ -28,7 +28,7 @@ _SHOWN = 40  # characters of an answer that an error shows
 
 def constraint(kind: Kind, request: Request) -> Mapping[str, Any]:
     """Return the fields that ask a kind of server for a constrained answer."""
-    return _fields(kind, request.role, request.form, request.actions)
+    return _fields(kind, request.shape)
 
 
 def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
@@ -42,7 +42,7 @@ def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
     """
     reader = _Reader(text, compact=kind in _BY_PATTERN)
     try:
-        reader.value(_schema(request.role, request.form, request.actions))
+        reader.value(_schema(request.shape))
         reader.blank()
         if reader.at == len(text):
             return None
@@ -56,8 +56,8 @@ def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
 
 
 @lru_cache
-def _schema(role: str, form: str, actions: tuple[str, ...]) -> Mapping[str, Any]:
-    schema = answer_schema(role, actions, form=form)
+def _schema(shape: Shape) -> Mapping[str, Any]:
+    schema = answer_schema(shape.role, shape.actions, form=shape.form)
     schema = {key: value for key, value in schema.items() if key not in ("$schema", "title")}
     if "evidence" in schema["properties"]:  # as with local engines, a constrained answer has no free text
         schema["properties"] = {**schema["properties"], "evidence": {"type": "string", "enum": [""]}}
@@ -65,8 +65,8 @@ def _schema(role: str, form: str, actions: tuple[str, ...]) -> Mapping[str, Any]
 
 
 @lru_cache
-def _fields(kind: Kind, role: str, form: str, actions: tuple[str, ...]) -> Mapping[str, Any]:
-    schema = _schema(role, form, actions)
+def _fields(kind: Kind, shape: Shape) -> Mapping[str, Any]:
+    schema = _schema(shape)
     match _BY_PATTERN.get(kind):
         case "regex":
             return {"structured_outputs": {"regex": _pattern(schema, re.escape)}}
