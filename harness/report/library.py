@@ -12,7 +12,7 @@ import hashlib
 import json
 import re
 from functools import cache
-from importlib.metadata import metadata, version
+from importlib.metadata import distribution, version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -58,9 +58,11 @@ def script() -> Markup:
 
 def licence() -> str:
     """Which libraries the page carries; their licences are in templates/licences.txt."""
-    carried = re.findall(r"^- (Vega.*): ([\d.]+)$", str(metadata(PACKAGE)), re.MULTILINE)
+    package = distribution(PACKAGE)
+    # As it stands in the file: newer Pythons refuse to write this message's long header as text.
+    carried = re.findall(r"^\s*- (Vega.*): ([\d.]+)$", package.read_text("METADATA") or "", re.MULTILINE)
     named = ", ".join(f"{name} {number}" for name, number in carried)
-    return f"Charts are drawn by {named}, which lie in this file as {PACKAGE} {version(PACKAGE)} has them"
+    return f"Charts are drawn by {named}, which lie in this file as {PACKAGE} {package.version} has them"
 
 
 def packed(value: Any) -> Markup:

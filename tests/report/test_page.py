@@ -1,9 +1,12 @@
 """The report page of a real, small run."""
 
 import base64
+import email.errors
+import email.message
 import hashlib
 import json
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -27,6 +30,7 @@ from harness.core.files import digest
 from harness.evaluate.asking import answer_of, requests
 from harness.prompts import readout
 from harness.prompts import versions as prompts
+from harness.report import library
 from harness.report.details import prompts_of
 from harness.report.page import render, visible
 from harness.report.runs import gather
@@ -218,6 +222,14 @@ def test_the_page_asks_for_nothing_and_runs_two_scripts_that_it_names(text, page
     own = text[text.rindex("<script>") + len("<script>") : text.rindex("</script>")]
     for script in (own, packed(text, "vega")):
         assert base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() in metas[0]
+
+
+def test_a_page_is_written_where_python_writes_no_package_metadata_as_text(monkeypatch):
+    def refuse(self, *args, **options):
+        raise email.errors.HeaderWriteError("folded header contains newline")  # Python 3.12.5 and later
+
+    monkeypatch.setattr(email.message.Message, "as_string", refuse)
+    assert re.search(r"Vega 5[\d.]+, Vega Lite 5[\d.]+, Vega Embed 6[\d.]+, which lie", library.licence())
 
 
 def test_the_same_runs_give_the_same_page(run):
