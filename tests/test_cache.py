@@ -46,6 +46,7 @@ CHANGED: dict[str, Any] = {
     "max_tokens": 65,
     "form": "recommendation",
     "answer": "constrained",
+    "sums": "divide",
     "thinking": True,
     "reasons_first": True,
     "temperature": 0.7,
@@ -57,7 +58,7 @@ CHANGED: dict[str, Any] = {
     "truth": {"nodes": []},
     "scenario": SCENARIO,
 }
-READ_BY_NO_MODEL = ("id", "timed", "agent", "reasons_first", "view", "truth", "scenario")
+READ_BY_NO_MODEL = ("id", "timed", "agent", "sums", "reasons_first", "view", "truth", "scenario")
 
 
 class Talker(Scripted):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
 Letters = Literal["raw", "cyclic"]
+Sums = Literal["refuse", "divide"]
 FinishReason = Literal["stop", "length", "error"]
 AGAIN = "#2"  # suffix of the id of a repair turn's request
 
@@ -39,6 +40,8 @@ class Request:
         answer: how the model answers. `json`: it writes freely. `constrained`: it fills in numbers and
             choices of a fixed text. `readout`: the messages ask for one letter (see
             `harness.prompts.readout`), and the letters' probabilities are the answer.
+        sums: what becomes of a sum of probabilities that is off 1 in `json`: the answer failed, or it is
+            divided out.
         thinking: whether the model is asked to think first (if its template can switch that).
         reasons_first: whether the prompt asks for reasons before the answer.
         temperature: 0 takes the likeliest token each time; above 0, tokens are drawn from softmax(logits /
@@ -61,6 +64,7 @@ class Request:
     form: str = "distribution"
     answer: AnswerMode = "json"
     orders: tuple[tuple[Mapping[str, str], ...], ...] = ()
+    sums: Sums = "refuse"
     thinking: bool = False
     reasons_first: bool = False
     temperature: float = 0.0
@@ -82,7 +86,7 @@ class Request:
     @property
     def divides(self) -> bool:
         """Whether the sum of the answer's probabilities is divided out, however far it is off 1."""
-        return self.answer == "constrained"
+        return self.answer == "constrained" or self.sums == "divide"
 
     def alike(self, **changes: Any) -> "Request":
         """Return the request with other values in some fields, in a third of the time of `replace`."""

@@ -63,6 +63,7 @@ def command(
     answer: options.Answer = "json",
     image: options.Image = "own",
     letters: options.Letters = None,
+    sums: options.Sums = "refuse",
     helper_model: options.HelperModel = None,
     helper_prompt: options.HelperPrompt = None,
     helper_answer: options.HelperAnswer = None,
@@ -121,7 +122,7 @@ def command(
     options.say_all(limit, frozen)
     swarm = Swarm(
         model, engine, prompt, answer, thinking, image,
-        helper_model, helper_prompt, helper_answer, helper_thinking, letters,
+        helper_model, helper_prompt, helper_answer, helper_thinking, letters, sums,
     )  # fmt: skip
     channel_seeds = options.parse_seeds(seeds)
     specs = [

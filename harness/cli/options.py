@@ -13,13 +13,14 @@ if TYPE_CHECKING:
 
     from harness.backends.base import AnswerMode
     from harness.backends.base import Letters as LettersMode
+    from harness.backends.base import Sums as SumsMode
     from harness.backends.cards import Card
     from harness.coordination.operating_point import OperatingPoint
     from harness.core import parallel, shards
     from harness.dataset.load import Dataset as Frozen  # Dataset is an option here
     from harness.evaluate.agent import ImageMode
 else:  # typer takes any text; what is evaluated says which are allowed
-    AnswerMode = ImageMode = LettersMode = str
+    AnswerMode = ImageMode = LettersMode = SumsMode = str
 
 MOST_SEEDS = 1000
 _RAY = "or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT."
@@ -113,6 +114,13 @@ Letters = Annotated[
     Option(
         help="How a readout's letters are read. raw: once. cyclic: averaged over as many orders of the list "
         "as there are actions, so that no letter is preferred. Default: the card's, or cyclic."
+    ),
+]
+Sums = Annotated[
+    SumsMode,
+    Option(
+        help="What becomes of an answer in json whose only fault is that its numbers do not sum to 1. "
+        "refuse: it failed. divide: they are divided by their sum, and the summary counts it as divided."
     ),
 ]
 Image = Annotated[

@@ -17,7 +17,7 @@ from harness.core.figures import interval
 from harness.core.formats import WORK
 
 if TYPE_CHECKING:
-    from harness.backends.base import AnswerMode, Letters
+    from harness.backends.base import AnswerMode, Letters, Sums
     from harness.evaluate.agent import Agent, ImageMode
     from harness.evaluate.lifecycle import Evaluated
     from harness.evaluate.spec import Spec
@@ -59,6 +59,7 @@ class Swarm:
     helper_answer: "AnswerMode | None" = None
     helper_thinking: bool | None = None
     letters: "Letters | None" = None
+    sums: "Sums" = "refuse"
 
     def agents(self, scenario: "Scenario") -> "dict[str, Any]":
         """The fields of a `Spec` that say who answers in a scenario: `ego` and `helpers`."""
@@ -68,7 +69,9 @@ class Swarm:
 
         version = self.prompt or scenario.prompt
         card = cards.resolve(self.model, self.engine)
-        ego = Agent(card, versions.load(version), self.answer, self.thinking, self.image, self.letters)
+        ego = Agent(
+            card, versions.load(version), self.answer, self.thinking, self.image, self.letters, self.sums
+        )
         models = self.helper_model.split(",") if self.helper_model else []
         prompt, mode = versions.load(self.helper_prompt or version), self.helper_answer or self.answer
         thinks = self.thinking if self.helper_thinking is None else self.helper_thinking
@@ -76,7 +79,8 @@ class Swarm:
         others = [cards.resolve(name.strip()) for name in models] or [card]
         with helper_options({"--answer": self.helper_answer, "--thinking": self.helper_thinking}):
             letters = self.letters if mode == "readout" else None
-            helpers = tuple(Agent(other, prompt, mode, thinks, image, letters) for other in others)
+            sums = self.sums if mode == "json" else "refuse"
+            helpers = tuple(Agent(other, prompt, mode, thinks, image, letters, sums) for other in others)
             return {"ego": ego, "helpers": helpers}
 
 
@@ -253,6 +257,9 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: st
         if shares[0] is not None:
             values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
             yield f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}{means}"
+        if divided := figures.get(("all", f"divided_rate_{role}")):
+            share = f"{100 * (divided.value or 0):.1f}"
+            yield f"{role} answers divided by their sum: {share} % of {divided.n}{means}"
         if (mass := figures.get(("all", f"label_mass_{role}"))) is not None:
             read = of_letter(figures, role) or "letters read once"
             yield f"{role} read-outs: {read}; mass on the letters {mass.value or 0:.2f}{means}"

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from harness.backends.base import AnswerMode, Letters, Request, Role
+from harness.backends.base import AnswerMode, Letters, Request, Role, Sums
 from harness.backends.cards import Card
 from harness.backends.registry import Capabilities, capabilities
 from harness.core.errors import UserError, printable, unknown
@@ -29,6 +29,8 @@ class Agent:
             read-out of a language model.
         image: the picture that an image prompt shows: the viewer's `own`, a `blank` one, one of `another`
             scene, or `none`, which leaves only the text.
+        sums: what becomes of an answer in `json` whose only fault is that its numbers do not sum to 1:
+            `refuse` counts it as failed, `divide` divides them by their sum.
     """
 
     card: Card
@@ -37,6 +39,7 @@ class Agent:
     thinking: bool = False
     image: ImageMode = "own"
     letters: Letters | None = None
+    sums: Sums = "refuse"
 
     def __post_init__(self) -> None:
         name = printable(self.card.name)
@@ -74,6 +77,13 @@ class Agent:
             reason = "cannot answer so" if self.can.language_model else "is no language model"
             modes = " or ".join(self.can.answer_modes)
             raise UserError(f"--answer {self.answer}: {name} {reason}; use {modes}")
+        if self.sums not in get_args(Sums):
+            raise unknown("sums", str(self.sums), get_args(Sums))
+        if self.sums == "divide" and self.answer != "json":
+            raise UserError(
+                f"--sums divide: {name} answers in {self.answer}, whose sums need no declaration; leave it "
+                "out, or use --answer json"
+            )
         if self.answer != "json" and self.thinking:
             raise UserError(
                 f"--answer {self.answer}: {name} thinks first, and only json leaves room for that; use "
@@ -109,7 +119,7 @@ class Agent:
         """Return a request in a role, without what differs between such requests."""
         return Request(
             id="", messages=(), role=role, actions=actions, max_tokens=self.most_tokens(role),
-            form=self.prompt.form(role), answer=self.answer, thinking=self.thinking,
+            form=self.prompt.form(role), answer=self.answer, sums=self.sums, thinking=self.thinking,
             reasons_first=role in self.prompt.reasons_first,
         )  # fmt: skip
 
@@ -150,6 +160,7 @@ class Agent:
             "answer": self.answer,
             "image": self.image,
             **({"letters": "cyclic"} if self.letters == "cyclic" else {}),  # earlier runs read them once
+            **({"sums": "divide"} if self.sums == "divide" else {}),  # earlier runs refused them
         }
 
 

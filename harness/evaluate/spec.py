@@ -304,6 +304,7 @@ class Spec:
         """Return, as plain values, the settings that must not change when a stopped run resumes."""
         return {
             **self.ego.settings(),
+            "sums": self.ego.sums,
             "helpers": [agent.settings() for agent in self.helpers],
             "world": msgspec.to_builtins(self.source.record()),
             "actions": list(self.actions),
@@ -335,6 +336,7 @@ class Spec:
             *self._helper_options(), *self.source.options(), ("--seeds", seeds),
             *(("--condition", point.name) for point in self.points), ("--answer", self.ego.answer),
             ("--image", None if self.ego.image == "own" else self.ego.image), ("--letters", self._letters),
+            ("--sums", None if self.ego.sums == "refuse" else self.ego.sums),
             ("--batch-size", self.batch_size), *(("--server", url) for url in self.servers),
             ("--device", self.device), ("--dtype", self.dtype),
             ("--temperature", self.temperature or None), ("--sampling-seed", self.sampling_seed or None),

@@ -91,6 +91,12 @@ def of_run(run: Run) -> Iterator[str]:
             f"Answers were sampled at temperature {run.manifest.temperature:g} with sampling seed "
             f"{run.manifest.sampling_seed}: another seed gives other answers."
         )
+    for role, (whose, _) in _FAILED.items():
+        if run.manifest.sums == "divide" and (score := run.score(ALL, f"divided_rate_{role}")):
+            yield (
+                f"{round((score.value or 0.0) * score.n)} of {whose} {score.n} answers did not sum to 1 and "
+                "were divided by their sum, as --sums divide says."
+            )
     retries = sum(answer.retries for answer in run.answers)
     if (found := tally(run)).words and not found.missing:
         yield f"{found}: each counts as a lost message."

@@ -140,6 +140,7 @@ class AnswerFacts(Struct, frozen=True):
     scene: str
     role: Role
     verdict: Literal["strict", "recovered", "failed"]
+    repairs: tuple[str, ...]
     prompt_tokens: int | None
     completion_tokens: int | None
     seconds: float | None
@@ -571,6 +572,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     answer: str
     image: str = "own"
     letters: Literal["raw", "cyclic"] = "raw"
+    sums: Literal["refuse", "divide"] = "refuse"
     batch_size: int
     dtype: str | None
     temperature: float = 0.0
@@ -621,6 +623,6 @@ class Manifest(Struct, frozen=True, kw_only=True):
         """Return the agent of a scene's viewer at this place, in the form of `helpers`; the ego is at 0."""
         if place and self.helpers:
             helper = self.helpers[(place - 1) % len(self.helpers)]
-            return {"image": "own", "letters": "raw", "thinking": False, **helper}
-        names = ("model", "prompt", "answer", "thinking", "image", "letters")
+            return {"image": "own", "letters": "raw", "sums": "refuse", "thinking": False, **helper}
+        names = ("model", "prompt", "answer", "thinking", "image", "letters", "sums")
         return {name: getattr(self, name) for name in names}

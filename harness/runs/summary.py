@@ -16,6 +16,7 @@ from harness.core.statistics import (
     seed_interval,
     seed_rate_interval,
 )
+from harness.parsing.status import Repair
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import (
     ALL,
@@ -142,6 +143,9 @@ def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator
         for verdict in ("strict", "recovered", "failed"):
             hits = np.array([float(answer.verdict == verdict) for answer in role_answers])
             yield Score.of(ALL, f"{verdict}_rate_{role}", rate_interval(hits, np.array(episodes)), "answers")
+        if any(divided := [Repair.DIVIDED in answer.repairs for answer in role_answers]):
+            hits = np.array(divided, dtype=float)
+            yield Score.of(ALL, f"divided_rate_{role}", rate_interval(hits, np.array(episodes)), "answers")
     for role, (role_answers, episodes) in by_role.items():
         if any(answer.turns > 1 for answer in role_answers):
             after = np.array([answer.verdict != "failed" for answer in role_answers])

@@ -12,7 +12,7 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
-from harness.backends.base import AnswerMode, Backend, Letters, Request, same_model
+from harness.backends.base import AnswerMode, Backend, Letters, Request, Sums, same_model
 from harness.backends.cache import default_file
 from harness.backends.cards import Card, own
 from harness.backends.registry import open_backend
@@ -316,6 +316,7 @@ class Stored:
         return Agent(
             card, prompt, cast("AnswerMode", stated["answer"]), stated["thinking"],
             cast("ImageMode", stated.get("image", "own")), cast("Letters", stated.get("letters", "raw")),
+            cast("Sums", stated.get("sums", "refuse")),
         )  # fmt: skip
 
     def _restore(self, stated: Mapping[str, Any]) -> str:
