@@ -86,7 +86,7 @@ def drive(spec: Spec, numbers: range) -> list[Episode]:
     """Walk some episodes and lay their decisions out as a table."""
     world = LiveWorld(SCENARIO, 0, numbers, spec.points, spec.seeds, spec.ego_alone)
     asker = Asker(spec, Proxy, LATENCY)
-    decided = [part for step in walk(world, spec.points, asker) for part in step]
+    decided = [part for step in walk(world, spec.points, asker, spec.ties) for part in step]
     table(decided, world.columns(), spec.actions)
     return world.episodes()
 

@@ -145,7 +145,7 @@ def walked(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path 
     asker = Asker(spec, lambda: backend, latency, kept)
     assert isinstance(spec.source, FrozenSource)
     world = FrozenWorld(spec.source.dataset, spec.points, spec.seeds)
-    parts = list(chain.from_iterable(walk(world, spec.points, asker)))
+    parts = list(chain.from_iterable(walk(world, spec.points, asker, spec.ties)))
     made = table(parts, world.columns(), spec.actions)
     grid = Grid(tuple(point.name for point in spec.points), spec.seeds, spec.source.dataset.episodes)
     episodes = counted(grid, made, world.episodes())

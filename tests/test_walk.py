@@ -158,7 +158,7 @@ def test_every_step_is_asked_once_and_yields_a_part_a_condition(
     asker = asker_of(spec, backend, A_TENTH)
     assert len(backend.asked) == len(set(backend.asked)) == 8 * 4
     world = FrozenWorld(played, spec.points, spec.seeds)
-    steps = list(walk(world, spec.points, asker))
+    steps = list(walk(world, spec.points, asker, spec.ties))
     assert [[part.point.name for part in parts] for parts in steps] == [["halves", "lossy"]] * 3
     assert [len(parts[0].moments) for parts in steps] == [3, 3, 2]
     assert [parts[0].due.episode.tolist() for parts in steps] == [

@@ -65,6 +65,7 @@ def command(
     helper_answer: options.HelperAnswer = None,
     helper_thinking: options.HelperThinking = None,
     ask: options.Ask = "all",
+    ties: options.Ties = None,
     batch_size: options.BatchSize = 8,
     server: options.Servers = None,
     workers: options.ModelWorkers = "2",
@@ -123,7 +124,7 @@ def command(
     options.in_range("--save-video", save_video, 0, driven)
     swarm = Swarm(
         model, engine, prompt, answer, thinking, image,
-        helper_model, helper_prompt, helper_answer, helper_thinking, letters, sums,
+        helper_model, helper_prompt, helper_answer, helper_thinking, letters, sums, ties,
     )  # fmt: skip
     spec = Spec(
         **swarm.agents(source.scenario),

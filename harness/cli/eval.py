@@ -77,6 +77,7 @@ def command(
         "above 0.",
     ),
     ask: options.Ask = "all",
+    ties: options.Ties = None,
     batch_size: options.BatchSize = 8,
     workers: options.RuleWorkers = None,
     server: options.Servers = None,
@@ -122,7 +123,7 @@ def command(
     options.say_all(limit, frozen)
     swarm = Swarm(
         model, engine, prompt, answer, thinking, image,
-        helper_model, helper_prompt, helper_answer, helper_thinking, letters, sums,
+        helper_model, helper_prompt, helper_answer, helper_thinking, letters, sums, ties,
     )  # fmt: skip
     channel_seeds = options.parse_seeds(seeds)
     specs = [

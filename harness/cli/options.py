@@ -233,6 +233,14 @@ Ask = Annotated[
         "scene, which gives the same decisions and lets other conditions be scored later without the model."
     ),
 ]
+Ties = Annotated[
+    str | None,
+    Option(
+        help="Which of equally likely actions the ego takes. drawn: one by chance, with the same draws for "
+        "every condition, prompt and model. first: the most careful. Default: drawn, or as in the run that "
+        "is replayed."
+    ),
+]
 NoCache = Annotated[
     bool, Option("--no-cache", help="Ask the model again, even for answers that an earlier run stored.")
 ]

@@ -1,7 +1,7 @@
 """What `harness eval` and `harness drive` have in common: a run's folder, its table and its JSON."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -46,7 +46,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Swarm:
-    """Who is asked, as it was typed: of the helpers, what is None is the ego's."""
+    """Who is asked and how ties fall, as it was typed: of the helpers, what is None is the ego's."""
 
     model: str
     engine: str | None
@@ -60,9 +60,10 @@ class Swarm:
     helper_thinking: bool | None = None
     letters: "Letters | None" = None
     sums: "Sums" = "refuse"
+    ties: str | None = None
 
     def agents(self, scenario: "Scenario") -> "dict[str, Any]":
-        """The fields of a `Spec` that say who answers in a scenario: `ego` and `helpers`."""
+        """The fields of a `Spec` that say who answers in a scenario, and `ties`."""
         from harness.backends import cards
         from harness.evaluate.agent import Agent
         from harness.prompts import versions
@@ -81,7 +82,17 @@ class Swarm:
             letters = self.letters if mode == "readout" else None
             sums = self.sums if mode == "json" else "refuse"
             helpers = tuple(Agent(other, prompt, mode, thinks, image, letters, sums) for other in others)
-            return {"ego": ego, "helpers": helpers}
+        return {"ego": ego, "helpers": helpers, "ties": self.ties or _usual_ties(ego)}
+
+
+def _usual_ties(ego: "Agent") -> str:
+    """How ties fall where nothing is typed: as in the run that is replayed, if one is."""
+    from harness.coordination.coordinate import TIES
+    from harness.runs.folder import read
+
+    with suppress(UserError):  # what is no run is refused when it is opened
+        return read(Path(ego.card.weights or "")).manifest.ties if ego.can.own_latency else TIES[0]
+    return TIES[0]
 
 
 @contextmanager

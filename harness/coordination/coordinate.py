@@ -17,12 +17,17 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.robust import outvoted
 from harness.coordination.rules import EGO_PROMPT, RULES
-from harness.core.arrays import Bools, Floats, Ints, any_of
+from harness.core.arrays import Bools, Floats, Ints, any_of, count_of
 from harness.radio.channel import Draws
 
 # From who was heard, `(..., H)`, to the fusion call's answer: the ego's intent `(..., A)`, NaN if it failed
 # or nobody was heard, and the seconds `(...)` that it took.
 FusionCall = Callable[[Bools], tuple[Floats, Floats]]
+# From where several actions are the likeliest, `(...)`, to a draw in [0, 1) for each such decision, `(k,)`.
+TieDraws = Callable[[Bools], Floats]
+
+TIES = ("drawn", "first")  # how a tie between the likeliest actions falls, the default first
+TIE = 1e-9  # probabilities that differ by less are equal: pooling rounds
 
 
 @dataclass(frozen=True)
@@ -33,10 +38,12 @@ class Fusion:
         call: the fusion call; required if the point's consensus is `ego-prompt`.
         state: the rule's memory of each decision's episode, `(..., K)`: `Coordination.state` of the episode's
             last step. None at the first step.
+        ties: the draws that decide between actions that are equally likely; None takes the first of them.
     """
 
     call: FusionCall | None = None
     state: Floats | None = None
+    ties: TieDraws | None = None
 
 
 @dataclass(frozen=True)
@@ -46,8 +53,8 @@ class Coordination(Exchange):
     Attributes:
         weights: each vehicle's weight in the policy, `(..., 1+H)`; NaN where a fusion call answered.
         fused: the policy, `(..., A)`.
-        action: index of its most probable action, `(...)`. A tie goes to the earlier action; this is why
-            actions are listed with the most conservative first.
+        action: index of its most probable action, `(...)`. A tie is drawn; without draws it goes to the
+            earlier action, the more careful one.
         fusion_failed: whether the fusion call's answer was unusable, so that `fused` is the ego's own intent,
             `(...)`.
         latency_s: when the ego acts, `(...)`: end of exchange and fusion. The paper's `latency_proxy`.
@@ -119,10 +126,26 @@ def fuse(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},
         weights=weights,
         fused=fused,
-        action=np.argmax(fused, axis=-1),
+        action=_likeliest(fused, fusion.ties),
         fusion_failed=failed,
         latency_s=np.where(unknown, np.nan, latency_s),
         deadline_missed=latency_s > point.window_s,
         state=state,
         trust=trust,
     )
+
+
+def _likeliest(policy: Floats, ties: TieDraws | None) -> Ints:
+    """Return the index of each policy's most probable action, `(...)`."""
+    action: Ints = np.argmax(policy, axis=-1)
+    if ties is None:
+        return action
+    alike = policy >= np.max(policy, axis=-1, keepdims=True) - TIE
+    tied = count_of(alike) > 1
+    if not tied.any():
+        return action
+    among = np.cumsum(alike[tied], axis=-1)
+    which = np.floor(ties(tied) * among[:, -1]) + 1
+    action = np.array(action)
+    action[tied] = np.argmax(among == which[:, None], axis=-1)
+    return action

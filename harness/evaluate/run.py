@@ -190,7 +190,7 @@ def _walk(
     served = list[Served]()
     for n, seeds in enumerate(_split(spec.seeds, at_once)):
         world, asker = _world_of(spec, chunk, seeds), asker_of(n, answers)
-        decided = list(chain.from_iterable(walk(world, spec.points, asker)))
+        decided = list(chain.from_iterable(walk(world, spec.points, asker, spec.ties)))
         viewers |= {scene.id: scene.viewers for part in decided for scene in part.moments}
         served += asker.served
         answers, more = asker.answers, world.columns()

@@ -8,6 +8,7 @@ import msgspec
 
 from harness.backends.cards import Card, argument
 from harness.backends.registry import registrations
+from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError, printable
@@ -93,6 +94,7 @@ class Spec:
         tags: words by which to find the run; they change nothing in it.
         ask: `used` asks a helper only when a condition uses its answer; `all` asks every helper in every
             scene, which gives the same decisions.
+        ties: which of several likeliest actions is taken: one that is `drawn`, or the `first`.
     """
 
     ego: Agent
@@ -111,6 +113,7 @@ class Spec:
     device_model: str | None = None
     tags: tuple[str, ...] = ()
     ask: str = "all"
+    ties: str = TIES[0]
 
     def __post_init__(self) -> None:
         if all(agent == self.ego for agent in self.helpers):
@@ -127,6 +130,8 @@ class Spec:
                 )
         if self.ask not in ASKS:
             raise UserError(f"--ask {printable(self.ask)}: give {' or '.join(ASKS)}")
+        if self.ties not in TIES:
+            raise UserError(f"--ties {printable(self.ties)}: give {' or '.join(TIES)}")
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
         self._check_servers()
@@ -318,6 +323,7 @@ class Spec:
             },
             "seeds": list(self.seeds),
             "ask": self.ask,
+            "ties": self.ties,
             "batch_size": self.batch_size,
             "dtype": self.dtype,
             "temperature": self.temperature,
@@ -343,7 +349,7 @@ class Spec:
             ("--latency", self.latency),
             ("--device-profile", self.device_profile and self.device_profile.name),
             ("--device-model", self.device_model), ("--ask", None if self.ask == ASKS[0] else self.ask),
-            *(("--tag", tag) for tag in self.tags),
+            ("--ties", None if self.ties == TIES[0] else self.ties), *(("--tag", tag) for tag in self.tags),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         flags = ["--thinking"] if self.ego.thinking else []

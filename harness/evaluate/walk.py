@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.coordination.claims import Claims
-from harness.coordination.coordinate import Coordination, Fusion, FusionCall, fuse
+from harness.coordination.coordinate import Coordination, Fusion, FusionCall, TieDraws, fuse
 from harness.coordination.exchange import Exchange, exchange, needed
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
@@ -158,9 +158,12 @@ class Ask(Protocol[AskedMoment]):
 
 
 def walk(
-    world: World[Moment], points: Sequence[OperatingPoint], ask: Ask[Moment]
+    world: World[Moment], points: Sequence[OperatingPoint], ask: Ask[Moment], ties: str
 ) -> Iterator[Sequence[Decided[Moment]]]:
-    """Walk a world under some conditions until every episode is decided; yield the decisions of each step."""
+    """Walk a world under some conditions until every episode is decided; yield the decisions of each step.
+
+    Of actions that are equally likely, `ties` takes the `first`, or one that is `drawn`.
+    """
     memories = {point: Memory() for point in points}
     attackers = {point: Attackers(point) for point in points}
     physical = {point for point in points if isinstance(point.channel, Physical)}
@@ -190,7 +193,7 @@ def walk(
         for point, due_here in due.items():
             said_here = said[point]
             call = calls[point.rewrites](due_here.at, shown(point, said_here)) if point.asks_again else None
-            fusion = Fusion(call, memories[point].recall(due_here))
+            fusion = Fusion(call, memories[point].recall(due_here), tie_draws(due_here.draws, ties))
             result = fuse(point, sent[point], said_here.intents, fusion)
             decided.append(Decided(point, moments, due_here, result, said_here))
         for part in decided:
@@ -337,6 +340,27 @@ def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers
     return Draws(
         uniforms[pair_of_decision, :2].transpose(0, 2, 1), uniforms[pair_of_decision, 2 + step], trips
     )
+
+
+@lru_cache(maxsize=1 << 16)
+def _tie_uniforms(seed: int, layout_seed: int, steps: int) -> NDArray[np.float64]:
+    return noise.uniforms((steps,), "ties", seed, layout_seed)
+
+
+def tie_draws(draws: Draws, ties: str) -> TieDraws | None:
+    """Return what decides ties in decisions (n,): None where the `first` action is taken.
+
+    The key is the seed, the episode's layout and the step, as in `channel_draws`.
+    """
+    trips = draws.trips
+    if ties == "first" or trips is None:
+        return None
+
+    def drawn(tied: Bools) -> Floats:
+        keys = (of[tied].tolist() for of in (trips.seed, trips.layout_seed, trips.step))
+        return np.array([_tie_uniforms(s, of, trips.steps)[step] for s, of, step in zip(*keys, strict=True)])
+
+    return drawn
 
 
 @lru_cache(maxsize=1 << 10)

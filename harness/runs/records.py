@@ -568,6 +568,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     schedules: dict[str, str] = {}
     seeds: tuple[int, ...]
     ask: Literal["used", "all"] = "all"
+    ties: Literal["drawn", "first"] = "first"
     thinking: bool
     answer: str
     image: str = "own"

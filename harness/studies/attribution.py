@@ -159,8 +159,8 @@ def _kind(scene: Scene, viewer: str, item: str) -> str:
 
 def messages(stored: Stored, point: OperatingPoint, drawn: Mapping[str, int]) -> Iterator[LeftOut]:
     """Every message that was in time left out in turn; `drawn` has a channel seed of each decision point."""
-    memory = Memory()
-    for [part] in walk(FrozenWorld(stored.dataset, [point], stored.seeds), [point], stored):
+    memory, world = Memory(), FrozenWorld(stored.dataset, [point], stored.seeds)
+    for [part] in walk(world, [point], stored, stored.spec.ties):
         yield from _messages(stored, part, memory, drawn)
         memory.keep(part.due, part.result.state)
 

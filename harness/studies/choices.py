@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from harness.coordination.coordinate import fuse
+from harness.coordination.coordinate import Fusion, fuse
 from harness.coordination.exchange import exchange, worth_of
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
@@ -22,7 +22,7 @@ from harness.core.errors import UserError, printable
 from harness.dataset.forest import Forest
 from harness.evaluate.device import helpers_j
 from harness.evaluate.outlook import outlook
-from harness.evaluate.walk import channel_draws
+from harness.evaluate.walk import channel_draws, tie_draws
 from harness.radio.channel import Draws, Physical
 from harness.studies.stored import Stored
 from harness.world.sight_lines import site
@@ -201,12 +201,13 @@ def _level(stored: Stored, point: OperatingPoint, seeds: Ints, at: Ints, sets: B
     draws = channel_draws(
         seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps, width
     )
-    intents = intents.take(node)
+    intents, ties = intents.take(node), tie_draws(draws, stored.spec.ties)
     own_j, actions, costs = stored.joules(scenes, point)[node], [], []
     for who in sets[:, :width]:
         heard = fuse(
-            point, exchange(point, intents, draws, np.broadcast_to(who, intents.valid.shape)), intents
-        )
+            point, exchange(point, intents, draws, np.broadcast_to(who, intents.valid.shape)), intents,
+            Fusion(ties=ties),
+        )  # fmt: skip
         actions.append(heard.action.reshape(shape))
         energy_j = own_j[:, 0] + helpers_j(heard.infers, own_j) + stored.radio_j(point, heard)
         each = (heard.messages, 1e3 * heard.airtime_s, 1e3 * heard.latency_s, np.ones(len(node)), energy_j)

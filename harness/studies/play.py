@@ -80,13 +80,14 @@ class Source(Protocol):
 
 
 def walk_through(
-    world: World[Any], points: Sequence[OperatingPoint], ask: Ask[Any], seeds: Sequence[int], episodes: Ints
-) -> Iterator[tuple[dict[str, Floats], Ints]]:
+    world: World[Any], points: Sequence[OperatingPoint], ask: Ask[Any], seeds: Sequence[int],
+    episodes: Ints, ties: str,
+) -> Iterator[tuple[dict[str, Floats], Ints]]:  # fmt: skip
     """`COLUMNS` and `places` of each point's decisions, rounded as rows are; `episodes` (E,) ascending."""
     parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
     places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
     ascending = np.argsort(seeds)
-    for decided in walk(world, points, ask):
+    for decided in walk(world, points, ask, ties):
         for part in decided:
             every = columns(part)
             parts[part.point].append({name: every[name] for name in COLUMNS})

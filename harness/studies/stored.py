@@ -160,7 +160,8 @@ class Stored:
             for point in different:
                 world.leave_out(point, moments)
 
-        walks = walk_through(world, different, _Nearest(self, vehicles - 1, leave_out), seeds, world.numbers)
+        nearest = _Nearest(self, vehicles - 1, leave_out)
+        walks = walk_through(world, different, nearest, seeds, world.numbers, self.spec.ties)
         walked = dict(zip(different, walks, strict=True))
         for point in points:
             yield [Walked(world.numbers, world.ends(point), *walked[point])]
@@ -305,6 +306,7 @@ class Stored:
             ego, FrozenSource(self.dataset), (), manifest.seeds, tuple(helpers),
             batch_size=manifest.batch_size, dtype=manifest.dtype,
             temperature=manifest.temperature, sampling_seed=manifest.sampling_seed, ask="used",
+            ties=manifest.ties,
         )  # fmt: skip
 
     def _agent(self, stated: Mapping[str, Any]) -> Agent:

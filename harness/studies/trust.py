@@ -154,7 +154,7 @@ def play(stored: Stored, point: OperatingPoint, seeds: Sequence[int], of: tuple[
     """Walk one cell: a rule, an attack and a share."""
     at = under(point, *of)
     world = FrozenWorld(stored.dataset, [at], seeds)
-    parts = [part for [part] in walk(world, [at], stored)]
+    parts = [part for [part] in walk(world, [at], stored, stored.spec.ties)]
     ends = world.ends(at)
     place = {number: n for n, number in enumerate(world.numbers.tolist())}
     row = {seed: n for n, seed in enumerate(seeds)}
@@ -316,7 +316,7 @@ def run_bench(
         cells[place] = cell
         progress(1)
     never = FrozenWorld(stored.dataset, [alone := OperatingPoint("never asks", None)], seeds)
-    for _ in walk(never, [alone], stored):
+    for _ in walk(never, [alone], stored, stored.spec.ties):
         pass
     stored.settle()
     return Bench(stored.name, stored.run.source, condition, cells, never.ends(alone)["success_rate"])

@@ -82,7 +82,7 @@ def driven(
     asker = Asker(of, lambda: opened, latency)
     world = LiveWorld(of.source.scenario, of.source.first_seed, episodes, of.points, of.seeds, of.ego_alone)
     decisions = table(
-        list(chain.from_iterable(walk(world, of.points, asker))), world.columns(), of.actions
+        list(chain.from_iterable(walk(world, of.points, asker, of.ties))), world.columns(), of.actions
     ).rounded()
     grid = Grid(tuple(point.name for point in of.points), of.seeds, tuple(episodes))
     return Driven(

@@ -185,7 +185,7 @@ def test_the_luck_is_the_frozen_runs(small):
 
     def draws(of, world):
         asker = Asker(of, lambda: open_backend(of.ego.card), PAPER)
-        for step, [decided] in enumerate(walk(world, of.points, asker)):
+        for step, [decided] in enumerate(walk(world, of.points, asker, of.ties)):
             due = decided.due
             for n, (episode, seed) in enumerate(zip(due.episode.tolist(), due.seed.tolist(), strict=True)):
                 yield (episode, seed, step), (due.draws.link[n].tolist(), due.draws.jitter[n].tolist())

@@ -27,7 +27,7 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
     answers = [change(answer_of(request, _completion(request))) for request in asked]
     asker = Asker(spec, _nobody, PAPER, answers={answer.id: answer for answer in answers})
     world = FrozenWorld(dataset, spec.points, SEEDS)
-    decided = list(chain.from_iterable(walk(world, spec.points, asker)))
+    decided = list(chain.from_iterable(walk(world, spec.points, asker, spec.ties)))
     decisions = table(decided, world.columns(), dataset.actions)
     answers = [answer for answer in answers if answer.scene in decisions.scenes]
     grid = Grid(tuple(point.name for point in spec.points), SEEDS, dataset.episodes)

@@ -8,9 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from harness.coordination.coordinate import TIE
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.coordination.trigger import entropy_nats
 from harness.core.arrays import Bools, Floats
+from harness.evaluate.walk import walk
 from harness.studies.axes import Setting
 from harness.studies.calibrated import (
     ACTIONS,
@@ -18,6 +20,7 @@ from harness.studies.calibrated import (
     FITTED_ON,
     STEPS,
     Calibrated,
+    CalibratedWorld,
     Parameters,
     peaked,
     spread,
@@ -198,3 +201,14 @@ def test_helpers_that_are_unsure_load_the_channel():
     high = walked(source, replace(busy, tau_nats=0.7))
     assert low.columns["effective_loss"] == pytest.approx(np.full(50 * STEPS, 0.066))
     assert high.columns["effective_loss"] == pytest.approx(np.full(50 * STEPS, 0.012))
+
+
+@pytest.mark.parametrize("point", POINTS.values(), ids=POINTS)
+def test_no_two_actions_are_alike_so_how_ties_fall_is_no_matter(point: OperatingPoint) -> None:
+    """The paper's numbers are the same whether ties are drawn or not."""
+    source = Calibrated(400)
+    numbers = np.arange(source.episodes)
+    world = CalibratedWorld(source._drawn((0, 1), 3, 0), (0, 1), numbers)
+    for [part] in walk(world, [point], world, "first"):
+        best, following = np.sort(part.result.fused, axis=-1)[:, :-3:-1].T
+        assert (best - following).min() > TIE

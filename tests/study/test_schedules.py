@@ -60,7 +60,8 @@ def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: Stored, text:
     success, costs = every.played(every.scheduled(point))
     [[walked]] = stored.walked([axes.Setting(text, point, stored.vehicles)], stored.seeds)
     world = FrozenWorld(stored.dataset, [point], stored.seeds)
-    airtime_ms = np.concatenate([columns(part)["airtime_ms"] for [part] in walk(world, [point], stored)])
+    steps = walk(world, [point], stored, stored.spec.ties)
+    airtime_ms = np.concatenate([columns(part)["airtime_ms"] for [part] in steps])
     of = {**walked.columns, "airtime_ms": airtime_ms}
     assert np.array_equal(success, walked.ends["success_rate"])
     for cost, metric in (("messages", "messages_per_episode"), ("airtime_ms", "airtime_ms")):

@@ -23,7 +23,7 @@ from harness.world.scenario import DIALS
 
 SETTINGS = (
     "model", "prompt", "answer", "thinking", "image", "letters", "sums", "temperature", "sampling_seed",
-    "helpers", "dtype", "latency", "identity", "versions",
+    "helpers", "ties", "dtype", "latency", "identity", "versions",
 )  # fmt: skip
 
 
