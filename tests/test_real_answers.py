@@ -46,9 +46,9 @@ def test_each_answer_is_parsed_as_it_was() -> None:
 
 def test_it_holds_answers_of_every_kind_of_question() -> None:
     records = corpus()
-    assert len({record["id"] for record in records}) == len(records) >= 700
+    assert len({record["id"] for record in records}) == len(records) >= 1000
     kinds = Counter((record["prompt"], record["role"], record["temperature"]) for record in records)
-    assert len(kinds) == 9 * 2 * 3
+    assert len(kinds) == 11 * 2 * 3
     assert len({record["text"] for record in records}) > 500
     assert len({record["status"] for record in records}) >= 10
 
