@@ -83,7 +83,7 @@ def test_each_fault_is_counted_and_the_commonest_stands_first() -> None:
         "4 of 12 answers copy a placeholder of the prompt",
     ]
     assert helper.faults == {"no_json": 12}
-    assert any("cannot be read: there is no JSON object" in sentence for sentence in helper.sentences())
+    assert "12 of 12 answers cannot be read: no_json" in helper.sentences()
     assert [pair.n for pair in trial.pairs] == [0, 0]  # none of them can be read
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from harness.backends.base import Backend, Completion, Request, Role
+from harness.backends.base import Backend, Completion, Role
 from harness.backends.findings import Moved
 from harness.core.errors import Unanswered, printable
 from harness.evaluate import questions
@@ -15,6 +15,7 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.asking import answer_of
 from harness.evaluate.examine import moved
 from harness.parsing.status import Repair, Status
+from harness.prompts.versions import Prompt
 from harness.runs.records import Answer
 
 ROLES: tuple[Role, ...] = ("ego", "helper")
@@ -64,18 +65,17 @@ class Answers(Struct, frozen=True):
             "state numbers that do not sum to one": self.bad_sums,
             "run to the limit of tokens": self.at_limit,
         }
-        known, meanings = {Status.SCHEMA_ECHO, Status.BAD_SUM}, {str(s): s.meaning for s in Status}
         for status, count in self.faults.items():
-            if status not in known:
-                meaning = meanings[status].rstrip(".")
-                causes[f"cannot be read: {meaning[0].lower()}{meaning[1:]} ({status})"] = count
+            if status not in (Status.SCHEMA_ECHO, Status.BAD_SUM):
+                causes[f"cannot be read: {status}"] = count
         for what, count in sorted(causes.items(), key=lambda cause: -cause[1]):
             if count:
                 yield f"{count} of {self.n} answers {what}"
         if self.distinct == 1 and self.n > 1:
             yield f"all {self.n} answers are the same text, whatever is asked"
-        elif self.action_count == self.readable > 1:
-            yield f"{self.action} is the likeliest action in all {self.readable} readable answers"
+        elif self.readable:
+            often = f"{self.action_count} of {self.readable} readable answers"
+            yield f"{self.action} is the likeliest action in {often}"
 
 
 class Trial(Struct, frozen=True):
@@ -114,23 +114,24 @@ def try_out(backend: Backend, agent: Agent, progress: Callable[[int], None] = la
         progress(len(chunk))
     rest = iter(completions)
     roles = tuple(
-        _answers(agent, role, [(request, next(rest)) for request in by_role[role]]) for role in ROLES
+        described(agent.prompt, role, asked[0].actions, [answer_of(request, next(rest)) for request in asked])
+        for role, asked in by_role.items()
     )
     return Trial(agent.card.name, agent.prompt.version, roles, moved(pairs, rest))
 
 
-def _answers(agent: Agent, role: Role, asked: Sequence[tuple[Request, Completion]]) -> Answers:
-    answers = [answer_of(request, completion) for request, completion in asked]
-    examples = [_value(e.answer) for e in agent.prompt.examples.of(role)] if agent.prompt.examples else []
+def described(prompt: Prompt, role: Role, actions: Sequence[str], answers: Sequence[Answer]) -> Answers:
+    """Return what a role's answers are like, for a prompt whose examples they may copy."""
+    examples = [_value(example.answer) for example in prompt.examples.of(role)] if prompt.examples else []
     intents = [answer.intent for answer in answers if answer.intent]
-    likeliest = Counter(asked[0][0].actions[intent.index(max(intent))] for intent in intents)
-    action = max(likeliest, key=likeliest.__getitem__, default=None)
+    likeliest = Counter(actions[intent.index(max(intent))] for intent in intents)
     faults = Counter(fault for answer in answers for fault in faults_of(answer))
     texts = Counter(answer.raw.strip() for answer in answers)
     return Answers(
         role=role, n=len(answers), readable=len(intents),
         strict=sum(answer.status == Status.STRICT for answer in answers), distinct=len(texts),
-        action=action, action_count=max(likeliest.values(), default=0),
+        action=max(likeliest, key=likeliest.__getitem__, default=None),
+        action_count=max(likeliest.values(), default=0),
         example_copies=sum(_value(answer.raw.strip()) in examples for answer in answers),
         placeholder_copies=sum(_echoes(answer) for answer in answers),
         bad_sums=faults[Status.BAD_SUM], at_limit=sum(a.finish_reason == "length" for a in answers),
