@@ -2,11 +2,14 @@
 
     python benchmarks/answer_modes.py [--model swarm-tiny] [--prompts 32] [--batch-size 8] [--repeats 1]
     python benchmarks/answer_modes.py --shape 0.6b --tokenizer GGUF --dtype bfloat16 --prompts 4
+    python benchmarks/answer_modes.py --model smollm2-135m --modes readout cyclic --prompts 8
 
 All on the same prompts: the ego's of the shipped dataset, with prompt v2. The baseline (a) is transformers'
 `generate`, one prompt at a time, greedy. (b) is lm-evaluation-harness's `hf` model on the rendered prompts
 (left out where `lm_eval` is not installed). `--shape` takes random weights of a Qwen3's shape and Qwen's
-vocabulary: such weights never stop, so every free answer is given the tokens of a JSON answer. CPU seconds of
+vocabulary: such weights never stop, so every free answer is given the tokens of a JSON answer. `readout`
+reads its letters once, `cyclic` over all cyclic orders. Without `json` among the modes there are no
+baselines. CPU seconds of
 this process (wall on CUDA), the median of repeats in turn; what llama.cpp does in its own process is its
 answers' wall time. The limit has the matrix products alone, of each prompt's tokens after what all begin with
 and of the answer's, at the rate of one such product.
@@ -41,8 +44,9 @@ from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 
 JSON_TOKENS = 43  # of a compact answer with three actions, in Qwen's vocabulary
-PEER = "b: lm-evaluation-harness"
-MODES = ("json", "constrained", "readout")
+PLAIN, PEER = "a: generate, batch 1", "b: lm-evaluation-harness"
+MODES = ("json", "constrained", "readout", "cyclic")
+CYCLIC_AIM = 1.4  # times the CPU of one pass, with three actions
 AIMS = {"json": 3.0, "readout": 6.0}  # times lm-evaluation-harness at the same batch size
 PRODUCT_ROWS = 1024  # tokens in the matrix product that the limit is taken from
 
@@ -53,6 +57,7 @@ def main() -> None:
     arguments.add_argument("--model", default="swarm-tiny")
     arguments.add_argument("--shape", choices=sorted(shapes.SHAPES))
     arguments.add_argument("--tokenizer", type=Path, help="tokenizer.json or GGUF with Qwen's vocabulary")
+    arguments.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
     arguments.add_argument("--device", default="cpu")
     arguments.add_argument("--dtype", default="float32")
     arguments.add_argument("--prompts", type=int, default=32)
@@ -73,15 +78,24 @@ def main() -> None:
         rates, limits = measure(card, given)
         if not given.shape:
             rates |= of_llama(cards.resolve(given.model, "llama-cpp"), given)
-    plainly, peer = rates["a: generate, batch 1"], rates.get(PEER, float("nan"))
+    peers = {"(a)": rates.get(PLAIN), "(b)": rates.get(PEER)}
+
+    def compared(rate: float) -> str:
+        return "".join(f", {rate / peer:.1f} of {name}" for name, peer in peers.items() if peer)
+
     for name, rate in rates.items():
-        print(f"{name:<40}{rate:9.2f} decisions/s{rate / plainly:7.1f} of (a){rate / peer:7.1f} of (b)")
+        print(f"{name:<40}{rate:9.2f} decisions/s{compared(rate)}")
     for mode, (limit, own, of_all) in limits.items():
         print(f"{mode}: {own:.0f} of {of_all:.0f} tokens of a prompt are its own")
         ours, aim = rates[f"{mode}, batch {given.batch_size}"], AIMS.get(mode)
         aimed = f", aim {aim:g} of (b)" if aim else ""
-        of_b = f"{limit / peer:.1f} of (b){aimed}"
-        print(f"{mode}: limit {limit:.0f} decisions/s, {of_b}; reached {ours / limit:.2f} of it")
+        print(
+            f"{mode}: limit {limit:.2f} decisions/s{compared(limit)}{aimed}; reached {ours / limit:.2f} of it"
+        )
+    if {"readout", "cyclic"} <= {*given.modes}:
+        for size in (f"batch {n}" for n in dict.fromkeys((1, given.batch_size))):
+            times = rates[f"readout, {size}"] / rates[f"cyclic, {size}"]
+            print(f"cyclic, {size}: {times:.2f} times one pass, aim {CYCLIC_AIM}")
     print(json.dumps({"rates": rates, "limits": limits, **vars(given)}, default=str))
 
 
@@ -89,7 +103,9 @@ def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[
     """The ego's requests, spread over the shipped dataset."""
     dataset = load.load(load.find(DATASET))
     source, points = FrozenSource(dataset), tuple(POINTS.values())
-    spec = Spec(Agent(card, prompts.load("v2"), mode), source, points, (0,))  # type: ignore[arg-type]
+    answer, letters = ("readout", mode) if mode == "cyclic" else (mode, "raw")
+    agent = Agent(card, prompts.load("v2"), answer, letters=letters)  # type: ignore[arg-type]
+    spec = Spec(agent, source, points, (0,))
     ids = dataset.courses()
     scenes = dataset.scenes(ids[:: max(1, len(ids) // count)][:count])
     egos = [r for r in requests(spec, scenes) if r.role == "ego"]
@@ -99,27 +115,27 @@ def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[
 def measure(card: cards.Card, given: argparse.Namespace) -> tuple[dict[str, float], dict[str, Any]]:
     """Rates of transformers, plain, by lm-evaluation-harness and by ours; and the `limit` of each mode."""
     most = JSON_TOKENS if given.shape else None
-    asked = {mode: asked_of(card, mode, given.prompts, most) for mode in MODES}
+    asked = {mode: asked_of(card, mode, given.prompts, most) for mode in given.modes}
     backend = open_backend(card, device=given.device, dtype=given.dtype, batch_size=given.batch_size)
     chat, engine = backend.chat, backend.engine  # type: ignore[attr-defined]
-    texts = [chat.render(r.messages, thinking=False) for r in asked["json"]]
-    work: dict[str, Callable[[], Any]] = {
-        "a: generate, batch 1": lambda: plain(engine.model, chat, texts, asked["json"])
-    }
-    by_others = lm_eval(engine.model, chat, texts, asked["json"], given.batch_size)
-    if by_others:
-        work[PEER] = by_others
+    work: dict[str, Callable[[], Any]] = {}
+    if free := asked.get("json"):
+        texts = [chat.render(r.messages, thinking=False) for r in free]
+        work[PLAIN] = lambda: plain(engine.model, chat, texts, free)
+        if by_others := lm_eval(engine.model, chat, texts, free, given.batch_size):
+            work[PEER] = by_others
     for size in (1, given.batch_size):
-        for mode in MODES:
+        for mode in given.modes:
             work[f"{mode}, batch {size}"] = partial(LanguageModel(engine, size).complete, asked[mode])
     for each in work.values():
         each()  # to warm up
     found: dict[str, list[float]] = {name: [] for name in work}
     for _ in range(given.repeats):
         for name, each in work.items():
-            found[name].append(len(texts) / seconds_of(each))
+            engine._reader._prefixes.clear()  # the modes' prompts begin alike, which no run's do
+            found[name].append(given.prompts / seconds_of(each))
     flops_per_s = product_rate(engine.model)
-    limits = {mode: limit(backend, asked[mode], flops_per_s) for mode in MODES}
+    limits = {mode: limit(backend, asked[mode], flops_per_s) for mode in given.modes}
     return {name: median(rates) for name, rates in found.items()}, limits
 
 
@@ -154,9 +170,10 @@ def limit(backend: Any, asked: Sequence[Request], flops_per_s: float) -> tuple[f
     weights = sum(p.numel() for p in net.model.layers.parameters() if p.ndim == 2)
     a_context = 4 * config.num_hidden_layers * config.num_attention_heads * config.head_dim
     flops = 0
-    for prompt, completion in zip(prompts, backend.complete(asked), strict=True):
-        # The last token of an answer is never read.
-        end, chosen = len(prompt) + completion.completion_tokens - 1, completion.completion_tokens
+    for request, completion in zip(asked, backend.complete(asked), strict=True):
+        # The last token of an answer is never read; of several orders, each has a distribution of its own.
+        end = completion.prompt_tokens + completion.completion_tokens - 1
+        chosen = completion.completion_tokens * (1 + len(request.orders))
         flops += 2 * weights * (end - known) + a_context * sum(range(known + 1, end + 1))
         flops += 2 * config.vocab_size * config.hidden_size * chosen
     mean = sum(map(len, prompts)) / len(prompts)
@@ -167,7 +184,7 @@ def of_llama(card: cards.Card, given: argparse.Namespace) -> dict[str, float]:
     """Rates of llama.cpp, one at a time, by the answers' own seconds."""
     backend = open_backend(card, device="cpu", batch_size=1)
     found = {}
-    for mode in MODES:
+    for mode in given.modes:
         asked = asked_of(card, mode, given.prompts, None)
         backend.complete(asked[:1])
         seconds = sum(c.seconds or 0 for c in backend.complete(asked))

@@ -90,6 +90,17 @@ def test_a_guess_after_a_picture_is_checked_at_its_own_places(model: Any) -> Non
     assert np.abs(session.log_probs() - plain.log_probs()).max() < 2e-4
 
 
+def test_each_way_to_go_on_after_a_picture_is_at_its_own_places(model: Any) -> None:
+    asked = [question(model, 0, 1), question(model, 1, None, text="No picture")]
+    prompts, some = [model.tokens(request) for request in asked], list(range(100))
+    ways = [[model.chat.encode(text) for text in ("A SLOWER", "B", "{")] for _ in asked]
+    found = model.engine.begin(prompts).ends(ways, some)
+    for turn in range(3):
+        plain = model.engine.begin(prompts)
+        plain.advance([of[turn] for of in ways])
+        assert np.abs(found[:, turn] - plain.log_probs(some)).max() < 2e-4
+
+
 def test_a_picture_has_the_tokens_that_the_card_says(model: Any) -> None:
     vision = model.engine.card.vision
     tokens = model.tokens(question(model, 0, 1))

@@ -159,6 +159,34 @@ def test_of_a_guess_stays_what_the_model_would_have_written(model: Any, data: st
             np.testing.assert_allclose(session.log_probs(EVERY), naive(model, sequences), atol=1e-4)
 
 
+@given(st.lists(st.lists(tokens, min_size=1, max_size=12), min_size=1, max_size=3), st.data())
+def test_each_way_to_go_on_ends_where_one_forward_does(
+    model: Any, sequences: list[list[int]], data: st.DataObject
+) -> None:
+    """Longer sequences than the window, and ways of different lengths."""
+    ways = data.draw(st.integers(1, 3))
+    chunks = [[data.draw(st.lists(tokens, min_size=1, max_size=8)) for _ in range(ways)] for _ in sequences]
+    with closing(Reader(model).begin(sequences)) as session:
+        found = session.ends(chunks, EVERY)
+    whole = [[*ids, *way] for ids, of in zip(sequences, chunks, strict=True) for way in of]
+    assert found.shape == (len(sequences), ways, len(EVERY))
+    np.testing.assert_allclose(found.reshape(len(whole), -1), naive(model, whole), atol=1e-4)
+
+
+@pytest.mark.parametrize("make", [full_attention, sliding_window])
+def test_exact_logits_of_16_bit_weights_are_float32s_until_the_next_call(make: Any) -> None:
+    half, exact, read = make().to(torch.bfloat16), [7, 9, 30], []
+    half.lm_head.register_forward_pre_hook(lambda _, inputs: read.append(inputs[0][0, -1]))
+    reader = Reader(half)
+    for asked, way in (((), []), (exact, []), ((), [5, 6]), (exact, [5, 6])):
+        with closing(reader.begin([[1, 2, 3, 4, 5, 6, 7, 8]], asked)) as session:
+            found = session.ends([[way]], exact)[0, 0] if way else session.log_probs(exact)[0]
+        with torch.inference_mode():
+            logits = (read[-1].float() @ half.lm_head.weight[exact].float().T).double().numpy()
+        off = float(np.abs(np.diff(found) - np.diff(logits)).max())
+        assert off < 1e-5 if asked else off > 1e-3
+
+
 def test_only_full_attention_is_padded() -> None:
     """A window that counts tokens would count the pads: such a model reads its prompts one by one."""
     for make, together in ((full_attention, True), (sliding_window, False)):

@@ -188,20 +188,18 @@ class Decoding:
         orders = [[list(prompt), *rest] for prompt, rest in zip(prompts, others, strict=True)]
         if len(orders[0]) == 1:
             with closing(self._engine.begin(prompts, tokens)) as session:
-                readings = [session.log_probs(tokens)]
+                readings = session.log_probs(tokens)[:, None]
         else:  # what all orders of a question begin with is read once, and then the rest of each
             shared = [common_length(of) for of in orders]
             heads = [of[0][:length] for of, length in zip(orders, shared, strict=True)]
             with closing(self._engine.begin(heads, tokens)) as session:
-                readings = [
-                    session.peek([of[n][length:] for of, length in zip(orders, shared, strict=True)], tokens)
-                    for n in range(len(orders[0]))
-                ]
+                rests = [[ids[length:] for ids in of] for of, length in zip(orders, shared, strict=True)]
+                readings = session.ends(rests, tokens)
         answers = []
         for i, request in enumerate(requests):
             log_p = [
-                [[float(reading[i][column[token]]) for token in of] for of in spellings[request.actions]]
-                for reading in readings
+                [[float(reading[column[token]]) for token in of] for of in spellings[request.actions]]
+                for reading in readings[i]
             ]
             answers.append(_read(request.actions, log_p))
         return answers

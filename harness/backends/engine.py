@@ -43,11 +43,17 @@ class Session(Protocol):
         """
         ...
 
-    def peek(self, chunks: Sequence[Sequence[int]], tokens: Sequence[int]) -> Floats:
-        """Return the log-probabilities of some tokens after a chunk, none empty, of each sequence.
+    def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
+        """Return the log-probabilities of some tokens after each of several chunks of each sequence.
 
-        The sequences stay as they are; their own distributions are not defined afterwards. Shape (n,
-        len(tokens)).
+        The sequences end with that: they can only be closed.
+
+        Args:
+            chunks: of each sequence equally many ways to go on, none empty.
+            tokens: as in `log_probs`.
+
+        Returns:
+            Shape (n, ways, len(tokens)).
         """
         ...
 

@@ -239,8 +239,9 @@ class LlamaSession:
     def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
         return _log_probs(self._logits, tokens)
 
-    def peek(self, chunks: Sequence[Sequence[int]], tokens: Sequence[int]) -> Floats:
-        return _log_probs(self._engine.peek(dict(zip(self._places, chunks, strict=True))), tokens)
+    def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
+        ways = [dict(zip(self._places, way, strict=True)) for way in zip(*chunks, strict=True)]
+        return np.stack([_log_probs(self._engine.peek(way), tokens) for way in ways], axis=1)
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
         rows = [row for row, chunk in enumerate(chunks) if chunk]

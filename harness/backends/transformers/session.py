@@ -140,17 +140,20 @@ class Reader:
         places = [self._eyes.positions(prompt) for prompt in prompts]
         return None if places[0] is None else places
 
-    def forward(self, cache: Cache, ids: Any, mask: Any, columns: int, places: Any) -> Any:
-        """Read tokens and return the logits after the last columns, (n, columns, vocabulary).
+    def forward(self, cache: Cache, ids: Any, mask: Any, columns: Any, places: Any) -> Any:
+        """Read tokens and return the logits after some columns, (n, columns, vocabulary).
 
         Args:
             cache: keys and values so far, to which the new ones are added.
             ids: tokens, (n, width), on the CPU.
-            mask: 1 for a token and 0 for a pad, (n, cached + width), on the CPU.
-            columns: after how many of the last columns.
-            places: positions, (3, n, width); None if they are consecutive.
+            mask: 1 for a token and 0 for a pad, (n, cached + width), or what each token sees, (n, 1, width,
+                cached + width), on the CPU.
+            columns: after how many of the last columns, or after which.
+            places: positions, (n, width) or (3, n, width); None if they are consecutive.
         """
         device = self._model.device
+        if mask.ndim == 4:  # added to what attention weighs: not every kind of it takes truth values
+            mask = torch.where(mask, 0.0, torch.finfo(self._model.dtype).min).to(self._model.dtype)
         options = {"attention_mask": mask.to(device), "past_key_values": cache, "use_cache": True}
         if places is not None:
             options["position_ids"] = places.to(device)
@@ -212,6 +215,11 @@ class Rows:
             self._parts = [(range(len(self._mask)), joined(self._parts))]
         return self._parts[0][1]
 
+    def copy(self) -> "Rows":
+        """Return sequences that go on by themselves."""
+        caches: list[tuple[Sequence[int], Cache]] = [(range(len(self._mask)), deepcopy(self._cache))]
+        return Rows(self._reader, caches, self._mask, self._logits, self._places)
+
     def layers(self) -> list[tuple[Any, Any]]:
         """Return each layer's keys and values, (n, heads, tokens, dim); advancing never alters them."""
         return [(layer.keys, layer.values) for layer in self._cache.layers]
@@ -228,17 +236,31 @@ class Rows:
     def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
         return _log_probs(self._logits, tokens)
 
-    def peek(self, chunks: Sequence[Sequence[int]], tokens: Sequence[int]) -> Floats:
-        mask, width = self._mask, max(map(len, chunks))
-        if self._reader.together:
-            logits = self._append(chunks, 1)[:, -1]
-            self._cache.crop(-width)
-        else:  # a window or a recurrent state cannot take back what it has read
-            cache = deepcopy(self._cache)
-            logits = self._append(chunks, 1)[:, -1]
-            self._parts = [(range(len(mask)), cache)]
-        self._mask = mask
-        return _log_probs(logits, tokens)
+    def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
+        # All ways of a sequence stand side by side in its row, and a token sees those of its own way alone:
+        # the sequence's keys and values are neither copied nor read again.
+        n, ways, width = len(chunks), len(chunks[0]), max(len(way) for of in chunks for way in of)
+        ids = torch.zeros(n, ways, width, dtype=torch.long)
+        own = torch.zeros(n, ways, width, dtype=torch.bool)
+        for row, of in enumerate(chunks):
+            for turn, way in enumerate(of):
+                ids[row, turn, width - len(way) :] = torch.tensor(way)
+                own[row, turn, width - len(way) :] = True
+        same = torch.eye(ways, dtype=torch.bool)[:, None, :, None]
+        earlier = torch.ones(width, width, dtype=torch.bool).tril()[:, None]
+        among = (same & earlier & own[:, None, None]).reshape(n, ways * width, ways * width)
+        before = self._mask.bool()[:, None].expand(-1, ways * width, -1)
+        if self._places is None:
+            starts = self._mask.sum(-1)
+        else:  # after the prompt, positions are consecutive
+            starts = torch.stack([place.max() + 1 for place in self._places])
+        places = (starts[:, None, None] + (own.cumsum(-1) - 1).clamp(min=0)).reshape(n, -1)
+        logits = self._reader.forward(
+            self._cache, ids.reshape(n, -1), torch.cat([before, among], dim=-1)[:, None],
+            torch.arange(1, ways + 1) * width - 1,
+            places if self._places is None else places.expand(3, -1, -1),
+        )  # fmt: skip
+        return _log_probs(logits.flatten(0, 1), tokens).reshape(n, ways, -1)
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
         if not any(chunks):
@@ -312,7 +334,7 @@ def _log_probs(logits: Any, tokens: Sequence[int] | None) -> Floats:
 class Apart:
     """A `Session` of sequences that are each read on their own."""
 
-    def __init__(self, sessions: Sequence[Session]) -> None:
+    def __init__(self, sessions: Sequence[Rows]) -> None:
         self._sessions = sessions
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
@@ -329,9 +351,14 @@ class Apart:
         self.advance(chunks)  # what a window or a recurrent state has read cannot be taken back
         return [0] * len(guesses)
 
-    def peek(self, chunks: Sequence[Sequence[int]], tokens: Sequence[int]) -> Floats:
-        pairs = zip(self._sessions, chunks, strict=True)
-        return np.concatenate([session.peek([chunk], tokens) for session, chunk in pairs])
+    def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
+        found = []
+        for session, ways in zip(self._sessions, chunks, strict=True):
+            forks = [session.copy() for _ in ways]  # what they read cannot be taken back
+            for fork, chunk in zip(forks, ways, strict=True):
+                fork.advance([chunk])
+            found.append(np.concatenate([fork.log_probs(tokens) for fork in forks]))
+        return np.stack(found)
 
     def keep(self, places: Sequence[int]) -> None:
         self._sessions = [self._sessions[place] for place in places]
