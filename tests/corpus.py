@@ -9,7 +9,7 @@ from harness.parsing.status import Status
 
 FOLDER = Path(__file__).parent / "completions"
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
-ASKED = {"role", "form", "thinking", "reasons_first", "divides", "finish_reason", "error"}
+ASKED = {"role", "form", "extension", "thinking", "reasons_first", "divides", "finish_reason", "error"}
 
 
 @dataclass(frozen=True)

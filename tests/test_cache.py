@@ -46,6 +46,7 @@ CHANGED: dict[str, Any] = {
     "max_tokens": 65,
     "form": "recommendation",
     "answer": "constrained",
+    "extension": "{}",
     "sums": "divide",
     "thinking": True,
     "reasons_first": True,

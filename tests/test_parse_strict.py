@@ -92,7 +92,7 @@ def test_strict_is_what_the_published_schema_and_the_sum_say_of_the_corpus(case:
         return  # not judged by its text
     text = case.text.removeprefix("<think>\n\n</think>")
     assert (case.status is Status.STRICT) == judged_strict(
-        text, Shape(case.asked["role"], ACTIONS, case.asked.get("form"))
+        text, Shape(case.asked["role"], ACTIONS, case.asked.get("form"), case.asked.get("extension", ""))
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.backends.skeleton import TWO_DIGITS, Skeleton, finished, parts, tokens_after
+from harness.backends.skeleton import TWO_DIGITS, Filled, Skeleton, start, tokens_after
 from harness.backends.tokens import tokenizer
 from harness.core.errors import UserError
 from harness.parsing.parse import Status, parse
@@ -55,9 +55,25 @@ def chat(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return of(tiny_qwen3.build(tmp_path_factory.mktemp("tiny")))
 
 
-def played(skeleton: Skeleton, choose: Callable[[list[int]], int]) -> tuple[list[int], list[list[int]], Any]:
-    """A whole walk: the tokens before its last decision, what stood to choose, and the chosen places."""
-    walk, ids, choices = skeleton.walk(), [], []
+def parts(shape: Shape) -> list[str | tuple[str, ...]]:
+    """The fixed texts of an answer without lists or texts, and between them what is chosen from."""
+    found: list[str | tuple[str, ...]] = []
+    way = start(shape).ways[0]
+    while way.then:
+        found += [way.text, way.then.options]
+        way = way.then.ways[0]
+    return [*found, way.text]
+
+
+def finished(shape: Shape, chosen: list[int]) -> str:
+    places = iter(chosen)
+    return "".join(p if isinstance(p, str) else p[next(places)] for p in parts(shape))
+
+
+def played(skeleton: Skeleton, choose: Callable[[Any], int]) -> tuple[list[int], list[list[int]], Filled]:
+    """A whole walk: the tokens before its last decision, what stood to choose, and the answer."""
+    walk: Any = skeleton.walk()
+    ids, choices = [], []
     ask = next(walk)
     while True:
         token = choose(ask.among)
@@ -159,17 +175,17 @@ def test_the_tokens_are_those_of_the_whole_text(
     chat: Any, kind: tuple[str, str], actions: tuple[str, ...], random: Any
 ) -> None:
     skeleton = Skeleton(chat, Shape(kind[0], actions, kind[1]))
-    ids, choices, chosen = played(skeleton, random.choice)
-    whole = chat.encode(finished(Shape(kind[0], actions, kind[1]), chosen))
+    ids, choices, done = played(skeleton, random.choice)
+    whole = chat.encode(done.text)
     assert ids == whole[: len(ids)], "another cut than the tokenizer's own"
-    assert skeleton.count(chosen) == len(whole) <= skeleton.most_tokens
+    assert done.tokens == len(whole) <= skeleton.most_tokens
     assert all(among == sorted(set(among)) and len(among) > 1 for among in choices)
 
 
 def test_labels_that_begin_alike_are_decided_where_they_part() -> None:
     skeleton = Skeleton(CHARACTERS, Shape("helper", ("LANE_LEFT", "LANE_RIGHT", "IDLE"), "recommendation"))
     said = iter("hLR07")
-    ids, choices, chosen = played(skeleton, lambda among: ord(next(said)))
+    ids, choices, done = played(skeleton, lambda among: ord(next(said)))
     assert ["".join(map(chr, among)) for among in choices] == [
         "hlm",  # risk: high, low, medium
         "IL",  # IDLE, or one of the lanes
@@ -180,7 +196,7 @@ def test_labels_that_begin_alike_are_decided_where_they_part() -> None:
     assert "".join(map(chr, ids)) == (
         '{"evidence":"","risk":"high","recommended_maneuver":"LANE_RIGHT","confidence":0.0'
     )
-    assert chosen == [2, 1, 7]
+    assert done.text == "".join(map(chr, ids)) + "7}"
 
 
 @pytest.mark.skipif(not QWEN.is_file(), reason="Qwen's vocabulary is not here")
@@ -190,9 +206,9 @@ def test_in_qwens_vocabulary_the_lanes_share_two_tokens_and_are_one_decision() -
     assert left[:2] == right[:2]
     assert len(left) == len(right) == 3
     skeleton = Skeleton(qwen, Shape("helper", ("LANE_LEFT", "LANE_RIGHT"), "recommendation"))
-    _, choices, chosen = played(skeleton, max)
+    _, choices, done = played(skeleton, max)
     assert choices[1] == sorted([left[2], right[2]])
-    assert chosen[1] == (0 if left[2] > right[2] else 1)
+    assert ('"LANE_LEFT"' in done.text) == (left[2] > right[2])
 
 
 @pytest.mark.parametrize(("said", "maneuver"), [('l"07', "SLOW"), ("lE07", "SLOWER")])
@@ -200,10 +216,10 @@ def test_a_label_that_is_another_ones_beginning_ends_with_its_quote(said: str, m
     actions = ("SLOWER", "SLOW")
     skeleton = Skeleton(CHARACTERS, Shape("helper", actions, "recommendation"))
     tokens = iter(said)
-    ids, choices, chosen = played(skeleton, lambda among: ord(next(tokens)))
+    ids, choices, done = played(skeleton, lambda among: ord(next(tokens)))
     assert "".join(map(chr, choices[1])) == '"E'
-    assert actions[chosen[1]] == maneuver
     assert f'maneuver":"{maneuver}","conf' in "".join(map(chr, ids)), "the quote stands once"
+    assert done.text == "".join(map(chr, ids)) + "7}"
 
 
 def test_a_tokenizer_that_merges_digits_is_asked_for_both_at_once() -> None:
@@ -217,9 +233,9 @@ def test_a_tokenizer_that_merges_digits_is_asked_for_both_at_once() -> None:
         return ids
 
     merging: Any = Encoder("merging", pairs)
-    _, choices, chosen = played(Skeleton(merging, Shape("ego", ("GO",), "distribution")), max)
+    _, choices, done = played(Skeleton(merging, Shape("ego", ("GO",), "distribution")), max)
     assert choices == [[100000 + n for n in range(100)]]
-    assert chosen == [99]
+    assert done.text == '{"action_distribution":{"GO":0.99}}'
 
 
 def test_a_tokenizer_that_marks_a_beginning_marks_none_inside_the_text() -> None:

@@ -40,6 +40,7 @@ class Request:
         answer: how the model answers. `json`: it writes freely. `constrained`: it fills in numbers and
             choices of a fixed text. `readout`: the messages ask for one letter (see
             `harness.prompts.readout`), and the letters' probabilities are the answer.
+        extension: further members of its answer (`Shape.extension`).
         sums: what becomes of a sum of probabilities that is off 1 in `json`: the answer failed, or it is
             divided out.
         thinking: whether the model is asked to think first (if its template can switch that).
@@ -64,6 +65,7 @@ class Request:
     form: str = "distribution"
     answer: AnswerMode = "json"
     orders: tuple[tuple[Mapping[str, str], ...], ...] = ()
+    extension: str = ""
     sums: Sums = "refuse"
     thinking: bool = False
     reasons_first: bool = False
@@ -81,7 +83,7 @@ class Request:
         """What the JSON of its answer is to be; a read-out is a bare distribution, even a helper's."""
         if self.answer == "readout":
             return Shape("ego", self.actions, "distribution")
-        return Shape(self.role, self.actions, self.form)
+        return Shape(self.role, self.actions, self.form, self.extension)
 
     @property
     def divides(self) -> bool:

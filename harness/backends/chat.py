@@ -136,6 +136,11 @@ class Chat:
         text: str = self.tokenizer.decode(ids, skip_special_tokens=True, clean_up_tokenization_spaces=False)
         return text
 
+    @property
+    def vocabulary(self) -> int:
+        """Number of tokens."""
+        return len(self.tokenizer)
+
     def pieces(self, ids: Sequence[int]) -> list[str]:
         """Return the text of each single token, with special tokens; incomplete bytes become U+FFFD."""
         return [

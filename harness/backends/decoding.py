@@ -15,7 +15,7 @@ from harness.backends.drafts import Drafts
 from harness.backends.engine import Engine, Session, common_length
 from harness.backends.orders import averaged
 from harness.backends.sampling import Choice
-from harness.backends.skeleton import Skeleton, finished, parts, tokens_after
+from harness.backends.skeleton import Filled, Skeleton, filled, tokens_after
 from harness.core.errors import UserError, printable
 from harness.prompts.answer_schema import Shape
 from harness.prompts.readout import letters, stated
@@ -117,8 +117,7 @@ class Decoding:
         drafts = Drafts(self._chat)
         for shape in {request.shape for request in requests}:
             for option in (0, -1):  # two fillings, so that what differs is not guessed
-                text = "".join(part if isinstance(part, str) else part[option] for part in parts(shape))
-                tokens = tokens_after(self._chat, "\n", text)
+                tokens = tokens_after(self._chat, "\n", filled(shape, option))
                 for end in range(1, len(tokens) + 1):
                     drafts.learn(shape, tokens[:end])
         return drafts
@@ -148,7 +147,7 @@ class Decoding:
     def _constrained(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Answer]:
         walks = [self._skeleton(request).walk() for request in requests]
         asks = [next(walk) for walk in walks]
-        chosen: dict[int, list[int]] = {}
+        done: dict[int, Filled] = {}
         live = list(range(len(requests)))
         while live:
             session.advance([asks[i].forced for i in live])
@@ -157,12 +156,9 @@ class Decoding:
                 try:
                     asks[i] = walks[i].send(token)
                 except StopIteration as end:
-                    chosen[i] = end.value
-            live = _narrow(session, live, [i not in chosen for i in live])
-        return [
-            Answer(finished(r.shape, chosen[i]), self._skeleton(r).count(chosen[i]), "stop")
-            for i, r in enumerate(requests)
-        ]
+                    done[i] = end.value
+            live = _narrow(session, live, [i not in done for i in live])
+        return [Answer(done[i].text, done[i].tokens, "stop") for i in range(len(requests))]
 
     def _skeleton(self, request: Request) -> Skeleton:
         shape = request.shape

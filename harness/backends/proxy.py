@@ -14,6 +14,7 @@ from harness.backends.cards import Card
 from harness.backends.failures import Failures, drawn, spoilt
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded
+from harness.prompts.answer_schema import plainest
 from harness.world.planner import plan, plans
 from harness.world.scenario import Scenario
 
@@ -88,11 +89,11 @@ def _answers(requests: Sequence[Request]) -> list[str]:
 def _told(request: Request, view: Mapping[str, Any], intent: dict[str, float]) -> str:
     """Return the text of an answer."""
     best = max(intent, key=intent.__getitem__)
-    body: dict[str, Any] = {}
+    body = {name: plainest(schema) for name, schema in request.shape.further.items()}
     if request.role == "helper":
         unsure = intent["SLOWER"] > (LEAST_DOUBT + MOST_DOUBT) / 2
         risk = "high" if best == "SLOWER" else "medium" if unsure else "low"
-        body = {"evidence": _reason(view), "risk": risk}
+        body |= {"evidence": _reason(view), "risk": risk}
     if key := request.shape.named:
         body |= {key: best, "confidence": intent[best]}
     else:

@@ -1,50 +1,110 @@
-"""The fixed text of a constrained answer, in which the model fills in digits and choices.
+"""The fixed text of a constrained answer, in which the model fills in digits, choices and bounded texts.
 
-The text is compact JSON that always fits the answer schema. A probability is `0.` and two digits, so 1.00
+The text is compact JSON that always fits the answer's schema. A probability is `0.` and two digits, so 1.00
 cannot be written, and the digits need not sum to 1: `harness.parsing` divides by their sum, as it does with
-what a server wrote. A helper's evidence is empty, since there is no free text.
+what a server wrote. A helper's evidence is empty; the members that a prompt version adds may have text.
 
 The model is never asked for fixed text. A choice is made token by token, and the model decides only where the
 remaining options differ in their next token (LANE_LEFT and LANE_RIGHT share two in Qwen's vocabulary).
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from harness.backends.chat import Chat
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json
-from harness.prompts.answer_schema import RISKS, Shape
+from harness.prompts.answer_schema import Shape, constrained_schema, number_texts
 
-Part = str | tuple[str, ...]
 TWO_DIGITS = tuple(f"{n:02d}" for n in range(100))
+LONGEST_PIECE = 16  # most characters of a token in a text that the model writes
+UNIT = (0, 1)  # bounds of a number that is `0.` and two digits
 
 
-def parts(shape: Shape) -> list[Part]:
-    """Return the text in parts: fixed strings, and tuples of options, each between two strings.
+class Way(NamedTuple):
+    """Fixed text that may follow a point, and the point behind it; None at the end."""
 
-    Parts begin and end only beside letters and digits, where tokenizers split as well.
+    text: str
+    then: "Point | None"
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A place where the model decides, and then goes on in one of several ways.
+
+    Attributes:
+        options: texts to choose from; one empty text where only the way is chosen.
+        most: most characters of a text that the model writes instead of a choice; 0 for a choice.
+        ways: what may follow.
+        instead: what may stand here instead: the end of a list that has no numbers.
     """
-    text: list[Part] = []
-    opening = "{"
-    if shape.role == "helper":
-        text, opening = ['{"evidence":"","risk":"', RISKS], '",'
-    names = tuple(canonical_json(action) for action in shape.actions)
-    if key := shape.named:
-        bare = tuple(name[1:-1] for name in names)
-        return [*text, f'{opening}"{key}":"', bare, '","confidence":0.', TWO_DIGITS, "}"]
-    opening += '"action_distribution":{'
-    for name in names:
-        text += [f"{opening}{name}:0.", TWO_DIGITS]
-        opening = ","
-    return [*text, "}}"]
+
+    options: tuple[str, ...]
+    most: int
+    ways: tuple[Way, ...]
+    instead: tuple[Way, ...] = ()
 
 
-def finished(shape: Shape, chosen: Sequence[int]) -> str:
-    """Return the text of an answer as it was filled in; `chosen` has the place of each choice's option."""
-    places = iter(chosen)
-    return "".join(p if isinstance(p, str) else p[next(places)] for p in parts(shape))
+def ways_of(schema: Mapping[str, Any], ways: Sequence[Way]) -> list[Way]:
+    """Return the ways to write a value of a schema and go on in one of some ways.
+
+    Fixed texts begin and end only beside letters and digits, where tokenizers split as well.
+    """
+    if "enum" in schema:
+        options = [canonical_json(choice) for choice in schema["enum"]]
+        if len(options) == 1:
+            return _after(options[0], ways)
+        return _quoted(Point(tuple(option[1:-1] for option in options), 0, tuple(_after('"', ways))))
+    match schema["type"]:
+        case "string":
+            return _quoted(Point(("",), schema["maxLength"], tuple(_after('"', ways))))
+        case "boolean":
+            return [Way("", Point(("false", "true"), 0, tuple(ways)))]
+        case "object":
+            members = [*schema["properties"].items()]
+            ways = _after("}", ways)
+            for place, (name, member) in reversed([*enumerate(members)]):
+                ways = _after(f"{',' if place else '{'}{canonical_json(name)}:", ways_of(member, ways))
+            return ways
+        case "array":
+            ends = further = _after("]", ways)
+            for place in reversed(range(schema["maxItems"])):
+                item = ways_of(schema["items"], further)
+                enough = place and place >= schema["minItems"]
+                further = _after("," if place else "[", item) + (ends if enough else [])
+            if schema["minItems"]:
+                return further
+            if further[0].text == "[" and (point := further[0].then):  # no fixed text to choose by
+                return [Way("[", replace(point, instead=tuple(ends)))]
+            return further + _after("[", ends)
+    if (schema["minimum"], schema["maximum"]) == UNIT and schema["type"] == "number":
+        return [Way("0.", Point(TWO_DIGITS, 0, tuple(ways)))]
+    return [Way("", Point(number_texts(schema), 0, tuple(ways)))]
+
+
+def _after(text: str, ways: Sequence[Way]) -> list[Way]:
+    return [Way(text + way.text, way.then) for way in ways]
+
+
+def _quoted(point: Point) -> list[Way]:
+    return [Way('"', point)]
+
+
+def start(shape: Shape) -> Point:
+    """Return the point at which an answer begins."""
+    return Point(("",), 0, tuple(ways_of(constrained_schema(shape), [Way("", None)])))
+
+
+def filled(shape: Shape, place: int) -> str:
+    """Return the answer with the option and the way at this place everywhere, and no text."""
+    text, point = "", Way("", start(shape)).then
+    while point:
+        way = point.ways[place]
+        text, point = text + point.options[place] + way.text, way.then
+    return text
 
 
 def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
@@ -65,62 +125,132 @@ class Ask(NamedTuple):
     """
 
     forced: list[int]
-    among: list[int]
+    among: Sequence[int]
+
+
+class Filled(NamedTuple):
+    """A filled-in answer: its text, and how many tokens it has."""
+
+    text: str
+    tokens: int
+
+
+class Leg(NamedTuple):
+    """An option and the way behind it: their text, its tokens, and the point that follows."""
+
+    text: str
+    tokens: tuple[int, ...]
+    way: Way
 
 
 class Skeleton:
-    """The text of `parts` in a tokenizer's tokens.
+    """The answers of a shape in a tokenizer's tokens; each follows a line break, as in every template.
 
     Attributes:
-        most_tokens: length of its longest filling.
+        most_tokens: length of the longest.
     """
 
     def __init__(self, chat: Chat, shape: Shape) -> None:
-        self._literals: list[tuple[int, ...]] = []
-        self._choices: list[list[tuple[int, ...]]] = []
-        pieces = parts(shape)
-        before = "\n"  # an answer follows a line break in every known chat template
-        for piece in pieces:
-            if isinstance(piece, str):
-                self._literals.append(tokens_after(chat, before, piece))
-                before = piece
-            else:
-                self._choices.append([tokens_after(chat, before, option) for option in piece])
-                before = piece[0]
-        for place, options in enumerate(self._choices):
-            # One option may be a prefix of another (SLOW, SLOWER), so the token after it is needed to decide.
-            stop = self._literals[place + 1][:1]
-            self._choices[place] = ended = [option + stop for option in options]
-            if any(longer[: len(short)] == short for short, longer in pairwise(sorted(ended))):
+        self._chat = chat
+        self._start = start(shape)
+        self._legs: dict[tuple[Point, str], list[Leg]] = {}
+        self._tokens = cache(partial(tokens_after, chat))
+        self._sizes: list[tuple[int, int]] = []
+        self._allowed: dict[tuple[int, frozenset[int]], list[int]] = {}
+        self.most_tokens = self._most()
+
+    def _legs_of(self, point: Point, before: str) -> list[Leg]:
+        """Return what may be chosen at a point that follows a fixed text."""
+        if (point, before) not in self._legs:
+            # Only the first option stands before a way: those of one kind end alike.
+            ends = [self._tokens(point.options[0] or before, way.text) for way in point.ways]
+            self._legs[point, before] = legs = [
+                Leg(option + way.text, self._tokens(before, option) + end, way)
+                for option in point.options for way, end in zip(point.ways, ends, strict=True)
+            ]  # fmt: skip
+            legs += [Leg(way.text, self._tokens(before, way.text), way) for way in point.instead]
+            # One option may be a prefix of another (SLOW, SLOWER), so the tokens after it decide.
+            if any(b.tokens[: len(a.tokens)] == a.tokens for a, b in pairwise(sorted(legs, key=_by_tokens))):
                 raise UserError(
-                    f"model {printable(chat.name)!r}: its tokenizer cannot tell the choices of a constrained "
-                    f"answer apart; use --answer json"
+                    f"model {printable(self._chat.name)!r}: its tokenizer cannot tell the choices of a "
+                    "constrained answer apart; use --answer json"
                 )
-        longest = [max(options, key=len) for options in self._choices]
-        self.most_tokens = self._count(longest)
+        return self._legs[point, before]
 
-    def _count(self, ended: Sequence[tuple[int, ...]]) -> int:
-        return sum(map(len, self._literals)) + sum(len(option) - 1 for option in ended)
+    def _most(self) -> int:
+        longest: dict[Point | None, int] = {None: 0}
+        pending = [Way("\n", self._start)]
+        while pending:
+            before, point = pending[-1]
+            if point is None or point in longest:
+                pending.pop()
+            elif later := [way for way in point.ways + point.instead if way.then not in longest]:
+                pending += later
+            else:
+                legs = self._legs_of(point, before)
+                longest[point] = point.most + max(len(leg.tokens) + longest[leg.way.then] for leg in legs)
+        return longest[self._start]
 
-    def count(self, chosen: Sequence[int]) -> int:
-        """Return the length of the filled-in text in tokens."""
-        return self._count([options[i] for options, i in zip(self._choices, chosen, strict=True)])
-
-    def walk(self) -> Generator[Ask, int, list[int]]:
-        """Yield each decision, receive its token, and return the chosen places that `finished` takes."""
-        chosen = []
-        forced = list(self._literals[0])
-        for options, after in zip(self._choices, self._literals[1:], strict=True):
-            remaining, depth = list(range(len(options))), 0
-            while len(remaining) > 1:
-                among = sorted({options[i][depth] for i in remaining})
+    def walk(self) -> Generator[Ask, int, Filled]:
+        """Yield each decision, receive its token, and return the answer."""
+        text, count, before = "", 0, "\n"
+        forced: list[int] = []
+        point: Point | None = self._start
+        while point:
+            legs, depth = self._legs_of(point, before), 0
+            if point.most:
+                written, tokens, legs = yield from self._write(point, before, legs, forced)
+                text, count = text + written, count + tokens
+            while len(legs) > 1:
+                among = sorted({leg.tokens[depth] for leg in legs})
                 if len(among) > 1:
                     token = yield Ask(forced, among)
                     forced = []
-                    remaining = [i for i in remaining if options[i][depth] == token]
-                if len(remaining) > 1:
-                    forced.append(options[remaining[0]][depth])
+                    legs = [leg for leg in legs if leg.tokens[depth] == token]
+                if len(legs) > 1:
+                    forced.append(legs[0].tokens[depth])
                     depth += 1
-            chosen.append(remaining[0])
-            forced += [*options[remaining[0]][depth:-1], *after]
-        return chosen
+            [leg] = legs
+            forced += leg.tokens[depth:]
+            text, count, before, point = text + leg.text, count + len(leg.tokens), leg.way.text, leg.way.then
+        return Filled(text, count)
+
+    def _write(
+        self, point: Point, before: str, legs: list[Leg], forced: list[int]
+    ) -> Generator[Ask, int, tuple[str, int, list[Leg]]]:
+        """Let the model write a text; return it, its tokens, and what may follow. `forced` is used up."""
+        ids: list[int] = []
+        head = self._chat.encode(before)
+        left, ends = point.most, frozenset(leg.tokens[0] for leg in legs)
+        while left > 0:
+            token = yield Ask(forced.copy(), self._among(left, ends))
+            forced.clear()
+            if token in ends:
+                legs = [leg for leg in legs if leg.tokens[0] == token]
+                break
+            ids.append(token)
+            forced.append(token)
+            left = point.most - len(self._text(head, ids))
+        return self._text(head, ids), len(ids), legs
+
+    def _text(self, head: list[int], ids: list[int]) -> str:
+        return self._chat.decode([*head, *ids])[len(self._chat.decode(head)) :]
+
+    def _among(self, left: int, ends: frozenset[int]) -> list[int]:
+        """Return the tokens that end a text, and those of plain text of up to so many characters, sorted."""
+        if not self._sizes:
+            head = self._chat.encode('"')
+            texts = ((i, self._text(head, [i])) for i in range(self._chat.vocabulary))
+            self._sizes = [(i, len(text)) for i, text in texts if _is_plain(text)]
+        key = min(left, LONGEST_PIECE), ends
+        if key not in self._allowed:
+            self._allowed[key] = sorted(ends.union(i for i, size in self._sizes if size <= key[0]))
+        return self._allowed[key]
+
+
+def _by_tokens(leg: Leg) -> tuple[int, ...]:
+    return leg.tokens
+
+
+def _is_plain(text: str) -> bool:
+    return bool(text) and text.isprintable() and not {'"', "\\", "\ufffd"} & set(text)

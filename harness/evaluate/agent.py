@@ -112,14 +112,15 @@ class Agent:
 
     def most_tokens(self, role: Role) -> int:
         """Return the most tokens that an answer may have, the thought included if the model thinks first."""
-        answer = self.card.max_new_tokens or self.prompt.max_answer_tokens[role]
+        answer = self.card.max_new_tokens or self.prompt.most_answer_tokens(role)
         return answer + (self.card.thinking_tokens if self.thinking else 0)
 
     def blank(self, role: Role, actions: tuple[str, ...]) -> Request:
         """Return a request in a role, without what differs between such requests."""
         return Request(
             id="", messages=(), role=role, actions=actions, max_tokens=self.most_tokens(role),
-            form=self.prompt.form(role), answer=self.answer, sums=self.sums, thinking=self.thinking,
+            form=self.prompt.form(role), extension=self.prompt.extension.get(role, ""),
+            answer=self.answer, sums=self.sums, thinking=self.thinking,
             reasons_first=role in self.prompt.reasons_first,
         )  # fmt: skip
 
@@ -189,9 +190,7 @@ def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[s
     likeliest = []
     for number, example in enumerate(prompt.examples.of(role) if prompt.examples else (), 1):
         first = role in prompt.reasons_first
-        parsed = parse(
-            example.answer, role=role, actions=actions, form=prompt.form(role), reasons_first=first
-        )
+        parsed = parse(example.answer, **prompt.shape(role, actions)._asdict(), reasons_first=first)
         if parsed.status is not Status.STRICT or parsed.intent is None:
             raise UserError(
                 f"prompt {prompt.version} examples.json: the answer of {role} example {number} is not as a "

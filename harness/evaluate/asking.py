@@ -131,6 +131,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         repairs=tuple(map(str, parsed.repairs)), intent=parsed.intent, mass=parsed.mass,
         message=parsed.message, detail=parsed.detail,
         faults=tuple(map(str, parsed.faults)) if len(parsed.faults) > 1 else UNSET,
+        extension=_or_unset(parsed.extension),
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ def sources(spec: Spec) -> dict[str, bytes]:
         for name, text in prompt.files.items():
             texts[f"prompts/{prompt.version}/{name}"] = text.encode()
         for role in ROLES:
-            schema = msgspec.json.encode(answer_schema(role, spec.actions, form=prompt.form(role)))
+            schema = msgspec.json.encode(answer_schema(**prompt.shape(role, spec.actions)._asdict()))
             texts[f"schemas/{prompt.version}/{role}.json"] = msgspec.json.format(schema, indent=1) + b"\n"
         card = agent.card.name.partition(":")[0]
         if card in cards.names() and cards.load(agent.card.name) == agent.card:

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from harness.core.errors import printable
 from harness.parsing import values
+from harness.parsing.schema import further
 from harness.parsing.status import Failure, Repair, Status, joined, noted
 from harness.prompts.answer_schema import EVIDENCE_CHARS, RISKS, Shape
 
@@ -22,12 +23,13 @@ MARKS = {"ego": ("maneuver", "action_distribution"), "helper": FIELDS["helper"]}
 
 
 class Answer(Struct, frozen=True):
-    """An intent, its sum as stated, a helper's message, and the repairs that reading them took."""
+    """An intent, its sum as stated, a helper's message, the repairs, and what else was asked for."""
 
     intent: values.Intent
     mass: float | None
     message: dict[str, Any] | None
     repairs: frozenset[Repair]
+    extension: dict[str, Any] | None = None
 
     def mended(self, repair: Repair) -> "Answer":
         """Return the answer with one more repair."""
@@ -47,7 +49,13 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
     if values.is_schema(members):
         raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")
     actions, repairs = shape.actions, set(so_far)
-    fields, rest = values.sort_fields(members, FIELDS[shape.role], repairs)
+    names = tuple(shape.further)
+    fields, rest = values.sort_fields(members, FIELDS[shape.role] + names, repairs)
+    extension = None
+    if names:
+        extension = further({name: fields.pop(name) for name in names if name in fields}, shape)
+        if extension is None:
+            repairs.add(Repair.UNFIT_EXTENSION)
     has_loose_actions = any(values.match(key, actions) for key in rest)
     if has_loose_actions and fields.keys() & {"action_distribution", "recommended_maneuver", "maneuver"}:
         raise Failure(Status.CONFLICTING_ANSWERS, "actions stand both inside and outside the answer's fields")
@@ -60,7 +68,7 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
     if _is_other_form(fields, shape):
         repairs.add(Repair.OTHER_FORM)
     if shape.role == "helper":
-        return _helper(fields, actions, repairs, divides)
+        return replace(_helper(fields, actions, repairs, divides), extension=extension)
     if "maneuver" in fields:
         intent, mass, maneuver, _ = _judgement(fields, "maneuver", actions, repairs, divides)
         if Repair.OTHER_FORM in repairs and mass is None:
@@ -70,7 +78,7 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
         if "confidence" in fields:
             repairs.add(Repair.EXTRA_FIELD)
         intent, mass = values.distribution(fields.get("action_distribution"), actions, repairs, divides)
-    return Answer(intent, mass, None, frozenset(repairs))
+    return Answer(intent, mass, None, frozenset(repairs), extension)
 
 
 def _is_other_form(fields: dict[str, Any], shape: Shape) -> bool:

@@ -53,6 +53,7 @@ class Parsed(Struct, frozen=True):
         reasoning: the thought, or None; the whole text if the thought was never closed.
         detail: one sentence for people, safe to print.
         faults: if failed, all that is wrong with it, the status first.
+        extension: the further members that were asked for; None without any, or if they do not fit.
     """
 
     status: Status
@@ -63,6 +64,7 @@ class Parsed(Struct, frozen=True):
     reasoning: str | None = None
     detail: str = ""
     faults: tuple[Status, ...] = ()
+    extension: dict[str, Any] | None = None
 
     @property
     def verdict(self) -> Literal["strict", "recovered", "failed"]:
@@ -78,6 +80,7 @@ def parse(
     role: str,
     actions: Sequence[str],
     form: str | None = None,
+    extension: str = "",
     thinking: bool = False,
     reasons_first: bool = False,
     divides: bool = False,
@@ -94,6 +97,7 @@ def parse(
         role: `ego` or `helper`.
         actions: meta-action names, in the environment's order.
         form: the form that was asked for; None if any of the role's `FORMS` will do.
+        extension: schemas of further members that were asked for (`Shape.extension`); empty for none.
         thinking: whether the text must hold a closed thought: the model was asked to think, and the engine
             did not take the thought out of the text.
         reasons_first: whether the prompt asked for reasons before the answer; then prose there is no repair.
@@ -109,7 +113,7 @@ def parse(
     if error is not None or finish_reason == "error":
         message = errors.printable(error or "no message", 80)
         return _failed(Failure(Status.ENGINE_ERROR, f"the engine failed: {message}"), None)
-    shape = Shape(role, tuple(actions), form)
+    shape = Shape(role, tuple(actions), form, extension)
     thought: str | None = None
     try:
         answer = None if thinking else _strict(text, shape)
@@ -135,7 +139,8 @@ def parse(
         answer.mass,
         answer.message,
         thought or None,
-        f"read after {len(repairs)} repair(s): {', '.join(repairs)}" if repairs else "fits the schema",
+        extension=answer.extension,
+        detail=f"read after {len(repairs)} repair(s): {', '.join(repairs)}" if repairs else "fits the schema",
     )
 
 

@@ -90,6 +90,10 @@ class Repair(_Documented):
         "other_form",
         "One action with a confidence was given where a distribution was asked for, or the reverse.",
     )
+    UNFIT_EXTENSION = (
+        "unfit_extension",
+        "What the prompt asks for beside the decision was missing or did not fit, and was dropped.",
+    )
     BOTH_FORMS = "both_forms", "A helper gave a distribution and a maneuver that agrees with it."
     MISSING_EVIDENCE = "missing_evidence", "A helper gave no evidence text."
     EVIDENCE_ECHO = "evidence_echo", "A helper's evidence was the prompt's placeholder, and was dropped."

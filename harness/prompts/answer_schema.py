@@ -3,7 +3,10 @@
 JSON Schema cannot express that probabilities sum to one; `harness.parsing.parse` checks that.
 """
 
-from collections.abc import Sequence
+import json
+import math
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 from harness.core import errors
@@ -11,6 +14,7 @@ from harness.core import errors
 FORMS = {"ego": ("distribution", "maneuver"), "helper": ("distribution", "recommendation")}
 ROLES = tuple(FORMS)
 NAMED = {"ego": "maneuver", "helper": "recommended_maneuver"}  # the key of an action that is named alone
+FIELDS = ("evidence", "risk", "action_distribution", "confidence", *NAMED.values())  # of any role's answer
 RISKS = ("low", "medium", "high")
 EVIDENCE_CHARS = 200
 
@@ -22,11 +26,14 @@ class Shape(NamedTuple):
         role: `ego` or `helper`.
         actions: meta-action names, in the environment's order.
         form: one of the role's `FORMS`; None for any of them.
+        extension: JSON text of the schemas of further members by name (`harness.prompts.extension`), which
+            come first; empty for none.
     """
 
     role: str
     actions: tuple[str, ...]
     form: str | None = None
+    extension: str = ""
 
     @property
     def forms(self) -> tuple[str, ...]:
@@ -38,9 +45,18 @@ class Shape(NamedTuple):
         """The key of the action that its form names, with a confidence; None for a distribution."""
         return None if self.form == "distribution" else NAMED[self.role]
 
+    @property
+    def further(self) -> dict[str, Any]:
+        """The schemas of further members by name."""
+        return dict(json.loads(self.extension)) if self.extension else {}
+
 
 def answer_schema(
-    role: str, actions: Sequence[str], scenario: str | None = None, form: str | None = None
+    role: str,
+    actions: Sequence[str],
+    scenario: str | None = None,
+    form: str | None = None,
+    extension: str = "",
 ) -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of one role's answer.
 
@@ -51,6 +67,7 @@ def answer_schema(
         actions: meta-action names, in the environment's order.
         scenario: named in the title only.
         form: the form that is asked for, one of the role's `FORMS`; None allows any.
+        extension: what a prompt version adds (`Shape.extension`).
 
     Raises:
         UserError: unknown role.
@@ -58,15 +75,13 @@ def answer_schema(
     if role not in ROLES:
         raise errors.unknown("role", role, ROLES)
     probability = {"type": "number", "minimum": 0, "maximum": 1}
-    report: dict[str, Any] = {}
+    shape = Shape(role, tuple(actions), form, extension)
+    report = shape.further
     if role == "helper":
-        report = {"evidence": {"type": "string", "maxLength": EVIDENCE_CHARS}, "risk": _choice(RISKS)}
-    distribution = {"action_distribution": _closed(dict.fromkeys(actions, probability))}
+        report |= {"evidence": {"type": "string", "maxLength": EVIDENCE_CHARS}, "risk": _choice(RISKS)}
+    distribution = {"action_distribution": closed(dict.fromkeys(actions, probability))}
     one = {NAMED[role]: _choice(actions), "confidence": probability}
-    forms = [
-        _closed(report | (distribution if each == "distribution" else one))
-        for each in Shape(role, tuple(actions), form).forms
-    ]
+    forms = [closed(report | (distribution if each == "distribution" else one)) for each in shape.forms]
     title = f"{role} answer" + (f", {scenario}" if scenario else "")
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title}
     return head | (forms[0] if len(forms) == 1 else {"oneOf": forms})
@@ -77,10 +92,65 @@ def _choice(names: Sequence[str]) -> dict[str, Any]:
     return {"type": "string", "enum": list(names)}
 
 
-def _closed(properties: dict[str, Any]) -> dict[str, Any]:
+def closed(properties: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the schema of an object that has all of some properties and no others."""
     return {
         "type": "object",
-        "properties": properties,
+        "properties": dict(properties),
         "required": list(properties),
         "additionalProperties": False,
     }
+
+
+@lru_cache
+def constrained_schema(shape: Shape) -> Mapping[str, Any]:
+    """Return the schema that constrains an answer of a stated form: a helper's evidence is an empty text."""
+    schema = answer_schema(shape.role, shape.actions, form=shape.form, extension=shape.extension)
+    schema = {key: value for key, value in schema.items() if key not in ("$schema", "title")}
+    if shape.role == "helper":
+        schema["properties"] = {**schema["properties"], "evidence": {"type": "string", "enum": [""]}}
+    return schema
+
+
+def number_texts(schema: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the texts of a number that a constrained answer chooses from, 100 to 1000 steps for a `number`.
+
+    The step is a power of ten: hundredths between 0 and 1, tenths between -10 and 10.
+    """
+    least, most = schema["minimum"], schema["maximum"]
+    decimals = 0 if schema["type"] == "integer" else 2 - math.floor(math.log10(most - least))
+    steps = range(math.ceil(least * 10.0**decimals), math.floor(most * 10.0**decimals) + 1)
+    texts = [f"{step / 10.0**decimals:.{max(decimals, 0)}f}" for step in steps]
+    return tuple(text for text in texts if least <= float(text) <= most)
+
+
+def longest(schema: Mapping[str, Any]) -> int:
+    """Return the most characters of a value's compact JSON, escapes aside."""
+    if "enum" in schema:
+        return max(len(json.dumps(choice, ensure_ascii=False)) for choice in schema["enum"])
+    match schema["type"]:
+        case "string":
+            return 2 + int(schema["maxLength"])
+        case "boolean":
+            return len("false")
+        case "array":
+            return 1 + int(schema["maxItems"]) * (1 + longest(schema["items"]))
+        case "object":
+            return 1 + sum(len(name) + 4 + longest(each) for name, each in schema["properties"].items())
+    return max(map(len, number_texts(schema)))
+
+
+def plainest(schema: Mapping[str, Any]) -> Any:
+    """Return a value that fits and says as little as possible."""
+    if "enum" in schema:
+        return schema["enum"][0]
+    match schema["type"]:
+        case "string":
+            return ""
+        case "boolean":
+            return False
+        case "array":
+            return [plainest(schema["items"])] * schema["minItems"]
+        case "object":
+            return {name: plainest(each) for name, each in schema["properties"].items()}
+    return min(max(0, schema["minimum"]), schema["maximum"])

@@ -34,5 +34,5 @@ def densest_repair(
 ) -> tuple[Mapping[str, str], ...]:
     """Return what a repair turn adds to a chat at most: the longest answer, and the request to repair it."""
     request = prompt.repair(role, dense(ERROR_CHARS), actions, words)
-    answer = dense(prompt.max_answer_tokens[role])
+    answer = dense(prompt.most_answer_tokens(role))
     return {"role": "assistant", "content": answer}, {"role": "user", "content": request}

@@ -20,7 +20,7 @@ CONTEXT = 8  # words shown before and after a change
 MARKS: Mapping[Kind, tuple[str, str]] = {"same": ("", ""), "removed": ("[-", "-]"), "added": ("{+", "+}")}
 SETTINGS = (
     "ego_answer", "helper_answer", "reasons_first", "max_answer_tokens", "max_objects", "max_conflicts",
-    "token_budget", "examples", "repair_turn",
+    "token_budget", "examples", "extension", "repair_turn",
 )  # fmt: skip
 
 
@@ -108,6 +108,7 @@ def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
         texts={**ego.texts, "helper": helper.texts["helper"]},
         max_answer_tokens={**ego.max_answer_tokens, "helper": helper.max_answer_tokens["helper"]},
         helper_answer=helper.helper_answer,
+        extension={r: p.extension[r] for r, p in (("ego", ego), ("helper", helper)) if r in p.extension},
         reasons_first=tuple(r for r, p in (("ego", ego), ("helper", helper)) if r in p.reasons_first),
     )
 

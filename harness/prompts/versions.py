@@ -2,7 +2,8 @@
 
 A version is a folder `prompts/<version>/` with `ego.j2`, `helper.j2` (each with the blocks `system` and
 `user`; `question` for what ends every question unless a letter is asked for, and `repair` for a repair turn)
-and `prompt.toml`; it may have examples, `examples.json`. Released versions are pinned by digest in
+and `prompt.toml`; it may have examples, `examples.json`, and further
+members of its answers, `answer.json`. Released versions are pinned by digest in
 `prompts/released.toml`: a changed text is a new version.
 """
 
@@ -23,8 +24,11 @@ from harness.core.files import canonical_json, sha256_bytes, text_of, write_whol
 from harness.core.resources import entries, find
 from harness.core.templates import TooMuch
 from harness.prompts.answer_schema import ROLES as ROLES
+from harness.prompts.answer_schema import Shape, closed, longest
 from harness.prompts.examples import EXAMPLES, Examples
 from harness.prompts.examples import read as read_examples
+from harness.prompts.extension import ANSWER
+from harness.prompts.extension import read as read_extension
 from harness.prompts.template import Template
 from harness.world.scenario import Scenario
 
@@ -57,6 +61,7 @@ class Prompt:
         ego_answer: what the ego is asked for: `distribution`, or `maneuver`, one action and a confidence.
         texts: template text by role.
         examples: earlier turns of the chat, from one scenario; None without any.
+        extension: further members of a role's answer, as `Shape` takes them; roles without any are not there.
         image: picture before the user's text: what the viewer's `camera` sees; None if there is none.
         files: the text of each of its files by name, as they were read.
     """
@@ -76,6 +81,7 @@ class Prompt:
     ego_answer: Literal["distribution", "maneuver"] = "distribution"
     max_conflicts: Count | None = None
     examples: Examples | None = None
+    extension: Mapping[str, str] = field(default_factory=dict)
     image: Literal["camera"] | None = None
     files: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
 
@@ -113,6 +119,15 @@ class Prompt:
     def form(self, role: str) -> str:
         """Return the form of a role's answer, one of its `FORMS`."""
         return self.ego_answer if role == "ego" else self.helper_answer
+
+    def shape(self, role: str, actions: Sequence[str]) -> Shape:
+        """Return what decides the JSON of a role's answer."""
+        return Shape(role, tuple(actions), self.form(role), self.extension.get(role, ""))
+
+    def most_answer_tokens(self, role: str) -> int:
+        """Return the most tokens of an answer: `max_answer_tokens`, and one a character of what is added."""
+        further = self.shape(role, ()).further
+        return self.max_answer_tokens[role] + (longest(closed(further)) if further else 0)
 
     def repair(self, role: str, error: str, actions: tuple[str, ...], words: Mapping[str, str]) -> str:
         """Render the message to a viewer whose answer could not be read, for the reason `error`."""
@@ -246,6 +261,10 @@ def unfit(prompt: Prompt, scenario: Scenario) -> str | None:
         return f"speaks of a crossing, which {scenario.name} is not"
     if prompt.examples and not prompt.examples.everywhere and prompt.examples.scenario != scenario.name:
         return f"has examples of {printable(prompt.examples.scenario)}, which {scenario.name} is not"
+    for role, actions in ((role, scenario.actions) for role in ROLES):
+        named = {action.casefold() for action in actions}
+        if taken := [name for name in prompt.shape(role, actions).further if name.casefold() in named]:
+            return f"has {taken[0]} in answer.json, which is an action of {scenario.name}"
     return None
 
 
@@ -258,7 +277,7 @@ def load(version: str, where: Path | None = None) -> Prompt:
     if version not in names(where):
         raise unknown("prompt", version, names(where))
     base = _base(version, where)
-    optional = [EXAMPLES] if os.path.lexists(base / version / EXAMPLES) else []
+    optional = [name for name in (EXAMPLES, ANSWER) if os.path.lexists(base / version / name)]
     texts = {name: _text(base / version / name) for name in (*FILES, *optional)}
     what = f"prompt {version} prompt.toml"
     table = loads(texts["prompt.toml"], what)
@@ -270,10 +289,14 @@ def load(version: str, where: Path | None = None) -> Prompt:
             f"version (its digest is pinned in {printable(base / 'released.toml')})"
         )
     table = {"reasons_first": REASONS_FIRST.get(sha256, ()), **table}
-    examples = [read_examples(texts[file], f"prompt {version} {file}") for file in optional]
+    examples, extension = (
+        reads(texts[name], f"prompt {version} {name}") if name in texts else None
+        for name, reads in ((EXAMPLES, read_examples), (ANSWER, read_extension))
+    )
     return convert(
         table, Prompt, what, version=version, sha256=sha256, released=version in released,
-        texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=next(iter(examples), None), files=texts,
+        texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=examples,
+        extension=extension or {}, files=texts,
     )  # fmt: skip
 
 
@@ -303,7 +326,7 @@ def _base(version: str, where: Path | None) -> Path:
 
 
 def digest(texts: Mapping[str, str]) -> str:
-    """Return the digest of a version's files, which are in the order of `FILES`, with the examples last."""
+    """Return the digest of a version's files, which are in the order of `FILES`, with the others last."""
     return sha256_bytes("\0".join(f"{name}\0{text}" for name, text in texts.items()).encode())
 
 

@@ -65,6 +65,7 @@ class Answer(Struct, frozen=True, kw_only=True):
         follows_letter: whether one letter is the likeliest in every order.
         agent: which of several helper models answered, from 1; unset where the place among all answers says.
         faults: all that is wrong with a failed answer, the status first; unset where that is the only fault.
+        extension: what a prompt's `answer.json` asks for beside the decision; unset where there is none.
     """
 
     scene: str
@@ -98,6 +99,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     follows_letter: bool | UnsetType = UNSET
     agent: int | UnsetType = UNSET
     faults: tuple[str, ...] | UnsetType = UNSET
+    extension: dict[str, Any] | UnsetType = UNSET
 
     @property
     def turns(self) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from harness.core.arrays import Floats
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded
-from harness.prompts.answer_schema import Shape
+from harness.prompts.answer_schema import plainest
 from harness.prompts.versions import Prompt
 
 PARTS = 20  # of a stated distribution: so small a model cannot make hundredths sum to 1
@@ -82,10 +82,13 @@ def answer(
     numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, said["intent"], strict=True))
     body = f'"action_distribution":{{{numbers}}}'
     best, confidence = said["recommended_maneuver"], f'"confidence":{said["confidence"]:.2f}'
-    if key := Shape(view["role"], tuple(actions), prompt.form(view["role"])).named:
+    shape = prompt.shape(view["role"], actions)
+    if key := shape.named:
         body = f'"{key}":"{best}",{confidence}'
     if view["role"] == "helper":
         reported = "" if bare else said["evidence"]
         body = f'"evidence":{canonical_json(reported)},"risk":"{said["risk"]}",{body}'
+    for name, schema in reversed(shape.further.items()):
+        body = f'"{name}":{canonical_json(plainest(schema))},{body}'
     reasons_first = view["role"] in prompt.reasons_first and not bare
     return f"{said['evidence']}. {{{body}}}" if reasons_first else f"{{{body}}}"

@@ -42,8 +42,12 @@ class GgufChat(Chat):
     def decode(self, ids: Sequence[int]) -> str:
         return self._vocabulary.decode(ids)
 
+    @property
+    def vocabulary(self) -> int:
+        return self._vocabulary.vocabulary
+
     def pieces(self, ids: Sequence[int]) -> list[str]:
         return self._vocabulary.pieces(ids)
 
     def _candidates(self, letters: str) -> Sequence[int]:
-        return range(self._vocabulary.vocabulary)
+        return range(self.vocabulary)

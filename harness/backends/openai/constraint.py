@@ -11,9 +11,10 @@ from typing import Any
 
 from harness.backends.base import Request
 from harness.backends.servers import Kind
+from harness.backends.skeleton import UNIT
 from harness.core.errors import printable
 from harness.core.files import canonical_json
-from harness.prompts.answer_schema import Shape, answer_schema
+from harness.prompts.answer_schema import Shape, constrained_schema, number_texts
 
 # Kinds that are sent a pattern: compact JSON, members in order, two decimals. With a JSON Schema most servers
 # allow numbers of any length.
@@ -23,6 +24,15 @@ _DECIMALS_BEGUN = re.compile(r"(?:0(?:\.[0-9]?)?|1(?:\.0?)?)?")
 _NUMBER = re.compile(r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?")
 _NUMBER_BEGUN = re.compile(r"-?(?:(?:0|[1-9][0-9]*)(?:\.[0-9]*)?(?:[eE][+-]?[0-9]*)?)?")
 _BLANK = re.compile(r"[ \t\n\r]*")
+_TEXT = r'[^"\\\x00-\x1f]'  # a character of a text, in both kinds of pattern
+_CHARACTERS = r'"(?:[^"\\\x00-\x1f]|\\(?:["\\/bfnrt]|u[0-9a-fA-F]{4}))*+'
+_STRING, _STRING_BEGUN = (
+    re.compile(_CHARACTERS + '"'),
+    re.compile(_CHARACTERS + r"(?:\\(?:u[0-9a-fA-F]{0,3})?)?"),
+)
+_STRING_BEGUN = re.compile(
+    r'"(?:[^"\\\x00-\x1f]|\\(?:["\\/bfnrt]|u[0-9a-fA-F]{4}))*+(?:\\(?:u[0-9a-fA-F]{0,3})?)?'
+)
 _SHOWN = 40  # characters of an answer that an error shows
 
 
@@ -42,7 +52,7 @@ def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
     """
     reader = _Reader(text, compact=kind in _BY_PATTERN)
     try:
-        reader.value(_schema(request.shape))
+        reader.value(constrained_schema(request.shape))
         reader.blank()
         if reader.at == len(text):
             return None
@@ -56,17 +66,8 @@ def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
 
 
 @lru_cache
-def _schema(shape: Shape) -> Mapping[str, Any]:
-    schema = answer_schema(shape.role, shape.actions, form=shape.form)
-    schema = {key: value for key, value in schema.items() if key not in ("$schema", "title")}
-    if "evidence" in schema["properties"]:  # as with local engines, a constrained answer has no free text
-        schema["properties"] = {**schema["properties"], "evidence": {"type": "string", "enum": [""]}}
-    return schema
-
-
-@lru_cache
 def _fields(kind: Kind, shape: Shape) -> Mapping[str, Any]:
-    schema = _schema(shape)
+    schema = constrained_schema(shape)
     match _BY_PATTERN.get(kind):
         case "regex":
             return {"structured_outputs": {"regex": _pattern(schema, re.escape)}}
@@ -83,8 +84,20 @@ def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:
     """
     if "enum" in schema:
         return f"({'|'.join(literal(json.dumps(value)) for value in schema['enum'])})"
-    if schema["type"] == "number":
-        return f"({literal('0.')}[0-9][0-9]|{literal('1.00')})"
+    match schema["type"]:
+        case "string":
+            mark = literal('"')
+            return f"{mark}{_TEXT}{{0,{schema['maxLength']}}}{mark}"
+        case "boolean":
+            return f"({literal('false')}|{literal('true')})"
+        case "number" if (schema["minimum"], schema["maximum"]) == UNIT:
+            return f"({literal('0.')}[0-9][0-9]|{literal('1.00')})"
+        case "number" | "integer":
+            return f"({'|'.join(map(literal, number_texts(schema)))})"
+        case "array":
+            item, least, most = _pattern(schema["items"], literal), schema["minItems"], schema["maxItems"]
+            items = f"({item}({literal(',')}{item}){{{max(least - 1, 0)},{most - 1}}})"
+            return f"{literal('[')}{items}{'' if least else '?'}{literal(']')}"
     members = [
         literal(f"{json.dumps(name)}:") + _pattern(value, literal)
         for name, value in schema["properties"].items()
@@ -93,7 +106,7 @@ def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:
 
 
 class _Reader:
-    """Reads a text along a schema: closed objects, whose values are numbers, choices of texts, or objects.
+    """Reads a text along a schema: closed objects, lists, bounded texts and numbers, choices.
 
     Neither `re` nor a validator of JSON can say whether a text that was cut off may still become one that
     fits. Each method raises EOFError if the text ends first, and ValueError if it cannot fit, with `at` the
@@ -110,10 +123,18 @@ class _Reader:
         self.blank()
         if "enum" in schema:
             self._one_of([json.dumps(value) for value in schema["enum"]])
-        elif schema["type"] == "number":
-            self._number(schema["minimum"], schema["maximum"])
-        else:
+        elif schema["type"] == "object":
             self._object(schema["properties"])
+        elif schema["type"] == "array":
+            self._array(schema["items"], schema["minItems"], schema["maxItems"])
+        elif schema["type"] == "string":
+            self._string(schema["maxLength"])
+        elif schema["type"] == "boolean":
+            self._one_of(["false", "true"])
+        elif self._compact and (schema["minimum"], schema["maximum"]) != UNIT:
+            self._one_of(sorted(number_texts(schema), key=len, reverse=True))
+        else:
+            self._number(schema["minimum"], schema["maximum"], schema["type"] == "integer")
 
     def blank(self) -> None:
         if not self._compact and (blank := _BLANK.match(self._text, self.at)):
@@ -128,6 +149,27 @@ class _Reader:
             self.value(missing.pop(name))
             self._one_of("," if missing else "}")
 
+    def _array(self, items: Mapping[str, Any], least: int, most: int) -> None:
+        self._one_of("[")
+        for count in range(most + 1):
+            ends = ("]" if count >= least else "") + ("," if 0 < count < most else "")
+            self.blank()
+            if count and self._one_of(ends) == "]":
+                return
+            if not count and not least and self._text.startswith("]", self.at):
+                self.at += 1
+                return
+            self.value(items)
+
+    def _string(self, most: int) -> None:
+        found = _STRING.match(self._text, self.at)
+        if not found:
+            ended = self.at == len(self._text) or _STRING_BEGUN.fullmatch(self._text, self.at)
+            raise EOFError if ended else ValueError
+        if len(json.loads(found[0])) > most or (self._compact and "\\" in found[0]):
+            raise ValueError
+        self.at = found.end()
+
     def _one_of(self, options: Sequence[str]) -> str:
         """Read one of some texts, none of which begins another; a str is one of its characters."""
         self.blank()
@@ -140,12 +182,12 @@ class _Reader:
             raise EOFError
         raise ValueError
 
-    def _number(self, least: float, most: float) -> None:
+    def _number(self, least: float, most: float, whole: bool) -> None:
         number, begun = (_DECIMALS, _DECIMALS_BEGUN) if self._compact else (_NUMBER, _NUMBER_BEGUN)
         found = number.match(self._text, self.at)
         open_ended = not found or not self._compact  # more digits or an exponent may follow
         if open_ended and begun.fullmatch(self._text, self.at):
             raise EOFError
-        if not found or not least <= float(found[0]) <= most:
+        if not found or not least <= (value := float(found[0])) <= most or (whole and not value.is_integer()):
             raise ValueError
         self.at = found.end()
