@@ -64,6 +64,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/servers.py
 	$(BIN)/python benchmarks/camera.py
 	$(BIN)/python benchmarks/pictures.py
+	$(BIN)/python benchmarks/constants.py
 	$(BIN)/python benchmarks/intervals.py
 
 .venv/bin/python:

@@ -6,20 +6,22 @@ from typing import Any
 from harness import __version__
 from harness.backends.base import Completion, Request, by_scenario
 from harness.backends.cards import Card
-from harness.core.errors import unknown
-from harness.core.files import canonical_json
-from harness.world.drivers import DRIVERS, choices
+from harness.core.errors import UserError, printable, unknown
+from harness.core.files import canonical_json, sha256_file
+from harness.world.drivers import CONSTANT, CONSTANTS, DRIVERS, UNIFORM, choices, constant
+
+REFERENCES = (*DRIVERS, UNIFORM, CONSTANT)
 
 
 def open(card: Card, **_: Any) -> "DriverBackend":
     """Open the driver that a card names. Raises UserError if there is none."""
-    if card.name not in DRIVERS:
-        raise unknown("driver", card.name, DRIVERS)
+    if card.name not in REFERENCES:
+        raise unknown("driver", card.name, REFERENCES)
     return DriverBackend(card.name)
 
 
 class DriverBackend:
-    """Answers with all probability on the driver's action, so it never asks for help."""
+    """Answers with all probability on the driver's action; `uniform` with the same on every action."""
 
     def __init__(self, driver: str) -> None:
         self.driver = driver
@@ -32,16 +34,25 @@ class DriverBackend:
         scenario = requests[0].scenario
         if scenario is None:
             raise ValueError(f"request {requests[0].id} has no scenario; a driver needs its road")
-        asked = [(self.driver, request.view or {}, request.truth) for request in requests]
+        if self.driver == UNIFORM:
+            return [self._answer(request, request.actions) for request in requests]
+        driver = self.driver if self.driver != CONSTANT else constant(scenario.name)
+        if driver is None:
+            raise UserError(
+                f"driver {CONSTANT}: none was chosen for {printable(scenario.name)}; give brake or cruise"
+            )
+        asked = [(driver, request.view or {}, request.truth) for request in requests]
         return [
-            self._answer(request, action)
+            self._answer(request, [action])
             for request, action in zip(requests, choices(scenario, asked), strict=True)
         ]
 
-    def _answer(self, request: Request, action: str) -> Completion:
-        text = canonical_json({"action_distribution": {a: float(a == action) for a in request.actions}})
+    def _answer(self, request: Request, among: Sequence[str]) -> Completion:
+        p = {action: (action in among) / len(among) for action in request.actions}
+        text = canonical_json({"action_distribution": p})
         return Completion(request.id, text, None, None, "stop", None, 1)
 
     def identity(self) -> dict[str, Any]:
-        """Return the driver and the version of its rules."""
-        return {"engine": "driver", "driver": self.driver, "harness": __version__}
+        """Return the driver and the version of its rules, with what the choice of `constant` follows from."""
+        chosen = {"constants": sha256_file(CONSTANTS, "record")} if self.driver == CONSTANT else {}
+        return {"engine": "driver", "driver": self.driver, "harness": __version__, **chosen}

@@ -208,8 +208,14 @@ def as_mapping(done: "Evaluated") -> dict[str, Any]:
     }
 
 
-def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str]) -> None:
-    """Print a run's table, a row a condition, with what it was run on and what to know about it."""
+def show(
+    done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str],
+    beside: "Mapping[str, Score] | None" = None,
+) -> None:  # fmt: skip
+    """Print a run's table, a row a condition, with what it was run on and what to know about it.
+
+    Rows `beside` it are of what needs no model: a score by name.
+    """
     from harness.report.caveats import causes, caveats, lost_at_once
     from harness.report.constancy import ignores_input
     from harness.runs.folder import read
@@ -226,7 +232,13 @@ def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Seque
         text.print(caveat)
     table(
         ("condition", *(column.head for column in columns)),
-        [(name, *(column.cell(figures.get((name, column.metric))) for column in columns)) for name in names],
+        [
+            *((name, *(c.cell(figures.get((name, c.metric))) for c in columns)) for name in names),
+            *(
+                (name, *(c.cell(score if c.metric == score.metric else None) for c in columns))
+                for name, score in (beside or {}).items()
+            ),
+        ],
     )
     for note in (*notes, *origins(m, figures)):
         text.print(note)

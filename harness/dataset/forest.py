@@ -183,4 +183,22 @@ class Forest:
 
     def driver_success(self, driver: str) -> Bools:
         """Return whether a reference driver succeeds in each episode, (E,)."""
-        return self.succeeds(self.last_edge(self.drivers[driver]), np.arange(len(self.root)))
+        return self._success(self.drivers[driver])
+
+    def constant_success(self, action: str) -> Bools:
+        """Return whether an ego that always takes one action succeeds in each episode, (E,)."""
+        return self._success(np.full(len(self.tree), self.actions.index(action)))
+
+    def _success(self, chosen: Ints) -> Bools:
+        return self.succeeds(self.last_edge(chosen), np.arange(len(self.root)))
+
+    def uniform_success(self) -> Floats:
+        """Return with what probability each episode succeeds, (E,), if every action is equally likely.
+
+        A pass from the leaves backwards gives it exactly: no action is drawn.
+        """
+        chance = self.succeeds(self.edge, self.tree[:, None]).astype(float)
+        for rows in self._levels_backwards():
+            child = self.child[rows]
+            chance[rows] = np.where(child >= 0, chance[child].mean(axis=-1), chance[rows])
+        return np.asarray(chance[self.root].mean(axis=-1))

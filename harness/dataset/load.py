@@ -14,7 +14,7 @@ from zipfile import ZipFile
 import msgspec
 import numpy as np
 
-from harness.core.arrays import Bools
+from harness.core.arrays import Floats
 from harness.core.errors import UserError, unknown
 from harness.core.files import text_of
 from harness.core.memory import uncollected
@@ -33,6 +33,7 @@ from harness.dataset.verify import (
     scenario_of,
     unusable,
 )
+from harness.world.drivers import CONSTANT, UNIFORM, constant
 from harness.world.scenario import Scenario
 from harness.world.state import WorldState
 
@@ -182,13 +183,20 @@ class Dataset:
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
         return replace(self, trees=trees)
 
-    def driver_success(self) -> dict[str, Bools]:
-        """Return whether each reference driver succeeds in each episode, (E,)."""
-        parts: dict[str, list[Bools]] = {}
+    def reference_success(self) -> dict[str, Floats]:
+        """Return the success of each reference in each episode, (E,): 0 or 1, of `uniform` its probability.
+
+        The references are the drivers, `uniform`, and `constant` where its action is known.
+        """
+        parts: dict[str, list[Floats]] = {}
+        action = constant(self.scenario.name)
         for start in range(0, len(self.trees), TREES_AT_ONCE):
             forest = replace(self, trees=self.trees[start : start + TREES_AT_ONCE]).forest
             for name in forest.drivers:
-                parts.setdefault(name, []).append(forest.driver_success(name))
+                parts.setdefault(name, []).append(forest.driver_success(name).astype(float))
+            if action in forest.actions:
+                parts.setdefault(CONSTANT, []).append(forest.constant_success(action).astype(float))
+            parts.setdefault(UNIFORM, []).append(forest.uniform_success())
         return {name: np.concatenate(of_trees) for name, of_trees in parts.items()}
 
     def scenes(self, ids: Sequence[str]) -> list[Scene]:

@@ -1,6 +1,7 @@
 """The report's charts, as Vega-Lite specifications: https://vega.github.io/vega-lite/docs/spec.html."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from harness.report import statistics
 from harness.report.drawing import colours
@@ -38,12 +39,13 @@ TIMES = {
     "inference": PALE, "reply on time": GOOD, "reply late": LATE, "reply lost": BAD, "fusion": ROLES["merge"],
     "decision": GREY,
 }  # fmt: skip
+APART = 0.05  # of success between two names of lines, the height of one
 # The paper's table of operating points: ms and success rate.
 PAPER = {"single-local": (145.0, 0.689), "v2x": (218.9, 0.835), "6g": (151.4, 0.941)}
 
 
 def success_latency(rows: Rows, references: Mapping[str, float], window_ms: Sequence[float]) -> Spec:
-    """Success over latency, a point a run and condition, and the paper's; reference drivers are lines."""
+    """Success over latency, a point a run and condition, and the paper's; references are lines."""
     condition = condition_colours(rows)
     condition["legend"] = {**condition["legend"], "title": None}
     shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition")
@@ -95,19 +97,26 @@ def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
 
 
 def _references(success: Mapping[str, float], y: Spec) -> Spec:
-    """A dashed line for each value, named after all that have it."""
-    named: dict[float, list[str]] = {}
-    for name, value in success.items():
-        named.setdefault(value, []).append(name)
+    """A dashed line for each value; names of lines too near for one each stand above the highest."""
+    highest_first = sorted(success.items(), key=lambda of: -of[1])
+    lines = [{"reference": name, "success": value} for name, value in highest_first]
+    names: list[dict[str, Any]] = []
+    for n, (name, value) in enumerate(highest_first):
+        if n and highest_first[n - 1][1] - value < APART:
+            names[-1]["named"] += f", {name}"
+        else:
+            names.append({"named": name, "success": value})
     text = {"type": "text", "align": "right", "dy": -5, "dx": -4, "color": "currentColor"}
-    at_edge = {"x": {"value": "width"}, "text": {"field": "drivers"}}
+    said = {"tooltip": [{"field": name} for name in ("reference", "success")]}
     return {
-        "data": {"values": [{"drivers": ", ".join(of), "success": value} for value, of in named.items()]},
         "layer": [
-            {"mark": {**RULE, "opacity": 0.6}, "encoding": {"y": y}},
-            {"mark": text, "encoding": {"y": y, **at_edge}},
+            {"data": {"values": lines}, "mark": {**RULE, "opacity": 0.6}, "encoding": {"y": y, **said}},
+            {
+                "data": {"values": names}, "mark": text,
+                "encoding": {"y": y, "x": {"value": "width"}, "text": {"field": "named"}},
+            },
         ],
-    }
+    }  # fmt: skip
 
 
 def statuses(rows: Rows) -> Spec:

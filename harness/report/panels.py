@@ -4,10 +4,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from harness.backends.registry import find
 from harness.report import charts, layers, statistics
+from harness.report.references import driven, in_trees, label, sentences
 from harness.report.runs import Runs
 from harness.runs.folder import Run
+from harness.runs.records import Score
 
 Part = Literal["overview", "answers", "communication"]
 BUDGET = (200, 400)  # tokens of a prompt: the paper's
@@ -47,15 +48,14 @@ def panels(runs: Runs) -> Iterator[Panel]:
     windows_ms = sorted({c["window_s"] * 1000 for c in points})
 
     if rows := joined(statistics.success):
-        references = _references(runs)
+        references, scenario = _references(runs), runs.scenario.name
+        success = {label(name, scenario): s.value for name, s in references.items() if s.value is not None}
         yield Panel(
             "success-latency", "overview", "Success and latency",
             "Each point is a condition; the lines through it are 95 % intervals over episodes. Rings: what "
             "the paper reports, with other scenes and another model. A reply that arrives after the "
-            "decision window is not fused." + (
-                " Dashed: reference drivers, which need no model, in the same episodes." if references else ""
-            ),
-            charts.success_latency(rows, references, windows_ms),
+            "decision window is not fused." + sentences(references, scenario),
+            charts.success_latency(rows, success, windows_ms),
         )  # fmt: skip
     if rows := joined(statistics.statuses):
         yield Panel(
@@ -122,15 +122,8 @@ def panels(runs: Runs) -> Iterator[Panel]:
         )  # fmt: skip
 
 
-def _references(runs: Runs) -> dict[str, float]:
-    """Success of the reference drivers: from the trees, in closed loop from their own runs."""
+def _references(runs: Runs) -> dict[str, Score]:
+    """Success of the references: from the trees, in closed loop from their own runs."""
     if runs.dataset is None:
-        drivers = {
-            run.manifest.model["name"]: run
-            for run in runs.runs
-            if (engine := find(str(run.manifest.model.get("engine")))) and engine.capabilities.reference
-        }
-        scores = {name: run.score(run.conditions[0], "success_rate") for name, run in drivers.items()}
-        return {name: score.value for name, score in scores.items() if score and score.value is not None}
-    some = runs.dataset.of_episodes({number for run in runs.runs for number in run.grid.episodes})
-    return {driver: float(success.mean()) for driver, success in some.driver_success().items()}
+        return driven(runs.runs)
+    return in_trees(runs.dataset.of_episodes({number for run in runs.runs for number in run.grid.episodes}))

@@ -8,13 +8,13 @@ from markupsafe import Markup
 
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.seeds import purposes
-from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
 from harness.report import caveats, words
 from harness.report.compare.page import Place, beside
 from harness.report.constancy import ignores_input
 from harness.report.drawing import colours
 from harness.report.page import environment, save
+from harness.report.references import in_trees
 from harness.runs.folder import Run, dataset_of
 from harness.runs.metrics import GAIN, SUCCESS, label, meaning
 from harness.runs.records import Score
@@ -47,7 +47,7 @@ class Line:
     Attributes:
         name: the family's.
         run: its run; None for the mean.
-        drivers: success of each reference driver, which needs no model, in the same episodes.
+        drivers: success of each reference, which needs no model, in the same episodes.
         cells: by condition.
     """
 
@@ -66,7 +66,8 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
     """
     datasets, gains = datasets or {}, BASELINE in suite.conditions
     drivers = {
-        family: _drivers(datasets.get(family) or dataset_of(run), run) for family, run in suite.runs.items()
+        family: in_trees((datasets.get(family) or dataset_of(run)).of_episodes(run.grid.episodes))
+        for family, run in suite.runs.items()
     }
     p_values = {
         (family, condition): p
@@ -92,12 +93,6 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
         *(Line(name, run, drivers[name], cells(name, run)) for name, run in suite.runs.items()),
         Line(MEAN, None, means, cells(MEAN, suite)),
     ]
-
-
-def _drivers(dataset: Dataset, run: Run) -> dict[str, Score]:
-    successes = dataset.of_episodes(run.grid.episodes).driver_success()
-    rates = {driver: rate_interval(success.astype(float)) for driver, success in successes.items()}
-    return {driver: Score.of(driver, SUCCESS, rate, "episodes") for driver, rate in rates.items()}
 
 
 def seeds_of(run: Run) -> str:

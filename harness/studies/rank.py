@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.core.arrays import Bools
+from harness.core.arrays import Bools, Floats
 from harness.core.parallel import Workers
 from harness.core.statistics import Estimate, rate_difference, rate_interval
 from harness.dataset.load import Dataset
@@ -33,17 +33,17 @@ class Standing:
 def rank(dataset: Dataset, workers: Workers, progress: Callable[[int], None]) -> dict[str, Standing]:
     """Each driver's standing over the dataset's episodes, every one of which is driven again."""
     live = drive_apart(dataset.scenario, dataset.seeds, workers, progress)
-    frozen = dataset.driver_success()
+    frozen = dataset.reference_success()
     return {
         driver: _standing(frozen[driver], np.array([o[driver].success for o in live])) for driver in DRIVERS
     }
 
 
-def _standing(frozen: Bools, live: Bools) -> Standing:
-    difference = rate_difference(frozen.astype(float), live.astype(float))
+def _standing(frozen: Floats, live: Bools) -> Standing:
+    difference = rate_difference(frozen, live.astype(float))
     points = {end: 100 * getattr(difference, end) for end in ("value", "low", "high")}
     return Standing(
-        rate_interval(frozen.astype(float)),
+        rate_interval(frozen),
         rate_interval(live.astype(float)),
         replace(difference, **points),
         rate_interval((frozen == live).astype(float)),

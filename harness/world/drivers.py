@@ -2,17 +2,27 @@
 
 `cruise` keeps its speed, `brake` always brakes, `local-view` plans with what the ego's sensors know and
 `full-view` plans with everything in view.
+
+Two references look at nothing at all. `uniform` holds every action for equally likely. `constant` always
+takes the action that did best in a scenario's tune layouts: `constants.csv` has what each clears, and
+`benchmarks/constants.py` writes it.
 """
 
+import csv
 from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
 from typing import Any
 
+from harness.core.files import text_of
 from harness.world.planner import plans
 from harness.world.scenario import Scenario
 
 DRIVERS = ("cruise", "brake", "local-view", "full-view")
 ALWAYS = {"cruise": "IDLE", "brake": "SLOWER"}
 PRIVILEGED = "full-view"  # the only one that may read the truth
+UNIFORM, CONSTANT = "uniform", "constant"
+CONSTANTS = Path(__file__).with_name("constants.csv")
 
 Graph = Mapping[str, Any]
 
@@ -24,9 +34,29 @@ def choose(scenario: Scenario, driver: str, graph: Graph, truth: Graph | None) -
 
 
 def choices(scenario: Scenario, asked: Sequence[tuple[str, Graph, Graph | None]]) -> list[str]:
-    """Return the meta-action of each driver for a scene graph of the ego, and the truth."""
-    planned = iter(plans(scenario, [_read(*each) for each in asked if each[0] not in ALWAYS]))
-    return [ALWAYS[driver] if driver in ALWAYS else next(planned) for driver, *_ in asked]
+    """Return the meta-action of each driver for a scene graph of the ego, and the truth.
+
+    A driver may also be an action, which is always taken.
+    """
+    always = {**{action: action for action in scenario.actions}, **ALWAYS}
+    planned = iter(plans(scenario, [_read(*each) for each in asked if each[0] not in always]))
+    return [always.get(driver) or next(planned) for driver, *_ in asked]
+
+
+def constant(scenario: str) -> str | None:
+    """Return the action of the driver `constant` in a scenario; None where nobody has measured it."""
+    return _constants().get(scenario.partition(":")[0])
+
+
+@cache
+def _constants() -> Mapping[str, str]:
+    """Return the best action of each scenario; of equally good ones the most careful."""
+    best: dict[str, dict[str, str]] = {}
+    for row in csv.DictReader(text_of(CONSTANTS).splitlines()):
+        of = best.setdefault(row["scenario"], row)
+        if int(row["cleared"]) > int(of["cleared"]):
+            best[row["scenario"]] = row
+    return {name: row["action"] for name, row in best.items()}
 
 
 def _read(driver: str, graph: Graph, truth: Graph | None) -> Graph:

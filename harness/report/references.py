@@ -1,0 +1,58 @@
+"""What a model is held against and needs none: reference drivers, and an ego that looks at nothing."""
+
+from collections.abc import Iterable, Mapping
+
+from harness.backends.registry import find
+from harness.core.statistics import rate_interval
+from harness.dataset.load import Dataset
+from harness.report.words import shown
+from harness.runs.folder import Run
+from harness.runs.metrics import SUCCESS
+from harness.runs.records import Score
+from harness.world.drivers import CONSTANT, UNIFORM, constant
+
+BLIND = (CONSTANT, UNIFORM)  # those that look at nothing, the best first
+
+
+def in_trees(dataset: Dataset) -> dict[str, Score]:
+    """Return the success of each reference in a dataset's episodes."""
+    rates = {name: rate_interval(success) for name, success in dataset.reference_success().items()}
+    return {name: Score.of(name, SUCCESS, rate, "episodes") for name, rate in rates.items()}
+
+
+def driven(runs: Iterable[Run]) -> dict[str, Score]:
+    """Return the success of each reference that some of these runs are of."""
+    scores = {}
+    for run in runs:
+        engine = find(str(run.manifest.model.get("engine")))
+        if engine and engine.capabilities.reference:
+            scores[str(run.manifest.model["name"])] = run.score(run.conditions[0], SUCCESS)
+    return {name: score for name, score in scores.items() if score and score.value is not None}
+
+
+def label(name: str, scenario: str) -> str:
+    """Return a reference's name for people; that of `constant` says which action it takes."""
+    action = constant(scenario) if name == CONSTANT else None
+    return f"{name} {action}" if action else name
+
+
+def meaning(name: str) -> str:
+    """Say what one of `BLIND` does."""
+    return {
+        CONSTANT: "constant: always the action that did best in the scenario's tune layouts",
+        UNIFORM: "uniform: every action is equally likely",
+    }[name]
+
+
+def sentences(references: Mapping[str, Score], scenario: str) -> str:
+    """Say how well each reference does, the best first, and what those that look at nothing do."""
+    if not references:
+        return ""
+    best_first = sorted(references.items(), key=lambda of: -(of[1].value or 0.0))
+    rates = [
+        f"{label(name, scenario)} {cell['value']} ({cell['interval']})"
+        for name, cell in ((name, shown(score)) for name, score in best_first)
+    ]
+    n = next(iter(references.values())).n
+    said = f" Dashed: references that need no model, in the same episodes: {', '.join(rates)}; n = {n}."
+    return " ".join([said, *(f"{meaning(name)}." for name in BLIND if name in references)])
