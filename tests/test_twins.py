@@ -352,6 +352,21 @@ def test_a_read_out_of_words_holds_and_one_of_letters_does_not(
     assert "Answer with one letter: A FASTER, B SLOWER, C IDLE." in row.broken[0].messages[1]
 
 
+@pytest.mark.parametrize(("mode", "names"), [("json", None), ("readout", ("letters", "ids", "rounding"))])
+def test_what_always_gives_the_same_answer_holds_what_is_said_of_it(
+    crossing: Dataset, tmp_path: Path, answering: Callable[[Any], None], mode: str,
+    names: tuple[str, ...] | None,
+) -> None:  # fmt: skip
+    spec = spec_for(crossing, "swarm-tiny", answer=mode)
+    answering(Reader(lambda r: [0.1, *[0.0] * (len(r.actions) - 2), 0.9]))
+    of, study = names or tuple(name for name in TWINS if name != "letters"), Study(spec, tuple(TWINS), 0)
+    rows = asked(spec, tmp_path / "out", *of)
+    for row in rows:
+        assert row.invariance_rate.value == page.of_constant(study, row.twin), row.twin.name
+    said = page.same_answer(study, rows)
+    assert ("letters, of which it holds 0 %" in said) == (mode == "readout")
+
+
 def test_who_believes_the_first_message_is_found_by_their_order(
     crossing: Dataset, tmp_path: Path, answering: Callable[[Any], None]
 ) -> None:

@@ -52,6 +52,8 @@ class Twin:
         senders: whose messages a fusion call has, `(senders)`, in the place of these.
         actions: the question's name for an action of the twin, where it is another.
         modes: answer modes in which it applies.
+        constant: whether it holds of an ego that always gives the same answer, and so reads nothing; of a
+            read-out, where the letters are read once.
     """
 
     name: str
@@ -65,6 +67,7 @@ class Twin:
     senders: Callable[[Sequence[str]], Sequence[str]] | None = None
     actions: Mapping[str, str] | None = None
     modes: tuple[str, ...] = get_args(AnswerMode)
+    constant: bool = True
 
     @property
     def of_text(self) -> bool:
@@ -337,7 +340,7 @@ _DECLARED = (
     ),
     Twin(
         "letters", "letters of the read-out stand for other actions", "--answer readout",
-        text=permuted_letters, modes=("readout",),
+        text=permuted_letters, modes=("readout",), constant=False,
     ),
     Twin(
         "message-order", "the helpers' messages in another order", "fusion calls, not of a readout",

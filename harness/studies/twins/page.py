@@ -17,7 +17,7 @@ from harness.report.compare.gate import Verdict
 from harness.report.compare.words import judged
 from harness.report.page import environment, visible
 from harness.studies.twins.asking import RESULT, Study, lack
-from harness.studies.twins.declared import TWINS
+from harness.studies.twins.declared import TWINS, Twin
 from harness.studies.twins.scoring import METRICS, Pair, Row, headline
 
 FORMAT = "swarmdrive-twins/1"
@@ -38,7 +38,7 @@ def write(
     page = environment(TEMPLATES).get_template("twins.html.j2").render(
         study=study, spec=study.spec, rows=rows, headline=headline(rows), notes=notes(study, rows, lost),
         points=decision_points(study), examples=EXAMPLES, verdicts=verdicts, judged=judged, cell=shown,
-        difference=difference,
+        difference=difference, of_constant=of_constant,
     )  # fmt: skip
     write_whole(out / "index.html", page)
     content = {"format": FORMAT, **mapping(study, rows, verdicts, lost), "versions": versions()}
@@ -53,6 +53,7 @@ def mapping(
     table = [
         {
             "twin": row.twin.name, "role": row.role, "holds": row.twin.holds, "episodes": row.episodes,
+            "holds_of_constant": of_constant(study, row.twin),
             **{metric: as_mapping(getattr(row, metric)) for metric in METRICS},
         }
         for row in rows
@@ -86,9 +87,25 @@ def notes(study: Study, rows: Sequence[Row], lost: str = "") -> list[str]:
     ]
     if lost:
         said.append(f"no answer to {printable(lost)}; their pairs are left out")
+    said.insert(0, same_answer(study, rows))
     if not study.spec.ego.can.language_model:
         said.insert(0, f"{who} reads the scene graph and not the text, so this says nothing about the prompt")
     return said
+
+
+def of_constant(study: Study, twin: Twin) -> bool:
+    """Whether a twin holds of an ego that always gives the same answer: every time, or never.
+
+    Over cyclic orders one letter is every action alike, which is the same for the twin.
+    """
+    return twin.constant or study.spec.ego.letters == "cyclic"
+
+
+def same_answer(study: Study, rows: Sequence[Row]) -> str:
+    """What these twins would say of an ego that reads nothing."""
+    broken = list(dict.fromkeys(row.twin.name for row in rows if not of_constant(study, row.twin)))
+    but = f" of every twin but {', '.join(broken)}, of which it holds 0 %" if broken else " of every twin"
+    return f"an ego that always gives the same answer holds 100 %{but}: to hold is not to read"
 
 
 def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
