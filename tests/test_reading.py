@@ -125,6 +125,7 @@ READ: dict[str, tuple[str, ...]] = {
     "prompts/mine/prompt.toml": (*QUICK, "--prompt", "mine"),
     "prompts/mine/ego.j2": (*QUICK, "--prompt", "mine"),
     "prompts/mine/examples.json": (*QUICK, "--prompt", "mine"),
+    "prompts/mine/answer.json": (*QUICK, "--prompt", "mine"),
     "datasets/suites.toml": ("eval", "--dataset", "suite:mine", "--dry-run"),
     "curves.csv": ("channel", "check", "mode4", "--against", "curves.csv"),
     "config.json": ("drive", "--env", "merge-v0", "--env-config", "config.json", "--episodes", "1"),

@@ -8,7 +8,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import echo_json
 from harness.core import errors
-from harness.core.files import LARGEST, bytes_of
+from harness.core.files import LARGEST, bytes_of, canonical_json
 
 HANDED_OVER = ("/dev/fd", "/proc/self/fd")  # folders of pipes that a shell opens for `<(command)`
 FINISH_REASONS = ("stop", "length", "error")
@@ -18,6 +18,11 @@ def command(
     file: str = typer.Argument(help="File with one raw completion; - means standard input."),
     scenario: str = typer.Option("occluded-intersection", help="Scenario whose actions the answer is about."),
     role: str = typer.Option("ego", help="Role that answered: ego or helper."),
+    prompt: str | None = typer.Option(
+        None,
+        help="Prompt version that asked: its form of answer, what else it asks for, and whether reasons may "
+        "come first. Default: any form.",
+    ),
     thinking: bool = typer.Option(False, "--thinking", help="State that the model was asked to think first."),
     reasons_first: bool = typer.Option(
         False, "--reasons-first", help="State that the prompt asked for reasons before the answer."
@@ -32,19 +37,26 @@ def command(
     It names every repair that the text needed.
     """
     from harness.parsing.parse import parse
+    from harness.prompts import versions
+    from harness.prompts.answer_schema import Shape
     from harness.world import scenarios
 
     if finish_reason not in FINISH_REASONS:
         raise errors.unknown("finish reason", finish_reason, FINISH_REASONS)
     actions = scenarios.get(options.typed(scenario)).actions
-    text = _read(file)
+    shape = Shape(role, actions)
+    if prompt is not None:
+        version = versions.load(prompt)
+        shape, reasons_first = version.shape(role, actions), reasons_first or role in version.reasons_first
     parsed = parse(
-        text, role=role, actions=actions, thinking=thinking, reasons_first=reasons_first,
+        _read(file), **shape._asdict(), thinking=thinking, reasons_first=reasons_first,
         finish_reason=finish_reason,
     )  # fmt: skip
     shares = None if parsed.intent is None else dict(zip(actions, parsed.intent, strict=True))
     if as_json:
-        fields = ("status", "verdict", "repairs", "intent", "mass", "message", "reasoning", "detail")
+        fields = (
+            "status", "verdict", "repairs", "intent", "mass", "message", "extension", "reasoning", "detail",
+        )  # fmt: skip
         echo_json({**{name: getattr(parsed, name) for name in fields}, "intent": shares}, indent=None)
         return
     rows = [("status", f"{parsed.status}: {parsed.status.meaning}")]
@@ -54,6 +66,8 @@ def command(
         rows.append(("mass", f"{parsed.mass:.4f}"))
     for name, value in (parsed.message or {}).items():
         rows.append((name, "-" if value is None else errors.printable(value, 200)))
+    for name, value in (parsed.extension or {}).items():
+        rows.append((name, errors.printable(canonical_json(value), 200)))
     if parsed.reasoning:
         rows.append(("reasoning", f"{len(parsed.reasoning)} characters"))
     rows.append(("detail", parsed.detail))

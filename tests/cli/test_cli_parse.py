@@ -3,12 +3,15 @@
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from harness.core import resources
 
 COMPLETIONS = Path(__file__).parents[1] / "completions"
 Parse = Callable[..., tuple[int, str, str]]
@@ -47,6 +50,33 @@ def test_json_has_the_intent_by_action_and_the_helpers_message(parse: Parse) -> 
     assert parsed["intent"] == {"SLOWER": 0.5, "IDLE": 0.4, "FASTER": 0.1}
     assert parsed["message"]["risk"] == "medium"
     assert parsed["repairs"] == []
+
+
+@pytest.mark.parametrize(
+    ("version", "role", "text", "status"),
+    [
+        ("v4", "ego", '{"maneuver": "IDLE", "confidence": 0.8}', "label_only"),
+        ("v9", "ego", '{"maneuver": "IDLE", "confidence": 0.8}', "strict"),
+        ("v5", "ego", 'So: {"action_distribution": {"SLOWER": 1, "IDLE": 0, "FASTER": 0}}', "strict"),
+        ("v4", "ego", 'So: {"action_distribution": {"SLOWER": 1, "IDLE": 0, "FASTER": 0}}', "recovered"),
+        ("mine", "ego", '{"sure": true, "maneuver": "IDLE", "confidence": 0.8}', "strict"),
+        ("mine", "ego", '{"sure": 2, "maneuver": "IDLE", "confidence": 0.8}', "recovered"),
+    ],
+)
+def test_a_prompt_says_what_was_asked_for(
+    version: str, role: str, text: str, status: str, parse: Parse, tmp_path: Path
+) -> None:
+    (tmp_path / resources.MARKER).touch()
+    shutil.copytree(resources.find("prompts", "v9"), tmp_path / "prompts/mine")
+    (tmp_path / "prompts/mine/answer.json").write_text('{"ego": {"sure": {"type": "boolean"}}}')
+    _, out, _ = parse("-", "--prompt", version, "--role", role, "--json", stdin=text.encode())
+    parsed = json.loads(out)
+    assert parsed["status"] == status
+    assert parsed["extension"] == ({"sure": True} if "true" in text else None)
+    rows = dict(
+        line.split(None, 1) for line in parse("-", "--prompt", version, stdin=text.encode())[1].splitlines()
+    )
+    assert rows.get("sure") == ("true" if "true" in text else None)
 
 
 def test_a_failed_verdict_is_data_and_exits_with_zero(parse: Parse) -> None:
