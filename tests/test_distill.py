@@ -20,10 +20,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from harness.backends import cards
 from harness.cli import app
 from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.dataset.load import load
+from harness.evaluate.agent import Agent, in_mode
 from harness.parsing.parse import parse
 from harness.prompts import readout
 from harness.prompts import versions as prompts
@@ -218,6 +220,25 @@ def test_an_excerpt_shows_the_conflicts_alone_and_keeps_the_label(asked: list[Qu
         shown = min(q.graph["conflicts"], key=lambda c: float(c["other"]["time_s"] or 1e9))
         assert shown["other"]["time_s"] is None or str(shown["other"]["time_s"]) in text
         assert np.array_equal(q.label, whole[q.key].label)
+
+
+def test_a_read_out_asks_for_a_letter_alone_as_an_evaluation_does(
+    few: list[Lessons], asked: list[Question]
+) -> None:
+    version = prompts.load("v9")  # its question is a block of its own, which a letter takes the place of
+    agent = Agent(cards.resolve("swarm-tiny"), version, "readout", letters="raw")
+    for q in asked[:4]:
+        words = q.scenario.prompt_words
+        of = replace(q, prompt=version, messages=version.render(q.graph, q.actions, words=words))
+        assert of.read_out == agent.chats(q.graph, q.actions, words)["messages"]
+        assert "JSON" not in of.read_out[-1]["content"]
+    intents = {q.key: np.array([0.91, 0.06, 0.03, 0.0, 0.0])[: len(q.actions)] for q in asked}
+    for short in excerpts(asked):
+        assert short.read_out == in_mode(
+            "readout", short.prompt, short.messages, short.graph["role"], short.actions
+        ), "where a question is no block, the letter follows it"
+    told = next(with_messages(few[0], few[0].scenes, intents))
+    assert "0.90" in told.read_out[-1]["content"], "the messages are there as well"
 
 
 # -- its optimizer ----------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from harness.backends.vision import Vision, of_checkpoint
 from harness.core import resources
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import bytes_of, opened, text_of
+from harness.core.files import bytes_of, text_of
 
 __all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", "each_engine", "load",
            "load_all", "names", "own", "resolve"]  # fmt: skip
@@ -190,8 +190,7 @@ def _of_file(text: str, file: Path, engine: str | None) -> Card:
 
     On llama-cpp the projector beside it goes with it, which has the same name behind its prefix.
     """
-    with opened(file, "weights"):  # what is no file is refused here, and what is no GGUF where it is loaded
-        told = said(file)
+    told = said(file)
     thinking: Thinking = "switch" if _SWITCH in (told.template or "").encode() else "none"
     description = f"Local GGUF file{f': {printable(told.name)}' if told.name else ''}"
     runs_on = "transformers" if engine == "transformers" else "llama-cpp"

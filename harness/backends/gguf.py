@@ -34,10 +34,14 @@ class Said:
 
 
 def said(file: Path) -> Said:
-    """Return what a file says of its model; nothing if it cannot be read, which opening it reports."""
+    """Return what a file says of its model; nothing if it is no GGUF, which loading it reports.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
     try:
         values = metadata(file)
-    except (OSError, ValueError):
+    except ValueError:
         return Said()
 
     def text(key: str) -> str | None:

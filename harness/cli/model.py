@@ -145,17 +145,10 @@ def check(
 
 def _usable(spec: "Spec", seen: "Checkup") -> bool:
     """Whether an answer in any mode says what to do."""
-    from harness.parsing.parse import parse
+    from harness.evaluate.asking import answer_of
 
-    ego = spec.ego
-    return any(
-        parse(
-            answer.text, role="ego", actions=spec.actions, thinking=ego.thinking,
-            reasons_first="ego" in ego.prompt.reasons_first, finish_reason=answer.finish_reason,
-            divides=mode == "constrained", error=answer.error,
-        ).intent
-        for mode, answer in seen.answers.items()
-    )  # fmt: skip
+    asked = spec.ego.blank("ego", spec.actions)
+    return any(answer_of(asked.alike(answer=mode), said).intent for mode, said in seen.answers.items())
 
 
 def _blind(card: "Card", fault: str) -> str:

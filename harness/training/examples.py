@@ -33,6 +33,8 @@ class Question:
         label: soft label, (A,).
         weight: how often it is learnt, beside others.
         image: what the viewer's cameras see, if the prompt shows it.
+        heard: helpers' messages in the prompt.
+        excerpt: what of the graph the prompt shows, if not all.
     """
 
     key: str
@@ -43,6 +45,8 @@ class Question:
     label: Floats
     weight: float
     image: Sight | None = None
+    heard: Sequence[Mapping[str, Any]] = ()
+    excerpt: Mapping[str, Any] | None = None
 
     @property
     def named(self) -> bool:
@@ -57,7 +61,9 @@ class Question:
     @property
     def read_out(self) -> tuple[Mapping[str, str], ...]:
         """The chat messages that ask for a letter."""
-        return in_mode("readout", self.prompt, self.messages, self.graph["role"], self.actions)
+        shown, words = self.excerpt or self.graph, self.scenario.prompt_words
+        messages = self.prompt.render(shown, self.actions, self.heard, words, letter=True)
+        return in_mode("readout", self.prompt, messages, self.graph["role"], self.actions)
 
 
 def alone(lessons: Lessons) -> Iterator[Question]:
@@ -73,7 +79,8 @@ def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
     for q in questions:
         if q.graph["conflicts"] or q.image:
             shown = {**q.graph, "nodes": [], "sectors": []}
-            yield replace(q, messages=q.prompt.render(shown, q.actions, words=q.scenario.prompt_words))
+            messages = q.prompt.render(shown, q.actions, words=q.scenario.prompt_words)
+            yield replace(q, messages=messages, excerpt=shown, heard=())
 
 
 def with_messages(
@@ -104,7 +111,7 @@ def question(
     name = key(lessons, scene, viewer, prompt) + ("+m" if heard else "")
     image = Sight(scenario, scene.state, viewer, VISION.size_px) if prompt.image else None
     label, weight = lessons.labels[scene.id], lessons.weights[scene.id]
-    return Question(name, scenario, prompt, graph, sent, label, weight, image)
+    return Question(name, scenario, prompt, graph, sent, label, weight, image, heard)
 
 
 def key(lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt) -> str:
