@@ -126,7 +126,7 @@ def test_a_check_shows_prompt_tokens_thinking_and_a_decision_in_each_way_of_answ
     assert [a[0] for a in answers] == ["json", "constrained", "readout"]
     assert all(float(a[1]) > 0 for a in answers)
     assert ["first token after" in " ".join(a) for a in answers] == [True, True, False]
-    assert answers[2][3].startswith('1 tokens, stop: \'{"action_distribution":')
+    assert answers[2][3].startswith('1 token, stop: \'{"action_distribution":')
 
 
 @pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
@@ -158,7 +158,7 @@ def test_a_way_that_a_model_cannot_answer_in_is_said_and_the_others_are_timed(
     code, out, _ = harness(monkeypatch, capsys, "model", "check", str(short), "--device", "cpu")
     assert code == 0
     assert "json         no answer: context overflow: " in out
-    assert " ms, 1 tokens, stop: " in out
+    assert " ms, 1 token, stop: " in out
 
 
 def test_a_check_as_json_has_every_token_and_asks_for_a_thought_in_json_only(

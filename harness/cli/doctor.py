@@ -3,6 +3,8 @@
 import json
 import os
 import subprocess
+from contextlib import suppress
+from dataclasses import asdict
 from shutil import which
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
@@ -26,13 +28,19 @@ GIB = 2**30
 
 def command(
     gpu: bool = typer.Option(False, "--gpu", help="Also ask torch for GPUs, which takes a few seconds."),
+    engines: bool = typer.Option(
+        False, "--engines", help="Also time the engines of each small model that has several; takes a minute."
+    ),
     as_json: options.Json = False,
 ) -> None:
     """Show what can run here: versions, machine, models, cache.
 
     For models that cannot run, it says what to install or fetch.
     """
+    from harness.evaluate.pace import Pace, advice
+
     facts = look(gpu)
+    facts["paces"] = _paces(as_json) if engines else {}
     if as_json:
         typer.echo(json.dumps(facts, indent=1))
         return
@@ -53,6 +61,25 @@ def command(
     _line("models", ", ".join(model["name"] for model in able))
     _lacking([(model["name"], model["remedy"]) for model in facts["models"] if model["missing"]])
     _lacking([(model["name"], model["remedy"]) for model in able if model["remedy"]])
+    for n, (name, found) in enumerate(facts["paces"].items()):
+        _line("" if n else "paces", f"{name}: {advice([Pace(**pace) for pace in found])}")
+
+
+def _paces(quiet: bool) -> dict[str, list[dict[str, Any]]]:
+    """How fast the engines of each small model are here, by card file; those alone that have several."""
+    from harness.backends import cards
+    from harness.cli.progress import bar
+    from harness.core.errors import Unanswered
+    from harness.evaluate.pace import paces
+
+    found = {}
+    stems = cards.names()
+    with bar("timing engines", len(stems), quiet) as progress:
+        for stem in stems:
+            with suppress(UserError, Unanswered):  # a card with a mistake is reported above
+                found[stem] = [asdict(pace) for pace in paces(stem)]
+            progress(1)
+    return {stem: of for stem, of in found.items() if of}
 
 
 def _line(head: str, text: str) -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from harness.backends.cards import Card
     from harness.backends.checkup import Checkup
     from harness.backends.findings import Findings
+    from harness.evaluate.pace import Pace
     from harness.evaluate.spec import Spec
 
 app = typer.Typer(help="List models, download one, or test one before a run.", no_args_is_help=True)
@@ -100,11 +101,13 @@ def check(
 
     It does so in each answer mode. Twelve fixed questions, and pairs of questions that differ in one fact,
     show whether its read-outs follow the letter and whether it reads the scene; later pages say so. A model
-    that takes pictures is also asked with a picture and with a blank one. Exit code 1 if no answer can be
-    read, or if it ignores the picture; 3 if it answers in no mode.
+    that takes pictures is also asked with a picture and with a blank one. If its card names several engines
+    and its weights are small, each is timed shortly, and a line says which is faster here. Exit code 1 if no
+    answer can be read, or if it ignores the picture; 3 if it answers in no mode.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities
+    from harness.evaluate.pace import advice
 
     card = resolve(name, engine)
     head: dict[str, Any] = {"name": card.name, "engine": card.engine}
@@ -117,12 +120,14 @@ def check(
             )
         return
     spec, seen, found = _seen(card, thinking, device, dtype)
+    paces = _paces(card)
     if as_json:
         typer.echo(
             json.dumps(
                 {
                     **head, "model_free": False, "thinking_asked": spec.ego.thinking, **asdict(seen),
                     "findings": found and {**to_builtins(found), "reads_scene": found.reads_scene},
+                    "paces": [asdict(pace) for pace in paces],
                 },
                 indent=2,
             )
@@ -130,6 +135,8 @@ def check(
     else:
         _show(spec, seen)
         _show_findings(found)
+        if paces:
+            typer.echo(f"engines      {advice(paces)}")
     every = [*seen.answers.values(), *(seen.looks.answers.values() if seen.looks else ())]
     errors = [answer.error for answer in every if answer.error is not None]
     if len(errors) == len(every):
@@ -206,6 +213,18 @@ def _seen(
     return spec, seen, found
 
 
+def _paces(card: "Card") -> "list[Pace]":
+    """Return how fast a card's engines are here; empty where that cannot be told."""
+    from harness.evaluate.pace import paces
+
+    try:
+        with bar(f"timing {printable(card.name, 30)}"):
+            return paces(card.name.partition(":")[0])
+    except (UserError, Unanswered) as error:
+        typer.echo(f"harness: its engines are not compared: {printable(error, 300)}", err=True)
+        return []
+
+
 def _show(spec: "Spec", seen: "Checkup") -> None:
     card, what = spec.ego.card, seen.identity
     where = " on ".join(printable(what[key]) for key in ("dtype", "device") if what.get(key))
@@ -247,8 +266,14 @@ def _show_findings(found: "Findings | None") -> None:
         f"action does in {found.follows_letter} of {found.n} questions; mass on the letters "
         f"{found.label_mass:.2f}"
     )
-    shown = ", ".join(f"{pair.fact} {pair.moved} of {pair.n} ({pair.mean:+.3f})" for pair in found.pairs)
-    typer.echo(f"pairs        letters {found.letters}; one fact changed, and the answer moved: {shown}")
+    # A mean that rounds to nothing has no sign.
+    shown = ", ".join(
+        f"{pair.fact} {pair.moved} of {pair.n} ({round(pair.mean, 3) + 0.0:+.3f})" for pair in found.pairs
+    )
+    typer.echo(
+        f"pairs        of questions that differ in one fact, letters {found.letters}; the answer "
+        f"followed the fact in (mean change of its probability): {shown}"
+    )
     for sentence in found.sentences():
         typer.echo(f"             {sentence}")
 
@@ -261,7 +286,8 @@ def _show_answers(answers: "Mapping[AnswerMode, Completion]") -> None:
         took = "" if answer.seconds is None else f"{answer.seconds * 1000:.1f} ms, "
         if answer.first_token_s is not None and answer.token_s is not None:
             took += f"first token after {answer.first_token_s * 1000:.1f} ms, "
-        tokens = "" if answer.completion_tokens is None else f"{answer.completion_tokens} tokens, "
+        count = answer.completion_tokens
+        tokens = "" if count is None else f"{count} token{'' if count == 1 else 's'}, "
         typer.echo(f"{way:<13}{took}{tokens}{answer.finish_reason}: {printable(repr(answer.text))}")
 
 

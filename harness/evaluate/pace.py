@@ -1,0 +1,90 @@
+"""How fast each engine of a card answers on this machine, shortly timed. It advises, and decides nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from harness.backends.cards import Card, each_engine, names
+from harness.backends.registry import missing, open_backend, registration, resolve
+from harness.core.errors import Unanswered
+from harness.evaluate import questions
+from harness.evaluate.agent import Agent
+from harness.prompts import versions
+
+PROMPT = "v2"
+TOKENS = 16  # of text that are timed
+MOST_BYTES = 10**9  # of weights: larger ones take more than seconds
+CLEAR = 1.2  # times as fast as another, which chance on a shared machine does not make
+
+
+@dataclass(frozen=True)
+class Pace:
+    """An engine's wall time of an answer that is asked alone, after a warm-up.
+
+    Attributes:
+        engine: its name.
+        readout_s: of a read-out whose letters are read once.
+        text_s: of the first `TOKENS` tokens of a free answer.
+    """
+
+    engine: str
+    readout_s: float
+    text_s: float
+
+
+def paces(stem: str) -> list[Pace]:
+    """Time the engines of a card file: those that run here, if there are several and weights are small.
+
+    Raises:
+        UserError: weights do not load, or the model cannot answer so.
+        Unanswered: a question got no answer.
+    """
+    able = [card for card in each_engine(stem) if missing(card) is None] if stem in names() else []
+    if len(able) < 2 or not all(_small(card) for card in able):
+        return []
+    return [_pace(card) for card in able]
+
+
+def advice(found: Sequence[Pace]) -> str:
+    """Say in one line which of several engines is faster here, and how to choose it."""
+    engines = " and ".join(pace.engine for pace in found)
+    of_letters, of_text = [pace.readout_s for pace in found], [pace.text_s for pace in found]
+    by_letters, by_text = _fastest(found, of_letters), _fastest(found, of_text)
+    if by_letters == by_text:
+        verdict = f"{by_text or 'neither'} is faster here"
+    else:
+        verdict = f"faster here: {by_letters or 'neither'} for read-outs, {by_text or 'neither'} for text"
+    letters_s, text_s = (" and ".join(f"{s:.2g} s" for s in of) for of in (of_letters, of_text))
+    return (
+        f"{verdict}; --engine chooses. On {engines}: a read-out {letters_s}, {TOKENS} tokens of text {text_s}"
+    )
+
+
+def _fastest(found: Sequence[Pace], seconds: Sequence[float]) -> str | None:
+    """Return the engine that is clearly the fastest; None if none is."""
+    first, second, *_ = sorted(seconds)
+    return found[seconds.index(first)].engine if second >= CLEAR * first else None
+
+
+def _small(card: Card) -> bool:
+    where: Path = resolve(registration(card.engine).finds)(card)
+    files = [file for file in where.rglob("*") if file.is_file()] if where.is_dir() else [where]
+    return sum(file.stat().st_size for file in files) <= MOST_BYTES
+
+
+def _pace(card: Card) -> Pace:
+    backend = open_backend(card, batch_size=1)
+    took: list[float] = []
+    try:
+        for answer in ("readout", "json"):
+            letters = "raw" if answer == "readout" else None
+            agent = Agent(card, versions.load(PROMPT), answer, letters=letters)  # type: ignore[arg-type]
+            for request in questions.requests(agent)[:2]:  # the first warms up
+                [done] = backend.complete([request.alike(max_tokens=TOKENS)])
+                if done.seconds is None:
+                    raise Unanswered(f"{card.name}: no answer to be timed: {done.error}")
+                seconds = done.seconds
+            took.append(seconds)
+    finally:
+        getattr(backend, "close", lambda: None)()
+    return Pace(card.engine, *took)

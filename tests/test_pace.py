@@ -1,0 +1,49 @@
+"""Which engine of a card is faster here: timed shortly, and said in one line."""
+
+import pytest
+
+from harness.backends import cards
+from harness.cli.doctor import _paces
+from harness.evaluate import pace
+from harness.evaluate.pace import Pace, advice, paces
+
+
+def of(*seconds: tuple[float, float]) -> list[Pace]:
+    return [Pace(engine, *pair) for engine, pair in zip("abc", seconds, strict=False)]
+
+
+@pytest.mark.parametrize(
+    ("found", "says"),
+    [
+        (of((0.4, 0.5), (1.6, 0.9)), "a is faster here; --engine chooses."),
+        (of((1.6, 0.5), (0.4, 0.9)), "faster here: b for read-outs, a for text; --engine chooses."),
+        (of((1.0, 0.5), (1.1, 0.9)), "faster here: neither for read-outs, a for text; --engine chooses."),
+        (of((1.0, 1.0), (1.1, 0.9)), "neither is faster here; --engine chooses."),
+        (of((3.0, 3.0), (2.9, 2.9), (1.0, 1.0)), "c is faster here; --engine chooses."),
+    ],
+)
+def test_only_a_clear_difference_makes_an_engine_the_faster_one(found: list[Pace], says: str) -> None:
+    assert advice(found).startswith(says)
+
+
+def test_the_line_has_every_figure() -> None:
+    assert advice(of((0.4, 0.51), (1.66, 0.9))).endswith(
+        " On a and b: a read-out 0.4 s and 1.7 s, 16 tokens of text 0.51 s and 0.9 s"
+    )
+
+
+def test_a_small_card_of_both_engines_is_timed_on_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    monkeypatch.setattr(cards, "names", lambda: ["proxy", "swarm-tiny"])
+    found = _paces(quiet=True)
+    assert list(found) == ["swarm-tiny"]
+    assert {of["engine"] for of in found["swarm-tiny"]} == {"transformers", "llama-cpp"}
+    assert all(0 < of[what] < 60 for of in found["swarm-tiny"] for what in ("readout_s", "text_s"))
+
+
+def test_what_has_one_engine_or_large_weights_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert paces("proxy") == paces("./no-card") == []
+    monkeypatch.setattr(pace, "MOST_BYTES", 1000)
+    monkeypatch.setattr(pace, "_pace", lambda card: pytest.fail("opened"))
+    assert paces("swarm-tiny") == []
