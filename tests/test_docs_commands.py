@@ -72,6 +72,7 @@ NOT_RUN = {
     "harness model check smollm2-135m": "needs those weights",
     "harness eval --model smollm2-135m --limit 4": "needs those weights",
     "harness eval --model smollm2-135m --engine llama-cpp --limit 4": "needs those weights",
+    "harness parity smollm2-135m --prompts 500 --read-outs": "needs those weights, and 12 CPU minutes",
     "harness model check qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b": "needs those weights",
     "harness eval --model my-served --server http://gpu-1:8000/v1 --server http://gpu-2:8000/v1"
