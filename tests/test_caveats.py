@@ -93,7 +93,7 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     Path("swarmdrive.toml").touch()
     Path("models").mkdir()
     Path("models/mute.toml").write_text(CARD)
-    options = ("--dataset", small_path, "--seeds", "0", "--condition", "6g")
+    options = ("--dataset", small_path, "--seeds", "0", "--condition", "6g", "--ties", "first")
     code, out, err = harness("eval", "--model", "mute", *options, "--out", "reports/mute")
     assert (code, err) == (0, "")
     said = " ".join(out.split())

@@ -328,9 +328,12 @@ def test_a_failed_ego_answer_is_undecided_so_it_asks(played: Dataset) -> None:
     assert value(told, "all", "strict_rate_ego", "answers") == (5 / 7, 7, 0)
 
 
-def test_alone_an_undecided_ego_takes_the_most_conservative_action(played: Dataset) -> None:
+def test_alone_an_undecided_ego_takes_the_most_careful_action_where_ties_fall_to_the_first(
+    played: Dataset,
+) -> None:
     brake = OperatingPoint("brake", None, fallback="brake")
-    told = walked(spec_of(played, points=(ALONE, brake), seeds=(0,)), Scripted({"00001-0/v1": "{}"}))
+    spec = spec_of(played, points=(ALONE, brake), seeds=(0,), ties="first")
+    told = walked(spec, Scripted({"00001-0/v1": "{}"}))
     for point, p in ((ALONE, [1 / 3, 1 / 3, 1 / 3]), (brake, [1.0, 0.0, 0.0])):
         assert told.result(point, "fused")[2] == pytest.approx(p)
         assert told.result(point, "action")[2] == 0

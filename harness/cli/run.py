@@ -217,7 +217,7 @@ def show(
     Rows `beside` it are of what needs no model: a score by name.
     """
     from harness.report.caveats import causes, caveats, lost_at_once
-    from harness.report.constancy import ignores_input
+    from harness.report.constancy import ignores_input, in_a_line
     from harness.runs.folder import read
 
     m = done.manifest
@@ -240,7 +240,7 @@ def show(
             ),
         ],
     )
-    for note in (*notes, *origins(m, figures)):
+    for note in (*notes, *in_a_line(run), *origins(m, figures)):
         text.print(note)
 
 

@@ -96,11 +96,12 @@ def _mapping(done: "SuiteRun", lines: "Sequence[Line]") -> dict[str, Any]:
 
 
 def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
-    """Print success, gains and the reference drivers, each a table of families."""
+    """Print success, gains and what needs no model, each a table of families."""
     from harness.report import caveats
     from harness.report.constancy import ignores_input
     from harness.report.suite import seeds_of
     from harness.runs.summary import BASELINE
+    from harness.world.drivers import ALWAYS
 
     text, m = console(), done.variant
     text.print(f"{printable(m.model, 30)} · prompt {m.prompt} · {m.answer} · suite {printable(done.name)}")
@@ -113,9 +114,10 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     gaining = [c for c in done.conditions if c != BASELINE] if BASELINE in done.conditions else []
     _matrix("success, % [95 % CI]", "success", done.conditions, lines)
     _matrix(f"gain over {BASELINE}, points", "gain", gaining, lines)
-    drivers = list(lines[-1].drivers)
+    # `constant` stands for the two that always take one action: a line has no room for all.
+    drivers = [name for name in lines[-1].drivers if name not in ALWAYS]
     table(
-        ("reference drivers, %", *drivers, "n", "seeds"),
+        ("references, %", *drivers, "n", "seeds"),
         [
             (
                 line.name, *(f"{100 * (line.drivers[d].value or 0.0):.1f}" for d in drivers),

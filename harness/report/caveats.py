@@ -64,12 +64,11 @@ def causes(run: Run) -> Iterator[str]:
     meanings = {str(status): status.meaning for status in Status}
     rates = {role: run.score(ALL, f"failed_rate_{role}") for role in _FAILED}
     for role in [role for role, rate in rates.items() if rate and rate.value]:
-        answers = [a for a in run.answers if a.role == role and a.error is None]
-        failed = Counter(a.status for a in answers if a.verdict == "failed")
+        failed, n = run.answered.failed.get(role, Counter()), run.answered.count[role]
         for status, count in failed.most_common(1):
             meaning = meanings.get(status, "it is not said").rstrip(".")
             yield (
-                f"{failed.total()} of {_FAILED[role][0]} {len(answers)} answers could not be read. The "
+                f"{failed.total()} of {_FAILED[role][0]} {n} answers could not be read. The "
                 f"commonest cause, {count} of {failed.total()}: {meaning[0].lower()}{meaning[1:]} "
                 f"({printable(status, 30)})."
             )

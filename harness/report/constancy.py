@@ -1,11 +1,11 @@
-"""Say of a language model that its answers are the same whatever it is shown."""
+"""Say of a language model what it answers most often, and how much that moves with what it is shown."""
 
 from collections import Counter
-from collections.abc import Iterator
-
-import numpy as np
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from harness.backends.registry import find
+from harness.coordination.coordinate import TIE
 from harness.runs.folder import Run
 
 LEAST = 20  # answers that say something about a model
@@ -13,31 +13,90 @@ CONSTANT = 0.98  # share of the likeliest action from which a model is said to i
 DRIVERS = {"SLOWER": "brake", "IDLE": "cruise"}  # reference drivers that always take one action
 
 
-def ignores_input(run: Run) -> Iterator[str]:
-    """Yield the sentence on an ego whose likeliest action is nearly always the same one.
+@dataclass(frozen=True)
+class Commonest:
+    """What an ego answers most often.
 
-    It is said of language models with `LEAST` readable ego answers or more, where one action is the likeliest
-    in a share of `CONSTANT` of them. The standard deviation is that of its probability over these answers.
+    Attributes:
+        actions: the likeliest action of these answers; several where they are equally likely.
+        count: in how many readable answers.
+        n: how many are readable.
+        moves: standard deviation of the action's probability over all readable answers.
+        all_read: whether every answer could be read.
     """
+
+    actions: Sequence[str]
+    count: int
+    n: int
+    moves: float
+    all_read: bool
+
+    @property
+    def likeliest(self) -> str:
+        """That the action is the likeliest, in words."""
+        if len(self.actions) == 1:
+            return f"{self.actions[0]} is the likeliest action"
+        return f"{', '.join(self.actions)} are equally likely"
+
+    @property
+    def constant(self) -> bool:
+        """Whether nearly all answers are of this kind."""
+        return self.count >= CONSTANT * self.n
+
+
+def commonest(run: Run) -> Commonest | None:
+    """Return what a language model's ego answers most often; None with fewer readable ones than `LEAST`."""
     engine = find(run.manifest.model["engine"])
     if engine is None or not engine.capabilities.language_model:
+        return None
+    p = run.answered.ego
+    if len(p) < LEAST:
+        return None
+    likeliest = p >= p.max(axis=1, keepdims=True) - TIE
+    [(places, count)] = Counter(map(tuple, likeliest.tolist())).most_common(1)
+    actions = [action for action, one in zip(run.actions, places, strict=True) if one]
+    moves = float(p[:, places.index(True)].std())
+    return Commonest(actions, count, len(p), moves, len(p) == run.answered.count["ego"])
+
+
+def ignores_input(run: Run) -> Iterator[str]:
+    """Yield the sentence on an ego whose likeliest action is nearly always the same one (`CONSTANT`)."""
+    found = commonest(run)
+    if found is None or not found.constant:
         return
-    answers = [answer for answer in run.answers if answer.role == "ego" and answer.error is None]
-    intents = [answer.intent for answer in answers if answer.intent]
-    if len(intents) < LEAST:
-        return
-    p = np.array(intents)
-    [(place, count)] = Counter(p.argmax(axis=1).tolist()).most_common(1)
-    if count < CONSTANT * len(intents):
-        return
-    action = run.actions[place]
-    said = ""
-    if len(intents) == len(answers):
-        driver = DRIVERS.get(action)
-        like = f"`{driver}`, which needs no model" if driver else f"one that always takes {action}"
-        said = f" Without messages it drives as the driver {like}."
+    said = f" Without messages it drives as {_like(run, found)}." if found.all_read else ""
     yield (
-        f"The model ignores its input: {action} is the likeliest action in {count} of the ego's "
-        f"{len(intents)} readable answers, and its probability moves by {p[:, place].std():.3f} (standard "
-        f"deviation) between them.{said}"
+        f"The model ignores its input: {found.likeliest} in {found.count} of the ego's {found.n} readable "
+        f"answers, and its probability moves by {found.moves:.3f} (standard deviation) between them.{said}"
     )
+
+
+def _like(run: Run, found: Commonest) -> str:
+    """Return like whom an ego drives that always answers so."""
+    taken = found.actions[:1] if run.manifest.ties == "first" else found.actions
+    if len(taken) == len(run.actions):
+        return "the driver `uniform`, which needs no model"
+    if len(taken) > 1:
+        return f"one that takes {' or '.join(taken)} by chance"
+    if driver := DRIVERS.get(taken[0]):
+        return f"the driver `{driver}`, which needs no model"
+    return f"one that always takes {taken[0]}"
+
+
+def in_a_line(run: Run) -> Iterator[str]:
+    """Yield what a language model's ego answers most often, where `ignores_input` has not said it."""
+    found = commonest(run)
+    if found and not found.constant:
+        yield (
+            f"ego answers: {found.likeliest} in {100 * found.count / found.n:.0f} % of {found.n}; its "
+            f"probability moves by {found.moves:.2f} (standard deviation)"
+        )
+
+
+def tile(run: Run) -> list[dict[str, str]]:
+    """Return the same as a figure of a page's first screen; none without a language model."""
+    found = commonest(run)
+    return [] if found is None else [{
+        "what": f"ego's answers in which {found.likeliest}", "value": f"{100 * found.count / found.n:.0f} %",
+        "interval": f"its probability moves by {found.moves:.2f}", "n": f"n = {found.n} readable answers",
+    }]  # fmt: skip

@@ -23,7 +23,7 @@ from harness.core.places import nameless, text
 from harness.parsing.parse import Repair, Status
 from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
-from harness.report.constancy import ignores_input
+from harness.report.constancy import ignores_input, tile
 from harness.report.decisions import Decisions
 from harness.report.details import Part, Prompts, prompts_of
 from harness.report.drawing import colours
@@ -133,7 +133,7 @@ def _pieces(
         unread=len(unread),
         size=contents.size(runs),
         headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),
-        key_figures=words.figures(runs.runs[0]) if alone else matrix.figures(lines),
+        key_figures=[*words.figures(runs.runs[0]), *tile(runs.runs[0])] if alone else matrix.figures(lines),
         palette=Markup(colours.variables()),
         actions=_actions(runs),
         lines=lines,

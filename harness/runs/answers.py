@@ -1,13 +1,32 @@
 """The answers of a run, `answers.jsonl`: one answer a line."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from io import BytesIO
 
 import msgspec
+import numpy as np
 
+from harness.core.arrays import Floats
 from harness.runs.records import Answer
 
 _ANSWER = msgspec.json.Decoder(Answer)
+
+
+@dataclass(frozen=True)
+class Answered:
+    """What the questions of a run came to that got an answer.
+
+    Attributes:
+        count: how many answers there are, by role.
+        failed: how many could not be read, by role and status.
+        ego: distributions over the actions that the ego answered and could be read, (n, A).
+    """
+
+    count: Counter[str]
+    failed: Mapping[str, Counter[str]]
+    ego: Floats
 
 
 class Answers:
@@ -21,7 +40,7 @@ class Answers:
 
     def __init__(self, lines: bytes, actions: int) -> None:
         """Check the lines of a run with so many actions. Raises ValueError for a broken one."""
-        self._lines, self._count = lines, 0
+        self._lines, self._count, self._actions = lines, 0, actions
         self._spans: list[tuple[int, int]] = []  # of lines that stand together and are of one decision point
         of_scene: dict[str, list[int]] = {}  # places in `_spans`
         keys: set[str] = set()
@@ -52,6 +71,19 @@ class Answers:
     def __iter__(self) -> Iterator[Answer]:
         for place in range(len(self._spans)):
             yield from self._span(place)
+
+    def counted(self) -> Answered:
+        """Go through the answers once, and return what they came to."""
+        count, failed, ego = Counter[str](), dict[str, Counter[str]](), list[tuple[float, ...]]()
+        for answer in self:
+            if answer.error is not None:
+                continue
+            count[answer.role] += 1
+            if answer.verdict == "failed":
+                failed.setdefault(answer.role, Counter())[answer.status] += 1
+            if answer.role == "ego" and answer.intent:
+                ego.append(answer.intent)
+        return Answered(count, failed, np.array(ego, dtype=float).reshape(-1, self._actions))
 
     def _span(self, place: int) -> list[Answer]:
         start, stop = self._spans[place]

@@ -31,7 +31,7 @@ from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
 from harness.dataset.verify import read_manifest
 from harness.runs import attribution
-from harness.runs.answers import Answers
+from harness.runs.answers import Answered, Answers
 from harness.runs.attribution import Attribution
 from harness.runs.decisions import DecisionFiles, Decisions, arrow_file
 from harness.runs.metrics import Grid, World
@@ -132,6 +132,11 @@ class Run:
     def answers(self) -> Answers:
         """The lines of `answers.jsonl`."""
         return self._read("answers.jsonl", lambda file: Answers(bytes_of(file, "rows"), len(self.actions)))
+
+    @cached_property
+    def answered(self) -> Answered:
+        """What the answers came to, of one pass through them."""
+        return self.answers.counted()
 
     @cached_property
     def answers_by_scene(self) -> Mapping[str, list[Answer]]:
