@@ -90,9 +90,9 @@ def judging(monkeypatch: pytest.MonkeyPatch) -> Judging:
 def made(small: Dataset, tmp_path: Path, judging: Judging) -> Callable[..., Path]:
     """A finished run of it under some conditions."""
 
-    def make(*points: Any) -> Path:
-        spec = spec_of(small, "swarm-tiny", "v4", points=points or (SIXG,), latency="paper")
-        done = run(spec, tmp_path / "run").out
+    def make(*points: Any, ask: str = "all") -> Path:
+        spec = spec_of(small, "swarm-tiny", "v4", points=points or (SIXG,), latency="paper", ask=ask)
+        done = run(spec, tmp_path / f"run-{ask}").out
         judging.asked.clear()
         return done
 
@@ -181,6 +181,18 @@ def test_a_message_left_out_of_a_pool_is_exact_and_asks_nobody(
         assert each.action == d.action
     moved = {row.kind: row.shift.value for row in rows(found) if row.role == "fusion"}
     assert moved["helper with sight"] > moved["helper without sight"]
+
+
+def test_helpers_that_were_never_asked_are_asked_first(made: Callable[..., Path], judging: Judging) -> None:
+    point = named_point("v2x:max_helpers=1")
+    everybody = attribute(Stored(made(point)), point.name, 12, 0)
+    path = made(point, ask="used")
+    told: list[str] = []
+    assert attribute(Stored(path, say=told.append), point.name, 12, 0) == everybody
+    missing = [name for name in judging.asked if "~without" not in name]
+    assert missing
+    assert {answer.id for answer in folder.read(path).answers}.isdisjoint(missing)
+    assert [f"is asked {len(judging.asked)} questions now" in text for text in told] == [True]
 
 
 def test_a_rule_with_memory_keeps_it(made: Callable[..., Path]) -> None:

@@ -39,9 +39,9 @@ def command(
     from harness.studies.stored import Stored
 
     options.in_range("--sample", sample, 1, MOST)
-    with bar("asking without", quiet=as_json or quiet) as progress:
+    with bar("asking without", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
-        stored = Stored(run, more=progress.more, done=progress, dataset=dataset, models=own)
+        stored = Stored(run, more=progress.more, done=progress, dataset=dataset, models=own, say=progress.say)
         chosen = condition or (USUAL if USUAL in stored.points else stored.run.conditions[-1])
         found = attribute(stored, chosen, sample, sample_seed)
     made, file = rows(found), write(found, run)

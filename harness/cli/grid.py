@@ -89,6 +89,7 @@ def command(
         device=device,
         dtype=dtype,
         latency=latency,
+        ask="all",  # combinations share answers: whom one does not ask, another does
     )
     from harness.studies.grid import run_cells
     from harness.studies.grid_page import in_a_sentence, ranked, strongest, tables, text, write_grid
@@ -102,7 +103,7 @@ def command(
             f"--out {printable(folder)} already holds a finished grid; choose another or delete it"
         )
     silent = as_json or quiet
-    with bar(f"{cells} combinations", quiet=silent) as progress:
+    with bar(f"{cells} combinations", quiet=silent, grows=True) as progress:
         cache = None if no_cache else default_file()
         grid = run_cells(spec, egos, helpers, folder, progress, progress.more, cache)
     page = write_grid(grid, spec, folder)

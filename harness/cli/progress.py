@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
+from functools import partial
 from itertools import count
 from threading import Event, Thread
 from typing import TYPE_CHECKING
@@ -24,13 +25,15 @@ class Bar:
 
     Attributes:
         label: what is done.
-        total: how many there are; 0 while nobody knows.
+        total: how many there are, as far as is known; 0 while nobody knows.
+        grows: whether more follow from what is done, so that the time left is a least one.
         done: how many are done.
     """
 
-    def __init__(self, label: str, total: int) -> None:
-        self.label, self.total, self.done = label, total, 0
+    def __init__(self, label: str, total: int, grows: bool = False) -> None:
+        self.label, self.total, self.grows, self.done = label, total, grows, 0
         self.changed: Callable[[], object] = lambda: None
+        self.say: Callable[[str], None] = lambda text: None  # writes a line above the bar
 
     def __call__(self, done: int) -> None:
         """So many are newly done."""
@@ -44,23 +47,25 @@ class Bar:
 
 
 @contextmanager
-def bar(label: str, total: int = 0, quiet: bool = False) -> Iterator[Bar]:
-    """How many are done, how fast, and the time left; nothing where `quiet`."""
-    progress = Bar(label, total)
+def bar(label: str, total: int = 0, quiet: bool = False, grows: bool = False) -> Iterator[Bar]:
+    """How many are done, how fast, and the time left (at least, if more follows); nothing if `quiet`."""
+    progress = Bar(label, total, grows)
     if quiet:
         yield progress
         return
     if not sys.stderr.isatty():
+        progress.say = partial(print, file=sys.stderr, flush=True)
         with _lines(progress):
             yield progress
         return
     from rich.console import Console
 
     with drawn(Console(stderr=True)) as bars:
-        task = bars.add_task(label, total=total or None)
+        task = bars.add_task(label, total=total or None, grows=grows)
         progress.changed = lambda: bars.update(
             task, completed=progress.done, total=progress.total or None, description=progress.label
         )
+        progress.say = partial(bars.console.print, markup=False, highlight=False)
         yield progress
 
 
@@ -95,7 +100,8 @@ def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> st
     speed = (done - before) / (now_s - since_s)
     of = f"{done}/{progress.total}" if progress.total else str(done or "")
     if speed:
-        at = pace(speed, (progress.total - done) / speed if progress.total else None, None)
+        left_s = (progress.total - done) / speed if progress.total else None
+        at = pace(speed, left_s, None, progress.grows)
     else:
         at = f"{timedelta(seconds=round(took_s))} so far"
     return " ".join(filter(None, (progress.label, of, at)))
@@ -111,7 +117,8 @@ def drawn(console: "Console") -> "Progress":
         max_refresh = 0.5
 
         def render(self, task: Task) -> Text:
-            return Text(pace(task.finished_speed or task.speed, task.time_remaining, task.finished_time))
+            speed, grows = task.finished_speed or task.speed, bool(task.fields.get("grows"))
+            return Text(pace(speed, task.time_remaining, task.finished_time, grows))
 
     return Progress(
         TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis")),
@@ -121,10 +128,11 @@ def drawn(console: "Console") -> "Progress":
     )
 
 
-def pace(speed: float | None, left_s: float | None, took_s: float | None) -> str:
+def pace(speed: float | None, left_s: float | None, took_s: float | None, grows: bool = False) -> str:
     """`61.3/s 0:00:06 left`: what is known of how many a second (or minute), and of the seconds to go.
 
-    At the end, `took_s`, it is `in` how long all was done.
+    It is `at least` so long where more follows from what is done. At the end, `took_s`, it is `in` how long
+    all was done.
     """
     parts = []
     if speed:
@@ -132,5 +140,5 @@ def pace(speed: float | None, left_s: float | None, took_s: float | None) -> str
     if took_s is not None:
         parts.append(f"in {timedelta(seconds=round(took_s))}")
     elif left_s is not None:
-        parts.append(f"{timedelta(seconds=round(left_s))} left")
+        parts.append(f"{'at least ' * grows}{timedelta(seconds=round(left_s))} left")
     return " ".join(parts)

@@ -49,7 +49,10 @@ def evaluate(
     folder = out or free_folder([spec], f"{spec.source.name}-repeats", together.goes_on)
     together.check(folder)
     name = printable(spec.ego.card.name, 30)
-    with work.going_on(folder), bar(f"asking {name}, {repeats} repeats", quiet=quiet or as_json) as progress:
+    with (
+        work.going_on(folder),
+        bar(f"asking {name}, {repeats} repeats", quiet=quiet or as_json, grows=True) as progress,
+    ):
         done = run_repeats(spec, repeats, folder, progress, progress.more, cache)
     page = write_repeats(done)
     if as_json:

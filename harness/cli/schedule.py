@@ -51,7 +51,8 @@ def learn(
     command = shlex.join(["harness", *sys.argv[1:]])
     with bar("learning", ROUNDS, quiet=quiet) as progress:
         train, others = (
-            [Stored(run, None, progress.more, progress, models=own) for run in of] for of in (runs, tune)
+            [Stored(run, None, progress.more, progress, models=own, say=progress.say) for run in of]
+            for of in (runs, tune)
         )
         progress.more(sum(each.dataset.scenario.parameters.decisions for each in (*train, *others)))
         made = run_learn(train, others, point, out, command, progress)
@@ -114,9 +115,12 @@ def compare(
             f"--tune: {len(tune)} given for {len(runs)} runs; give one for each, in order, or none"
         )
     silent = as_json or quiet
-    with bar("schedules", quiet=silent) as progress:
+    with bar("schedules", quiet=silent, grows=True) as progress:
         own = options.cards(model)
-        stored = [Stored(run, latency, progress.more, progress, models=own) for run in (*runs, *tune)]
+        stored = [
+            Stored(run, latency, progress.more, progress, models=own, say=progress.say)
+            for run in (*runs, *tune)
+        ]
         for other in stored[len(runs) :]:
             layouts(other, "tune")
         draws = options.parse_seeds(seeds) if seeds else stored[0].seeds

@@ -75,9 +75,12 @@ def command(
         raise unknown("--latency", latency, ("run", "paper"))
     grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]
     conditions, silent = list(dict.fromkeys(condition)), as_json or quiet
-    with bar("grid points", quiet=silent) as progress:
+    with bar("grid points", quiet=silent, grows=True) as progress:
         own = options.cards(model)
-        stored = [Stored(run, latency, progress.more, progress, not no_model, dataset, own) for run in runs]
+        stored = [
+            Stored(run, latency, progress.more, progress, not no_model, dataset, own, progress.say)
+            for run in runs
+        ]
         panels = {
             axis.name: settings(stored, axis, values, conditions)
             for axis, values in zip(axes, grids, strict=True)
@@ -94,11 +97,8 @@ def command(
         for source in stored:
             if source.lost:
                 typer.echo(source.lost)
-            if left := source.left_out:
-                typer.echo(
-                    f"{printable(source.name)}: left out episodes that reach one of {len(left)} decision "
-                    "points without a stored answer; without --no-model the model is asked there"
-                )
+            if source.left_out:
+                typer.echo(source.leaves_out)
         typer.echo(f"wrote {printable(where / 'index.html')}")
 
 

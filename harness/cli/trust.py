@@ -82,7 +82,7 @@ def command(
     ways, parts = names_of("--rules", rules, (*RULES, CAPPED), tuple(RULES)), shares_of(share)
     if (run is None and model is None) or (run and prompt):
         raise UserError("give either RUN, the folder of a finished run, or --model, with its --prompt")
-    with bar("rules under attack", quiet=as_json or quiet) as progress:
+    with bar("rules under attack", quiet=as_json or quiet, grows=True) as progress:
         if run is None:
             assert model is not None
             spec = _spec(model, prompt, condition, seeds)
@@ -91,7 +91,9 @@ def command(
             cache = default_file()
             run = read_or_evaluate(spec, out / "run", progress, cache, progress.more, open_backend).path
         own = options.cards([model] if model else None)
-        stored = Stored(run, more=progress.more, done=progress, asks=not no_model, models=own)
+        stored = Stored(
+            run, more=progress.more, done=progress, asks=not no_model, models=own, say=progress.say
+        )
         draws = options.parse_seeds(seeds) if seeds else stored.seeds
         where = out or run / "trust"
         with work.going_on(where):
@@ -104,6 +106,8 @@ def command(
     typer.echo(f"{printable(bench.name)} · {printable(bench.source)} · {printable(bench.condition)}")
     if stored.lost:
         typer.echo(fill(stored.lost, WIDTH))
+    if stored.left_out:
+        typer.echo(fill(stored.leaves_out, WIDTH))
     for sentence in in_a_sentence(bench):
         typer.echo(fill(printable(sentence, 1000), WIDTH))
     for part in bench.shares:
@@ -137,4 +141,5 @@ def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> 
         source=FrozenSource(frozen),
         points=options.points([condition], None, None),
         seeds=options.parse_seeds(seeds or "0:5"),
+        ask="all",  # attacks use what every helper intends
     )

@@ -93,6 +93,7 @@ def command(
         batch_size=batch_size,
         device=device,
         dtype=dtype,
+        ask="all",  # every viewer has a twin
     )
     study = asking.Study(spec, tuple(dict.fromkeys(twin or TWINS)), sample_seed)
     able = [name for name in study.twins if asking.lack(spec, TWINS[name]) is None]

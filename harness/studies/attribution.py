@@ -122,7 +122,8 @@ def draw(stored: Stored, condition: str, sample: int, seed: int) -> tuple[dict[s
 def objects(stored: Stored, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
     """Every listed object left out of every prompt about these decision points in turn."""
     asked = [each for scene in scenes for each in _questions(stored, scene)]
-    answers = stored.answered([request for *_, request in asked])
+    whole = requests(stored.spec, scenes)
+    answers = stored.answered([*whole, *(request for *_, request in asked)])
     for scene, viewer, item, request in asked:
         p = answers[f"{scene.id}/{viewer}"].intent
         if p and answers[request.id].error is None:

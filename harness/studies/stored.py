@@ -34,7 +34,7 @@ from harness.evaluate.asking import EGO, Asker, wanted_in
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
-from harness.evaluate.walk import Fuses
+from harness.evaluate.walk import Ask, Fuses
 from harness.prompts import versions
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
@@ -47,6 +47,7 @@ from harness.studies.play import Walked, walk_through
 
 WALKS = 1 << 17  # most that are walked together, unless one grid point has more: some 120 MB
 _GIVE_IT = "to ask it, give --model with its folder, .gguf file or hub id, or write a card models/NAME.toml"
+OWN = ("ego", "helper")  # roles that have one answer a vehicle
 MORE = "more-answers.jsonl"  # answers at decision points that the run did not come to, and its fusion calls
 
 
@@ -70,6 +71,7 @@ class Stored:
         self, folder: Path, latency: str | None = None,
         more: Callable[[int], None] = lambda count: None, done: Callable[[int], None] = lambda count: None,
         asks: bool = True, dataset: Path | None = None, models: Sequence[Card] = (),
+        say: Callable[[str], None] = lambda text: None,
     ) -> None:  # fmt: skip
         """A run.
 
@@ -78,10 +80,13 @@ class Stored:
             latency: `paper` for the paper's inference times.
             more: told how many answers are owed.
             done: told how many have come.
-            asks: whether its model is asked what the run has no answer to; else such walks are left out.
+            asks: whether its model is asked what the run has no answer to. Else a walk is left out that
+                comes to a decision point without an answer of the ego, and one that needs a helper whom the
+                run did not ask is refused.
             dataset: folder of its dataset; None where the run states.
             models: cards that the user gave; a model of another name is asked only if the user has a card
                 file of it. What a run says of a model's place is never used.
+            say: told once, before a language model is asked, how much is asked.
         """
         self.run = read(folder)
         if self.run.world != "frozen":
@@ -112,7 +117,9 @@ class Stored:
         self.dataset = dataset_of(self.run, dataset).of_episodes(self.run.grid.episodes)
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
         self._asks, self._models = asks, models
+        self._say, self._more, self._done = say, more, done
         self.left_out: set[str] = set()
+        self._said, self._due = False, 0  # questions that are owed next
         self._opened: dict[int, Backend] = {}
         self._laid_out: Intents | None = None  # at every decision point that was asked for
         self._row: dict[str, int] = {}  # of each of them, by id
@@ -120,8 +127,30 @@ class Stored:
         answers = {a.id: a for a in self.run.answers if a.error is None or a.role not in missing}
         self._asker = Asker(
             self._spec(), self._open, PAPER if latency == "paper" else manifest.latency, folder / MORE,
-            answers, done, more,
+            answers, self._came, self._owed,
         )  # fmt: skip
+
+    def _owed(self, count: int) -> None:
+        self._due = count
+        self._more(count)
+
+    def _came(self, count: int) -> None:
+        self._due -= count
+        self._done(count)
+
+    def _say_once(self) -> None:
+        """Tell how much is asked now, at the first questions to a language model."""
+        if self._said or not any(agent.can.language_model for agent in self.spec.agents):
+            return
+        self._said = True
+        tokens = [answer.prompt_tokens for answer in self.run.answers if answer.prompt_tokens is not None]
+        about = f" (about {float(f'{self._due * np.mean(tokens):.2g}'):.0f} prompt tokens)" if tokens else ""
+        reached = self.run.decisions.scenes
+        lacks = len(reached) * self.vehicles - sum(answer.role in OWN for answer in self.run.answers)
+        self._say(
+            f"{printable(self.name)} is asked {self._due} questions now that the run did not ask{about}; "
+            f"of helpers at the {len(reached)} decision points that it reached, it lacks {lacks} at most"
+        )
 
     def _roots(self) -> list[str]:
         forest = self.dataset.forest
@@ -155,16 +184,22 @@ class Stored:
         """The same at points that are walked together."""
         different = list(dict.fromkeys(points))
         world = FrozenWorld(self.dataset, different, seeds)
-
-        def leave_out(moments: Bools) -> None:
-            for point in different:
-                world.leave_out(point, moments)
-
-        nearest = _Nearest(self, vehicles - 1, leave_out)
-        walks = walk_through(world, different, nearest, seeds, world.numbers, self.spec.ties)
+        ask = self.asked_in(world, different, vehicles - 1)
+        walks = walk_through(world, different, ask, seeds, world.numbers, self.spec.ties)
         walked = dict(zip(different, walks, strict=True))
         for point in points:
             yield [Walked(world.numbers, world.ends(point), *walked[point])]
+
+    def asked_in(
+        self, world: FrozenWorld, points: Sequence[OperatingPoint], helpers: int | None = None
+    ) -> Ask[Scene]:
+        """What intends whoever a walk of this world asks, of so many of the nearest helpers; None for all."""
+
+        def leave_out(moments: Bools) -> None:
+            for point in points:
+                world.leave_out(point, moments)
+
+        return _Nearest(self, self.vehicles - 1 if helpers is None else helpers, leave_out)
 
     def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> Floats:
         """Joules of each vehicle's answer, (n, 1+H); NaN where unknown."""
@@ -203,6 +238,14 @@ class Stored:
             f"{printable(self.name)}: no answer to {counts}; left out, as lost messages are" if counts else ""
         )
 
+    @property
+    def leaves_out(self) -> str:
+        """Where walks were left out, in a sentence."""
+        return (
+            f"{printable(self.name)}: left out episodes that reach one of {len(self.left_out)} decision "
+            "points without a stored answer; without --no-model the model is asked there"
+        )
+
     def settle(self) -> None:
         """Raise Unanswered if too many of the questions that were asked here got no answer."""
         self._asker.settle()
@@ -228,7 +271,10 @@ class Stored:
                 f"leave it out{remedy}"
             )
         with self._writing():
-            return self._asker.helpers(moments, wanted, blind)
+            there = self._asker.helpers(moments, wanted, blind)
+        if not blind:
+            self._lay_out(scenes)
+        return there
 
     def intents(self, moments: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
         """What every vehicle intends; where its model is not asked, walks without an answer are left out."""
@@ -236,33 +282,13 @@ class Stored:
         if any(self._asker.lacks(new, places=[EGO] * len(new))):
             if self._asks:
                 return self(moments)
-            self._leave_out(moments, self._asker.lacks(moments, places=[EGO] * len(moments)), leave_out)
+            lacks = self._asker.lacks(moments, places=[EGO] * len(moments))
+            self.left_out |= {scene.id for scene, lacking in zip(moments, lacks, strict=True) if lacking}
+            leave_out(np.array(lacks))
             return self._asker.laid_out(moments)
         if new:
             self._lay_out(new)
         return self._there(moments, max(len(scene.viewers) for scene in moments) - 1)
-
-    def helpers_of(
-        self, moments: Sequence[Scene], wanted: Bools, leave_out: Callable[[Bools], None]
-    ) -> Intents:
-        """The same once these helpers, (n, H), were asked; where they cannot be, walks are left out."""
-        scenes, places = wanted_in(moments, wanted)
-        lacks = self._asker.lacks(scenes, places=places)
-        if any(lacks) and not self._asks:
-            without = {scene.id for scene, lacking in zip(scenes, lacks, strict=True) if lacking}
-            self._leave_out(moments, [scene.id in without for scene in moments], leave_out)
-            there = self._asker.laid_out(scenes, width=1 + wanted.shape[1])
-            return replace(there, unasked=None if there.unasked is None else np.zeros_like(there.unasked))
-        if any(lacks):
-            self.helpers(moments, wanted)
-            self._lay_out([scene for scene, lacking in zip(scenes, lacks, strict=True) if lacking])
-        return self._there(scenes, wanted.shape[1])
-
-    def _leave_out(
-        self, moments: Sequence[Scene], lacks: Sequence[bool], leave_out: Callable[[Bools], None]
-    ) -> None:
-        self.left_out |= {scene.id for scene, left in zip(moments, lacks, strict=True) if left}
-        leave_out(np.array(lacks))
 
     def _lay_out(self, scenes: Sequence[Scene]) -> None:
         """Keep the intents in these scenes as arrays."""
@@ -332,6 +358,7 @@ class Stored:
         """This process's backend, opened once: a forked process may not ask its parent's."""
         if (process := os.getpid()) not in self._opened:
             self._opened[process] = self._newly_opened()
+        self._say_once()
         return self._opened[process]
 
     def _newly_opened(self) -> Backend:
@@ -368,9 +395,7 @@ class _Nearest:
         return self._of(self._stored.blind(moments, at))
 
     def helpers(self, moments: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
-        if blind:
-            return self._of(self._stored.helpers(moments, wanted, blind))
-        return self._of(self._stored.helpers_of(moments, wanted, self._leave_out))
+        return self._of(self._stored.helpers(moments, wanted, blind))
 
     def _of(self, intents: Intents) -> Intents:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)

@@ -154,7 +154,7 @@ def play(stored: Stored, point: OperatingPoint, seeds: Sequence[int], of: tuple[
     """Walk one cell: a rule, an attack and a share."""
     at = under(point, *of)
     world = FrozenWorld(stored.dataset, [at], seeds)
-    parts = [part for [part] in walk(world, [at], stored, stored.spec.ties)]
+    parts = [part for [part] in walk(world, [at], stored.asked_in(world, [at]), stored.spec.ties)]
     ends = world.ends(at)
     place = {number: n for n, number in enumerate(world.numbers.tolist())}
     row = {seed: n for n, seed in enumerate(seeds)}
@@ -164,6 +164,7 @@ def play(stored: Stored, point: OperatingPoint, seeds: Sequence[int], of: tuple[
     nats = np.concatenate([_nats(stored, part) for part in parts])
     flagged, first = _flagged(parts, len(place), place)
     means = mean_by_place(nats, np.concatenate(cells), len(seeds) * len(place)).reshape(len(seeds), -1)
+    means[np.isnan(ends["success_rate"])] = np.nan  # left out
     return Cell(*of, ends["success_rate"], ends["unsafe_rate"], means, flagged, first)
 
 
@@ -316,7 +317,7 @@ def run_bench(
         cells[place] = cell
         progress(1)
     never = FrozenWorld(stored.dataset, [alone := OperatingPoint("never asks", None)], seeds)
-    for _ in walk(never, [alone], stored, stored.spec.ties):
+    for _ in walk(never, [alone], stored.asked_in(never, [alone]), stored.spec.ties):
         pass
     stored.settle()
     return Bench(stored.name, stored.run.source, condition, cells, never.ends(alone)["success_rate"])

@@ -27,13 +27,23 @@ def test_pace_is_a_second_or_a_minute_and_time_is_left_or_over(
     assert pace(speed, left_s, took_s) == said
 
 
+def test_where_more_follows_the_time_left_is_the_least() -> None:
+    assert pace(61.34, 6.4, None, grows=True) == "61.3/s at least 0:00:06 left"
+    assert pace(61.34, 0, 19.7, grows=True) == "61.3/s in 0:00:20"
+    progress = Bar("asking proxy", 1206, grows=True)
+    assert (
+        line(progress, [(0.0, 0), (10.0, 100)], 10.0) == "asking proxy 100/1206 10.0/s at least 0:01:51 left"
+    )
+
+
+@pytest.mark.parametrize("grows", [False, True])
 @pytest.mark.parametrize("label", ["asking proxy", "driving " + "x" * 30])
-def test_a_line_fits_eighty_columns_and_tells_all(label: str) -> None:
+def test_a_line_fits_eighty_columns_and_tells_all(label: str, grows: bool) -> None:
     now = [0.0]
     out = io.StringIO()
     progress = drawn(Console(file=out, width=80, force_terminal=True, color_system=None))
     progress.get_time = lambda: now[0]
-    task = progress.add_task(label, total=1206)
+    task = progress.add_task(label, total=1206, grows=grows)
     for done in (0, 406, 406):
         now[0] += 7
         progress.advance(task, done)
@@ -42,8 +52,8 @@ def test_a_line_fits_eighty_columns_and_tells_all(label: str) -> None:
     assert len(line.rstrip()) <= 80
     assert line.startswith(label)
     assert " 812/1206 " in line
-    assert line.rstrip().endswith("58.0/s 0:00:07 left")
-    assert "━━" in line
+    assert line.rstrip().endswith(f"58.0/s {'at least ' * grows}0:00:07 left")
+    assert "━━" in line or (grows and "x" in label)  # the bar gives way
 
 
 TYPED = """

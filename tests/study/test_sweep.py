@@ -81,7 +81,8 @@ def test_points_that_are_walked_together_are_each_as_alone(
     small: Dataset, asks: bool, tmp_path: Path
 ) -> None:
     """The run came to few decision points: at others its model is asked, or walks are left out."""
-    few = run(spec_of(small, points=(POINTS["single-local"],)), tmp_path / "few").out
+    ask = "used" if asks else "all"
+    few = run(spec_of(small, points=(POINTS["single-local"],), ask=ask), tmp_path / "few").out
     names = [name for name in TOGETHER if asks or "blind" not in name]
     points = [Setting(name, named_point(name), vehicles) for vehicles in (4, 2) for name in names]
     source = Stored(few, asks=asks)
