@@ -65,6 +65,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/camera.py
 	$(BIN)/python benchmarks/pictures.py
 	$(BIN)/python benchmarks/constants.py
+	$(BIN)/python benchmarks/asked.py
 	$(BIN)/python benchmarks/intervals.py
 
 .venv/bin/python:

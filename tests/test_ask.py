@@ -1,13 +1,16 @@
 """Asking only the helpers whose answers are used: the same decisions as asking all, with fewer questions."""
 
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from harness.backends import cards
 from harness.backends.base import Backend, Request
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import named_point
+from harness.core.errors import UserError
 from harness.dataset import load
 from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
@@ -17,6 +20,10 @@ from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
 from harness.runs.folder import read
+from harness.studies import stored
+from harness.studies.axes import Setting
+from harness.studies.stored import Stored
+from harness.studies.trust import run_bench
 
 # Some ask nobody, few, those who are there, by who is there, again where an answer fails, or what helpers
 # intended before; and some hear other helpers, or blind ones.
@@ -106,4 +113,62 @@ def test_a_stopped_run_asks_the_same_in_the_same_batches(tmp_path: Path) -> None
 @pytest.mark.parametrize("ask", ["all", "used"])
 def test_the_command_that_repeats_a_run_asks_alike(ask: str) -> None:
     words = " ".join(spec(frozen(2), ask).words())
-    assert ("--ask used" in words) == (ask == "used")
+    assert ("--ask all" in words) == (ask == "all")
+    assert "--ask used" not in words  # the default
+
+
+STUDIED = [Setting(name, named_point(name), 4) for name in ("v2x", "v2x:tau_nats=0.2", "6g:attack=stale")]
+
+
+def test_a_study_of_a_run_that_asked_few_is_that_of_one_that_asked_all(tmp_path: Path) -> None:
+    for ask in ("all", "used"):
+        evaluate(spec(frozen(4), ask, ("single-local",)), tmp_path / ask, lambda done: None)
+    shutil.copytree(tmp_path / "used", tmp_path / "alone")
+    owed: dict[str, list[int]] = {"all": [], "used": []}
+    by_run = [
+        [one for [one] in Stored(tmp_path / ask, more=asked.append).walked(STUDIED, (0, 1))]
+        for ask, asked in owed.items()
+    ]
+    for one, other in zip(*by_run, strict=True):
+        for of in ("ends", "columns"):
+            assert getattr(one, of).keys() == getattr(other, of).keys()
+            for name, values in getattr(one, of).items():
+                np.testing.assert_array_equal(values, getattr(other, of)[name])
+    assert sum(owed["used"]) > sum(owed["all"]) > 0
+    with pytest.raises(UserError, match=r"--no-model: .* did not ask; leave it out, .* --ask all$") as told:
+        list(Stored(tmp_path / "alone", asks=False).walked(STUDIED, (0, 1)))
+    assert "\n" not in str(told.value)
+    assert not (tmp_path / "alone" / stored.MORE).exists()
+
+
+def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+    evaluate(spec(frozen(8), "all", ("single-local",)), out, lambda done: None)
+    monkeypatch.setattr(stored, "open_backend", None)  # nothing opens a model
+    source = Stored(out, asks=False)
+    bench = run_bench(
+        source, "6g", ("linear",), ("liar",), (1 / 3,), (0, 1), tmp_path / "trust",
+        lambda done: None, lambda owed: None,
+    )  # fmt: skip
+    left = np.isnan(bench.at("linear", "liar", 1 / 3).success)
+    assert 0 < left.sum() < left.size
+    assert np.array_equal(left, np.isnan(bench.at("linear", "liar", 1 / 3).nats))
+    assert not np.isnan(bench.alone).any()
+    assert f"one of {len(source.left_out)} decision points" in source.leaves_out
+
+
+def test_how_much_is_asked_is_said_once_and_first(tmp_path: Path) -> None:
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    evaluate(spec(frozen(2), "used", ("single-local",), "swarm-tiny"), tmp_path / "run", lambda done: None)
+    told: list[str] = []
+    list(
+        Stored(tmp_path / "run", more=lambda n: told.append(str(n)), say=told.append).walked(
+            STUDIED[:1], (0,)
+        )
+    )
+    owed, text, *others = told
+    assert f"is asked {owed} questions now that the run did not ask (about " in text
+    assert others
+    assert all(each.isdigit() for each in others)

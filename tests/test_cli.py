@@ -184,13 +184,19 @@ def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, sm
     scenes = len(load(small_path, 2).courses())
     said = harness("eval", "--dry-run", "--dataset", small_path, "--limit", "2", "--seeds", "7,9")
     assert (said.code, said.err, os.listdir()) == (0, "", [])
-    assert f"{4 * scenes} requests for the {scenes} scenes on the reference drivers' courses" in said.out
+    on_courses = f"for the {scenes} scenes on the reference drivers' courses"
+    assert f"{scenes} requests to the ego and at most {3 * scenes} to helpers {on_courses}" in said.out
     assert "; would score 3 conditions × 2 channel seeds; no model was called" in said.out
     assert "prompt tokens not counted" in said.out
+    counted = ("eval", "--dry-run", "--dataset", small_path, "--limit", "2")
+    assert f"{4 * scenes} requests {on_courses}" in harness(*counted, "--ask", "all").out
+    for nobody in ("single-local", "v2x:schedule=never", "v2x:max_helpers=0"):
+        assert f"{scenes} requests {on_courses}" in harness(*counted, "--condition", nobody).out
     said = harness("eval", "--dry-run", "--dataset", small_path, "--model", "brake", "--json")
     told = json.loads(said.out)
     scenes = len(load(small_path).courses())
     assert (told["requests"], told["seeds"], told["world"]["limit"]) == (scenes, [0, 1, 2, 3, 4], None)
+    assert told["requests_by_role"] == {"ego": scenes}
     assert [c["name"] for c in told["conditions"]] == ["single-local", "v2x", "6g"]
 
 

@@ -392,7 +392,7 @@ def test_a_server_killed_in_mid_run_loses_nothing(
     assert f"server {one} is set aside" in capfd.readouterr().err
     assert same_files(out, whole)
     ids = [answer.id for answer in folder.read(out).answers]
-    assert len(ids) == len(set(ids)) > 150
+    assert len(ids) == len(set(ids)) > 100
     manifest = folder.read(out).manifest
     assert (manifest.engine_errors, manifest.retries) == (0, 0)
     assert f"--server {one} --server {other}" in manifest.command

@@ -111,7 +111,7 @@ def test_a_server_that_refuses_everything_is_asked_little_and_its_words_stand_fi
     ask: Typed, harness: Typed, play: Play, tmp_path: Path
 ) -> None:
     play.again(lambda asked: True)
-    code, out, err = ask("eval", *EVAL, "--out", "run")
+    code, out, err = ask("eval", *EVAL, "--ask", "all", "--out", "run")  # more questions than that at once
     assert (code, out) == (3, "")
     said = rf"harness: HTTP 404: {re.escape(WORDS)} \({FIRST} times\): no answer to \d+ of \d+ questions to "
     assert re.match(said, err)
@@ -136,7 +136,7 @@ def test_a_server_that_refuses_everything_is_asked_little_and_its_words_stand_fi
     assert f"run is no finished run, since its model could not be asked: HTTP 404: {WORDS}" in err
 
     play.again()
-    code, _, err = ask("eval", *EVAL, "--out", "run")
+    code, _, err = ask("eval", *EVAL, "--ask", "all", "--out", "run")
     assert (code, err) == (0, "")
     assert not (tmp_path / "run/.work").exists()
 

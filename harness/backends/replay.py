@@ -85,6 +85,7 @@ class Replay:
                 raise UserError(
                     f"{shown} holds no answer for {request.id}; replay a run of the same dataset and limit"
                     + (", whose conditions delivered the same messages" if "+" in request.id else "")
+                    + (", made with --ask all" if unasked else "")
                 )
             self._check(request, agent)
         if role not in self._models:

@@ -64,7 +64,7 @@ def command(
     helper_prompt: options.HelperPrompt = None,
     helper_answer: options.HelperAnswer = None,
     helper_thinking: options.HelperThinking = None,
-    ask: options.Ask = "all",
+    ask: options.Ask = "used",
     ties: options.Ties = None,
     batch_size: options.BatchSize = 8,
     server: options.Servers = None,

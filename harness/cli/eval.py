@@ -1,5 +1,6 @@
 """`harness eval`: a model with a prompt on a dataset."""
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from itertools import chain
@@ -76,7 +77,7 @@ def command(
         help="Evaluate this many times, 2 to 100, each with the next sampling seed; needs a --temperature "
         "above 0.",
     ),
-    ask: options.Ask = "all",
+    ask: options.Ask = "used",
     ties: options.Ties = None,
     batch_size: options.BatchSize = 8,
     workers: options.RuleWorkers = None,
@@ -204,7 +205,7 @@ def _evaluated(
     """Evaluate, and write the run and its page."""
     from harness.evaluate.run import evaluate
 
-    with bar(f"asking {printable(spec.ego.card.name, 30)}", quiet=silent) as progress:
+    with bar(f"asking {printable(spec.ego.card.name, 30)}", quiet=silent, grows=True) as progress:
         done = evaluate(spec, folder, progress, cache, progress.more, workers, opens)
     from harness.cli.report import write
 
@@ -224,28 +225,39 @@ def _refuse_language_models(specs: "Sequence[Spec]", workers: str) -> None:
 
 
 def _counted(spec: "Spec", dataset: "Frozen", tokenizer: Path | None) -> dict[str, Any]:
-    """What would be asked: the settings, how many requests about the scenes, and the tokens of prompts."""
+    """What would be asked: the settings, how many requests about the scenes, and the tokens of prompts.
+
+    Who asks a helper depends on answers: unless all are asked, helpers are asked as often at most.
+    """
     from harness.backends.tokens import counter, spread_of
-    from harness.evaluate.asking import requests
+    from harness.evaluate.asking import EGO, requests
 
     count = counter(tokenizer, spec.ego.card)
     sizes: dict[str, list[int]] = {}
-    asked, scenes = 0, dataset.scenes(dataset.courses())
-    blind = any(point.asks_blind for point in spec.points)
-    for request in chain(requests(spec, scenes), requests(spec, scenes, blind=True) if blind else ()):
-        asked += 1
+    asked, scenes = Counter[str](), dataset.scenes(dataset.courses())
+    sighted = spec.asks_all or any(point.asks and not point.asks_blind for point in spec.points)
+    blind = any(point.asks_blind and (spec.asks_all or point.asks) for point in spec.points)
+    own = requests(spec, scenes, places=None if sighted else [EGO] * len(scenes))
+    for request in chain(own, requests(spec, scenes, blind=True) if blind else ()):
+        asked[request.role] += 1
         if count:
             vision = spec.agents[request.agent].card.vision if request.image else None
             tokens = count(request.messages) + (vision.tokens if vision else 0)
             sizes.setdefault(request.role, []).append(tokens)
     stats = {role: spread_of(n) for role, n in sizes.items()}
-    return {**spec.settings(), "requests": asked, "scenes": len(scenes), "prompt_tokens": stats or None}
+    return {
+        **spec.settings(), "requests": asked.total(), "requests_by_role": dict(asked),
+        "scenes": len(scenes), "prompt_tokens": stats or None,
+    }  # fmt: skip
 
 
 def _show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
     repeated = f" × {counted['repeats']} repeats" if "repeats" in counted else ""
+    by_role, requests = counted["requests_by_role"], f"{counted['requests']} requests"
+    if "helper" in by_role and not spec.asks_all:
+        requests = f"{by_role['ego']} requests to the ego and at most {by_role['helper']} to helpers"
     typer.echo(
-        f"{spec.source.name}: {counted['requests']} requests{repeated} for the {counted['scenes']} scenes "
+        f"{spec.source.name}: {requests}{repeated} for the {counted['scenes']} scenes "
         f"on the reference drivers' courses; would score {len(spec.points)} conditions × {len(spec.seeds)} "
         "channel seeds; no model was called"
     )

@@ -29,7 +29,7 @@ import numpy as np
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import FUSION, OperatingPoint
 from harness.coordination.schedules import SCHEDULES
-from harness.coordination.scheduling import NEVER, Known, chosen
+from harness.coordination.scheduling import Known, chosen
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints, any_of, count_of
 from harness.core.errors import UserError, printable
@@ -155,7 +155,7 @@ def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
     all that are present under an attack, which may use what any of them intends now or later.
     """
     nobody = np.zeros(intents.range_m.shape, dtype=bool)
-    if point.profile is None or point.max_helpers == 0 or point.schedule == NEVER:
+    if not point.asks:
         return nobody
     if point.attack:
         return nobody | np.isfinite(intents.range_m)

@@ -330,6 +330,11 @@ class OperatingPoint:
             channel = getattr(channel, "channel", None)  # what a wrapper wraps
         return None
 
+    @property
+    def asks(self) -> bool:
+        """Whether an ego may ask a helper here at all."""
+        return self.profile is not None and self.max_helpers > 0 and self.schedule != NEVER
+
     def needs(self, what: str) -> bool:
         """Whether its schedule, its rule or an attack needs `in_time`, `outlook`, `lot` or `claims`."""
         return what in self._needs

@@ -24,7 +24,7 @@ from harness.world.scenario import Scenario
 
 TAG_CHARACTERS = 40
 HOTTEST = 2.0
-ASKS = ("all", "used")  # what --ask takes, the default first
+ASKS = ("used", "all")  # what --ask takes, the default first
 
 
 class Source(Protocol):
@@ -112,7 +112,7 @@ class Spec:
     device_profile: Device | None = None
     device_model: str | None = None
     tags: tuple[str, ...] = ()
-    ask: str = "all"
+    ask: str = ASKS[0]
     ties: str = TIES[0]
 
     def __post_init__(self) -> None:

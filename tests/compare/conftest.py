@@ -12,10 +12,10 @@ from harness.dataset.load import Dataset
 
 @pytest.fixture(scope="session")
 def evaluated(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The proxy on four episodes, alone and under 6g, with two seeds."""
+    """The proxy on four episodes, alone and under 6g, with two seeds; every helper is asked."""
     points = (POINTS["single-local"], POINTS["6g"])
     return evaluate(
-        spec_of(small, points=points, seeds=SEEDS), tmp_path_factory.mktemp("compare") / "run"
+        spec_of(small, points=points, seeds=SEEDS, ask="all"), tmp_path_factory.mktemp("compare") / "run"
     ).out
 
 
