@@ -14,7 +14,7 @@ SEES := $(BIN)/python -c "import llama_cpp.mtmd_cpp" 2>/dev/null || $(LLAMA_CPP)
 REAL_PROMPT ?= v10
 REAL_LIMIT ?= 5
 
-.PHONY: eval real test check light browser docs bench clean
+.PHONY: eval real results test check light browser docs bench clean
 
 eval: .venv/base ## a rule at once; then build llama.cpp, and evaluate the default language model with a report
 	$(BIN)/harness eval --model proxy
@@ -24,6 +24,10 @@ eval: .venv/base ## a rule at once; then build llama.cpp, and evaluate the defau
 real: .venv/dev ## fetch a published model, SmolLM2 with 135 million weights, and evaluate it with a report
 	$(BIN)/harness model pull smollm2-135m
 	$(BIN)/harness eval --model smollm2-135m --prompt $(REAL_PROMPT) --limit $(REAL_LIMIT)
+
+results: .venv/dev ## docs/results.md and its picture: hours on a CPU; RESULTS="--limit 20" asks published models less
+	$(BIN)/harness model pull smollm2-135m
+	$(BIN)/python benchmarks/results.py --page docs/results.md --picture docs/pictures/results.svg $(RESULTS)
 
 test: check browser ## every check and every test
 	$(BIN)/python -m pytest -n 2 --dist worksteal

