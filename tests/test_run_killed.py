@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from evaluating import FILES, run, same_files, spec_of, walked
+from evaluating import FILES, run, same_files, spec_of, walked, with_ego
 from killed_run import TREES_AT_ONCE, WALKS_AT_ONCE
+from run_on_disk import answers_of
 
+from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
@@ -222,3 +224,26 @@ def test_a_run_is_written_by_one_process_at_a_time(answers: bytes, small: Datase
         run(spec_of(small), out)
     assert (out / ".work" / "answers.jsonl").read_bytes() == answers[:5000]
     run(spec_of(small), out)
+
+
+def test_a_read_out_over_cyclic_orders_goes_on_where_it_was_killed(small: Dataset, tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    card = cards.resolve("swarm-tiny", "transformers")
+    spec = with_ego(spec_of(small, limit=2), card=card, answer="readout", letters="cyclic")
+    kept = tmp_path / "answers.jsonl"
+    walked(spec, open_backend(spec.ego.card, device="cpu"), PAPER, kept)
+    lines = kept.read_bytes().splitlines(keepends=True)
+    half = b"".join(lines[: len(lines) // 2])
+    whole = run(spec, tmp_path / "whole")
+    out = unfinished(spec, tmp_path / "killed", half + lines[len(lines) // 2][:40])
+    resumed = run(spec, out)
+    assert (out / "episodes.csv").read_bytes() == (whole.out / "episodes.csv").read_bytes()
+    one, other = answers_of(whole.out), answers_of(out)
+    assert len(one) > 6
+    assert [a.id for a in one] == [a.id for a in other]
+    # Batches are others from the middle on, and move a probability by its last stated digit.
+    for was, now in zip(one, other, strict=True):
+        assert was.intent == pytest.approx(now.intent, abs=3e-6)
+        assert was.letter_share == pytest.approx(now.letter_share, abs=1e-4)
+        assert was.follows_letter == now.follows_letter
+    assert resumed.manifest.letters == "cyclic"

@@ -32,6 +32,7 @@ def command(
     helper_answer: str | None = typer.Option(
         None, help="Answer modes of the helpers. Default: the ego's modes."
     ),
+    letters: options.Letters = None,
     dataset: options.Dataset = resources.DATASET,
     condition: options.Conditions = None,
     control: options.Controls = None,
@@ -70,7 +71,10 @@ def command(
     def agents(choices: Mapping[str, str]) -> list[Agent]:
         each = product(*(_several(option, text) for option, text in choices.items()))
         # Agent checks the mode.
-        return [Agent(cards.resolve(m), versions.load(p), a) for m, p, a in each]  # type: ignore[arg-type]
+        return [
+            Agent(cards.resolve(m), versions.load(p), a, letters=letters if a == "readout" else None)  # type: ignore[arg-type]
+            for m, p, a in each
+        ]
 
     egos = agents({"--model": model, "--prompt": prompt, "--answer": answer})
     with helper_options({"--answer": helper_answer}):
@@ -78,6 +82,8 @@ def command(
             "--helper-model": helper_model or model, "--helper-prompt": helper_prompt or prompt,
             "--helper-answer": helper_answer or answer,
         })  # fmt: skip
+    if letters and not any(agent.answer == "readout" for agent in (*egos, *helpers)):
+        raise UserError(f"--letters {printable(letters)}: no agent reads out; add --answer readout")
     if not 1 < (cells := len(egos) * len(helpers)) <= MOST_CELLS:
         raise UserError(f"{cells} combinations: give 2 to {MOST_CELLS}, such as --model a,b")
     spec = Spec(

@@ -170,3 +170,17 @@ def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset
         assert (out / f"{name}.svg").stat().st_size > 1000
     assert "proxy-faulty · v2 · json" in page
     assert page.count("<a href=") == page.count('<a href="cells/1-2/report.html">cells/1-2</a>') == 3
+
+
+def test_letters_are_those_of_the_agents_that_read_out(
+    harness: Callable[..., Any], small_path: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    few = ("--dataset", str(small_path), "--limit", "1", "--seeds", "0:1", "--condition", "single-local")
+    asked = ("grid", "--model", "swarm-tiny", "--answer", "json,readout", "--helper-answer", "json")
+    code, _, err = harness(*asked, "--letters", "cyclic", *few, "--out", str(tmp_path / "grid"), "--quiet")
+    assert code == 0, err
+    stated = [json.loads(file.read_text()) for file in sorted((tmp_path / "grid").rglob("run.json"))]
+    assert {(of["answer"], of.get("letters")) for of in stated} == {("json", "raw"), ("readout", "cyclic")}
+    code, _, err = harness("grid", "--prompt", "v1,v2", "--letters", "cyclic", *few)
+    assert (code, err) == (2, "harness: --letters cyclic: no agent reads out; add --answer readout\n")
