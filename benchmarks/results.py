@@ -30,7 +30,7 @@ from harness.runs.records import Score
 
 CONDITIONS_SHOWN = ("single-local", "v2x", "6g", "6g:messages=shuffled")
 HEADS = ("alone", "v2x", "6g", "6g, shuffled")
-CONDITION_ARGUMENTS = ("--control", "shuffled-messages")
+ARGUMENTS = ("--control", "shuffled-messages", "--ask", "all")  # every helper's answers are described
 
 
 class Row(NamedTuple):
@@ -114,7 +114,7 @@ def make(row: Row, given: argparse.Namespace) -> None:
                 words += [f"--{option.replace('_', '-')}", str(value)]
     print(f"harness {' '.join(words)}", file=sys.stderr, flush=True)
     subprocess.run(
-        [sys.executable, "-m", "harness", *words, *CONDITION_ARGUMENTS], check=True, stdout=sys.stderr
+        [sys.executable, "-m", "harness", *words, *ARGUMENTS], check=True, stdout=sys.stderr
     )
 
 
