@@ -113,9 +113,7 @@ def make(row: Row, given: argparse.Namespace) -> None:
             if value := getattr(given, option):
                 words += [f"--{option.replace('_', '-')}", str(value)]
     print(f"harness {' '.join(words)}", file=sys.stderr, flush=True)
-    subprocess.run(
-        [sys.executable, "-m", "harness", *words, *ARGUMENTS], check=True, stdout=sys.stderr
-    )
+    subprocess.run([sys.executable, "-m", "harness", *words, *ARGUMENTS], check=True, stdout=sys.stderr)
 
 
 def success(runs: dict[Row, Run]) -> str:
@@ -132,8 +130,10 @@ def success(runs: dict[Row, Run]) -> str:
 
 
 def percent(score: Score | None) -> str:
-    """A score in percent with its interval."""
-    return "–" if score is None else interval(score.value, score.low, score.high, 100)
+    """A score in percent over its interval."""
+    if score is None:
+        return "–"
+    return interval(score.value, score.low, score.high, 100).replace(" [", "<br>[").replace(", ", ",&nbsp;")
 
 
 def answers(runs: dict[Row, Run]) -> str:
