@@ -43,6 +43,7 @@ CHANGED: dict[str, Any] = {
     "messages": ({"role": "user", "content": "Another scene"},),
     "actions": ("SLOWER", "IDLE"),
     "orders": (({"role": "user", "content": "The same in another order"},),),
+    "flips": (({"role": "user", "content": "The list reversed"},),),
     "max_tokens": 65,
     "form": "recommendation",
     "answer": "constrained",
@@ -59,7 +60,7 @@ CHANGED: dict[str, Any] = {
     "truth": {"nodes": []},
     "scenario": SCENARIO,
 }
-READ_BY_NO_MODEL = ("id", "timed", "agent", "sums", "reasons_first", "view", "truth", "scenario")
+READ_BY_NO_MODEL = ("id", "flips", "timed", "agent", "sums", "reasons_first", "view", "truth", "scenario")
 
 
 class Talker(Scripted):

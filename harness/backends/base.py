@@ -34,6 +34,8 @@ class Request:
         messages: chat messages, `{"role": "system" | "user" | "assistant", "content": text}`.
         orders: of a read-out over cyclic orders, the chat with each further order of the actions behind the
             letters; empty if the letters are read once.
+        flips: of a read-out, its chats with the list of actions reversed, `messages` and `orders`, which are
+            asked as a request of their own (`harness.evaluate.flip`); empty if that is not asked.
         actions: meta-action names, in the environment's order.
         max_tokens: most tokens the answer may have.
         form: what the prompt asks for (`Prompt.form`).
@@ -65,6 +67,7 @@ class Request:
     form: str = "distribution"
     answer: AnswerMode = "json"
     orders: tuple[tuple[Mapping[str, str], ...], ...] = ()
+    flips: tuple[tuple[Mapping[str, str], ...], ...] = ()
     extension: str = ""
     sums: Sums = "refuse"
     thinking: bool = False
@@ -126,6 +129,8 @@ class Completion:
         letter_share: how much of a read-out over several orders follows the letter, 0 to 1
             (`harness.backends.orders`); None otherwise, like the next.
         follows_letter: whether one letter is the likeliest in every order.
+        flipped: of a replayed read-out, whether its likeliest action changed in the reversed list; None where
+            that is not known.
         retries: failed attempts before this one; their time is in `seconds`.
         cached: whether it comes from the cache, in which case it has no seconds.
         slow_s: declared seconds of this answer beyond its card's latency (the slow tail of a proxy).
@@ -150,6 +155,7 @@ class Completion:
     token_s: float | None = None
     letter_share: float | None = None
     follows_letter: bool | None = None
+    flipped: bool | None = None
 
 
 def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None) -> float | None:

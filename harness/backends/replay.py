@@ -121,6 +121,8 @@ class Replay:
             raise UserError(f"{shown} was run with --answer {agent['answer']}; replay it with the same")
         if bool(request.orders) != (agent["answer"] == "readout" and agent["letters"] == "cyclic"):
             raise UserError(f"{shown} was run with --letters {agent['letters']}; replay it with the same")
+        if request.flips and not agent["flip"]:
+            raise UserError(f"{shown} was run without --flip; leave it out, or make the run again with it")
         if request.thinking != agent["thinking"]:
             how = "off; leave --thinking out" if request.thinking else "on; add --thinking"
             raise UserError(f"{shown} was run with thinking {how}")
@@ -128,6 +130,8 @@ class Replay:
     def _completion(self, request: Request, answer: Answer) -> Completion:
         agent = self._run.agent(answer)
         self._check(request, agent)
+        if self._run.actions != request.actions == self._run.actions[::-1]:  # only its likeliest was compared
+            return Completion(request.id, "", None, None, "error", None, 1, "the run has no such answer")
         again = request.id.endswith(AGAIN)
         asked = digest(request.messages[: -2 if again else None]), request.image_sha256
         if asked != (answer.prompt_sha256, answer.image_sha256 or None):
@@ -140,6 +144,7 @@ class Replay:
             answer.finish_reason, answer.seconds, answer.batch_size, answer.error,  # type: ignore[arg-type]
             answer.label_mass, answer.retries, answer.cached, answer.slow_s, answer.first_token_s,
             answer.token_s, answer.cell("letter_share"), answer.cell("follows_letter"),
+            answer.cell("flipped"),
         )  # fmt: skip
         return _turn(whole, answer.first, again) if answer.first else whole
 

@@ -59,6 +59,7 @@ def command(
     answer: options.Answer = "json",
     image: options.Image = "own",
     letters: options.Letters = None,
+    flip: options.Flip = False,
     sums: options.Sums = "refuse",
     helper_model: options.HelperModel = None,
     helper_prompt: options.HelperPrompt = None,
@@ -124,7 +125,7 @@ def command(
     options.in_range("--save-video", save_video, 0, driven)
     swarm = Swarm(
         model, engine, prompt, answer, thinking, image,
-        helper_model, helper_prompt, helper_answer, helper_thinking, letters, sums, ties,
+        helper_model, helper_prompt, helper_answer, helper_thinking, letters, sums, ties, flip,
     )  # fmt: skip
     spec = Spec(
         **swarm.agents(source.scenario),

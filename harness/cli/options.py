@@ -116,6 +116,14 @@ Letters = Annotated[
         "as there are actions, so that no letter is preferred. Default: the card's, or cyclic."
     ),
 ]
+Flip = Annotated[
+    bool,
+    Option(
+        "--flip",
+        help="Ask each readout once more with the list of actions reversed, and count how often the "
+        "likeliest action changes. It changes no decision.",
+    ),
+]
 Sums = Annotated[
     SumsMode,
     Option(

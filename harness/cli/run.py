@@ -61,6 +61,7 @@ class Swarm:
     letters: "Letters | None" = None
     sums: "Sums" = "refuse"
     ties: str | None = None
+    flip: bool = False
 
     def agents(self, scenario: "Scenario") -> "dict[str, Any]":
         """The fields of a `Spec` that say who answers in a scenario, and `ties`."""
@@ -71,8 +72,9 @@ class Swarm:
         version = self.prompt or scenario.prompt
         card = cards.resolve(self.model, self.engine)
         ego = Agent(
-            card, versions.load(version), self.answer, self.thinking, self.image, self.letters, self.sums
-        )
+            card, versions.load(version), self.answer, self.thinking, self.image, self.letters, self.sums,
+            self.flip,
+        )  # fmt: skip
         models = self.helper_model.split(",") if self.helper_model else []
         prompt, mode = versions.load(self.helper_prompt or version), self.helper_answer or self.answer
         thinks = self.thinking if self.helper_thinking is None else self.helper_thinking
@@ -81,7 +83,9 @@ class Swarm:
         with helper_options({"--answer": self.helper_answer, "--thinking": self.helper_thinking}):
             letters = self.letters if mode == "readout" else None
             sums = self.sums if mode == "json" else "refuse"
-            helpers = tuple(Agent(other, prompt, mode, thinks, image, letters, sums) for other in others)
+            flip = self.flip and mode == "readout"
+            how = (prompt, mode, thinks, image, letters, sums, flip)
+            helpers = tuple(Agent(other, *how) for other in others)
         return {"ego": ego, "helpers": helpers, "ties": self.ties or _usual_ties(ego)}
 
 
@@ -285,6 +289,9 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: st
             yield f"{role} answers divided by their sum: {share} % of {divided.n}{means}"
         if (mass := figures.get(("all", f"label_mass_{role}"))) is not None:
             read = of_letter(figures, role) or "letters read once"
+            if flip := figures.get(("all", f"flip_rate_{role}")):
+                hits = round((flip.value or 0) * flip.n)
+                read += f"; the reversed list changes the likeliest action in {hits} of {flip.n}"
             yield f"{role} read-outs: {read}; mass on the letters {mass.value or 0:.2f}{means}"
         for when in ("at_first", "after_repair"):
             if turn := figures.get(("all", f"valid_{when}_rate_{role}")):

@@ -27,6 +27,8 @@ class Agent:
         letters: how a read-out's letters are read: `raw`, once, or `cyclic`, averaged over as many orders of
             the list as there are actions; None takes the card's, or else cyclic. Always raw for what is no
             read-out of a language model.
+        flip: whether each read-out is asked once more with the list of actions reversed, to see whether its
+            likeliest action changes (`harness.evaluate.flip`); the answer is that of the list as it stands.
         image: the picture that an image prompt shows: the viewer's `own`, a `blank` one, one of `another`
             scene, or `none`, which leaves only the text.
         sums: what becomes of an answer in `json` whose only fault is that its numbers do not sum to 1:
@@ -40,17 +42,17 @@ class Agent:
     image: ImageMode = "own"
     letters: Letters | None = None
     sums: Sums = "refuse"
+    flip: bool = False
 
     def __post_init__(self) -> None:
         name = printable(self.card.name)
         if self.letters not in (None, *get_args(Letters)):
             raise unknown("letters", str(self.letters), get_args(Letters))
         if not (self.answer == "readout" and self.can.language_model):
-            if self.letters == "cyclic":
+            if option := "--letters cyclic" if self.letters == "cyclic" else "--flip" if self.flip else "":
                 reason = "is no language model" if self.answer == "readout" else f"answers in {self.answer}"
                 raise UserError(
-                    f"--letters cyclic: {name} {reason}; leave it out, or give a language model and "
-                    "--answer readout"
+                    f"{option}: {name} {reason}; leave it out, or give a language model and --answer readout"
                 )
             object.__setattr__(self, "letters", "raw")
         elif self.letters is None:
@@ -129,7 +131,7 @@ class Agent:
     ) -> dict[str, Any]:
         """Return the chat about a scene graph in the agent's answer mode, as fields of a request.
 
-        They are the `messages`, and those of the further `orders` of a read-out's letters.
+        They are the `messages`, and those of the further `orders` and the `flips` of a read-out's letters.
         """
         rendered = self.rendered(graph, actions, (), words)
         return self.in_orders(
@@ -141,8 +143,17 @@ class Agent:
         chat: Callable[[Sequence[str]], tuple[Mapping[str, str], ...]],
     ) -> dict[str, Any]:  # fmt: skip
         """Return a chat in each order of the actions in which letters are read, as fields of a request."""
-        messages, *further = map(chat, readout.cyclic(actions) if self.letters == "cyclic" else [actions])
-        return {"messages": messages, "orders": tuple(further)} if further else {"messages": messages}
+
+        def each(listed: tuple[str, ...]) -> list[tuple[Mapping[str, str], ...]]:
+            return [*map(chat, readout.cyclic(listed) if self.letters == "cyclic" else [listed])]
+
+        messages, *further = each(actions)
+        chats: dict[str, Any] = {"messages": messages}
+        if further:
+            chats["orders"] = tuple(further)
+        if self.flip:
+            chats["flips"] = tuple(each(actions[::-1]))
+        return chats
 
     def rendered(
         self, graph: Mapping[str, Any], actions: tuple[str, ...], heard: Sequence[Mapping[str, Any]],
@@ -162,6 +173,7 @@ class Agent:
             "image": self.image,
             **({"letters": "cyclic"} if self.letters == "cyclic" else {}),  # earlier runs read them once
             **({"sums": "divide"} if self.sums == "divide" else {}),  # earlier runs refused them
+            **({"flip": True} if self.flip else {}),  # earlier runs asked for no reversed list
         }
 
 

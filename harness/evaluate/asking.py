@@ -22,7 +22,7 @@ from harness.core.arrays import Bools, Ints
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.files import bytes_of, canonical_bytes, digest
 from harness.dataset.load import Scene
-from harness.evaluate import repair, servers
+from harness.evaluate import flip, repair, servers
 from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
@@ -124,7 +124,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         retries=completion.retries, cached=completion.cached, slow_s=completion.slow_s,
         first_token_s=completion.first_token_s, token_s=completion.token_s,
         letter_share=_or_unset(completion.letter_share),
-        follows_letter=_or_unset(completion.follows_letter),
+        follows_letter=_or_unset(completion.follows_letter), flipped=_or_unset(completion.flipped),
         prompt_sha256=digest(request.messages),
         image_sha256=request.image_sha256 or UNSET,
         status=str(parsed.status), verdict=parsed.verdict,
@@ -279,17 +279,22 @@ class Asker:
         return due
 
     def _answered(self, backend: Backend, chunk: Sequence[Request]) -> dict[str, Answer]:
-        """Answer each request; one whose answer cannot be parsed gets a repair turn if its prompt has one."""
+        """Answer each request, and ask what its answer calls for: a repair turn, or the reversed list."""
         words = self.spec.scenario.prompt_words
         answers = [answer_of(r, c) for r, c in zip(chunk, backend.complete(chunk), strict=True)]
-        repairs = {}
+        repairs, flips = {}, {}
         for place, (request, answer) in enumerate(zip(chunk, answers, strict=True)):
+            if flip.wanted(request, answer):
+                flips[place] = flip.asked(request)
             prompt = self.spec.agents[request.agent].prompt
             if repair.wanted(request, answer, prompt):
                 repairs[place] = repair.asked(request, answer, prompt, words)
         completions = backend.complete(list(repairs.values())) if repairs else []
         for place, completion in zip(repairs, completions, strict=True):
             answers[place] = repair.together(answers[place], answer_of(chunk[place], completion))
+        completions = backend.complete(list(flips.values())) if flips else []
+        for place, completion in zip(flips, completions, strict=True):
+            answers[place] = flip.compared(answers[place], answer_of(flips[place], completion))
         if len(self.spec.helpers) > 1 and not self.spec.asks_all:  # its place would not say whose it is
             for place, request in enumerate(chunk):
                 if request.agent:

@@ -17,7 +17,8 @@ from harness.evaluate.spec import Spec
 from harness.runs import folder
 from harness.runs.records import Latency, Manifest, Score
 
-ABSENT = {"ask": "all", "sums": "refuse", "ties": "first"}  # settings that older runs lack, and what they did
+# Settings that older runs lack, and what they did.
+ABSENT = {"ask": "all", "flip": False, "sums": "refuse", "ties": "first"}
 
 
 class Begun(work.Begun, frozen=True, kw_only=True):

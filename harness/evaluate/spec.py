@@ -310,6 +310,7 @@ class Spec:
         return {
             **self.ego.settings(),
             "sums": self.ego.sums,
+            "flip": self.ego.flip,
             "helpers": [agent.settings() for agent in self.helpers],
             "world": msgspec.to_builtins(self.source.record()),
             "actions": list(self.actions),
@@ -353,6 +354,7 @@ class Spec:
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         flags = ["--thinking"] if self.ego.thinking else []
+        flags += ["--flip"] if self.ego.flip else []
         helpers_think = any(agent.thinking and agent.card.thinking != "always" for agent in self.helpers)
         if self.helpers and helpers_think != self.ego.thinking:
             flags.append("--helper-thinking" if helpers_think else "--no-helper-thinking")

@@ -96,6 +96,11 @@ def of_run(run: Run) -> Iterator[str]:
                 f"{round((score.value or 0.0) * score.n)} of {whose} {score.n} answers did not sum to 1 and "
                 "were divided by their sum, as --sums divide says."
             )
+        if score := run.score(ALL, f"flip_rate_{role}"):
+            yield (
+                f"{round((score.value or 0.0) * score.n)} of {whose} {score.n} read-outs have another "
+                "likeliest action when the list of actions is reversed."
+            )
     retries = sum(answer.retries for answer in run.answers)
     if (found := tally(run)).words and not found.missing:
         yield f"{found}: each counts as a lost message."

@@ -63,6 +63,8 @@ class Answer(Struct, frozen=True, kw_only=True):
         letter_share: how much of a read-out over several orders of its letters follows the letter, 0 to 1;
             unset where the letters were read once, like the next.
         follows_letter: whether one letter is the likeliest in every order.
+        flipped: whether the likeliest action changed when the list of actions was reversed; unset where that
+            was not asked, or got no answer.
         agent: which of several helper models answered, from 1; unset where the place among all answers says.
         faults: all that is wrong with a failed answer, the status first; unset where that is the only fault.
         extension: what a prompt's `answer.json` asks for beside the decision; unset where there is none.
@@ -97,6 +99,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     image_sha256: str | UnsetType = UNSET
     letter_share: float | UnsetType = UNSET
     follows_letter: bool | UnsetType = UNSET
+    flipped: bool | UnsetType = UNSET
     agent: int | UnsetType = UNSET
     faults: tuple[str, ...] | UnsetType = UNSET
     extension: dict[str, Any] | UnsetType = UNSET
@@ -155,6 +158,7 @@ class AnswerFacts(Struct, frozen=True):
     first: FirstTurn | UnsetType = UNSET
     letter_share: float | UnsetType = UNSET
     follows_letter: bool | UnsetType = UNSET
+    flipped: bool | UnsetType = UNSET
 
     @property
     def turns(self) -> int:
@@ -576,6 +580,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     image: str = "own"
     letters: Literal["raw", "cyclic"] = "raw"
     sums: Literal["refuse", "divide"] = "refuse"
+    flip: bool = False
     batch_size: int
     dtype: str | None
     temperature: float = 0.0
@@ -626,6 +631,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
         """Return the agent of a scene's viewer at this place, in the form of `helpers`; the ego is at 0."""
         if place and self.helpers:
             helper = self.helpers[(place - 1) % len(self.helpers)]
-            return {"image": "own", "letters": "raw", "sums": "refuse", "thinking": False, **helper}
-        names = ("model", "prompt", "answer", "thinking", "image", "letters", "sums")
+            absent = {"image": "own", "letters": "raw", "sums": "refuse", "flip": False, "thinking": False}
+            return {**absent, **helper}
+        names = ("model", "prompt", "answer", "thinking", "image", "letters", "sums", "flip")
         return {name: getattr(self, name) for name in names}

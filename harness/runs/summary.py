@@ -146,6 +146,9 @@ def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator
         if any(divided := [Repair.DIVIDED in answer.repairs for answer in role_answers]):
             hits = np.array(divided, dtype=float)
             yield Score.of(ALL, f"divided_rate_{role}", rate_interval(hits, np.array(episodes)), "answers")
+        flipped = np.array([np.nan if a.flipped is UNSET else float(a.flipped) for a in role_answers])
+        if not np.isnan(flipped).all():
+            yield Score.of(ALL, f"flip_rate_{role}", rate_interval(flipped, np.array(episodes)), "answers")
     for role, (role_answers, episodes) in by_role.items():
         if any(answer.turns > 1 for answer in role_answers):
             after = np.array([answer.verdict != "failed" for answer in role_answers])

@@ -22,8 +22,8 @@ from harness.runs.records import Episode, FrozenScenes
 from harness.world.scenario import DIALS
 
 SETTINGS = (
-    "model", "prompt", "answer", "thinking", "image", "letters", "sums", "temperature", "sampling_seed",
-    "helpers", "ties", "dtype", "latency", "identity", "versions",
+    "model", "prompt", "answer", "thinking", "image", "letters", "sums", "flip", "temperature",
+    "sampling_seed", "helpers", "ties", "dtype", "latency", "identity", "versions",
 )  # fmt: skip
 
 
