@@ -77,10 +77,24 @@ def test_several_rules_are_named_in_one_sentence(done: Evaluated) -> None:
         return replace(manifest, **names)
 
     assert no_prompt([under("v1"), under("v2")]) == [NO_PROMPT.replace("v2", "v1 or v2")]
-    assert no_prompt([under("v2", "cruise"), under("v2", "brake"), done.manifest]) == [
-        "cruise, brake and proxy read no prompt: they decide by the scene graph, whatever v2 says."
+    assert no_prompt([under("v2", "mine"), under("v2", "yours"), done.manifest]) == [
+        "mine, yours and proxy read no prompt: they decide by the scene graph, whatever v2 says."
     ]
     assert no_prompt([with_engine(done, "llama-cpp"), done.manifest]) == [NO_PROMPT]
+
+
+def test_a_driver_that_looks_at_nothing_does_not_decide_by_the_scene_graph(done: Evaluated) -> None:
+    def driven(name: str) -> Manifest:
+        return replace(done.manifest, model={**done.manifest.model, "engine": "driver", "name": name})
+
+    told = no_prompt([driven("local-view"), *map(driven, ("cruise", "brake", "uniform", "constant"))])
+    assert told == [
+        NO_PROMPT.replace("proxy", "local-view"),
+        "cruise, brake, uniform and constant read no prompt: they decide without looking, whatever v2 says.",
+    ]
+    assert no_prompt([driven("uniform")]) == [
+        "uniform reads no prompt: it decides without looking, whatever v2 says."
+    ]
 
 
 def test_an_engine_that_is_not_here_is_not_judged(done: Evaluated) -> None:
@@ -93,7 +107,18 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     Path("swarmdrive.toml").touch()
     Path("models").mkdir()
     Path("models/mute.toml").write_text(CARD)
-    options = ("--dataset", small_path, "--seeds", "0", "--condition", "6g", "--ties", "first")
+    options = (
+        "--dataset",
+        small_path,
+        "--seeds",
+        "0",
+        "--condition",
+        "6g",
+        "--ties",
+        "first",
+        "--ask",
+        "all",
+    )
     code, out, err = harness("eval", "--model", "mute", *options, "--out", "reports/mute")
     assert (code, err) == (0, "")
     said = " ".join(out.split())

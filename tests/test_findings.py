@@ -57,6 +57,7 @@ def test_a_model_that_brakes_for_a_listed_conflict_reads_the_scene() -> None:
     assert found.reads_scene
     assert (found.n, found.letter_share, found.follows_letter, found.label_mass) == (12, 0.97, 12, 0.2)
     assert [s.partition(" follows")[0] for s in found.sentences()] == ["its likeliest action"]
+    assert list(found.sentences(letters=False)) == []
 
 
 def test_a_model_that_answers_ever_the_same_does_not_read_the_scene() -> None:

@@ -63,8 +63,8 @@ class Findings(Struct, frozen=True):
         """Whether a conflict in the scene, or its gap, moves the answer."""
         return any(pair.read for pair in self.pairs if pair.fact in ("conflict", "gap"))
 
-    def sentences(self) -> Iterator[str]:
-        """Yield what a reader of the model's runs has to know."""
+    def sentences(self, letters: bool = True) -> Iterator[str]:
+        """Yield what a reader of the model's runs has to know; `letters` says whether they are read out."""
         if not self.reads_scene:
             moved = sum(pair.moved for pair in self.pairs if pair.fact in ("conflict", "gap"))
             n = sum(pair.n for pair in self.pairs if pair.fact in ("conflict", "gap"))
@@ -73,7 +73,7 @@ class Findings(Struct, frozen=True):
                 f"its answer in {moved} of {n} pairs (model check, prompt {self.prompt})."
             )
         # A model that learnt one order of the letters is read in that order.
-        if self.letters == "cyclic" and self.letter_share > MOST:
+        if letters and self.letters == "cyclic" and self.letter_share > MOST:
             yield (
                 f"its likeliest action follows the letter in {self.follows_letter} of {self.n} questions "
                 "(model check); --letters cyclic averages that out."

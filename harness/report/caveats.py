@@ -15,6 +15,7 @@ from harness.runs.listing import UNREAD
 from harness.runs.metrics import ALL
 from harness.runs.records import ClosedLoop, Manifest, Score
 from harness.runs.unanswered import tally
+from harness.world.drivers import BLIND
 from harness.world.scenario import Parameters
 
 FEW = 100  # episodes; with fewer a page warns of wide intervals
@@ -130,7 +131,7 @@ def findings_of(manifest: Manifest) -> Iterator[str]:
     agents = [manifest.agent(0), *manifest.helpers]
     for agent, identity in zip(agents, identities, strict=False):
         if isinstance(identity, Mapping) and (found := findings.recall(identity)):
-            for sentence in found.sentences():
+            for sentence in found.sentences(agent["answer"] == "readout"):
                 yield f"{printable(str(agent['model']['name']), 30)}: {sentence}"
 
 
@@ -199,17 +200,19 @@ def beyond_sources(manifest: Manifest) -> Iterator[str]:
 
 
 def no_prompt(manifests: Iterable[Manifest]) -> list[str]:
-    """One sentence about the runs whose model reads no prompt; empty where there are none."""
-    rules = [
-        (str(agent["model"]["name"]), str(agent["prompt"]["version"]))
-        for manifest in manifests for agent in (manifest.agent(0), *manifest.helpers)
-        if (engine := find(str(agent["model"].get("engine")))) and not engine.capabilities.language_model
-    ]  # fmt: skip
-    models = list(dict.fromkeys(printable(model, 30) for model, _ in rules))
-    versions = " or ".join(dict.fromkeys(printable(prompt, 20) for _, prompt in rules))
-    if not models:
-        return []
-    if len(models) == 1:
-        return [f"{models[0]} reads no prompt: it decides by the scene graph, whatever {versions} says."]
-    names = f"{', '.join(models[:-1])} and {models[-1]}"
-    return [f"{names} read no prompt: they decide by the scene graph, whatever {versions} says."]
+    """A sentence about the models that read no prompt, and one about those that look at nothing either."""
+    rules: dict[str, list[tuple[str, str]]] = {"by the scene graph": [], "without looking": []}
+    for agent in (agent for manifest in manifests for agent in (manifest.agent(0), *manifest.helpers)):
+        name, engine = str(agent["model"]["name"]), str(agent["model"].get("engine"))
+        if (known := find(engine)) and not known.capabilities.language_model:
+            how = "without looking" if engine == "driver" and name in BLIND else "by the scene graph"
+            rules[how].append((printable(name, 30), printable(str(agent["prompt"]["version"]), 20)))
+    return [_no_prompt(how, *zip(*of, strict=True)) for how, of in rules.items() if of]
+
+
+def _no_prompt(how: str, models: Sequence[str], prompts: Sequence[str]) -> str:
+    *others, last = dict.fromkeys(models)
+    versions = " or ".join(dict.fromkeys(prompts))
+    if not others:
+        return f"{last} reads no prompt: it decides {how}, whatever {versions} says."
+    return f"{', '.join(others)} and {last} read no prompt: they decide {how}, whatever {versions} says."

@@ -22,6 +22,7 @@ DRIVERS = ("cruise", "brake", "local-view", "full-view")
 ALWAYS = {"cruise": "IDLE", "brake": "SLOWER"}
 PRIVILEGED = "full-view"  # the only one that may read the truth
 UNIFORM, CONSTANT = "uniform", "constant"
+BLIND = (*ALWAYS, UNIFORM, CONSTANT)  # look at nothing
 CONSTANTS = Path(__file__).with_name("constants.csv")
 
 Graph = Mapping[str, Any]
