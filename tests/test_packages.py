@@ -15,6 +15,7 @@ import pytest
 from harness.backends import cards, packages
 from harness.backends.card import Card, Latency
 from harness.backends.packages import Packaged, packaged, unpack
+from harness.backends.weights import find_weights
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes, sha256_file
 
@@ -217,8 +218,9 @@ def card(**changes: object) -> Card:
      "package:a/\nm.gguf", "package:a @ http:/m.gguf"],
 )  # fmt: skip
 def test_a_card_names_a_package_and_a_file_and_nothing_else(weights: str) -> None:
-    with pytest.raises(UserError, match=r"allowed: package:NAME/FILE"):
-        packaged(card(weights=weights))
+    for look in (packaged, find_weights):
+        with pytest.raises(UserError, match=r"allowed: package:NAME/FILE"):
+            look(card(weights=weights))
 
 
 def test_a_card_names_a_version_and_a_digest() -> None:
