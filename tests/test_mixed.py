@@ -150,7 +150,12 @@ def test_a_mix_drives_as_well(tmp_path: Path) -> None:
     ("ego", "helpers", "options", "said"),
     [
         ("proxy", ("full-view",), {}, "--helper-model: full-view is a driver, which decides for an ego"),
-        ("local-view", ("proxy",), {}, "--helper-model: local-view is a driver"),
+        (
+            "local-view",
+            ("proxy",),
+            {},
+            "--model local-view: it is a driver, which asks no helpers; give another model",
+        ),
         (
             "proxy",
             ("swarm-tiny",),

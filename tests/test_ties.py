@@ -1,6 +1,7 @@
 """Which of several likeliest actions is taken: drawn by seed, layout and step, or the first."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -200,6 +201,9 @@ def test_the_command_that_repeats_a_run_falls_alike(ties: str, small: Dataset) -
     assert ("--ties first" in " ".join(spec_of(small, ties=ties).words())) == (ties == "first")
 
 
-def test_another_word_is_refused_in_one_line(small: Dataset) -> None:
+def test_another_word_is_refused_in_one_line(
+    small: Dataset, harness: Callable[..., tuple[int, str, str]]
+) -> None:
     with pytest.raises(UserError, match=r"--ties random: give drawn or first"):
         spec_of(small, ties="random")
+    assert harness("eval", "--ties", "") == (2, "", "harness: --ties : give drawn or first\n")

@@ -86,7 +86,7 @@ class Swarm:
             flip = self.flip and mode == "readout"
             how = (prompt, mode, thinks, image, letters, sums, flip)
             helpers = tuple(Agent(other, *how) for other in others)
-        return {"ego": ego, "helpers": helpers, "ties": self.ties or _usual_ties(ego)}
+        return {"ego": ego, "helpers": helpers, "ties": _usual_ties(ego) if self.ties is None else self.ties}
 
 
 def _usual_ties(ego: "Agent") -> str:

@@ -140,6 +140,11 @@ class Spec:
             self._check(agent)
         drivers = [agent for agent in self.agents if not agent.can.asks_helpers]
         if self.helpers and drivers:
+            if self.ego in drivers:
+                raise UserError(
+                    f"--model {printable(self.ego.card.name)}: it is a driver, which asks no helpers; give "
+                    "another model, or leave the helpers' options out"
+                )
             raise UserError(
                 f"--helper-model: {printable(drivers[0].card.name)} is a driver, which decides for an ego "
                 "only; give other models"
