@@ -159,9 +159,10 @@ def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
     assert f"one of {len(source.left_out)} decision points" in source.leaves_out
 
 
-def test_how_much_is_asked_is_said_once_and_first(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ask", ["used", "all"])
+def test_how_much_is_asked_is_said_once_and_first(ask: str, tmp_path: Path) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
-    evaluate(spec(frozen(2), "used", ("single-local",), "swarm-tiny"), tmp_path / "run", lambda done: None)
+    evaluate(spec(frozen(2), ask, ("single-local",), "swarm-tiny"), tmp_path / "run", lambda done: None)
     told: list[str] = []
     list(
         Stored(tmp_path / "run", more=lambda n: told.append(str(n)), say=told.append).walked(
@@ -169,6 +170,8 @@ def test_how_much_is_asked_is_said_once_and_first(tmp_path: Path) -> None:
         )
     )
     owed, text, *others = told
-    assert f"is asked {owed} questions now that the run did not ask (about " in text
+    questions = "1 question" if owed == "1" else f"{owed} questions"
+    assert f"is asked {questions} now that the run did not ask (about " in text
+    assert ("it lacks" in text) == (ask == "used")
     assert others
     assert all(each.isdigit() for each in others)

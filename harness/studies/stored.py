@@ -147,9 +147,13 @@ class Stored:
         about = f" (about {float(f'{self._due * np.mean(tokens):.2g}'):.0f} prompt tokens)" if tokens else ""
         reached = self.run.decisions.scenes
         lacks = len(reached) * self.vehicles - sum(answer.role in OWN for answer in self.run.answers)
+        questions = "1 question" if self._due == 1 else f"{self._due} questions"
+        others = (
+            f"; of helpers at the {len(reached)} decision points that it reached, it lacks {lacks} at most"
+        )
         self._say(
-            f"{printable(self.name)} is asked {self._due} questions now that the run did not ask{about}; "
-            f"of helpers at the {len(reached)} decision points that it reached, it lacks {lacks} at most"
+            f"{printable(self.name)} is asked {questions} now that the run did not ask{about}"
+            f"{others if lacks > 0 else ''}"
         )
 
     def _roots(self) -> list[str]:
