@@ -107,10 +107,14 @@ def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -
                 **{name: answer.cell(name) for name in plain},
                 "heard": "+".join(answer.heard), "repairs": " ".join(answer.repairs),
                 "detail": text(answer.detail), "error": answer.error and text(answer.error),
+                "extension": _json(answer.cell("extension")),
             }  # fmt: skip
-            message = answer.message and msgspec.json.encode(answer.message).decode()
-            file.write(_line([*values.values(), *(answer.intent or unknown), message]))
+            file.write(_line([*values.values(), *(answer.intent or unknown), _json(answer.message)]))
     return path
+
+
+def _json(value: object) -> str | None:
+    return None if value is None else msgspec.json.encode(value).decode()
 
 
 def _line(cells: Sequence[object]) -> str:

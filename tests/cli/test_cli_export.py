@@ -27,7 +27,7 @@ def run(tmp_path: Path) -> Path:
         if row["viewer"] == "v2":
             row |= {"verdict": "failed", "status": "no_json", "intent": None, "mass": None, "message": None}
         if row["viewer"] == "v3":
-            row["repairs"] = ("code_fence", "prose")
+            row |= {"repairs": ("code_fence", "prose"), "extension": {"why": HOSTILE, "gaps": [0.5]}}
         if row["viewer"] == "v4":
             row |= {"viewer": "v1", "heard": ("v2", "v4"), "role": "merge"}
 
@@ -81,9 +81,11 @@ def test_csv_has_every_decision_and_answer(run: Path, harness: Callable[..., Sai
     assert {row["image_sha256"] for row in said} == {""}
     assert {row["repairs"] for row in said} == {"", "code_fence prose"}
     assert [row["intent_IDLE"] for row in said] == ["1.0" if a.intent else "" for a in answers]
-    assert [json.loads(row["message"]) if row["message"] else None for row in said] == [
-        answer.message for answer in answers
-    ]
+    for name in ("message", "extension"):
+        assert [json.loads(row[name]) if row[name] else None for row in said] == [
+            answer.cell(name) for answer in answers
+        ]
+    assert any(row["extension"] for row in said)
 
 
 def test_jsonl_has_an_object_a_decision(
