@@ -321,7 +321,9 @@ def test_what_cannot_be_constrained_is_refused_in_one_line(file: Any, said: str)
     assert "\n" not in str(refused.value)
 
 
-def test_a_member_named_as_an_action_is_refused_where_that_is_one(copied: Path) -> None:
+def test_a_member_named_as_an_action_is_refused_where_that_is_one(
+    copied: Path, harness: Callable[..., tuple[int, str, str]], small_path: Path
+) -> None:
     from harness.world import scenarios
 
     scenario = scenarios.get("occluded-intersection")
@@ -330,6 +332,13 @@ def test_a_member_named_as_an_action_is_refused_where_that_is_one(copied: Path) 
     assert versions.unfit(versions.load("mine", copied), scenario) == (
         "has slower in answer.json, which is an action of occluded-intersection"
     )
+    Path("swarmdrive.toml").touch()
+    shutil.copytree(copied / "mine", Path("prompts/mine"))
+    assert harness("prompt", "check", "mine", "--dataset", small_path) == (
+        2, "",
+        "harness: prompt mine has slower in answer.json, which is an action of occluded-intersection; give "
+        "another --dataset, or fix the prompt\n",
+    )  # fmt: skip
 
 
 def test_the_largest_that_is_allowed_is_walked_in_time() -> None:

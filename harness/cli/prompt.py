@@ -199,6 +199,8 @@ def check(
     from harness.prompts.densest import densest_messages, densest_repair
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
+    if reason := prompts.unfit(prompt, data.scenario):
+        raise UserError(f"prompt {version} {reason}; give another --dataset, or fix the prompt")
     words = data.scenario.prompt_words
     scenes = data.scenes(data.courses())
     taker = pictures.taker(prompt, model, checked=True)
