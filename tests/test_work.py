@@ -106,8 +106,13 @@ def test_a_damaged_beginning_is_one_line(text: str, tmp_path: Path) -> None:
 
 def test_settings_that_differ_are_named(tmp_path: Path) -> None:
     work.same(tmp_path, {"seed": (1, 2)}, {"seed": [1, 2]})
-    with pytest.raises(UserError, match="was begun with another seed, limit; repeat its settings"):
+    with pytest.raises(UserError, match="was begun with another seed, limit; repeat its settings") as raised:
         work.same(tmp_path, {"seed": 1, "limit": 3}, {"seed": 2})
+    assert "repeat its settings (seed 2), delete it" in str(raised.value)
+    stated = {"ask": "all", "ties": "fir\nst", "identity": "f" * 64, "dtype": None, "tags": []}
+    with pytest.raises(UserError, match=r"settings \(ask all, ties fir\\nst\), delete") as raised:
+        work.same(tmp_path, {}, stated)
+    assert str(raised.value).isprintable()
 
 
 PARENT = """

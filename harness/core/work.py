@@ -21,6 +21,7 @@ LOCK = "lock"
 UNANSWERED = "unanswered.txt"  # why the work stopped, if the model could not be asked
 MOST_WORDS = 10_000  # characters of it that are read
 GONE_S = 3.0  # seconds until the processes of a killed command are gone
+SHORT = 30  # most characters of a setting's value that a message has
 
 
 class Begun(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,12 +88,17 @@ def _nothing_done(work: Path) -> bool:
 
 
 def same(out: Path, now: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Raise UserError, naming what differs, unless work began with these settings."""
+    """Raise UserError, naming what differs and what it was, unless work began with these settings."""
     now = msgspec.json.decode(msgspec.json.encode(now))  # turns tuples into lists, as they are stored
     if differing := [key for key in {**now, **stored} if now.get(key) != stored.get(key)]:
+        words = {
+            key: str(value) for key in differing if isinstance(value := stored.get(key), str | int | float)
+        }
+        short = ", ".join(f"{key} {value}" for key, value in words.items() if len(value) <= SHORT)
         raise UserError(
             f"--out {printable(out)} was begun with another {printable(', '.join(differing))}; "
-            "repeat its settings, delete it, or choose another folder"
+            f"repeat its settings{printable(f' ({short})') if short else ''}, delete it, or choose another "
+            "folder"
         )
 
 
