@@ -277,7 +277,7 @@ class Said:
 
     def log_probs(self, tokens: Sequence[int]) -> Any:
         self.asked = list(tokens)
-        return [[math.log(self.p[token]) for token in tokens]]
+        return torch.tensor([[math.log(self.p[token]) for token in tokens]], dtype=torch.float64)
 
     def close(self) -> None:
         """Nothing is held."""

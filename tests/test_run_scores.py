@@ -70,7 +70,7 @@ def played(small: Dataset) -> Dataset:
 @pytest.fixture
 def told(played: Dataset) -> Walked:
     """Three conditions, one seed, 0.1 s an answer."""
-    return walked(spec_of(played, points=(ALONE, CLEAR, DEAF), seeds=(0,)), Scripted(SAID))
+    return walked(spec_of(played, points=(ALONE, CLEAR, DEAF), seeds=(0,), ask="all"), Scripted(SAID))
 
 
 def value(told: Walked, condition: str, metric: str, interval: str = "episodes") -> tuple[Any, int, int]:
@@ -351,7 +351,7 @@ def test_alone_an_undecided_ego_takes_the_most_careful_action_where_ties_fall_to
 def test_a_helper_whose_answer_failed_sends_nothing(
     line: str | Completion, status: str, played: Dataset
 ) -> None:
-    spec = spec_of(played, points=(CLEAR,), seeds=(0,))
+    spec = spec_of(played, points=(CLEAR,), seeds=(0,), ask="all")
     backend = Scripted({**SAID, "00001-0/v3": line})
     told, intents = walked(spec, backend), asker_of(spec, backend)(scenes_of(played))
     assert intents.valid[2].tolist() == [True, False, True]
@@ -394,7 +394,7 @@ NASTY = st.text(max_size=40) | st.sampled_from(
 def test_whatever_is_said_the_record_is_one_json_object_a_line(
     lines: list[str], error: str, played: Dataset, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    spec = spec_of(played, points=(CLEAR,), seeds=(0,))
+    spec = spec_of(played, points=(CLEAR,), seeds=(0,), ask="all")
     said: dict[str, str | Completion] = {f"00001-0/v{n}": line for n, line in enumerate(lines, 1)}
     kept = tmp_path_factory.mktemp("nasty") / "answers.jsonl"
     answered = walked(spec, Scripted(said), kept=kept)

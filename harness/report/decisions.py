@@ -69,7 +69,7 @@ class Decisions:
         for name in telling:
             # A run without helpers, such as a driver's, has fewer viewers.
             here = [run for run in self._runs.runs if name in run.decisions.scenes]
-            scene = scene_of(max(here, key=lambda run: len(run.answers_by_scene.get(name, ()))), name)
+            scene = scene_of(max(here, key=lambda run: run.decisions.helpers), name)
             if scene.id == name:
                 replayed[name] = scene
         self._not_replayed -= len(replayed)

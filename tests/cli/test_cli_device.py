@@ -23,7 +23,8 @@ Said = tuple[int, str, str]
 def alone(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the model that ships, each answer asked alone."""
     out = tmp_path_factory.mktemp("runs") / "alone"
-    run(spec_of(small, "swarm-tiny", points=(POINTS["single-local"],), seeds=(0,), batch_size=1), out)
+    points = (POINTS["single-local"],)
+    run(spec_of(small, "swarm-tiny", points=points, seeds=(0,), batch_size=1, ask="all"), out)
     return out
 
 
