@@ -18,7 +18,7 @@ from harness.runs import folder
 from harness.runs.records import Latency, Manifest, Score
 
 # Settings that older runs lack, and what they did.
-ABSENT = {"ask": "all", "flip": False, "sums": "refuse", "ties": "first"}
+ABSENT = {"ask": "all", "flip": False, "letters": "raw", "sums": "refuse", "ties": "first"}
 
 
 class Begun(work.Begun, frozen=True, kw_only=True):
