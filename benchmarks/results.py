@@ -86,7 +86,8 @@ def main() -> None:
         if given.only in row.folder:
             make(row, given)
     runs = {row: read(path) for row in ROWS if (path := given.out / row.folder).joinpath("run.json").exists()}
-    tables = "\n\n".join([success(runs), answers(runs), sentences(runs)])
+    said = {row: list(of_roles(row, run)) for row, run in runs.items() if row in MODELS}
+    tables = "\n\n".join([success(runs), answers(runs, said), sentences(said)])
     print(tables)
     if given.page:
         text = given.page.read_text("utf-8")
@@ -136,37 +137,29 @@ def percent(score: Score | None) -> str:
     return interval(score.value, score.low, score.high, 100).replace(" [", "<br>[").replace(", ", ",&nbsp;")
 
 
-def answers(runs: dict[Row, Run]) -> str:
+def answers(runs: dict[Row, Run], said: dict[Row, list[Answers]]) -> str:
     """What the answers of every model are like, in both roles."""
     lines = [
         "| who answers | role | n | readable % | strict % | copies an example % | follows the letter % "
         "| distinct | commonest action % |",
         "|---|---|--:|--:|--:|--:|--:|--:|---|",
     ]
-    for row, run in runs.items():
-        if row in MODELS:
-            for it in of_roles(row, run):
-                shares = [f"{100 * n / it.n:.1f}" for n in (it.readable, it.strict, it.example_copies)]
-                common = f"{it.action} {100 * it.action_count / it.readable:.1f}" if it.readable else "–"
-                letter = run.score("all", f"follows_letter_{it.role}")
-                shares.append("–" if letter is None else f"{100 * (letter.value or 0):.1f}")
-                cells = [row.name, it.role, str(it.n), *shares, str(it.distinct), common]
-                lines.append(f"| {' | '.join(cells)} |")
+    for row, it in ((row, it) for row, roles in said.items() for it in roles):
+        shares = [f"{100 * n / it.n:.1f}" for n in (it.readable, it.strict, it.example_copies)]
+        common = f"{it.action} {100 * it.action_count / it.readable:.1f}" if it.readable else "–"
+        letter = runs[row].score("all", f"follows_letter_{it.role}")
+        shares.append("–" if letter is None else f"{100 * (letter.value or 0):.1f}")
+        lines.append(f"| {' | '.join([row.name, it.role, str(it.n), *shares, str(it.distinct), common])} |")
     return "\n".join(lines)
 
 
-def sentences(runs: dict[Row, Run]) -> str:
+def sentences(said: dict[Row, list[Answers]]) -> str:
     """What each prompt did, in a sentence a role: the two things that are true of most answers."""
-    lines = []
-    for row, run in runs.items():
-        if row in MODELS:
-            for it in of_roles(row, run):
-                most = (
-                    "; ".join(islice(it.sentences(), 2))
-                    or "every answer can be read, and none repeats another's fault"
-                )
-                lines.append(f"- **{row.name}**, {it.role}: {most}.")
-    return "\n".join(lines)
+    return "\n".join(
+        f"- **{row.name}**, {it.role}: {'; '.join(islice(it.sentences(), 2))}."
+        for row, roles in said.items()
+        for it in roles
+    )
 
 
 def of_roles(row: Row, run: Run) -> Iterator[Answers]:
