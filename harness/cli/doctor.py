@@ -15,6 +15,8 @@ from harness.cli import options
 from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from harness.backends.cards import Card
 
 WIDTH, MARGIN = 80, 10
@@ -37,8 +39,6 @@ def command(
 
     For models that cannot run, it says what to install or fetch.
     """
-    from harness.evaluate.pace import Pace, advice
-
     facts = look(gpu)
     facts["paces"] = _paces(as_json) if engines else {}
     if as_json:
@@ -61,7 +61,14 @@ def command(
     _line("models", ", ".join(model["name"] for model in able))
     _lacking([(model["name"], model["remedy"]) for model in facts["models"] if model["missing"]])
     _lacking([(model["name"], model["remedy"]) for model in able if model["remedy"]])
-    for n, (name, found) in enumerate(facts["paces"].items()):
+    if engines:
+        _show_paces(facts["paces"])
+
+
+def _show_paces(paces: "Mapping[str, Sequence[Mapping[str, Any]]]") -> None:
+    from harness.evaluate.pace import Pace, advice
+
+    for n, (name, found) in enumerate(paces.items()):
         _line("" if n else "paces", f"{name}: {advice([Pace(**pace) for pace in found])}")
 
 
