@@ -6,7 +6,7 @@ from pathlib import Path
 
 from harness.backends.cards import Card
 from harness.backends.gguf import Said, said
-from harness.backends.registry import registration, resolve
+from harness.backends.weights import located
 from harness.core.errors import printable
 from harness.core.files import text_of
 
@@ -17,7 +17,7 @@ def at_odds(card: Card) -> Iterator[str]:
     Raises:
         UserError: the weights are not found.
     """
-    where: Path = resolve(registration(card.engine).finds)(card)
+    where = located(card)
     of = said(where) if where.is_file() else Said(context_tokens=_context(where))
     if card.licence and of.licence and card.licence.casefold() != of.licence.casefold():
         yield (

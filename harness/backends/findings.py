@@ -32,6 +32,11 @@ class Moved(Struct, frozen=True):
     mean: float
 
     @property
+    def change(self) -> str:
+        """The mean change with its sign; what rounds to nothing has none of its own."""
+        return f"{round(self.mean, 3) + 0.0:+.3f}"
+
+    @property
     def read(self) -> bool:
         """Whether most pairs moved."""
         return 2 * self.moved > self.n

@@ -133,10 +133,15 @@ def pull(card: Card) -> Path:
     return _prepared(card)
 
 
+def located(card: Card) -> Path:
+    """Return where the weights of a card lie for its engine. Raises UserError if they are not found."""
+    where: Path = resolve(registration(card.engine).finds)(card)
+    return where
+
+
 def _prepared(card: Card) -> Path:
     """Return the weights that were fetched, held to their digest and made ready for their engine."""
-    engine = registration(card.engine)
-    where: Path = resolve(engine.finds)(card)
+    engine, where = registration(card.engine), located(card)
     held_to_digest(card, where if where.is_file() else where / "model.safetensors")
     if engine.prepares and missing_package(card.engine) is None:
         resolve(engine.prepares)(card)

@@ -183,11 +183,11 @@ def command(
         echo_json(as_mapping(done))
     if silent:
         return
-    from harness.report.references import BLIND, in_trees, label, meaning
+    from harness.report.references import BESIDE, in_trees, label, meaning
 
     seeds_of = frozen[0].manifest.episodes if selection.given else len(frozen[0].episodes)
     references = in_trees(frozen[0])
-    beside = {name: references[name] for name in BLIND if name in references}
+    beside = {name: references[name] for name in BESIDE if name in references}
     notes = (
         f"n = {len(frozen[0].episodes)} episodes × {len(channel_seeds)} channel seeds; "
         f"{'of ' if selection.given else ''}{stated(frozen[0].manifest.seed, seeds_of)};",

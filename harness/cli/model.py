@@ -272,10 +272,7 @@ def _show_findings(found: "Findings | None") -> None:
         f"action does in {found.follows_letter} of {found.n} questions; mass on the letters "
         f"{found.label_mass:.2f}"
     )
-    # A mean that rounds to nothing has no sign.
-    shown = ", ".join(
-        f"{pair.fact} {pair.moved} of {pair.n} ({round(pair.mean, 3) + 0.0:+.3f})" for pair in found.pairs
-    )
+    shown = ", ".join(f"{pair.fact} {pair.moved} of {pair.n} ({pair.change})" for pair in found.pairs)
     typer.echo(
         f"pairs        of questions that differ in one fact, letters {found.letters}; the answer "
         f"followed the fact in (mean change of its probability): {shown}"

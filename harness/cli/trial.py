@@ -99,5 +99,5 @@ def _show_moved(what: str, pairs: "Sequence[Moved]") -> None:
             continue
         typer.echo(
             f"{what:<7} {pair.fact} changed: {pair.moved} of {pair.n} answers moved as they should "
-            f"({pair.mean:+.3f})"
+            f"({pair.change})"
         )

@@ -3,7 +3,7 @@
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, get_args
 
 from msgspec import Struct
 
@@ -18,7 +18,7 @@ from harness.parsing.status import Repair, Status
 from harness.prompts.versions import Prompt
 from harness.runs.records import Answer
 
-ROLES: tuple[Role, ...] = ("ego", "helper")
+ROLES: tuple[Role, ...] = get_args(Role)
 COUNT = len(ROLES) * 12 + 2 * 8  # requests of a trial
 CHUNK = 8  # requests that are asked together
 
@@ -125,7 +125,7 @@ def described(prompt: Prompt, role: Role, actions: Sequence[str], answers: Seque
     examples = [_value(example.answer) for example in prompt.examples.of(role)] if prompt.examples else []
     intents = [answer.intent for answer in answers if answer.intent]
     likeliest = Counter(actions[intent.index(max(intent))] for intent in intents)
-    faults = Counter(fault for answer in answers for fault in faults_of(answer))
+    faults = Counter(fault for answer in answers for fault in _faults(answer))
     texts = Counter(answer.raw.strip() for answer in answers)
     return Answers(
         role=role, n=len(answers), readable=len(intents),
@@ -139,7 +139,7 @@ def described(prompt: Prompt, role: Role, actions: Sequence[str], answers: Seque
     )  # fmt: skip
 
 
-def faults_of(answer: Answer) -> tuple[str, ...]:
+def _faults(answer: Answer) -> tuple[str, ...]:
     """Return all faults of an answer that cannot be read, the first first; none of one that can."""
     if answer.intent:
         return ()
@@ -147,7 +147,7 @@ def faults_of(answer: Answer) -> tuple[str, ...]:
 
 
 def _echoes(answer: Answer) -> bool:
-    return Status.SCHEMA_ECHO in faults_of(answer) or Repair.EVIDENCE_ECHO in answer.repairs
+    return Status.SCHEMA_ECHO in _faults(answer) or Repair.EVIDENCE_ECHO in answer.repairs
 
 
 def _value(text: str) -> Any:

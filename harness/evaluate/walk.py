@@ -357,8 +357,10 @@ def tie_draws(draws: Draws, ties: str) -> TieDraws | None:
         return None
 
     def drawn(tied: Bools) -> Floats:
-        keys = (of[tied].tolist() for of in (trips.seed, trips.layout_seed, trips.step))
-        return np.array([_tie_uniforms(s, of, trips.steps)[step] for s, of, step in zip(*keys, strict=True)])
+        keys = (key[tied].tolist() for key in (trips.seed, trips.layout_seed, trips.step))
+        return np.array([
+            _tie_uniforms(seed, layout, trips.steps)[step] for seed, layout, step in zip(*keys, strict=True)
+        ])  # fmt: skip
 
     return drawn
 

@@ -2,9 +2,8 @@
 
 A version is a folder `prompts/<version>/` with `ego.j2`, `helper.j2` (each with the blocks `system` and
 `user`; `question` for what ends every question unless a letter is asked for, and `repair` for a repair turn)
-and `prompt.toml`; it may have examples, `examples.json`, and further
-members of its answers, `answer.json`. Released versions are pinned by digest in
-`prompts/released.toml`: a changed text is a new version.
+and `prompt.toml`; it may have examples, `examples.json`, and further members of its answers, `answer.json`.
+Released versions are pinned by digest in `prompts/released.toml`: a changed text is a new version.
 """
 
 import os

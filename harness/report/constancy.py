@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from harness.backends.registry import find
 from harness.coordination.coordinate import TIE
 from harness.runs.folder import Run
+from harness.world.drivers import ALWAYS
 
 LEAST = 20  # answers that say something about a model
 CONSTANT = 0.98  # share of the likeliest action from which a model is said to ignore its input
-DRIVERS = {"SLOWER": "brake", "IDLE": "cruise"}  # reference drivers that always take one action
+DRIVERS = {action: driver for driver, action in ALWAYS.items()}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from harness.runs.metrics import SUCCESS
 from harness.runs.records import Score
 from harness.world.drivers import CONSTANT, UNIFORM, constant
 
-BLIND = (CONSTANT, UNIFORM)  # those that look at nothing, the best first
+BESIDE = (CONSTANT, UNIFORM)  # rows beside a model's on the terminal, the best first
 
 
 def in_trees(dataset: Dataset) -> dict[str, Score]:
@@ -37,7 +37,7 @@ def label(name: str, scenario: str) -> str:
 
 
 def meaning(name: str) -> str:
-    """Say what one of `BLIND` does."""
+    """Say what one of `BESIDE` does."""
     return {
         CONSTANT: "constant: always the action that did best in the scenario's tune layouts",
         UNIFORM: "uniform: every action is equally likely",
@@ -55,4 +55,4 @@ def sentences(references: Mapping[str, Score], scenario: str) -> str:
     ]
     n = next(iter(references.values())).n
     said = f" Dashed: references that need no model, in the same episodes: {', '.join(rates)}; n = {n}."
-    return " ".join([said, *(f"{meaning(name)}." for name in BLIND if name in references)])
+    return " ".join([said, *(f"{meaning(name)}." for name in BESIDE if name in references)])

@@ -26,13 +26,8 @@ _NUMBER_BEGUN = re.compile(r"-?(?:(?:0|[1-9][0-9]*)(?:\.[0-9]*)?(?:[eE][+-]?[0-9
 _BLANK = re.compile(r"[ \t\n\r]*")
 _TEXT = r'[^"\\\x00-\x1f]'  # a character of a text, in both kinds of pattern
 _CHARACTERS = r'"(?:[^"\\\x00-\x1f]|\\(?:["\\/bfnrt]|u[0-9a-fA-F]{4}))*+'
-_STRING, _STRING_BEGUN = (
-    re.compile(_CHARACTERS + '"'),
-    re.compile(_CHARACTERS + r"(?:\\(?:u[0-9a-fA-F]{0,3})?)?"),
-)
-_STRING_BEGUN = re.compile(
-    r'"(?:[^"\\\x00-\x1f]|\\(?:["\\/bfnrt]|u[0-9a-fA-F]{4}))*+(?:\\(?:u[0-9a-fA-F]{0,3})?)?'
-)
+_STRING = re.compile(_CHARACTERS + '"')
+_STRING_BEGUN = re.compile(_CHARACTERS + r"(?:\\(?:u[0-9a-fA-F]{0,3})?)?")
 _SHOWN = 40  # characters of an answer that an error shows
 
 
