@@ -1,8 +1,9 @@
-"""What a dataclass's docstring says of its fields."""
+"""What the source of a dataclass says of its fields."""
 
 import inspect
 import re
 import textwrap
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -10,14 +11,23 @@ import typer
 
 from harness.core.errors import printable
 
+_FIELD = re.compile(r"((?:^    # .*\n)*)^    (\w+): [^#\n]+?(?:  # (.*))?$", re.MULTILINE)
+
 
 def attributes(kind: type) -> dict[str, str]:
-    """Meaning of each field, those of its bases included, out of the sections `Attributes:`."""
+    """Return the meaning of each field, those of its bases included.
+
+    It is the comment beside or above the field, or stands in the docstring's section `Attributes:`.
+    """
     meanings: dict[str, str] = {}
     for each in reversed(kind.__mro__[:-1]):
         section = str(inspect.getdoc(each)).partition("Attributes:\n")[2]
         meanings |= re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE)
-    return {name: " ".join(meaning.split()) for name, meaning in meanings.items()}
+        with suppress(OSError):  # a class that has no source file
+            for above, name, beside in _FIELD.findall(inspect.getsource(each)):
+                if name in each.__annotations__ and (above or beside):
+                    meanings[name] = beside or above.replace("#", " ")
+    return {name: " ".join(meaning.split()).rstrip(".") + "." for name, meaning in meanings.items()}
 
 
 def echo_fields(record: Any) -> None:

@@ -22,13 +22,9 @@ EXIT_CODES = {
 
 
 class UserError(Exception):
-    """Bad input. The message names the thing, the value, what is allowed and what to do.
+    """Bad input. The message names the thing, the value, what is allowed and what to do."""
 
-    Attributes:
-        code: what the command ends with, one of `EXIT_CODES`.
-    """
-
-    code: ClassVar[int] = 2
+    code: ClassVar[int] = 2  # what the command ends with, one of `EXIT_CODES`
 
 
 class Unfinished(UserError):

@@ -11,19 +11,12 @@ WHOLE = 10**6  # most characters of a message
 
 @dataclass(frozen=True)
 class Case:
-    """One test case of a class `of`.
+    """One test case of a class `of`."""
 
-    Attributes:
-        of: the class.
-        name: the case's own name.
-        failure: why it failed; None if it passed.
-        error: why it has no result; None if it has one.
-    """
-
-    of: str
-    name: str
-    failure: str | None = None
-    error: str | None = None
+    of: str  # the class
+    name: str  # the case's own name
+    failure: str | None = None  # why it failed; None if it passed
+    error: str | None = None  # why it has no result; None if it has one
 
 
 def junit(name: str, cases: Sequence[Case]) -> str:

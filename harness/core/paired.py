@@ -8,20 +8,13 @@ from harness.core.statistics import rate_difference
 
 @dataclass(frozen=True)
 class SuccessTest:
-    """Result of a test of the difference in success.
+    """Result of a test of the difference in success."""
 
-    Attributes:
-        method: `mcnemar` if no seed changes any episode's success, so that an episode is one yes or no;
-            else `interval`.
-        p_value: exact two-sided p-value of McNemar's test; None for an interval.
-        low: lower end of the 95 % interval of B - A over episodes; None for McNemar's test.
-        high: upper end.
-    """
-
+    # `mcnemar` if no seed changes any episode's success, so that an episode is one yes or no; else `interval`
     method: str
-    p_value: float | None = None
-    low: float | None = None
-    high: float | None = None
+    p_value: float | None = None  # exact two-sided p-value of McNemar's test; None for an interval
+    low: float | None = None  # lower end of the 95 % interval of B - A over episodes; None for McNemar's test
+    high: float | None = None  # upper end
 
 
 def success_test(a: Floats, b: Floats) -> SuccessTest | None:

@@ -18,21 +18,13 @@ ROUNDING = 1e-18  # a smaller sum of squares is rounding only; relative to the m
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean and its confidence interval.
+    """A mean and its confidence interval."""
 
-    Attributes:
-        value: the mean; NaN if there was nothing to average.
-        low: lower end of the interval; NaN if the data cannot bound it.
-        high: upper end.
-        n: number of independent units: episodes, pairs of episodes or seeds.
-        n_excluded: units left out because their value is NaN.
-    """
-
-    value: float
-    low: float
-    high: float
-    n: int
-    n_excluded: int
+    value: float  # the mean; NaN if there was nothing to average
+    low: float  # lower end of the interval; NaN if the data cannot bound it
+    high: float  # upper end
+    n: int  # number of independent units: episodes, pairs of episodes or seeds
+    n_excluded: int  # units left out because their value is NaN
 
 
 def safe_target(safe: Bools) -> Floats:

@@ -25,15 +25,10 @@ SHORT = 30  # most characters of a setting's value that a message has
 
 
 class Begun(msgspec.Struct, frozen=True, kw_only=True):
-    """The settings that a piece of work began with.
+    """The settings that a piece of work began with."""
 
-    Attributes:
-        settings: plain values that must be the same for the work to be resumed.
-        shard: which part of the work this is, such as `3/16`; empty for the whole.
-    """
-
-    settings: dict[str, Any]
-    shard: str = ""
+    settings: dict[str, Any]  # plain values that must be the same for the work to be resumed
+    shard: str = ""  # which part of the work this is, such as `3/16`; empty for the whole
 
     def facts(self) -> dict[str, Any]:
         """Return the values that must be the same in all shards of one work."""

@@ -20,38 +20,26 @@ CLEAR, VEHICLE, BUILDING = 0, 1, 2
 
 
 class Unit(NamedTuple):
-    """A fixed roadside unit.
+    """A fixed roadside unit."""
 
-    Attributes:
-        x_m: position, m to the east of the centroid of the conflict zone.
-        y_m: position, m to the south of it.
-        antenna_m: height of the antenna.
-    """
-
-    x_m: float
-    y_m: float
-    antenna_m: float
+    x_m: float  # position, m to the east of the centroid of the conflict zone
+    y_m: float  # position, m to the south of it
+    antenna_m: float  # height of the antenna
 
 
 @dataclass(frozen=True)
 class Site:
-    """The true positions of the ego and its helpers, and what stands between them.
+    """The true positions of the ego and its helpers, and what stands between them."""
 
-    Attributes:
-        xy_m: positions, `(..., 1+H, 2)`, the ego's first; NaN for an absent helper.
-        sight: what stands between the ego and each helper, `(..., H)`: CLEAR, VEHICLE or BUILDING.
-        blocker_m: height of the tallest vehicle between them, `(..., H)`; 0 without one.
-        corner_m: distance of the ego and of the helper to the crossing of their streets, `(..., H, 2)`; NaN
-            if the streets do not cross.
-        first_m: height of the antenna at the first position; None if it is as high as all others.
-        units: the sites of roadside units: each has the unit first, then the ego, then the helpers.
-    """
-
-    xy_m: Floats
-    sight: Ints
-    blocker_m: Floats
+    xy_m: Floats  # positions, `(..., 1+H, 2)`, the ego's first; NaN for an absent helper
+    sight: Ints  # what stands between the ego and each helper, `(..., H)`: CLEAR, VEHICLE or BUILDING
+    blocker_m: Floats  # height of the tallest vehicle between them, `(..., H)`; 0 without one
+    # distance of the ego and of the helper to the crossing of their streets, `(..., H, 2)`; NaN if the
+    # streets do not cross
     corner_m: Floats
+    # height of the antenna at the first position; None if it is as high as all others
     first_m: float | None = None
+    # the sites of roadside units: each has the unit first, then the ego, then the helpers
     units: Mapping[Unit, "Site"] = field(default_factory=dict)
 
     @property
@@ -91,20 +79,15 @@ class Site:
 
 @dataclass(frozen=True)
 class Draws:
-    """The channel's draws in [0, 1), which are the same for every operating point.
+    """The channel's draws in [0, 1), which are the same for every operating point."""
 
-    Attributes:
-        link: draws of the request and the reply of each helper, `(..., H, 2)`; equal for all steps of an
-            episode under block fading.
-        jitter: draw of each reply's delay, `(..., H)`.
-        trips: the keys of further draws, which only physical radios make; None if there are none.
-        given: draws of packets, `(..., 1+2H)`, instead of those of `trips`.
-    """
-
+    # draws of the request and the reply of each helper, `(..., H, 2)`; equal for all steps of an episode
+    # under block fading
     link: Floats
-    jitter: Floats
+    jitter: Floats  # draw of each reply's delay, `(..., H)`
+    # the keys of further draws, which only physical radios make; None if there are none
     trips: Trips | None = None
-    given: Floats | None = None
+    given: Floats | None = None  # draws of packets, `(..., 1+2H)`, instead of those of `trips`
 
     def take(self, at: Any) -> "Draws":
         """Select draws by places of the leading dimension."""
@@ -165,27 +148,17 @@ NO_SITE = (
 
 @dataclass(frozen=True)
 class Links:
-    """The inputs of a channel about the links between the ego and its helpers.
+    """The inputs of a channel about the links between the ego and its helpers."""
 
-    Attributes:
-        asked: which helpers were asked, `(..., H)`. Values for the others may be anything, even NaN.
-        ready_s: seconds from the start of the request until the helper has heard it and has its own answer,
-            `(..., H)`.
-        range_m: ego-helper distance, `(..., H)`, as the ego knows it, with the beacon's error.
-        payload_bits: size of the reply, `(..., H)`.
-        in_radius: which helpers are present and in the ego's radius, asked or not, `(..., H)`.
-        rounds: which of these open a round of their own, `(..., H)`.
-        request_bits: size of the request.
-        site: positions; None if the channel is not `Physical`, or the world has no positions.
-    """
-
-    asked: Bools
+    asked: Bools  # which helpers were asked, `(..., H)`. Values for the others may be anything, even NaN
+    # seconds from the start of the request until the helper has heard it and has its own answer, `(..., H)`
     ready_s: Floats
-    range_m: Floats
-    payload_bits: Floats
-    in_radius: Bools
-    rounds: Bools
-    request_bits: float = 0.0
+    range_m: Floats  # ego-helper distance, `(..., H)`, as the ego knows it, with the beacon's error
+    payload_bits: Floats  # size of the reply, `(..., H)`
+    in_radius: Bools  # which helpers are present and in the ego's radius, asked or not, `(..., H)`
+    rounds: Bools  # which of these open a round of their own, `(..., H)`
+    request_bits: float = 0.0  # size of the request
+    # positions; None if the channel is not `Physical`, or the world has no positions
     site: Site | None = None
 
     @property
@@ -204,33 +177,25 @@ class Links:
 
 
 class Broadcast(NamedTuple):
-    """The times of a request's broadcast.
+    """The times of a request's broadcast."""
 
-    Attributes:
-        heard_s: seconds from the decision to ask until the helpers have the request, `(...)` or one number.
-        airtime_s: seconds that it occupies the medium, `(...)` or one number.
-    """
-
+    # seconds from the decision to ask until the helpers have the request, `(...)` or one number
     heard_s: Floats | float
-    airtime_s: Floats | float
+    airtime_s: Floats | float  # seconds that it occupies the medium, `(...)` or one number
 
 
 class Delivery(NamedTuple):
-    """What becomes of the replies on a channel.
+    """What becomes of the replies on a channel."""
 
-    Attributes:
-        up: whether request and reply cross, `(..., H)`; anything for helpers that were not asked.
-        delay_s: seconds from the request to the end of the reply's slot, `(..., H)`; inf for helpers that
-            were not asked. A lost reply keeps its slot.
-        loss: probability that one crossing (request or reply) is lost, `(..., H)`, or `(..., 1)` if it is the
-            same on all links.
-        airtime_s: seconds that the reply occupies the medium, `(..., H)`; anything for helpers that were not
-            asked, NaN if the model does not know it.
-    """
-
-    up: Bools
+    up: Bools  # whether request and reply cross, `(..., H)`; anything for helpers that were not asked
+    # seconds from the request to the end of the reply's slot, `(..., H)`; inf for helpers that were not
+    # asked. A lost reply keeps its slot
     delay_s: Floats
+    # probability that one crossing (request or reply) is lost, `(..., H)`, or `(..., 1)` if it is the same on
+    # all links
     loss: Floats
+    # seconds that the reply occupies the medium, `(..., H)`; anything for helpers that were not asked, NaN if
+    # the model does not know it
     airtime_s: Floats
 
 

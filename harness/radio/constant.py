@@ -17,28 +17,22 @@ from harness.radio.channel import Broadcast, Delivery, Draws, Links, served_s
 
 @dataclass(frozen=True)
 class Radio:
-    """A channel with a nominal latency and one loss for all links.
+    """A channel with a nominal latency and one loss for all links."""
 
-    Attributes:
-        latency_s: nominal seconds of one exchange, the request included, without serialisation.
-        loss: probability that one crossing is lost. If helpers open rounds of their own, it is the loss with
-            that many active vehicles, if that is larger.
-        bandwidth_bps: bits per second while a message is on air.
-        access: `serial`: replies share one medium and are served one after another, so the k-th pays k slots;
-            `parallel`: all replies are on air at once.
-        jitter_s: largest extra delay of a reply's hop; the delay is uniform in [0, jitter_s).
-        density_coupled: whether the loss follows from the vehicles in the radius, the ego included, asked or
-            not.
-        roadside_edge: whether replies also travel over a roadside edge node, in a second hop as long as the
-            first, with its jitter. The two paths are declared independent. Requests are direct.
-    """
-
-    latency_s: Seconds
+    latency_s: Seconds  # nominal seconds of one exchange, the request included, without serialisation
+    # probability that one crossing is lost. If helpers open rounds of their own, it is the loss with that
+    # many active vehicles, if that is larger
     loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")]
+    # bits per second while a message is on air
     bandwidth_bps: Annotated[float, Meta(ge=1, le=1e15, description="bits per second, 1 or more")]
+    # `serial`: replies share one medium and are served one after another, so the k-th pays k slots;
+    # `parallel`: all replies are on air at once
     access: Literal["serial", "parallel"]
-    jitter_s: Seconds = 0.0
+    jitter_s: Seconds = 0.0  # largest extra delay of a reply's hop; the delay is uniform in [0, jitter_s)
+    # whether the loss follows from the vehicles in the radius, the ego included, asked or not
     density_coupled: bool = False
+    # whether replies also travel over a roadside edge node, in a second hop as long as the first, with its
+    # jitter. The two paths are declared independent. Requests are direct
     roadside_edge: bool = False
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:

@@ -23,21 +23,13 @@ BLOCK = 1024  # decisions computed at once, so that their waves stay in the proc
 
 @dataclass(frozen=True)
 class Trips:
-    """The keys of each decision's draws.
+    """The keys of each decision's draws."""
 
-    Attributes:
-        seed: seed of the channel, `(...)`.
-        layout_seed: seed of the episode's layout, `(...)`.
-        step: step of the decision, `(...)`.
-        steps: most steps of an episode.
-        links: name of the links; empty for those among vehicles.
-    """
-
-    seed: Ints
-    layout_seed: Ints
-    step: Ints
-    steps: int
-    links: str = ""
+    seed: Ints  # seed of the channel, `(...)`
+    layout_seed: Ints  # seed of the episode's layout, `(...)`
+    step: Ints  # step of the decision, `(...)`
+    steps: int  # most steps of an episode
+    links: str = ""  # name of the links; empty for those among vehicles
 
     def take(self, at: Any) -> "Trips":
         """Select trips by places of the leading dimension."""

@@ -53,46 +53,36 @@ IMPLEMENTATION = 0.37  # share of Shannon's rate that is reached: Wu et al., arX
 
 
 class Hazards(NamedTuple):
-    """Mean number of harmful packets, by distance (steps of STEP_M) and received power (steps of STEP_DB).
+    """Mean number of harmful packets, by distance (steps of STEP_M) and received power (steps of STEP_DB)."""
 
-    Attributes:
-        before: packets that began earlier or at the same time and that the receiver is locked to, or that
-            spoil this one, `(D, P)`.
-        during: later packets that spoil it, for each second that it is on air, `(D, P)`.
-    """
-
+    # packets that began earlier or at the same time and that the receiver is locked to, or that spoil this
+    # one, `(D, P)`
     before: Floats
-    during: Floats
+    during: Floats  # later packets that spoil it, for each second that it is on air, `(D, P)`
 
 
 @dataclass(frozen=True)
 class ItsG5(Transceiver):
-    """802.11p with background traffic, which sends packets of one size at one rate.
+    """802.11p with background traffic, which sends packets of one size at one rate."""
 
-    Attributes:
-        frequency_ghz: carrier frequency, here the control channel's.
-        environment_height_m: see `Propagation`; the source's 0.5 m leaves effective antennas of 1 m.
-        packet_bytes: size of a background packet.
-        header_bytes: bytes that the layers below add to a packet and to a message.
-        data_rate_mbps: one of 802.11p's 3, 4.5, 6, 9, 12, 18, 24 and 27.
-        aifs_slots: slots after SIFS in which nobody begins; 6 is that of best effort (EN 302 663).
-        contention_window: back-off is uniform from 0 to this number of slots; a broadcast never doubles it.
-            There is always a back-off, as after a packet of one's own.
-        curve: block error curve of frames, a name of `harness.radio.block_error`. `11p-goubet`, the source's,
-            is over the energy of a bit, so it holds for every rate. A curve of MCS 2 or 4 (6 or 12 Mb/s) is
-            shifted for another rate by the additional SINR that an implementation at 0.37 of Shannon's rate
-            needs.
-    """
-
-    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89
+    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89  # carrier frequency, here the control channel's
+    # see `Propagation`; the source's 0.5 m leaves effective antennas of 1 m
     environment_height_m: Annotated[float, between(0, 100)] = 0.5
     density_per_km: Annotated[float, between(0, 10000)] = 60.0
     sensing_dbm: Annotated[float, between(-200, 50)] = -85.0
-    packet_bytes: Annotated[int, between(1, 2304)] = 190
+    packet_bytes: Annotated[int, between(1, 2304)] = 190  # size of a background packet
+    # bytes that the layers below add to a packet and to a message
     header_bytes: Annotated[int, between(0, 2304)] = 30
+    # one of 802.11p's 3, 4.5, 6, 9, 12, 18, 24 and 27
     data_rate_mbps: Annotated[float, between(1, 100)] = 6.0
+    # slots after SIFS in which nobody begins; 6 is that of best effort (EN 302 663)
     aifs_slots: Annotated[int, between(0, 15)] = 6
+    # back-off is uniform from 0 to this number of slots; a broadcast never doubles it. There is always a
+    # back-off, as after a packet of one's own
     contention_window: Annotated[int, between(1, 1023)] = 15
+    # block error curve of frames, a name of `harness.radio.block_error`. `11p-goubet`, the source's, is over
+    # the energy of a bit, so it holds for every rate. A curve of MCS 2 or 4 (6 or 12 Mb/s) is shifted for
+    # another rate by the additional SINR that an implementation at 0.37 of Shannon's rate needs
     curve: str = "11p-goubet"
 
     def __post_init__(self) -> None:

@@ -20,13 +20,9 @@ CODINGS = {4: ("lte-qpsk-0.7-190B", 10), 2: ("lte-qpsk-0.5-190B", 12)}
 
 @dataclass(frozen=True)
 class LteMode4(Sidelink):
-    """Mode 4 in 10 MHz.
+    """Mode 4 in 10 MHz."""
 
-    Attributes:
-        subchannels: packets beside each other in a subframe, and with them the coding: 4 of QPSK at rate 0.7,
-            or 2 at 0.5.
-    """
-
+    # packets beside each other in a subframe, and with them the coding: 4 of QPSK at rate 0.7, or 2 at 0.5
     subchannels: Literal[2, 4] = 4
     ranks: ClassVar[bool] = True
 

@@ -16,19 +16,13 @@ from harness.core.files import written_ns
 
 @dataclass(frozen=True)
 class Network:
-    """A distribution of round trips, without the time of the answer at the other end.
+    """A distribution of round trips, without the time of the answer at the other end."""
 
-    Attributes:
-        description: one sentence for lists.
-        source: who measured the round trips, where and how many.
-        status: `cited` from a publication or its data, `measured` by oneself, or `assumed`.
-        quantiles_ms: quantiles of the round trips by percentage, from 0 to 100.
-    """
-
-    description: str
-    source: str
+    description: str  # one sentence for lists
+    source: str  # who measured the round trips, where and how many
+    # `cited` from a publication or its data, `measured` by oneself, or `assumed`
     status: Literal["cited", "measured", "assumed"]
-    quantiles_ms: dict[str, float]
+    quantiles_ms: dict[str, float]  # quantiles of the round trips by percentage, from 0 to 100
 
     def round_trip_s(self, uniforms: Floats) -> Floats:
         """Return the quantiles at these draws, interpolated linearly."""

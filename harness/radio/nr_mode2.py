@@ -38,29 +38,23 @@ CURVES = {7: "nr-mcs7-100B-urban-nlos", 21: "nr-mcs21-1500B-urban-nlos"}
 
 @dataclass(frozen=True)
 class NrMode2(Sidelink):
-    """Mode 2 in one resource pool.
-
-    Attributes:
-        bandwidth_mhz: 10, 20, 30 or 40.
-        numerology: 0, 1 or 2: slots of 1, 0.5 or 0.25 ms, subcarriers of 15, 30 or 60 kHz.
-        subchannel_blocks: resource blocks of a sub-channel. A packet takes as many of these as it needs.
-        mcs: modulation and coding, 0 to 28 (TS 38.214, table 5.1.3.1-1). 7 and 21 have curves of block error,
-            the others a threshold of SINR.
-        packet_bytes: size of a background packet.
-        efficiency: share of Shannon's bound that codings without a curve reach (`block_error.threshold`). 0.4
-            is WiLabV2Xsim's for moving vehicles, 0.62 that of MCS 14 in 5G-LENA's tables without fading: half
-            of the blocks are lost at 10.1 dB.
-    """
+    """Mode 2 in one resource pool."""
 
     environment: Environment = "tr37885-highway"
     frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89
     t1_slots: Annotated[int, between(0, 10000)] = 2
     t2_slots: Annotated[int, between(0, 10000)] = 33
-    bandwidth_mhz: Literal[10, 20, 30, 40] = 40
-    numerology: Literal[0, 1, 2] = 0
+    bandwidth_mhz: Literal[10, 20, 30, 40] = 40  # 10, 20, 30 or 40
+    numerology: Literal[0, 1, 2] = 0  # 0, 1 or 2: slots of 1, 0.5 or 0.25 ms, subcarriers of 15, 30 or 60 kHz
+    # resource blocks of a sub-channel. A packet takes as many of these as it needs
     subchannel_blocks: Annotated[int, between(1, 1000)] = 50
+    # modulation and coding, 0 to 28 (TS 38.214, table 5.1.3.1-1). 7 and 21 have curves of block error, the
+    # others a threshold of SINR
     mcs: Annotated[int, between(0, 28)] = 14
-    packet_bytes: Annotated[int, between(1, 10000)] = 200
+    packet_bytes: Annotated[int, between(1, 10000)] = 200  # size of a background packet
+    # share of Shannon's bound that codings without a curve reach (`block_error.threshold`). 0.4 is
+    # WiLabV2Xsim's for moving vehicles, 0.62 that of MCS 14 in 5G-LENA's tables without fading: half of the
+    # blocks are lost at 10.1 dB
     efficiency: Annotated[float, between(0.1, 1)] = 0.4
     ranks: ClassVar[bool] = False
 

@@ -35,22 +35,15 @@ MODELS = {
 
 @dataclass(frozen=True)
 class Profile:
-    """The content of a file of `channels/`.
+    """The content of a file of `channels/`."""
 
-    Attributes:
-        model: one of `MODELS`.
-        description: one sentence for lists.
-        source: source of the model and its parameters.
-        status: their kind: `measured` on radios, `cited` from a publication, `modelled`, or `assumed`.
-        parameters: parameters of the model.
-        limits: for some parameters, the least and largest value for which the source validated the model.
-    """
-
-    model: str
-    description: str
-    source: str
+    model: str  # one of `MODELS`
+    description: str  # one sentence for lists
+    source: str  # source of the model and its parameters
+    # their kind: `measured` on radios, `cited` from a publication, `modelled`, or `assumed`
     status: Literal["measured", "cited", "modelled", "assumed"]
-    parameters: dict[str, Any] = field(default_factory=dict)
+    parameters: dict[str, Any] = field(default_factory=dict)  # parameters of the model
+    # for some parameters, the least and largest value for which the source validated the model
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 

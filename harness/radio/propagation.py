@@ -25,30 +25,23 @@ NEAREST_M = 3.0
 
 @dataclass(frozen=True)
 class Propagation:
-    """The laws of propagation with their heights and widths. A radio model inherits these as settings.
+    """The laws of propagation with their heights and widths. A radio model inherits these as settings."""
 
-    Attributes:
-        environment: law of links without a building between, with its LOS probabilities and decorrelation.
-        frequency_ghz: carrier frequency.
-        antenna_m: height of every antenna.
-        environment_height_m: average height of the vehicles' surroundings, for `winner-b1` only. The
-            effective antenna height is `antenna_m` less this: 1.5 m with 0 (Gonzalez-Martin et al.), 0.5 m
-            with 1 (TR 36.885), 12 dB more at 100 m.
-        blocker_m: height of a blocking vehicle if no scene gives it: 1.6 m is a car, 3.0 m a lorry (TR
-            37.885, 6.1.2).
-        street_m: width of the receiver's street, in the law of the corner.
-        wall_m: distance of the transmitter from its wall, in the law of the corner.
-        suburban: adds 2.94 dB round a corner.
-    """
-
+    # law of links without a building between, with its LOS probabilities and decorrelation
     environment: Environment = "winner-b1"
-    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.91
-    antenna_m: Annotated[float, between(0, 100)] = 1.5
+    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.91  # carrier frequency
+    antenna_m: Annotated[float, between(0, 100)] = 1.5  # height of every antenna
+    # average height of the vehicles' surroundings, for `winner-b1` only. The effective antenna height is
+    # `antenna_m` less this: 1.5 m with 0 (Gonzalez-Martin et al.), 0.5 m with 1 (TR 36.885), 12 dB more at
+    # 100 m
     environment_height_m: Annotated[float, between(0, 100)] = 0.0
+    # height of a blocking vehicle if no scene gives it: 1.6 m is a car, 3.0 m a lorry (TR 37.885, 6.1.2)
     blocker_m: Annotated[float, between(0, 100)] = 1.6
+    # width of the receiver's street, in the law of the corner
     street_m: Annotated[float, between(0.1, 1000)] = 14.0
+    # distance of the transmitter from its wall, in the law of the corner
     wall_m: Annotated[float, between(0.1, 1000)] = 7.0
-    suburban: bool = False
+    suburban: bool = False  # adds 2.94 dB round a corner
 
     def path_loss_db(
         self,

@@ -30,14 +30,10 @@ class Relay(Wrapped):
     A reply arrives if it crosses to the ego, or to the unit and from there to the ego. The ego takes the one
     that comes first, which is the direct one. Copies are sent whether or not the ego needs them, since the
     unit cannot know, and do not wait for other messages.
-
-    Attributes:
-        unit: the unit.
-        delay_s: time from a reply's end at the unit until its copy is to be sent.
     """
 
-    unit: Unit
-    delay_s: float
+    unit: Unit  # the unit
+    delay_s: float  # time from a reply's end at the unit until its copy is to be sent
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """A lost reply keeps its slot, and that of its copy if there is one."""
@@ -64,31 +60,18 @@ class Relay(Wrapped):
 
 
 class Consulted(NamedTuple):
-    """Result of a consultation, in seconds from the ego's request.
+    """Result of a consultation, in seconds from the ego's request."""
 
-    Attributes:
-        asked: which helpers were asked, `(..., H)`; with a unit none if the ego's request to it was lost.
-        up: whether request and reply crossed, `(..., H)`; with a unit also its policy, if it sent one.
-        end_s: end of each reply at the place of fusion, `(..., H)`; inf for helpers that were not asked.
-        fused: which replies may be part of the policy, `(..., H)`.
-        acts_s: when the ego has heard all that it waits for, `(...)`, or gives up waiting for a policy.
-        loss: probability that a reply is lost, `(..., H)` or `(..., 1)`.
-        requests: number of requests of the ego and the unit, `(...)`.
-        request_bits: their size, with the ego's intent in its request to a unit, `(...)`.
-        policy_bits: size of the unit's policy, `(...)`.
-        airtime_s: time on air of all messages, `(...)`.
-    """
-
-    asked: Bools
-    up: Bools
-    end_s: Floats
-    fused: Bools
-    acts_s: Floats
-    loss: Floats
-    requests: Ints
-    request_bits: Floats
-    policy_bits: Floats
-    airtime_s: Floats
+    asked: Bools  # which helpers were asked, `(..., H)`; with a unit none if the ego's request to it was lost
+    up: Bools  # whether request and reply crossed, `(..., H)`; with a unit also its policy, if it sent one
+    end_s: Floats  # end of each reply at the place of fusion, `(..., H)`; inf for helpers that were not asked
+    fused: Bools  # which replies may be part of the policy, `(..., H)`
+    acts_s: Floats  # when the ego has heard all that it waits for, `(...)`, or gives up waiting for a policy
+    loss: Floats  # probability that a reply is lost, `(..., H)` or `(..., 1)`
+    requests: Ints  # number of requests of the ego and the unit, `(...)`
+    request_bits: Floats  # their size, with the ego's intent in its request to a unit, `(...)`
+    policy_bits: Floats  # size of the unit's policy, `(...)`
+    airtime_s: Floats  # time on air of all messages, `(...)`
 
 
 def by_unit(

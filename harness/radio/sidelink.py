@@ -36,20 +36,16 @@ CELLS = 160
 
 @dataclass(frozen=True)
 class Sidelink(Transceiver):
-    """The common part of LTE Mode 4 and NR Mode 2; its fields and `Transceiver`'s are settings of both.
+    """The common part of LTE Mode 4 and NR Mode 2; its fields and `Transceiver`'s are settings of both."""
 
-    Attributes:
-        keep: probability that a vehicle keeps its resource when it might choose a new one.
-        transmissions: how often every vehicle sends each block (blind repetition). Given the link's
-            shadowing, copies are received independently, and not combined.
-        t1_slots: first slot of the selection window.
-        t2_slots: last slot. A message takes a random slot of the window (one-shot), since a triggered message
-            has no reservation.
-    """
-
+    # probability that a vehicle keeps its resource when it might choose a new one
     keep: Annotated[float, between(0, 1)] = 0.0
+    # how often every vehicle sends each block (blind repetition). Given the link's shadowing, copies are
+    # received independently, and not combined
     transmissions: Annotated[int, between(1, 100)] = 1
-    t1_slots: Annotated[int, between(0, 10000)] = 1
+    t1_slots: Annotated[int, between(0, 10000)] = 1  # first slot of the selection window
+    # last slot. A message takes a random slot of the window (one-shot), since a triggered message has no
+    # reservation
     t2_slots: Annotated[int, between(0, 10000)] = 100
 
     ranks: ClassVar[bool]

@@ -26,23 +26,17 @@ STEP_DB = 0.1
 
 @dataclass(frozen=True)
 class Scheduling:
-    """The inputs of a vehicle's choice among the resources of one period.
+    """The inputs of a vehicle's choice among the resources of one period."""
 
-    Attributes:
-        per_m: packets that the vehicles on one metre of road send in a period.
-        resources: number of resources in a period (28).
-        forgotten: share of the choices in which a vehicle that could sense another does not know of the
-            other's choice, since both were made anew within one period (24).
-        sensed: share of the packets of a vehicle so many metres away whose power is above a threshold in dBm
-            (11), for an array of metres; the second argument is the threshold.
-        threshold_dbm: sensing threshold of a receiver.
-    """
-
-    per_m: float
-    resources: float
+    per_m: float  # packets that the vehicles on one metre of road send in a period
+    resources: float  # number of resources in a period (28)
+    # share of the choices in which a vehicle that could sense another does not know of the other's choice,
+    # since both were made anew within one period (24)
     forgotten: float
+    # share of the packets of a vehicle so many metres away whose power is above a threshold in dBm (11), for
+    # an array of metres; the second argument is the threshold
     sensed: Callable[[Floats, float], Floats]
-    threshold_dbm: float
+    threshold_dbm: float  # sensing threshold of a receiver
 
     @property
     def busy_ratio(self) -> float:

@@ -29,34 +29,21 @@ COLUMNS = {"distance_m", "reception", "sight", "latency_ms"}
 
 
 class Point(NamedTuple):
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-        distance_m: distance between sender and receiver.
-        reception: share of packets received.
-        sight: one of `SIGHTS`; None in a table without this column.
-        latency_s: time from the wish to send until reception; None in a table without this column.
-    """
-
-    distance_m: float
-    reception: float
-    sight: str | None
-    latency_s: float | None
+    distance_m: float  # distance between sender and receiver
+    reception: float  # share of packets received
+    sight: str | None  # one of `SIGHTS`; None in a table without this column
+    latency_s: float | None  # time from the wish to send until reception; None in a table without this column
 
 
 @dataclass(frozen=True)
 class Table:
-    """A file of receptions.
+    """A file of receptions."""
 
-    Attributes:
-        file: path of the file.
-        sha256: its digest.
-        points: its rows.
-    """
-
-    file: str
-    sha256: str
-    points: tuple[Point, ...]
+    file: str  # path of the file
+    sha256: str  # its digest
+    points: tuple[Point, ...]  # its rows
 
 
 @dataclass(frozen=True)
@@ -66,16 +53,12 @@ class Trace:
     The table is averaged over shadowing and for one packet size, so a link's own shadowing and a message's
     bits change nothing, and replies do not wait for each other. The helpers have a request after the table's
     longest latency.
-
-    Attributes:
-        receptions: the table.
-        latency_s: latency of each message if the table has none.
-        beyond: reception beyond the last distance: `zero`, since a table usually ends where packets are no
-            longer received, or `held`, that of the last row, for a table that ends early.
     """
 
-    receptions: Table
-    latency_s: Seconds = 0.025
+    receptions: Table  # the table
+    latency_s: Seconds = 0.025  # latency of each message if the table has none
+    # reception beyond the last distance: `zero`, since a table usually ends where packets are no longer
+    # received, or `held`, that of the last row, for a table that ends early
     beyond: Literal["zero", "held"] = "zero"
     decorrelation_m: ClassVar[float] = math.inf
 

@@ -18,22 +18,15 @@ STEP_M, STEP_DB = 10.0, 0.5
 
 @dataclass(frozen=True)
 class Transceiver(Propagation):
-    """The radio of all vehicles, and background traffic with packets of one size at one rate.
+    """The radio of all vehicles, and background traffic with packets of one size at one rate."""
 
-    Attributes:
-        density_per_km: background vehicles on one kilometre of road, all lanes and both directions together.
-        rate_hz: packets that each of them sends a second.
-        power_dbm: transmit power of every vehicle.
-        gain_dbi: gain of each antenna.
-        noise_figure_db: noise figure of the receivers.
-        sensing_dbm: least power of a whole packet at which it is received or sensed.
-    """
-
+    # background vehicles on one kilometre of road, all lanes and both directions together
     density_per_km: Annotated[float, between(0, 10000)] = 100.0
-    rate_hz: Annotated[float, between(0, 1000)] = 10.0
-    power_dbm: Annotated[float, between(-100, 100)] = 23.0
-    gain_dbi: Annotated[float, between(-50, 50)] = 0.0
-    noise_figure_db: Annotated[float, between(0, 50)] = 9.0
+    rate_hz: Annotated[float, between(0, 1000)] = 10.0  # packets that each of them sends a second
+    power_dbm: Annotated[float, between(-100, 100)] = 23.0  # transmit power of every vehicle
+    gain_dbi: Annotated[float, between(-50, 50)] = 0.0  # gain of each antenna
+    noise_figure_db: Annotated[float, between(0, 50)] = 9.0  # noise figure of the receivers
+    # least power of a whole packet at which it is received or sensed
     sensing_dbm: Annotated[float, between(-200, 50)] = -90.5
 
     @abstractmethod

@@ -10,13 +10,9 @@ from harness.radio.channel import Broadcast, Channel, Delivery, Draws, Links, Ph
 
 @dataclass(frozen=True)
 class Wrapped:
-    """A physical channel that forwards everything to another one.
+    """A physical channel that forwards everything to another one."""
 
-    Attributes:
-        channel: the wrapped channel.
-    """
-
-    channel: Physical
+    channel: Physical  # the wrapped channel
 
     @property
     def decorrelation_m(self) -> float:
@@ -51,13 +47,9 @@ def innermost(channel: Channel) -> Channel:
 
 @dataclass(frozen=True)
 class AtLoss(Wrapped):
-    """A physical channel that loses every crossing with one probability, wherever its ends are.
+    """A physical channel that loses every crossing with one probability, wherever its ends are."""
 
-    Attributes:
-        probability: probability that one crossing is lost.
-    """
-
-    probability: float
+    probability: float  # probability that one crossing is lost
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Replies arrive when the channel says, but do not affect each other otherwise."""

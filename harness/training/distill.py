@@ -27,18 +27,12 @@ FACTS = "training.json"  # written last
 
 @dataclass(frozen=True)
 class Curriculum:
-    """What is learnt from.
+    """What is learnt from."""
 
-    Attributes:
-        prompts: of each scenario, the versions that are learnt.
-        layouts: how many of each scenario.
-        seed: layout seed of the first.
-        base: folder of the model of texts that it begins as; None begins with random weights.
-    """
-
-    prompts: Mapping[Scenario, tuple[Prompt, ...]]
-    layouts: int
-    seed: int
+    prompts: Mapping[Scenario, tuple[Prompt, ...]]  # of each scenario, the versions that are learnt
+    layouts: int  # how many of each scenario
+    seed: int  # layout seed of the first
+    # folder of the model of texts that it begins as; None begins with random weights
     base: Path | None = None
 
     def settings(self) -> dict[str, Any]:

@@ -22,31 +22,18 @@ ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
 
 @dataclass(frozen=True)
 class Question:
-    """One prompt.
+    """One prompt."""
 
-    Attributes:
-        key: scenario, scene, viewer and prompt version, and `+m` where messages are in it.
-        scenario: what is decided in.
-        prompt: which version.
-        graph: the viewer's scene graph.
-        messages: chat messages.
-        label: soft label, (A,).
-        weight: how often it is learnt, beside others.
-        image: what the viewer's cameras see, if the prompt shows it.
-        heard: helpers' messages in the prompt.
-        excerpt: what of the graph the prompt shows, if not all.
-    """
-
-    key: str
-    scenario: Scenario
-    prompt: Prompt
-    graph: Mapping[str, Any]
-    messages: tuple[Mapping[str, str], ...]
-    label: Floats
-    weight: float
-    image: Sight | None = None
-    heard: Sequence[Mapping[str, Any]] = ()
-    excerpt: Mapping[str, Any] | None = None
+    key: str  # scenario, scene, viewer and prompt version, and `+m` where messages are in it
+    scenario: Scenario  # what is decided in
+    prompt: Prompt  # which version
+    graph: Mapping[str, Any]  # the viewer's scene graph
+    messages: tuple[Mapping[str, str], ...]  # chat messages
+    label: Floats  # soft label, (A,)
+    weight: float  # how often it is learnt, beside others
+    image: Sight | None = None  # what the viewer's cameras see, if the prompt shows it
+    heard: Sequence[Mapping[str, Any]] = ()  # helpers' messages in the prompt
+    excerpt: Mapping[str, Any] | None = None  # what of the graph the prompt shows, if not all
 
     @property
     def named(self) -> bool:

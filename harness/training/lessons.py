@@ -45,19 +45,12 @@ CALM = {"FASTER": 0.3, "LANE_LEFT": 0.3, "LANE_RIGHT": 0.3}  # prior weight of a
 
 @dataclass(frozen=True)
 class Lessons:
-    """What is learnt from one scenario.
+    """What is learnt from one scenario."""
 
-    Attributes:
-        scenario: whose actions and words the prompts have.
-        prompts: versions that are learnt.
-        scenes: decision points, layout by layout.
-        labels: soft label of each, (A,), by its id.
-    """
-
-    scenario: Scenario
-    prompts: tuple[Prompt, ...]
-    scenes: tuple[Scene, ...]
-    labels: Mapping[str, Floats]
+    scenario: Scenario  # whose actions and words the prompts have
+    prompts: tuple[Prompt, ...]  # versions that are learnt
+    scenes: tuple[Scene, ...]  # decision points, layout by layout
+    labels: Mapping[str, Floats]  # soft label of each, (A,), by its id
 
     @property
     def episodes(self) -> tuple[int, ...]:

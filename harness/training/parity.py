@@ -37,53 +37,32 @@ PASSES = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing compared.
+    """One thing compared."""
 
-    Attributes:
-        what: what was compared.
-        measured: the figure.
-        allowed: its limit; None where there is none.
-        holds: whether it is within.
-        n: prompts.
-        differences: the first prompts that differ, and how.
-    """
-
-    what: str
-    measured: float
-    allowed: float | None
-    holds: bool
-    n: int
-    differences: tuple[str, ...] = ()
+    what: str  # what was compared
+    measured: float  # the figure
+    allowed: float | None  # its limit; None where there is none
+    holds: bool  # whether it is within
+    n: int  # prompts
+    differences: tuple[str, ...] = ()  # the first prompts that differ, and how
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was compared, and what could not be.
+    """What was compared, and what could not be."""
 
-    Attributes:
-        findings: everything compared.
-        left_out: why llama.cpp was not held to the same float32 weights; None if it was.
-    """
-
-    findings: tuple[Finding, ...]
-    left_out: str | None
+    findings: tuple[Finding, ...]  # everything compared
+    left_out: str | None  # why llama.cpp was not held to the same float32 weights; None if it was
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """The outputs of one engine, a prompt at a time.
+    """The outputs of one engine, a prompt at a time."""
 
-    Attributes:
-        tokens: token ids of the text of each prompt, of those for JSON first.
-        logits: log-probabilities of the whole vocabulary after each json prompt, (n, V).
-        texts: greedy answers to the json prompts.
-        readouts: distributions read out, (n, A).
-    """
-
-    tokens: list[list[int]]
-    logits: Floats
-    texts: list[str]
-    readouts: Floats
+    tokens: list[list[int]]  # token ids of the text of each prompt, of those for JSON first
+    logits: Floats  # log-probabilities of the whole vocabulary after each json prompt, (n, V)
+    texts: list[str]  # greedy answers to the json prompts
+    readouts: Floats  # distributions read out, (n, A)
 
 
 def compare(

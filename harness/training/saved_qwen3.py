@@ -28,19 +28,13 @@ _BYTES = {"type": "ByteLevel", "add_prefix_space": False, "use_regex": False}
 
 
 class Saved(NamedTuple):
-    """What its small files say.
+    """What its small files say."""
 
-    Attributes:
-        config: of the text part.
-        tokenizer: whole.
-        template: of a chat.
-        vision: config of the vision encoder, and its processor's `image_mean` and `image_std`; None if the
-            model reads text only.
-    """
-
-    config: dict[str, Any]
-    tokenizer: dict[str, Any]
-    template: str
+    config: dict[str, Any]  # of the text part
+    tokenizer: dict[str, Any]  # whole
+    template: str  # of a chat
+    # config of the vision encoder, and its processor's `image_mean` and `image_std`; None if the model reads
+    # text only
     vision: dict[str, Any] | None = None
 
 

@@ -44,46 +44,30 @@ KEEP_S = 60.0  # a killed run loses at most so much
 
 @dataclass(frozen=True)
 class Sample:
-    """One sequence.
+    """One sequence."""
 
-    Attributes:
-        ids: token ids, the shared beginning included.
-        shared: how many of them are the system message, equal in all samples of a `kind`.
-        kind: names that system message.
-        answer_at: where the answer starts.
-        target: what the read-out there should be, (A,), of one length in a `kind`; None where the answer is a
-            text from its first token.
-        weight: how often it is drawn, beside others.
-        image: the picture behind the system message, whose tokens are among `ids`; all of a `kind` have one,
-            or none has.
-    """
-
-    ids: NDArray[np.int32]
-    shared: int
-    kind: str
-    answer_at: int
+    ids: NDArray[np.int32]  # token ids, the shared beginning included
+    shared: int  # how many of them are the system message, equal in all samples of a `kind`
+    kind: str  # names that system message
+    answer_at: int  # where the answer starts
+    # what the read-out there should be, (A,), of one length in a `kind`; None where the answer is a text from
+    # its first token
     target: Floats | None
-    weight: float = 1.0
+    weight: float = 1.0  # how often it is drawn, beside others
+    # the picture behind the system message, whose tokens are among `ids`; all of a `kind` have one, or none
+    # has
     image: Sight | None = None
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How long and how fast.
+    """How long and how fast."""
 
-    Attributes:
-        samples: sequences per stage, by name.
-        batch: sequences a step.
-        muon_lr: learning rate of the matrices (Muon).
-        adam_lr: learning rate of embeddings and norms (AdamW).
-        seed: of the weights and of the order.
-    """
-
-    samples: dict[str, int]
-    batch: int = 16
-    muon_lr: float = 3e-3
-    adam_lr: float = 3e-3
-    seed: int = 0
+    samples: dict[str, int]  # sequences per stage, by name
+    batch: int = 16  # sequences a step
+    muon_lr: float = 3e-3  # learning rate of the matrices (Muon)
+    adam_lr: float = 3e-3  # learning rate of embeddings and norms (AdamW)
+    seed: int = 0  # of the weights and of the order
 
 
 def run_stage(

@@ -15,23 +15,14 @@ Colour = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Ambient:
-    """One kind of light and weather.
+    """One kind of light and weather."""
 
-    Attributes:
-        camera_m: distance up to which a camera tells class, indicator and brake lamps.
-        fades_m: distance over which contrast falls to 1/e.
-        light: brightness of what the sky lights, 1 by day; lamps keep their brightness.
-        haze: colour to which everything fades.
-        sky: colour overhead.
-        glare_rad: angle around a low sun within which a camera tells nothing; 0 without a low sun.
-    """
-
-    camera_m: float
-    fades_m: float
-    light: float = 1.0
-    haze: Colour = (205, 217, 228)
-    sky: Colour = (134, 178, 222)
-    glare_rad: float = 0.0
+    camera_m: float  # distance up to which a camera tells class, indicator and brake lamps
+    fades_m: float  # distance over which contrast falls to 1/e
+    light: float = 1.0  # brightness of what the sky lights, 1 by day; lamps keep their brightness
+    haze: Colour = (205, 217, 228)  # colour to which everything fades
+    sky: Colour = (134, 178, 222)  # colour overhead
+    glare_rad: float = 0.0  # angle around a low sun within which a camera tells nothing; 0 without a low sun
 
 
 DAY = "day"

@@ -36,24 +36,18 @@ BY_SIZE = {"car": 0.0, "van": 0.5, "truck": 1.0}
 
 @dataclass(frozen=True)
 class Audit:
-    """How well a danger that is out of sight can be told from what is in sight.
+    """How well a danger that is out of sight can be told from what is in sight."""
 
-    Attributes:
-        scenario: name of the scenario.
-        layouts: number of layouts.
-        seed: layout seed of the first one.
-        steps: decision points that were compared: those at which at least half of the dangers are hidden.
-            Later, an empty road is an observation and gives nothing away.
-        auc: for each question (`danger`, and each sector that it can come from) the probability that a layout
-            with it ranks above one without. Intervals are a bootstrap over layouts, for these models.
-        told_by: the numbers that gave it away, with the AUC lost without each; empty unless it `tells`.
-    """
-
-    scenario: str
-    layouts: int
-    seed: int
+    scenario: str  # name of the scenario
+    layouts: int  # number of layouts
+    seed: int  # layout seed of the first one
+    # decision points that were compared: those at which at least half of the dangers are hidden. Later, an
+    # empty road is an observation and gives nothing away
     steps: tuple[int, ...]
+    # for each question (`danger`, and each sector that it can come from) the probability that a layout with
+    # it ranks above one without. Intervals are a bootstrap over layouts, for these models
     auc: Mapping[str, Estimate]
+    # the numbers that gave it away, with the AUC lost without each; empty unless it `tells`
     told_by: Mapping[str, float]
 
     @property
@@ -69,21 +63,13 @@ class Audit:
 
 @dataclass(frozen=True)
 class Moments:
-    """Moments of some layouts at which the danger is out of sight.
+    """Moments of some layouts at which the danger is out of sight."""
 
-    Attributes:
-        layout: index of each moment's layout, (m,).
-        step: index of its decision, (m,).
-        danger: sector that its danger comes from, (m,); `NONE` without a danger.
-        names: name of each number.
-        numbers: numbers of the scene graphs, (m, k); NaN if the ego does not know one.
-    """
-
-    layout: Ints
-    step: Ints
-    danger: Any
-    names: tuple[str, ...]
-    numbers: Floats
+    layout: Ints  # index of each moment's layout, (m,)
+    step: Ints  # index of its decision, (m,)
+    danger: Any  # sector that its danger comes from, (m,); `NONE` without a danger
+    names: tuple[str, ...]  # name of each number
+    numbers: Floats  # numbers of the scene graphs, (m, k); NaN if the ego does not know one
 
 
 def audit(
@@ -244,16 +230,11 @@ def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
 
 @dataclass(frozen=True)
 class Ranks:
-    """Comparisons between layouts with the danger in question and layouts without.
+    """Comparisons between layouts with the danger in question and layouts without."""
 
-    Attributes:
-        above: number of pairs of moments in which the layout with it ranks higher, (with, without); a tie
-            counts half.
-        pairs: number of all compared pairs of moments, (with, without).
-    """
-
+    # number of pairs of moments in which the layout with it ranks higher, (with, without); a tie counts half
     above: Floats
-    pairs: Floats
+    pairs: Floats  # number of all compared pairs of moments, (with, without)
 
     @classmethod
     def of(cls, layout: Ints, alike: Ints, score: Floats, there: Bools) -> "Ranks":

@@ -116,35 +116,20 @@ def compiled_fleet() -> "type[Fleet] | None":
 
 @dataclass(frozen=True)
 class Lanes:
-    """The lanes of a network as arrays; each is a straight lane or an arc.
+    """The lanes of a network as arrays; each is a straight lane or an arc."""
 
-    Attributes:
-        number: number of each lane.
-        names: lane of each number.
-        base: beginning of a straight lane, or centre of an arc, (L, 2).
-        along: direction of a straight lane, (L, 2).
-        across: direction to its right, (L, 2).
-        heading: heading of a straight lane.
-        length: m.
-        width: m.
-        arc: whether the lane is an arc.
-        radius: radius of an arc.
-        phase: phase of an arc's beginning, rad.
-        sign: 1 if an arc turns clockwise as pictures show it, else -1.
-    """
-
-    number: dict[Lane, int]
-    names: list[Lane]
-    base: Floats
-    along: Floats
-    across: Floats
-    heading: Floats
-    length: Floats
-    width: Floats
-    arc: Bools
-    radius: Floats
-    phase: Floats
-    sign: Floats
+    number: dict[Lane, int]  # number of each lane
+    names: list[Lane]  # lane of each number
+    base: Floats  # beginning of a straight lane, or centre of an arc, (L, 2)
+    along: Floats  # direction of a straight lane, (L, 2)
+    across: Floats  # direction to its right, (L, 2)
+    heading: Floats  # heading of a straight lane
+    length: Floats  # m
+    width: Floats  # m
+    arc: Bools  # whether the lane is an arc
+    radius: Floats  # radius of an arc
+    phase: Floats  # phase of an arc's beginning, rad
+    sign: Floats  # 1 if an arc turns clockwise as pictures show it, else -1
 
     def coordinates(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
         """Return the positions along and to the right of lanes (...), m, like `local_coordinates`."""

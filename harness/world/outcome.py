@@ -19,27 +19,19 @@ ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an episode ended for the ego.
+    """How an episode ended for the ego."""
 
-    Attributes:
-        result: `cleared` (the only success), `collision`, or a forced failure: `time_out` (never cleared the
-            intersection), `late` (cleared it too long after the full-view driver) or `off_road`;
-            `running` while undecided.
-        time_s: when it was decided; None while running.
-        partner: id of the vehicle that the ego collided with.
-        striker: whose front hit the other: `ego`, `other`, `both` or `neither` (a side swipe).
-        fault: who should have given way, or drove into the other's back: `ego` or `other`.
-        least_gap_m: smallest distance so far between the ego's outline and any other vehicle's.
-        other_crashes: number of vehicles that crashed without the ego.
-    """
-
+    # `cleared` (the only success), `collision`, or a forced failure: `time_out` (never cleared the
+    # intersection), `late` (cleared it too long after the full-view driver) or `off_road`; `running` while
+    # undecided
     result: Result = "running"
-    time_s: float | None = None
-    partner: str | None = None
+    time_s: float | None = None  # when it was decided; None while running
+    partner: str | None = None  # id of the vehicle that the ego collided with
+    # whose front hit the other: `ego`, `other`, `both` or `neither` (a side swipe)
     striker: str | None = None
-    fault: str | None = None
-    least_gap_m: float = 1000.0
-    other_crashes: int = 0
+    fault: str | None = None  # who should have given way, or drove into the other's back: `ego` or `other`
+    least_gap_m: float = 1000.0  # smallest distance so far between the ego's outline and any other vehicle's
+    other_crashes: int = 0  # number of vehicles that crashed without the ego
 
     @property
     def ended(self) -> bool:

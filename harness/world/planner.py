@@ -37,38 +37,25 @@ Point = tuple[Floats, Floats]
 
 @dataclass(frozen=True, eq=False)
 class Sequences:
-    """Sequences of actions that the ego may take.
+    """Sequences of actions that the ego may take."""
 
-    Attributes:
-        first: first action of each, (n,).
-        levels: levels by which each decision changes the target speed, (n, decisions).
-        ends: final way, counted to the right from the present one, (n,).
-        calm: place of each among all of them, the calmest first, (n,).
-        right_m: distance to the right of the way that the ego is on now, (n, steps); None if it stays.
-        shift: number of the motion to the side that each has, (n,).
-    """
-
-    first: Sequence[str]
-    levels: Ints
-    ends: Ints
-    calm: Ints
+    first: Sequence[str]  # first action of each, (n,)
+    levels: Ints  # levels by which each decision changes the target speed, (n, decisions)
+    ends: Ints  # final way, counted to the right from the present one, (n,)
+    calm: Ints  # place of each among all of them, the calmest first, (n,)
+    # distance to the right of the way that the ego is on now, (n, steps); None if it stays
     right_m: Floats | None
-    shift: Ints
+    shift: Ints  # number of the motion to the side that each has, (n,)
 
 
 @dataclass(frozen=True, eq=False)
 class Rollouts:
-    """The motions of the ego under some sequences; sequences that move it alike share one.
+    """The motions of the ego under some sequences; sequences that move it alike share one."""
 
-    Attributes:
-        travelled_m: distance along the ego's way, (motions, steps).
-        right_m: distance to the right of the way that the ego is on now, (motions, steps); None if it stays.
-        motion: number of each sequence's motion, (n,).
-    """
-
-    travelled_m: Floats
+    travelled_m: Floats  # distance along the ego's way, (motions, steps)
+    # distance to the right of the way that the ego is on now, (motions, steps); None if it stays
     right_m: Floats | None
-    motion: Ints
+    motion: Ints  # number of each sequence's motion, (n,)
 
     @cached_property
     def speed_mps(self) -> Floats:
@@ -240,21 +227,13 @@ def _right_m(ends: Ints, parameters: Parameters) -> Floats:
 
 @dataclass(frozen=True)
 class Motion:
-    """The assumed motion of another vehicle, and the ego's way on which they may meet.
+    """The assumed motion of another vehicle, and the ego's way on which they may meet."""
 
-    Attributes:
-        way: the ego's way.
-        begin_m: the ego's present position on it.
-        path: the other's path.
-        arc_m: the other's position on its path, (steps,).
-        size_m: the other's length and width.
-    """
-
-    way: Path
-    begin_m: float
-    path: Path
-    arc_m: Floats
-    size_m: tuple[float, float]
+    way: Path  # the ego's way
+    begin_m: float  # the ego's present position on it
+    path: Path  # the other's path
+    arc_m: Floats  # the other's position on its path, (steps,)
+    size_m: tuple[float, float]  # the other's length and width
 
 
 def predicted(road: Road, graph: Mapping[str, Any], steps: int) -> list[Motion]:

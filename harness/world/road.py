@@ -31,28 +31,17 @@ NORTH = np.array([1.0, -1.0])  # factors from this frame to that of pictures
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """One path along the road, in sections, each of which is a lane of highway-env.
+    """One path along the road, in sections, each of which is a lane of highway-env."""
 
-    Attributes:
-        approach: where it comes from.
-        route: what it does, such as `straight`. A vehicle on a route `left` or `right` indicates.
-        points: evenly spaced points, (n, 2) m.
-        arc_m: distance of each point along the path, (n,).
-        ends_m: arc lengths at which a section ends and the next begins; paths of one approach share the first
-            section.
-        roles: name of each section in a scene graph.
-        lanes: lane of each section.
-        priority: right of way; the higher one goes first.
-    """
-
-    approach: str
-    route: str
-    points: Floats
-    arc_m: Floats
+    approach: str  # where it comes from
+    route: str  # what it does, such as `straight`. A vehicle on a route `left` or `right` indicates
+    points: Floats  # evenly spaced points, (n, 2) m
+    arc_m: Floats  # distance of each point along the path, (n,)
+    # arc lengths at which a section ends and the next begins; paths of one approach share the first section
     ends_m: tuple[float, ...]
-    roles: tuple[str, ...]
-    lanes: tuple[Lane, ...]
-    priority: int
+    roles: tuple[str, ...]  # name of each section in a scene graph
+    lanes: tuple[Lane, ...]  # lane of each section
+    priority: int  # right of way; the higher one goes first
 
     @classmethod
     def along(
@@ -157,73 +146,52 @@ def _within(points: Floats, reach_m: float) -> Floats:
 
 @dataclass(frozen=True)
 class Crossing:
-    """The point where another path meets the ego's.
+    """The point where another path meets the ego's."""
 
-    Attributes:
-        x_m: position, m to the east.
-        y_m: position, m to the south.
-        ego_arc_m: arc length along the ego's path.
-        other_arc_m: arc length along the other path.
-        kind: whether the other path crosses, or merges into a lane that the ego takes as well.
-    """
-
-    x_m: float
-    y_m: float
-    ego_arc_m: float
-    other_arc_m: float
+    x_m: float  # position, m to the east
+    y_m: float  # position, m to the south
+    ego_arc_m: float  # arc length along the ego's path
+    other_arc_m: float  # arc length along the other path
+    # whether the other path crosses, or merges into a lane that the ego takes as well
     kind: Literal["crossing", "merging"] = "crossing"
 
 
 @dataclass(frozen=True)
 class Ground:
-    """The parts of a road that pictures show, in m to the east and to the *north*.
+    """The parts of a road that pictures show, in m to the east and to the *north*."""
 
-    Attributes:
-        outlines: edges of the surface, (n, 2) each: the outer one, and those of islands.
-        marks: centre lines, (n, 2) each.
-        stops: stop lines, (n, 2) each.
-        boxes: south-west and north-east corners (2, 2) of areas that labels must avoid.
-    """
-
-    outlines: tuple[Floats, ...]
-    marks: tuple[Floats, ...]
-    stops: tuple[Floats, ...]
-    boxes: tuple[Floats, ...]
+    outlines: tuple[Floats, ...]  # edges of the surface, (n, 2) each: the outer one, and those of islands
+    marks: tuple[Floats, ...]  # centre lines, (n, 2) each
+    stops: tuple[Floats, ...]  # stop lines, (n, 2) each
+    boxes: tuple[Floats, ...]  # south-west and north-east corners (2, 2) of areas that labels must avoid
 
 
 @dataclass(frozen=True)
 class Road:
-    """A road, and what matters on it for the ego.
+    """A road, and what matters on it for the ego."""
 
-    Attributes:
-        facts: description in frozen records: texts, and numbers with their unit in the name.
-        paths: every path, by approach and route.
-        ego: key of the ego's path.
-        ways: paths that the ego reaches by changing lane, from left to right, `ego` among them; they lie side
-            by side and are equally long.
-        form: form of the scene graphs: 2 lists every relation to the ego's ways; 1 lists crossings only, as
-            in the frozen dataset `occluded-intersection-v2`.
-        crossings: points where other paths meet the ego's, at which conflicts are looked for.
-        zone_m: position of the conflict zone; messages are weighted by the distance to it.
-        sectors: sectors that danger can come from, each with the points (k, 2) m that must be seen.
-        network: returns highway-env's network, always the same object, which must not be written to.
-        ground: returns the ground for a picture that reaches so many metres from the origin.
-        origin_m: position of the origin in highway-env's own frame.
-        goal_m: returns, for the scenario's parameters, the arc length of the ego's path at which the episode
-            ends; vehicles beyond do not matter. None if the goal is not a place on its path.
-    """
-
+    # description in frozen records: texts, and numbers with their unit in the name
     facts: Mapping[str, str | float]
-    paths: Mapping[PathKey, Path]
-    ego: PathKey
+    paths: Mapping[PathKey, Path]  # every path, by approach and route
+    ego: PathKey  # key of the ego's path
+    # points where other paths meet the ego's, at which conflicts are looked for
     crossings: Mapping[PathKey, Crossing]
-    zone_m: tuple[float, float]
+    zone_m: tuple[float, float]  # position of the conflict zone; messages are weighted by the distance to it
+    # sectors that danger can come from, each with the points (k, 2) m that must be seen
     sectors: Mapping[str, Floats]
+    # returns highway-env's network, always the same object, which must not be written to
     network: Callable[[], Any]
+    # returns the ground for a picture that reaches so many metres from the origin
     ground: Callable[[float], Ground]
+    # paths that the ego reaches by changing lane, from left to right, `ego` among them; they lie side by side
+    # and are equally long
     ways: tuple[PathKey, ...] = ()
+    # form of the scene graphs: 2 lists every relation to the ego's ways; 1 lists crossings only, as in the
+    # frozen dataset `occluded-intersection-v2`
     form: Literal[1, 2] = 2
-    origin_m: tuple[float, float] = (0.0, 0.0)
+    origin_m: tuple[float, float] = (0.0, 0.0)  # position of the origin in highway-env's own frame
+    # returns, for the scenario's parameters, the arc length of the ego's path at which the episode ends;
+    # vehicles beyond do not matter. None if the goal is not a place on its path
     goal_m: Callable[[Any], float] | None = None
 
     def beside(self, key: PathKey, arc_m: float | None = None) -> dict[str, PathKey]:
@@ -295,21 +263,13 @@ class Road:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Points of all paths, in cells of CELL successive ones, to find the nearest without asking all.
+    """Points of all paths, in cells of CELL successive ones, to find the nearest without asking all."""
 
-    Attributes:
-        middles: x and y of a point of each cell, (2, paths, cells); inf after the last one of a path.
-        reach: distance from there to the farthest point of the cell, (paths, cells).
-        begins: number of the first point of each path, and the number of all points, (paths + 1,).
-        points: of every point x, y, arc length, heading, and its cosine and sine, (6, points).
-        bends: `_bends` of each path, (2, paths).
-    """
-
-    middles: Floats
-    reach: Floats
-    begins: Ints
-    points: Floats
-    bends: Floats
+    middles: Floats  # x and y of a point of each cell, (2, paths, cells); inf after the last one of a path
+    reach: Floats  # distance from there to the farthest point of the cell, (paths, cells)
+    begins: Ints  # number of the first point of each path, and the number of all points, (paths + 1,)
+    points: Floats  # of every point x, y, arc length, heading, and its cosine and sine, (6, points)
+    bends: Floats  # `_bends` of each path, (2, paths)
 
     @classmethod
     def of(cls, paths: Sequence[Path]) -> "_Cells":

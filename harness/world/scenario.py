@@ -43,52 +43,35 @@ def frames(latency_s: float, simulation_hz: int) -> int:
 
 @dataclass(frozen=True)
 class Parameters:
-    """The parameters that every scenario has; a scenario adds its own in a subclass.
+    """The parameters that every scenario has; a scenario adds its own in a subclass."""
 
-    Attributes:
-        target_speeds_mps: the levels that SLOWER, IDLE and FASTER step through.
-        braking_mps2: hardest braking.
-        acceleration_mps2: hardest acceleration.
-        decisions: number of decisions in an episode.
-        decision_period_s: seconds between two decisions.
-        decision_lag_s: seconds from seeing to acting, below the period, in decision trees and for reference
-            drivers: the paper's inference. Until then the ego keeps to its last action.
-        simulation_hz: frames a second.
-        time_limit_s: an ego that has not reached its goal by then has failed.
-        delay_allowance_s: how much later than the full-view driver an ego may reach its goal.
-        perfect_knowledge: whether the ego and the helpers know each other's true state instead of beacons.
-        beacon_rule: when a vehicle sends a beacon: `fixed`, or `cam`, depending on its motion (ETSI EN 302
-            637-2); `harness.world.beacons` has the sources of these parameters.
-        beacon_hz: beacons a second; under `cam`, checks a second whether one is due.
-        beacon_delay_s: time from a beacon's pose until receivers have it.
-        beacon_loss: probability that a receiver does not receive a beacon.
-        beacon_channel: physical radio that gives this loss on each link instead, with settings of its own:
-            `its-g5+density_per_km=120+rate_hz=20`.
-        beacon_noise_m: standard deviation of a beacon's position on each axis.
-        beacon_noise_mps: standard deviation of a beacon's speed.
-        beacon_noise_rad: standard deviation of a beacon's heading.
-        ambient: light and weather, one of `harness.world.ambient`.
-    """
-
+    # the levels that SLOWER, IDLE and FASTER step through
     target_speeds_mps: tuple[float, ...] = (0.0, 7.0, 14.0)
-    braking_mps2: float = 8.0
-    acceleration_mps2: float = 3.0
-    decisions: int = 6
-    decision_period_s: float = 1.0
+    braking_mps2: float = 8.0  # hardest braking
+    acceleration_mps2: float = 3.0  # hardest acceleration
+    decisions: int = 6  # number of decisions in an episode
+    decision_period_s: float = 1.0  # seconds between two decisions
+    # seconds from seeing to acting, below the period, in decision trees and for reference drivers: the
+    # paper's inference. Until then the ego keeps to its last action
     decision_lag_s: float = 0.145
-    simulation_hz: int = 50
-    time_limit_s: float = 10.0
-    delay_allowance_s: float = 1.0
+    simulation_hz: int = 50  # frames a second
+    time_limit_s: float = 10.0  # an ego that has not reached its goal by then has failed
+    delay_allowance_s: float = 1.0  # how much later than the full-view driver an ego may reach its goal
+    # whether the ego and the helpers know each other's true state instead of beacons
     perfect_knowledge: bool = False
+    # when a vehicle sends a beacon: `fixed`, or `cam`, depending on its motion (ETSI EN 302 637-2);
+    # `harness.world.beacons` has the sources of these parameters
     beacon_rule: BeaconRule = "fixed"
-    beacon_hz: float = 10.0
-    beacon_delay_s: float = 0.02
-    beacon_loss: float = 0.08
+    beacon_hz: float = 10.0  # beacons a second; under `cam`, checks a second whether one is due
+    beacon_delay_s: float = 0.02  # time from a beacon's pose until receivers have it
+    beacon_loss: float = 0.08  # probability that a receiver does not receive a beacon
+    # physical radio that gives this loss on each link instead, with settings of its own:
+    # `its-g5+density_per_km=120+rate_hz=20`
     beacon_channel: str = ""
-    beacon_noise_m: float = 0.2
-    beacon_noise_mps: float = 0.1
-    beacon_noise_rad: float = 0.0035
-    ambient: str = DAY
+    beacon_noise_m: float = 0.2  # standard deviation of a beacon's position on each axis
+    beacon_noise_mps: float = 0.1  # standard deviation of a beacon's speed
+    beacon_noise_rad: float = 0.0035  # standard deviation of a beacon's heading
+    ambient: str = DAY  # light and weather, one of `harness.world.ambient`
 
     def __post_init__(self) -> None:
         bounds = {
@@ -199,83 +182,53 @@ class Draws:
 
 @dataclass(frozen=True)
 class Spawn:
-    """One vehicle at the start of an episode.
+    """One vehicle at the start of an episode."""
 
-    Attributes:
-        id: `v1`, `v2`, …
-        kind: class of vehicle.
-        part: `ego`, `helper` or `other`.
-        approach: where its path comes from.
-        route: what its path does.
-        arc_m: position along the path.
-        speed_mps: speed.
-        brakes_at_s: when it begins to brake by itself; None if it does not.
-        brakes_mps2: its deceleration then.
-        brakes_to_mps: the speed down to which it brakes.
-    """
-
-    id: str
-    kind: Kind
-    part: Part
-    approach: str
-    route: str
-    arc_m: float
-    speed_mps: float
-    brakes_at_s: float | None = None
-    brakes_mps2: float = 0.0
-    brakes_to_mps: float = 0.0
+    id: str  # `v1`, `v2`, …
+    kind: Kind  # class of vehicle
+    part: Part  # `ego`, `helper` or `other`
+    approach: str  # where its path comes from
+    route: str  # what its path does
+    arc_m: float  # position along the path
+    speed_mps: float  # speed
+    brakes_at_s: float | None = None  # when it begins to brake by itself; None if it does not
+    brakes_mps2: float = 0.0  # its deceleration then
+    brakes_to_mps: float = 0.0  # the speed down to which it brakes
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The start of one episode.
+    """The start of one episode."""
 
-    Attributes:
-        spawns: vehicles in spawn order, the ego first, then the helpers.
-        buildings: obstacles to sight besides vehicles.
-        danger: sector that the danger comes from; None without a danger.
-        danger_id: id of the dangerous vehicle; None without a danger.
-    """
-
-    spawns: tuple[Spawn, ...]
-    buildings: tuple[Building, ...]
-    danger: str | None
-    danger_id: str | None
+    spawns: tuple[Spawn, ...]  # vehicles in spawn order, the ego first, then the helpers
+    buildings: tuple[Building, ...]  # obstacles to sight besides vehicles
+    danger: str | None  # sector that the danger comes from; None without a danger
+    danger_id: str | None  # id of the dangerous vehicle; None without a danger
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One scenario. It is pickled as its name and its parameters.
+    """One scenario. It is pickled as its name and its parameters."""
 
-    Attributes:
-        name: its name for users, and in manifests and frozen states.
-        description: text whose first line is `Scenario <name>: <summary>`.
-        actions: names of highway-env's meta-actions that the ego chooses from, the most careful first.
-        parameters: its parameters.
-        road: returns the road, always the same object.
-        layout: draws the start of a seed's episode, `(seed, parameters)`.
-        cleared: tells whether the ego has reached its goal, `(xy_m, approaches, parameters)`. It is called
-            after every frame, for any number of worlds: `xy_m` has the vehicles' centres in highway-env's own
-            frame (..., V, 2), the ego first, NaN where a world has fewer, and `approaches` theirs (..., V).
-        words: texts for prompts: `task`, after "You drive car v1:", and `hiding`, after "Others may be hidden
-            by". Templates read `words.<name>`.
-        brake_lamps: whether vehicles have brake lamps.
-        prompt: default prompt version.
-        one_sided: why scenes with left and right swapped are not valid scenes; None if they are.
-        start: starts an episode that the harness does not simulate, `(scenario, seed)`; returns a `World`.
-    """
-
-    name: str
-    description: str
+    name: str  # its name for users, and in manifests and frozen states
+    description: str  # text whose first line is `Scenario <name>: <summary>`
+    # names of highway-env's meta-actions that the ego chooses from, the most careful first
     actions: tuple[str, ...]
-    parameters: Parameters
-    road: Callable[[], Road]
-    layout: Callable[[int, Any], Layout]
+    parameters: Parameters  # its parameters
+    road: Callable[[], Road]  # returns the road, always the same object
+    layout: Callable[[int, Any], Layout]  # draws the start of a seed's episode, `(seed, parameters)`
+    # tells whether the ego has reached its goal, `(xy_m, approaches, parameters)`. It is called after every
+    # frame, for any number of worlds: `xy_m` has the vehicles' centres in highway-env's own frame (..., V,
+    # 2), the ego first, NaN where a world has fewer, and `approaches` theirs (..., V)
     cleared: Callable[[Floats, Texts, Any], Bools]
+    # texts for prompts: `task`, after "You drive car v1:", and `hiding`, after "Others may be hidden by".
+    # Templates read `words.<name>`
     words: Mapping[str, str]
-    brake_lamps: bool = False
-    prompt: str = "v4"
+    brake_lamps: bool = False  # whether vehicles have brake lamps
+    prompt: str = "v4"  # default prompt version
+    # why scenes with left and right swapped are not valid scenes; None if they are
     one_sided: str | None = "nothing says that a mirrored scene is one of it"
+    # starts an episode that the harness does not simulate, `(scenario, seed)`; returns a `World`
     start: Callable[["Scenario", int], Any] | None = None
 
     @property

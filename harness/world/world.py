@@ -28,31 +28,19 @@ HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 @dataclass
 class World:
-    """One episode in the simulator.
+    """One episode in the simulator."""
 
-    Attributes:
-        scenario: the episode's scenario.
-        seed: seed of the episode's layout.
-        layout: its start.
-        road: highway-env's road with its vehicles, the ego first.
-        step: number of decisions taken so far.
-        frame: number of frames simulated so far.
-        outcome: the outcome so far; its `ended` says whether the episode is decided.
-        hard_brakings: how often the ego began to brake harder than HARD_BRAKING_MPS2.
-        braking_hard: whether it braked so hard in the last frame.
-        beacons: the beacons that still matter (`WorldState.beacons`).
-    """
-
-    scenario: Scenario
-    seed: int
-    layout: Layout
-    road: Any
-    step: int = 0
-    frame: int = 0
+    scenario: Scenario  # the episode's scenario
+    seed: int  # seed of the episode's layout
+    layout: Layout  # its start
+    road: Any  # highway-env's road with its vehicles, the ego first
+    step: int = 0  # number of decisions taken so far
+    frame: int = 0  # number of frames simulated so far
+    # the outcome so far; its `ended` says whether the episode is decided
     outcome: Outcome = field(default_factory=Outcome)
-    hard_brakings: int = 0
-    braking_hard: bool = False
-    beacons: tuple[Beacon, ...] = ()
+    hard_brakings: int = 0  # how often the ego began to brake harder than HARD_BRAKING_MPS2
+    braking_hard: bool = False  # whether it braked so hard in the last frame
+    beacons: tuple[Beacon, ...] = ()  # the beacons that still matter (`WorldState.beacons`)
 
     @classmethod
     def start(cls, scenario: Scenario, seed: int) -> "World":

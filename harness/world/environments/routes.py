@@ -26,17 +26,12 @@ TURNS = ("straight", "right", "back", "left")  # in quarters of a turn to the ri
 
 @dataclass(frozen=True)
 class Routes:
-    """A network's paths.
+    """A network's paths."""
 
-    Attributes:
-        network: highway-env's network.
-        paths: paths by approach (the node where they begin) and route (where they go, and on which lane).
-        ways: the paths of each route from left to right.
-    """
-
-    network: Any
+    network: Any  # highway-env's network
+    # paths by approach (the node where they begin) and route (where they go, and on which lane)
     paths: dict[PathKey, Path]
-    ways: dict[Route, tuple[PathKey, ...]]
+    ways: dict[Route, tuple[PathKey, ...]]  # the paths of each route from left to right
 
     def ahead(self, lane: Lane, plan: Sequence[Lane] | None) -> Route:
         """Return the roads that a vehicle in a lane will take by highway-env's rule and its plan, if any."""

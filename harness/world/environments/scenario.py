@@ -28,15 +28,11 @@ HALFWAY = 0.4  # share of the way to the goal at which the origin lies, the midd
 
 @dataclass(frozen=True)
 class Parameters(Common):
-    """The parameters of an environment.
+    """The parameters of an environment."""
 
-    Attributes:
-        helpers: number of helpers: other controlled vehicles first, then those nearest to the ego.
-    """
-
-    braking_mps2: float = 20.0  # highway-env's own controller has no limits
+    braking_mps2: float = 20.0  # hardest braking; highway-env's own controller has no limit
     acceleration_mps2: float = 20.0
-    helpers: int = 3
+    helpers: int = 3  # number of helpers: other controlled vehicles first, then those nearest to the ego
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -52,23 +48,14 @@ class Parameters(Common):
 
 @dataclass(frozen=True)
 class Place:
-    """The properties of an environment that are the same for every seed.
+    """The properties of an environment that are the same for every seed."""
 
-    Attributes:
-        routes: the paths of its network.
-        ends: where the network's lanes begin and end, m.
-        road: the harness's road.
-        actions: the ego's actions.
-        parameters: the scenario's parameters.
-        kind: name of the environment's class.
-    """
-
-    routes: Routes
-    ends: Mapping[Lane, tuple[float, ...]]
-    road: Road
-    actions: tuple[str, ...]
-    parameters: Parameters
-    kind: str
+    routes: Routes  # the paths of its network
+    ends: Mapping[Lane, tuple[float, ...]]  # where the network's lanes begin and end, m
+    road: Road  # the harness's road
+    actions: tuple[str, ...]  # the ego's actions
+    parameters: Parameters  # the scenario's parameters
+    kind: str  # name of the environment's class
 
 
 @lru_cache(maxsize=16)

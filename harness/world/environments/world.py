@@ -28,27 +28,18 @@ MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # limits of the ids in a record
 
 @dataclass
 class EnvironmentWorld(World):
-    """One episode in an environment.
+    """One episode in an environment."""
 
-    Attributes:
-        env: highway-env's environment.
-        constants: highway-env's class constants as this environment wants them.
-        here: properties that are the same for every seed.
-        everybody: its vehicles in the order of their ids, the ego first.
-        born: number of vehicles that have entered so far.
-        action: the action that was taken last.
-        taken: the frame and the name of each action.
-        failed: whether the environment has ended the episode without success.
-    """
-
-    env: Any = None
+    env: Any = None  # highway-env's environment
+    # highway-env's class constants as this environment wants them
     constants: Constants = field(default_factory=lambda: Constants({}))
-    here: Any = None
+    here: Any = None  # properties that are the same for every seed
+    # its vehicles in the order of their ids, the ego first
     everybody: list[Any] = field(default_factory=list)
-    born: int = 0
-    action: str = "IDLE"
-    taken: tuple[tuple[int, str], ...] = ()
-    failed: bool = False
+    born: int = 0  # number of vehicles that have entered so far
+    action: str = "IDLE"  # the action that was taken last
+    taken: tuple[tuple[int, str], ...] = ()  # the frame and the name of each action
+    failed: bool = False  # whether the environment has ended the episode without success
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "EnvironmentWorld":

@@ -34,44 +34,33 @@ SECTOR_REACH_M = (15.0, 60.0)  # stretch of the right lane before that point tha
 
 @dataclass(frozen=True)
 class Parameters(Common):
-    """The scenario's own dials. Pairs are bounds of a uniform draw.
+    """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
-    Attributes:
-        ego_speed_mps: speed at the start: 50 km/h.
-        ego_start_m: from the start to where the ego's way has run into the right lane.
-        cleared_m: where the ego has cleared, m beyond that point.
-        danger_share: probability that an episode holds a danger.
-        danger_offset_s: when a danger is where the ego comes into its lane, after a cruising ego.
-        main_mps: speed of cars on the main road, dangerous or not: 50 to 60 km/h.
-        left_share: probability of a car on the left lane at the same time.
-        before_share: probability of a car on the right lane that has passed.
-        before_offset_s: when it is where the ego comes into its lane, after a cruising ego.
-        late_share: probability of a car on the right lane that comes later than the critical headway of a
-            merge, 3.7 s (HCM 7, equation 31-50).
-        late_offset_s: when it is there, after a cruising ego.
-        wall_end_m: from the wall's end to where the ego's way has run into the right lane.
-        truck_offset_s: when the truck on the left lane is beside that point, after a cruising ego.
-        truck_mps: speed of the truck.
-        ahead_m: where a helper ahead starts, m beyond that point: within LiDAR's reach of a danger.
-        ahead_mps: its speed, not below that of who is behind it.
-    """
-
-    ego_speed_mps: float = 14.0
+    ego_speed_mps: float = 14.0  # speed at the start: 50 km/h
+    # from the start to where the ego's way has run into the right lane
     ego_start_m: tuple[float, float] = (58.0, 70.0)
-    cleared_m: float = 12.0
-    danger_share: float = 0.65
+    cleared_m: float = 12.0  # where the ego has cleared, m beyond that point
+    danger_share: float = 0.65  # probability that an episode holds a danger
+    # when a danger is where the ego comes into its lane, after a cruising ego
     danger_offset_s: tuple[float, float] = (-0.1, 0.5)
+    # speed of cars on the main road, dangerous or not: 50 to 60 km/h
     main_mps: tuple[float, float] = (14.0, 16.5)
-    left_share: float = 0.5
-    before_share: float = 0.4
+    left_share: float = 0.5  # probability of a car on the left lane at the same time
+    before_share: float = 0.4  # probability of a car on the right lane that has passed
+    # when it is where the ego comes into its lane, after a cruising ego
     before_offset_s: tuple[float, float] = (-3.2, -2.2)
+    # probability of a car on the right lane that comes later than the critical headway of a merge, 3.7 s (HCM
+    # 7, equation 31-50)
     late_share: float = 0.4
-    late_offset_s: tuple[float, float] = (5.5, 7.5)
+    late_offset_s: tuple[float, float] = (5.5, 7.5)  # when it is there, after a cruising ego
+    # from the wall's end to where the ego's way has run into the right lane
     wall_end_m: tuple[float, float] = (30.0, 42.0)
+    # when the truck on the left lane is beside that point, after a cruising ego
     truck_offset_s: tuple[float, float] = (2.6, 3.6)
-    truck_mps: tuple[float, float] = (13.0, 14.0)
+    truck_mps: tuple[float, float] = (13.0, 14.0)  # speed of the truck
+    # where a helper ahead starts, m beyond that point: within LiDAR's reach of a danger
     ahead_m: tuple[float, float] = (-10.0, 5.0)
-    ahead_mps: tuple[float, float] = (16.5, 17.5)
+    ahead_mps: tuple[float, float] = (16.5, 17.5)  # its speed, not below that of who is behind it
 
 
 @cache

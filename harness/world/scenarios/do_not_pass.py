@@ -34,43 +34,29 @@ CAR, TRUCK = SIZES_M["car"][0], SIZES_M["truck"][0]
 
 @dataclass(frozen=True)
 class Parameters(Common):
-    """The scenario's own dials. Pairs are bounds of a uniform draw.
+    """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
-    Attributes:
-        target_speeds_mps: up to 54 km/h.
-        speed_mps: of the ego and the truck at the start, and of the car behind: one of the target speeds.
-        ego_start_m: where the ego starts, m before the conflict zone, which is where it would be beside the
-            truck.
-        ahead_m: gap to the truck's front that the ego needs when it is back on its lane.
-        behind_m: an ego that has let go by what came is no farther behind the truck's rear.
-        danger_share: probability that a car comes in time to meet an ego that passes at once.
-        gap_m: from the ego to the truck, bumper to bumper.
-        oncoming_mps: speed of what comes, dangerous or not.
-        danger_s: when a danger would meet an ego that stays where it is.
-        late_share: probability of a harmless car that comes later.
-        late_s: when it would meet an ego that stays where it is: 9 s is what a deployed do-not-pass warning
-            takes for safe (Open-V2X).
-        leader_m: how far ahead of the truck the helper there is, bumper to bumper.
-        leader_mps: its speed: it has just passed.
-        follower_m: how far behind the ego the helper there is.
-    """
-
-    target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0)
+    target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0)  # up to 54 km/h
     time_limit_s: float = 12.0
     delay_allowance_s: float = 1.0
+    # of the ego and the truck at the start, and of the car behind: one of the target speeds
     speed_mps: float = 5.0
+    # where the ego starts, m before the conflict zone, which is where it would be beside the truck
     ego_start_m: tuple[float, float] = (28.0, 32.0)
-    ahead_m: float = 6.0
-    behind_m: float = 40.0
-    danger_share: float = 0.6
-    gap_m: tuple[float, float] = (8.0, 11.0)
-    oncoming_mps: tuple[float, float] = (12.0, 16.0)
-    danger_s: tuple[float, float] = (4.2, 5.9)
-    late_share: float = 0.4
+    ahead_m: float = 6.0  # gap to the truck's front that the ego needs when it is back on its lane
+    behind_m: float = 40.0  # an ego that has let go by what came is no farther behind the truck's rear
+    danger_share: float = 0.6  # probability that a car comes in time to meet an ego that passes at once
+    gap_m: tuple[float, float] = (8.0, 11.0)  # from the ego to the truck, bumper to bumper
+    oncoming_mps: tuple[float, float] = (12.0, 16.0)  # speed of what comes, dangerous or not
+    danger_s: tuple[float, float] = (4.2, 5.9)  # when a danger would meet an ego that stays where it is
+    late_share: float = 0.4  # probability of a harmless car that comes later
+    # when it would meet an ego that stays where it is: 9 s is what a deployed do-not-pass warning takes for
+    # safe (Open-V2X)
     late_s: tuple[float, float] = (15.0, 19.0)
+    # how far ahead of the truck the helper there is, bumper to bumper
     leader_m: tuple[float, float] = (20.0, 35.0)
-    leader_mps: tuple[float, float] = (11.0, 14.0)
-    follower_m: tuple[float, float] = (12.0, 20.0)
+    leader_mps: tuple[float, float] = (11.0, 14.0)  # its speed: it has just passed
+    follower_m: tuple[float, float] = (12.0, 20.0)  # how far behind the ego the helper there is
 
 
 @cache

@@ -34,45 +34,29 @@ LEFT, RIGHT = "left lane", "right lane"
 
 @dataclass(frozen=True)
 class Parameters(Common):
-    """The scenario's own dials. Pairs are bounds of a uniform draw.
+    """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
-    Attributes:
-        target_speeds_mps: 72 km/h, half of it, and standing.
-        speed_mps: everybody's at the start: motorway traffic that has come close together.
-        ego_start_m: where the ego starts, m before the conflict zone.
-        cleared_m: where it has passed, m behind the conflict zone.
-        danger_share: probability that the car beyond the van brakes.
-        headway_s: of the ego to the van, bumper to bumper. Below 1 s, half of a motorway's drivers in dense
-            traffic; at 1.5 s the van's own lamps come in time, and no message is needed.
-        lead_headway_s: of the van to the car before it: from 1.7 s on the van,
-            which brakes late, does not crash itself.
-        brakes_at_s: when that car begins to brake.
-        brakes_mps2: how hard: an emergency, 6 to 9 m/s2 (SUMO's defaults; NHTSA DOT HS 811 731: above 0.6 g).
-        beside_m: how far ahead of the ego's middle the car beside is.
-        front_m: how far ahead of the ego the helper on the left lane is.
-        slow_share: probability that the farthest car on the left lane slows down.
-        slow_m: how far ahead of the ego that car is.
-        slows_at_s: when it does.
-        slows_to_mps: down to which speed.
-    """
-
-    target_speeds_mps: tuple[float, ...] = (0.0, 10.0, 20.0)
+    target_speeds_mps: tuple[float, ...] = (0.0, 10.0, 20.0)  # 72 km/h, half of it, and standing
     time_limit_s: float = 14.0
     delay_allowance_s: float = 1.0
-    speed_mps: float = 20.0
-    ego_start_m: tuple[float, float] = (88.0, 92.0)
-    cleared_m: float = 45.0
-    danger_share: float = 0.65
+    speed_mps: float = 20.0  # everybody's at the start: motorway traffic that has come close together
+    ego_start_m: tuple[float, float] = (88.0, 92.0)  # where the ego starts, m before the conflict zone
+    cleared_m: float = 45.0  # where it has passed, m behind the conflict zone
+    danger_share: float = 0.65  # probability that the car beyond the van brakes
+    # of the ego to the van, bumper to bumper. Below 1 s, half of a motorway's drivers in dense traffic; at
+    # 1.5 s the van's own lamps come in time, and no message is needed
     headway_s: tuple[float, float] = (0.55, 0.75)
+    # of the van to the car before it: from 1.7 s on the van, which brakes late, does not crash itself
     lead_headway_s: tuple[float, float] = (1.7, 2.0)
-    brakes_at_s: tuple[float, float] = (0.1, 1.4)
+    brakes_at_s: tuple[float, float] = (0.1, 1.4)  # when that car begins to brake
+    # how hard: an emergency, 6 to 9 m/s2 (SUMO's defaults; NHTSA DOT HS 811 731: above 0.6 g)
     brakes_mps2: tuple[float, float] = (6.0, 8.0)
-    beside_m: tuple[float, float] = (-3.0, 4.0)
-    front_m: tuple[float, float] = (48.0, 60.0)
-    slow_share: float = 0.4
-    slow_m: tuple[float, float] = (85.0, 100.0)
-    slows_at_s: tuple[float, float] = (0.5, 2.5)
-    slows_to_mps: tuple[float, float] = (14.0, 16.0)
+    beside_m: tuple[float, float] = (-3.0, 4.0)  # how far ahead of the ego's middle the car beside is
+    front_m: tuple[float, float] = (48.0, 60.0)  # how far ahead of the ego the helper on the left lane is
+    slow_share: float = 0.4  # probability that the farthest car on the left lane slows down
+    slow_m: tuple[float, float] = (85.0, 100.0)  # how far ahead of the ego that car is
+    slows_at_s: tuple[float, float] = (0.5, 2.5)  # when it does
+    slows_to_mps: tuple[float, float] = (14.0, 16.0)  # down to which speed
 
 
 @cache

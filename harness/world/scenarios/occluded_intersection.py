@@ -28,46 +28,36 @@ SPARE_S = 0.15  # more than rounding, between the truck's tail and a car that cr
 
 @dataclass(frozen=True)
 class Parameters(Common):
-    """The scenario's own dials. Pairs are bounds of a uniform draw.
+    """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
-    Attributes:
-        ego_speed_mps: speed at the start.
-        ego_start_m: distance from the start to the centroid of the conflict zone.
-        time_limit_s: an ego that has not cleared the intersection by then never will.
-        delay_allowance_s: how much later than the full-view driver an ego may clear the intersection. A
-            needless SLOWER costs about 0.65 s: one is forgiven, two are not.
-        cleared_m: arc length behind the junction's exit at which the ego's centre has cleared it.
-        danger_share: probability that an episode holds a danger.
-        sector_shares: probability of left, right, oncoming, given a danger (`mechanism`: .40/.27/.33).
-        danger_offset_s: when a danger from a side reaches the conflict point, after a cruising ego would; as
-            soon as the truck has passed, if that is later.
-        crossing_speed_mps: speed of a car from a side, dangerous or not.
-        truck_offset_s: when the truck passes where an oncoming danger would meet the ego, after a cruising
-            ego would.
-        truck_speed_mps: speed of the truck, and of an oncoming car, dangerous or not.
-        follow_m: from the truck's centre to that of an oncoming danger behind it.
-        corner_m: distance of a building's walls from the centre lines.
-        late_share: probability of a harmless car that comes as a danger would, from any sector, but later.
-        late_offset_s: when that car reaches the conflict point, after a cruising ego would.
-        helper_start_m: how far behind the junction helpers are at the start.
-        helper_speed_mps: speed at which they leave.
-    """
-
-    ego_speed_mps: float = 14.0
+    time_limit_s: float = 10.0  # an ego that has not cleared the intersection by then never will
+    # how much later than the full-view driver an ego may clear the intersection. A needless SLOWER costs
+    # about 0.65 s: one is forgiven, two are not
+    delay_allowance_s: float = 1.0
+    ego_speed_mps: float = 14.0  # speed at the start
+    # distance from the start to the centroid of the conflict zone
     ego_start_m: tuple[float, float] = (61.0, 69.0)
-    cleared_m: float = 2.5
-    danger_share: float = 0.75
+    cleared_m: float = 2.5  # arc length behind the junction's exit at which the ego's centre has cleared it
+    danger_share: float = 0.75  # probability that an episode holds a danger
+    # probability of left, right, oncoming, given a danger (`mechanism`: .40/.27/.33)
     sector_shares: tuple[float, float, float] = (0.40, 0.27, 0.33)
+    # when a danger from a side reaches the conflict point, after a cruising ego would; as soon as the truck
+    # has passed, if that is later
     danger_offset_s: tuple[float, float] = (-0.4, 0.9)
-    crossing_speed_mps: tuple[float, float] = (8.5, 12.5)
+    crossing_speed_mps: tuple[float, float] = (8.5, 12.5)  # speed of a car from a side, dangerous or not
+    # when the truck passes where an oncoming danger would meet the ego, after a cruising ego would
     truck_offset_s: tuple[float, float] = (-2.3, -1.9)
+    # speed of the truck, and of an oncoming car, dangerous or not
     truck_speed_mps: tuple[float, float] = (7.5, 8.5)
+    # from the truck's centre to that of an oncoming danger behind it
     follow_m: tuple[float, float] = (10.5, 13.0)
-    corner_m: tuple[float, float] = (8.0, 15.0)
+    corner_m: tuple[float, float] = (8.0, 15.0)  # distance of a building's walls from the centre lines
+    # probability of a harmless car that comes as a danger would, from any sector, but later
     late_share: float = 0.4
+    # when that car reaches the conflict point, after a cruising ego would
     late_offset_s: tuple[float, float] = (4.0, 7.0)
-    helper_start_m: tuple[float, float] = (2.0, 8.0)
-    helper_speed_mps: tuple[float, float] = (4.0, 7.0)
+    helper_start_m: tuple[float, float] = (2.0, 8.0)  # how far behind the junction helpers are at the start
+    helper_speed_mps: tuple[float, float] = (4.0, 7.0)  # speed at which they leave
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:

@@ -37,46 +37,31 @@ VAN = SIZES_M["van"][0]
 
 @dataclass(frozen=True)
 class Parameters(Common):
-    """The scenario's own dials. Pairs are bounds of a uniform draw.
+    """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
-    Attributes:
-        target_speeds_mps: up to a driver's pace in a car park.
-        ego_speed_mps: speed at the start.
-        ego_start_m: how far before the pull-out's beginning the ego starts.
-        cleared_m: where the ego has cleared, m beyond the pull-out's end.
-        danger_share: probability that an episode holds a danger.
-        danger_offset_s: when a danger is where the ego comes into the lane, after a cruising ego.
-        lane_mps: speed of a car in the lane, dangerous or not: 8 to 28 km/h is what crossing-traffic alerts
-            cover, 30 km/h and more what a street has.
-        late_share: probability of a harmless car that comes from behind as well, but later.
-        late_offset_s: when it is where the ego comes into the lane, after a cruising ego.
-        oncoming_share: probability of a car on the lane for the other direction.
-        oncoming_m: where it starts, m ahead of the ego.
-        behind_m: gap from the ego's rear to the van behind it, at the start.
-        vans_m: gap between two vans of the row.
-        ahead_m: gap from the pull-out's end to the van ahead.
-        opposite_m: where the car that is parked opposite stands, m before the pull-out's end.
-        passed_m: where the car that has just driven past is, m beyond the pull-out's end.
-        passed_mps: its speed.
-    """
-
-    target_speeds_mps: tuple[float, ...] = (0.0, 2.0, 4.0)
-    ego_speed_mps: float = 4.0
-    ego_start_m: tuple[float, float] = (2.0, 8.0)
-    cleared_m: float = 6.0
-    danger_share: float = 0.65
+    target_speeds_mps: tuple[float, ...] = (0.0, 2.0, 4.0)  # up to a driver's pace in a car park
+    ego_speed_mps: float = 4.0  # speed at the start
+    ego_start_m: tuple[float, float] = (2.0, 8.0)  # how far before the pull-out's beginning the ego starts
+    cleared_m: float = 6.0  # where the ego has cleared, m beyond the pull-out's end
+    danger_share: float = 0.65  # probability that an episode holds a danger
+    # when a danger is where the ego comes into the lane, after a cruising ego
     danger_offset_s: tuple[float, float] = (-0.5, 0.3)
+    # speed of a car in the lane, dangerous or not: 8 to 28 km/h is what crossing-traffic alerts cover, 30
+    # km/h and more what a street has
     lane_mps: tuple[float, float] = (8.0, 11.0)
-    late_share: float = 0.5
+    late_share: float = 0.5  # probability of a harmless car that comes from behind as well, but later
+    # when it is where the ego comes into the lane, after a cruising ego
     late_offset_s: tuple[float, float] = (8.0, 10.5)
-    oncoming_share: float = 0.5
-    oncoming_m: tuple[float, float] = (30.0, 60.0)
-    behind_m: tuple[float, float] = (0.8, 2.0)
-    vans_m: tuple[float, float] = (0.8, 1.6)
-    ahead_m: tuple[float, float] = (2.0, 8.0)
+    oncoming_share: float = 0.5  # probability of a car on the lane for the other direction
+    oncoming_m: tuple[float, float] = (30.0, 60.0)  # where it starts, m ahead of the ego
+    behind_m: tuple[float, float] = (0.8, 2.0)  # gap from the ego's rear to the van behind it, at the start
+    vans_m: tuple[float, float] = (0.8, 1.6)  # gap between two vans of the row
+    ahead_m: tuple[float, float] = (2.0, 8.0)  # gap from the pull-out's end to the van ahead
+    # where the car that is parked opposite stands, m before the pull-out's end
     opposite_m: tuple[float, float] = (5.0, 20.0)
+    # where the car that has just driven past is, m beyond the pull-out's end
     passed_m: tuple[float, float] = (10.0, 20.0)
-    passed_mps: tuple[float, float] = (8.0, 11.0)
+    passed_mps: tuple[float, float] = (8.0, 11.0)  # its speed
 
 
 @cache

@@ -43,49 +43,37 @@ SEEN_AS = {"own": "south", "right": "east", "oncoming": "north", "left": "west"}
 
 @dataclass(frozen=True)
 class Parameters(Common):
-    """The scenario's own dials. Pairs are bounds of a uniform draw.
-
-    Attributes:
-        ego_speed_mps: speed at the start: 29 km/h, which a circle of 22 m allows (NCHRP 672: 8.76 R^0.386).
-        ego_start_m: from the start to where the ego's way joins the ring.
-        danger_share: probability that an episode holds a danger.
-        sector_shares: probability of left, oncoming, given a danger.
-        danger_offset_s: when a danger passes where the ego enters, after a cruising ego would.
-        ring_mps: speed of everybody on the ring (NCHRP 672: 7.7 m/s for a circle of 20 m).
-        leaver_share: probability, without a danger, of a car in its place that leaves at the ego's arm.
-        before_share: probability of a car that leaves there shortly before.
-        before_offset_s: when that car would pass where the ego enters if it went on.
-        late_share: probability of a car that comes as a danger would, but later than the critical headway of
-            4.98 s (HCM 7, equation 22-1) allows the ego to be in its way.
-        late_offset_s: when it passes where the ego enters, after a cruising ego would.
-        mound_m: radius of the planted part of the island.
-        hedge_end_m: from the ring's centre to the end of the hedge.
-        hedge_half_m: half its width; the splitter island is 4 m wide at its narrowest.
-        helper_south_m: how far behind the ring's edge the helper that left at the ego's arm starts.
-        helper_west_m: how far the one that left at the west arm is.
-        helper_ahead_m: how far beyond the point of entry the one that entered before the ego is.
-        helper_mps: speed of helpers.
-    """
+    """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 4.0, 8.0)
+    # speed at the start: 29 km/h, which a circle of 22 m allows (NCHRP 672: 8.76 R^0.386)
     ego_speed_mps: float = 8.0
-    ego_start_m: tuple[float, float] = (33.0, 39.0)
-    danger_share: float = 0.65
-    sector_shares: tuple[float, float] = (0.5, 0.5)
+    ego_start_m: tuple[float, float] = (33.0, 39.0)  # from the start to where the ego's way joins the ring
+    danger_share: float = 0.65  # probability that an episode holds a danger
+    sector_shares: tuple[float, float] = (0.5, 0.5)  # probability of left, oncoming, given a danger
+    # when a danger passes where the ego enters, after a cruising ego would
     danger_offset_s: tuple[float, float] = (0.0, 0.6)
+    # speed of everybody on the ring (NCHRP 672: 7.7 m/s for a circle of 20 m)
     ring_mps: tuple[float, float] = (6.8, 7.8)
+    # probability, without a danger, of a car in its place that leaves at the ego's arm
     leaver_share: float = 0.6
-    before_share: float = 0.4
+    before_share: float = 0.4  # probability of a car that leaves there shortly before
+    # when that car would pass where the ego enters if it went on
     before_offset_s: tuple[float, float] = (-1.8, -1.3)
+    # probability of a car that comes as a danger would, but later than the critical headway of 4.98 s (HCM 7,
+    # equation 22-1) allows the ego to be in its way
     late_share: float = 0.4
+    # when it passes where the ego enters, after a cruising ego would
     late_offset_s: tuple[float, float] = (5.0, 7.0)
-    mound_m: tuple[float, float] = (12.0, 15.0)
-    hedge_end_m: tuple[float, float] = (24.0, 32.0)
-    hedge_half_m: float = 1.5
+    mound_m: tuple[float, float] = (12.0, 15.0)  # radius of the planted part of the island
+    hedge_end_m: tuple[float, float] = (24.0, 32.0)  # from the ring's centre to the end of the hedge
+    hedge_half_m: float = 1.5  # half its width; the splitter island is 4 m wide at its narrowest
+    # how far behind the ring's edge the helper that left at the ego's arm starts
     helper_south_m: tuple[float, float] = (16.0, 22.0)
-    helper_west_m: tuple[float, float] = (6.0, 12.0)
+    helper_west_m: tuple[float, float] = (6.0, 12.0)  # how far the one that left at the west arm is
+    # how far beyond the point of entry the one that entered before the ego is
     helper_ahead_m: tuple[float, float] = (8.0, 14.0)
-    helper_mps: tuple[float, float] = (5.5, 7.0)
+    helper_mps: tuple[float, float] = (5.5, 7.0)  # speed of helpers
 
 
 @cache
