@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 from evaluating import run, spec_of, with_ego
-from shipped import PROMPTS
 from tokenizers import Tokenizer, models
 
 from harness import __version__, cli
@@ -21,6 +20,7 @@ from harness.core import work
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.run import evaluate
+from harness.prompts import versions
 
 HEAVY = (
     "numpy", "pandas", "scipy", "torch", "transformers", "tokenizers", "jinja2", "jsonschema", "json_repair",
@@ -202,7 +202,7 @@ def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, sm
 
 def test_what_says_json_is_json(harness: Harness, small_path: Path) -> None:
     listed = json.loads(harness("prompt", "list", "--json").out)
-    assert [p["version"] for p in listed] == PROMPTS
+    assert [p["version"] for p in listed] == versions.names()
     args = ("prompt", "show", "v2", "--scene", "00001-0", "--dataset", small_path)
     shown = json.loads(harness(*args, "--json").out)
     assert list(shown) == ["v1", "v2", "v3", "v4"]
@@ -231,8 +231,7 @@ def test_the_version_is_printed(harness: Harness) -> None:
 
 def test_people_read_the_same_in_eighty_columns(harness: Harness, small_path: Path) -> None:
     said = harness("prompt", "list")
-    versions = PROMPTS
-    assert [line.split()[:2] for line in said.out.splitlines()] == [[v, "released"] for v in versions]
+    assert [line.split()[:2] for line in said.out.splitlines()] == [[v, "released"] for v in versions.names()]
     assert max(map(len, said.out.splitlines())) <= 80
     said = harness("prompt", "show", "v2", "--scene", "00001-0", "--viewer", "v1", "--dataset", small_path)
     assert said.out.startswith("--- v1 system\nYou drive car v1")

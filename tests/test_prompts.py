@@ -28,11 +28,8 @@ from harness.world import scenarios
 GOLDEN = Path(__file__).parent / "golden"
 VERSIONS = prompts.names()
 CROSSING = scenarios.get(scenarios.DEFAULT).prompt_words
-LISTS_NOBODY = (
-    "v8",
-    "v9",
-    "v10",
-)  # a picture is all that v8 says of others; v9 and v10 say who is in conflict
+LISTS_NOBODY = [v for v in VERSIONS if "in objects" not in prompts.load(v).texts["ego"]]
+DRAFT = "my-draft"  # no version that ships is called so
 ID = re.compile(r"\bv[1-9][0-9]?\b")
 
 
@@ -110,18 +107,13 @@ WORDS = "{{ graph }} {% raw %} </s> \x1b[31m \n ${x} %s {# #} \u202e \U0001f697"
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("role", prompts.ROLES)
 def test_hostile_words_in_a_graph_stay_words(version: str, role: str) -> None:
-    node = {**TRUCK, "id": WORDS, "lane": WORDS, "type": WORDS}
-    seen = graph(role, [node], [{**STANDING, "with": WORDS}])
-    messages = ({**MESSAGES[0], "sender": WORDS, "evidence": WORDS},) if role == "ego" else ()
-    said = text_of(prompts.load(version).render(seen, ACTIONS, messages, CROSSING))
-    assert said.count(WORDS) >= {
-        ("ego", "v7"): 2,
-        ("helper", "v7"): 2,
-        ("ego", "v8"): 1,
-        ("helper", "v8"): 0,
-        **dict.fromkeys([("ego", "v9"), ("ego", "v10")], 2),
-        **dict.fromkeys([("helper", "v9"), ("helper", "v10")], 1),
-    }.get((role, version), 3)
+    def count(words: str) -> int:
+        node = {**TRUCK, "id": words, "lane": words, "type": words}
+        seen = graph(role, [node], [{**STANDING, "with": words}])
+        messages = ({**MESSAGES[0], "sender": words, "evidence": words},) if role == "ego" else ()
+        return text_of(prompts.load(version).render(seen, ACTIONS, messages, CROSSING)).count(words)
+
+    assert count(WORDS) == count("plain-words".ljust(len(WORDS), "-"))
 
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
@@ -182,14 +174,14 @@ Edit = Callable[[str, str, str], prompts.Prompt]
 
 @pytest.fixture
 def draft(copied: Path) -> Edit:
-    """A draft `v99`, which is `v2` with one piece of one file replaced."""
-    shutil.copytree(copied / "v2", copied / "v99")
+    """A draft, which is `v2` with one piece of one file replaced."""
+    shutil.copytree(copied / "v2", copied / DRAFT)
 
     def edit(file: str, old: str, new: str) -> prompts.Prompt:
-        text = (copied / "v99" / file).read_text(encoding="utf-8")
+        text = (copied / DRAFT / file).read_text(encoding="utf-8")
         assert old in text
-        (copied / "v99" / file).write_text(text.replace(old, new), encoding="utf-8")
-        return prompts.load("v99", copied)
+        (copied / DRAFT / file).write_text(text.replace(old, new), encoding="utf-8")
+        return prompts.load(DRAFT, copied)
 
     return edit
 
@@ -223,7 +215,7 @@ def test_a_template_that_fails_or_reaches_out_is_one_line(draft: Edit, template:
     with pytest.raises(UserError) as caught:
         prompt.render(graph("ego", [CAR], []), ACTIONS)
     message = one_line(caught)
-    assert message.startswith("prompt v99 ego.j2 does not render: ")
+    assert message.startswith(f"prompt {DRAFT} ego.j2 does not render: ")
     assert said in message
     assert "may use graph, actions, objects, more, conflicts, messages" in message
 
@@ -233,7 +225,7 @@ def test_a_template_that_is_no_jinja_is_one_line_with_its_number(draft: Edit, te
     prompt = draft("helper.j2", "Message to", f"{template} Message to")
     with pytest.raises(UserError) as caught:
         prompt.render(graph("ego", [], []), ACTIONS)
-    assert re.match(r"prompt v99 helper\.j2 line \d+ is no Jinja: ", one_line(caught))
+    assert re.match(rf"prompt {DRAFT} helper\.j2 line \d+ is no Jinja: ", one_line(caught))
 
 
 def test_a_template_without_a_block_says_which_it_needs(draft: Edit) -> None:
@@ -245,7 +237,11 @@ def test_a_template_without_a_block_says_which_it_needs(draft: Edit) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("max_objects = 3", "max_object = 3", "unknown key in prompt v99 prompt.toml 'max_object'; did you"),
+        (
+            "max_objects = 3",
+            "max_object = 3",
+            "unknown key in prompt my-draft prompt.toml 'max_object'; did you",
+        ),
         ("max_objects = 3", 'max_objects = "3"', "max_objects = '3'; allowed: int"),
         ("max_objects = 3", "max_objects = true", "max_objects = True; allowed: int"),
         ("max_objects = 3", "max_objects = 0", "max_objects = 0; allowed: 1 or more"),
@@ -263,18 +259,18 @@ def test_a_prompt_toml_with_a_mistake_is_one_line(draft: Edit, old: str, new: st
     with pytest.raises(UserError) as caught:
         draft("prompt.toml", old, new)
     message = one_line(caught)
-    assert "prompt v99 prompt.toml" in message
+    assert f"prompt {DRAFT} prompt.toml" in message
     assert said in message
 
 
 def test_a_missing_or_unreadable_template_is_one_line(copied: Path) -> None:
-    shutil.copytree(copied / "v2", copied / "v99")
-    (copied / "v99" / "helper.j2").write_bytes(b"\xff\xfe")
+    shutil.copytree(copied / "v2", copied / DRAFT)
+    (copied / DRAFT / "helper.j2").write_bytes(b"\xff\xfe")
     with pytest.raises(UserError, match=r"helper\.j2 cannot be read"):
-        prompts.load("v99", copied)
-    (copied / "v99" / "helper.j2").unlink()
+        prompts.load(DRAFT, copied)
+    (copied / DRAFT / "helper.j2").unlink()
     with pytest.raises(UserError, match=r"helper\.j2 cannot be read: .*No such file"):
-        prompts.load("v99", copied)
+        prompts.load(DRAFT, copied)
 
 
 @pytest.mark.parametrize("name", ["v22", "", ".", "..", "../prompts/v2", "v2/", "\x1b[31m", "v" * 5000])
@@ -307,10 +303,10 @@ def test_every_version_here_is_released() -> None:
 def test_a_version_says_whether_reasons_come_first_and_v1_was_released_before_it_could(copied: Path) -> None:
     asked = {name: prompts.load(name).reasons_first for name in ("v1", "v2", "paper")}
     assert asked == {"v1": ("ego", "helper"), "v2": (), "paper": ("ego",)}
-    shutil.copytree(copied / "v2", copied / "v99")
-    toml = copied / "v99/prompt.toml"
+    shutil.copytree(copied / "v2", copied / DRAFT)
+    toml = copied / DRAFT / "prompt.toml"
     toml.write_text(toml.read_text(encoding="utf-8") + 'reasons_first = ["helper"]\n', encoding="utf-8")
-    assert prompts.load("v99", copied).reasons_first == ("helper",)
+    assert prompts.load(DRAFT, copied).reasons_first == ("helper",)
 
 
 @pytest.mark.parametrize(
@@ -341,7 +337,7 @@ def test_reasons_before_the_answer_are_a_repair_only_if_the_prompt_did_not_ask(
         assert answer.repairs == (() if answer.status == "strict" else ("prose_around",))
 
 
-@pytest.mark.parametrize("version", ["v99", "v1.1", "über 'v'"])
+@pytest.mark.parametrize("version", ["no-such-version", "v1.1", "über 'v'"])
 def test_a_draft_may_change_until_it_is_locked(version: str, copied: Path) -> None:
     shutil.copytree(copied / "v2", copied / version)
     changed = copied / version / "ego.j2"
@@ -404,8 +400,7 @@ def test_every_prompt_keeps_its_token_budget(
     prompt, count = prompts.load(version), counter(vocabulary)
     assert count is not None
     least, most = prompt.token_budget
-    budgets = {"v6": (400, 1200), "v9": (150, 400), "v10": (400, 900)}
-    assert (least, most) == budgets.get(version, (200, 400))
+    assert most <= 400 or prompt.examples
     for scene in scenes_of(small):
         for viewer, seen in scene.record["graphs"].items():
             if messages and seen["role"] == "helper":

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from shipped import PROMPTS
 
 from harness.backends import cards
 from harness.core import resources
@@ -47,12 +46,13 @@ def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Pat
 def test_its_own_are_found_beside_those_that_ship_and_only_there(
     harness: Harness, project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert prompts.names() == ["mine", *PROMPTS]
+    ship = prompts.names(resources.folder("prompts"))
+    assert prompts.names() == sorted(["mine", *ship])
     assert prompts.load("mine").texts == prompts.load("v3").texts
     assert not prompts.load("mine").released
     assert {"my-model", "proxy"} <= set(cards.names())
     monkeypatch.chdir(project.parent)
-    assert prompts.names() == PROMPTS
+    assert prompts.names() == ship
     assert "my-model" not in cards.names()
 
 
