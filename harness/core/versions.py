@@ -3,7 +3,7 @@
 import platform
 from collections.abc import Sequence
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib import metadata
 from typing import Any
 
 from harness import __version__
@@ -12,13 +12,16 @@ from harness.core.kept import code_sha256
 PACKAGES = ("numpy", "scipy", "jinja2", "highway-env", "torch", "transformers", "llama-cpp-python")
 
 
+_version = cache(metadata.version)
+
+
 def versions(packages: Sequence[str] = PACKAGES) -> Any:
     """Return the versions of the harness, Python, the platform and those packages that are installed."""
     installed = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
     for name in packages:
         try:
-            installed[name] = version(name)
-        except PackageNotFoundError:
+            installed[name] = _version(name)
+        except metadata.PackageNotFoundError:
             continue
     return installed
 

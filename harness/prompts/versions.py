@@ -9,7 +9,7 @@ Released versions are pinned by digest in `prompts/released.toml`: a changed tex
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -32,6 +32,7 @@ from harness.prompts.template import Template
 from harness.world.scenario import Scenario
 
 Graph = Mapping[str, Any]
+_compiled = lru_cache(maxsize=64)(Template)  # a process may load a version many times
 FILES = ("ego.j2", "helper.j2", "prompt.toml")
 NO_WORDS: Mapping[str, str] = MappingProxyType({})
 # Digest of v1, which asks for reasons first and was released before prompt.toml could say so.
@@ -102,7 +103,7 @@ class Prompt:
         compiled = {}
         for role, text in self.texts.items():
             try:
-                compiled[role] = Template(text)
+                compiled[role] = _compiled(text)
             except TemplateSyntaxError as error:
                 raise UserError(
                     f"prompt {self.version} {role}.j2 line {error.lineno} is no Jinja: "
