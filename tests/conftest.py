@@ -3,9 +3,13 @@
 import fcntl
 import gc
 import os
+import resource
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Generator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -32,6 +36,13 @@ sys.dont_write_bytecode = False
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
+# What tests write need not outlast a power cut. Processes that they start are as they are.
+os.fsync = lambda fd: None
+
+# Collecting makes much and drops little: a search for cycles finds none, for a fifth of the time.
+gc.disable()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests first: the last tests are short, and no worker waits long for another."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
@@ -43,6 +54,64 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 10, 10)
+    gc.enable()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    what = "fail a test that is not `slow` and takes more CPU seconds, with the fixtures that it alone has"
+    parser.addoption("--cpu-limit", type=float, metavar="S", help=what)
+
+
+ALONE_S = 0.01  # what `slowness` works on takes on a core of a server of 2023 that does nothing else
+BEGUN = pytest.StashKey[tuple[float, int]]()  # CPU seconds and imported modules at the start of a test
+SHARED = SimpleNamespace(cpu_s=0.0)  # what fixtures took which several tests have
+
+
+def cpu_s() -> float:
+    """CPU seconds of this process and of those that it started and that have ended."""
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + ended.ru_utime + ended.ru_stime
+
+
+def slowness() -> float:
+    """How many times as long a piece of work takes now as on a core of its own; other work shares caches."""
+
+    def work_s() -> float:
+        start = time.process_time()
+        sorted(str(n) for n in range(100_000))
+        return time.process_time() - start
+
+    return max(1.0, min(work_s() for _ in range(3)) / ALONE_S)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Generator[None, Any, Any]:
+    start, before = cpu_s(), SHARED.cpu_s
+    try:
+        return (yield)
+    finally:
+        if fixturedef.scope != "function":
+            SHARED.cpu_s = before + cpu_s() - start
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item: pytest.Item) -> Generator[None, Any, Any]:
+    item.stash[BEGUN] = cpu_s() - SHARED.cpu_s, len(sys.modules)
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
+    """Fail who takes too long. Who imports packages is let off: it does so for all who come after."""
+    report = yield
+    limit = item.config.getoption("cpu_limit")
+    if limit and call.when == "call" and report.passed and not item.get_closest_marker("slow"):
+        start, modules = item.stash[BEGUN]
+        took = cpu_s() - SHARED.cpu_s - start
+        if took > limit and len(sys.modules) < modules + 20 and took > limit * slowness():
+            report.outcome = "failed"
+            report.longrepr = f"{took:.2f} CPU s, allowed {limit}: make it smaller, or mark it slow"
+    return report
 
 
 @pytest.fixture(scope="session", autouse=True)
