@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
-from harness.core.figures import interval
+from harness.core.figures import shown
 from harness.evaluate.trial import ROLES, Answers, described
 from harness.prompts import versions as prompts
 from harness.report.drawing.colours import CONDITIONS, GREY
@@ -134,7 +134,7 @@ def percent(score: Score | None) -> str:
     """A score in percent over its interval."""
     if score is None:
         return "–"
-    return interval(score.value, score.low, score.high, 100).replace(" [", "<br>[").replace(", ", ",&nbsp;")
+    return shown(score).replace(" [", "<br>[").replace(", ", ",&nbsp;")
 
 
 def answers(runs: dict[Row, Run], said: dict[Row, list[Answers]]) -> str:

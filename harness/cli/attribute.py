@@ -9,7 +9,7 @@ from harness.cli import options
 from harness.cli.estimates import WIDTH, echo_json, table
 from harness.cli.progress import bar
 from harness.core.errors import printable
-from harness.core.figures import as_mapping, shown
+from harness.core.figures import Unit, as_mapping, shown
 
 MOST = 100_000
 USUAL = "6g"
@@ -62,7 +62,7 @@ def command(
             (
                 r.kind,
                 r.role,
-                shown(r.shift, 1, 2),
+                shown(r.shift, Unit(decimals=2)),
                 shown(r.flips),
                 f"{100 * r.failed.value:.1f}",
                 str(r.shift.n),

@@ -10,7 +10,7 @@ from harness.cli import options
 from harness.cli.estimates import echo_json, echo_wrong, table
 from harness.core import resources
 from harness.core.errors import UserError, printable, unknown
-from harness.core.figures import as_mapping, known, shown
+from harness.core.figures import Unit, as_mapping, known, shown
 
 if TYPE_CHECKING:
     from harness.radio.channel import Channel
@@ -186,8 +186,8 @@ def check(
             [
                 (
                     f"{w.distance_m:g} m",
-                    shown(w.mean_s, 1.0, 3),
-                    shown(w.p95_s, 1.0, 2),
+                    shown(w.mean_s, Unit("s", 3)),
+                    shown(w.p95_s, Unit("s", 2)),
                     f"{w.independent_s:.3f}",
                 )
                 for w in waits

@@ -12,7 +12,7 @@ from harness.cli.estimates import console, echo_json, table
 from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.core.errors import UserError, printable, unknown
-from harness.core.figures import as_mapping, shown
+from harness.core.figures import PLAIN, as_mapping, shown
 
 if TYPE_CHECKING:
     from harness.studies.rank import Standing
@@ -176,7 +176,7 @@ def _table(episodes: int, standings: dict[str, "Standing"]) -> None:
     rows = []
     for driver, s in standings.items():
         agreement = f"{100 * s.agreement.value:.0f}"
-        rows.append((driver, shown(s.frozen), shown(s.live), shown(s.difference_points, 1.0), agreement))
+        rows.append((driver, shown(s.frozen), shown(s.live), shown(s.difference_points, PLAIN), agreement))
     table(heads, rows)
     text = console()
     text.print(f"n = {episodes} episodes; same: share of them that end alike, frozen and in closed loop")

@@ -11,7 +11,7 @@ from harness.cli import options
 from harness.cli.estimates import echo_json, echo_wrong, table
 from harness.core import resources
 from harness.core.errors import UserError, printable
-from harness.core.figures import as_mapping, known, shown
+from harness.core.figures import Unit, as_mapping, known, shown
 
 if TYPE_CHECKING:
     from harness.core.statistics import Estimate
@@ -155,7 +155,7 @@ def check(
             (
                 each.role,
                 scales[each.what][0],
-                shown(each.measured, scales[each.what][1]),
+                shown(each.measured, Unit(factor=scales[each.what][1])),
                 _shown(each.stated * scales[each.what][1], 1),
                 str(each.measured.n),
             )
@@ -227,8 +227,8 @@ def measure(
     table(
         ["meter", "idle W", "asking W", "J an answer", "J above idling"],
         [
-            (printable(each.meter), f"{each.idle_watts:.2f}", shown(each.watts, 1.0, 2),
-             shown(each.answer_j, 1.0, 3), shown(each.more_j, 1.0, 3))
+            (printable(each.meter), f"{each.idle_watts:.2f}", shown(each.watts, Unit("W", 2)),
+             shown(each.answer_j, Unit("J", 3)), shown(each.more_j, Unit("J", 3)))
             for each in drawn
         ],
     )  # fmt: skip
@@ -281,4 +281,4 @@ def _share(estimate: "Estimate") -> str:
 
 
 def _interval(estimate: "Estimate") -> str:
-    return "unknown" if estimate.value != estimate.value else shown(estimate, 1.0, 2)
+    return "unknown" if estimate.value != estimate.value else shown(estimate, Unit("J", 2))

@@ -8,7 +8,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import WIDTH, echo_json, echo_wrong
 from harness.core.errors import UserError, printable
-from harness.core.figures import interval
+from harness.core.figures import Unit, shown
 from harness.runs.listing import SUCCESS
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def command(
         for line in group.lines:
             value = n = "–"
             if score := line.score:
-                value, n = interval(score.value, score.low, score.high, factor, decimals), str(score.n)
+                value, n = shown(score, Unit(suffix.strip(), decimals, factor)), str(score.n)
             who = printable(line.run.manifest.variant, VARIANT)
             typer.echo(f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}")
     for name, error in wrong.items():

@@ -9,7 +9,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import WIDTH, echo_json
 from harness.core.errors import printable
-from harness.core.figures import interval
+from harness.core.figures import PERCENT
 
 if TYPE_CHECKING:
     from harness.runs.listing import Listed
@@ -48,5 +48,4 @@ def _outcome(run: "Listed") -> str:
         return f"{run.state}: {run.why}"
     if run.success is None:
         return ""
-    low, high = (float("nan") if end is None else end for end in (run.low, run.high))
-    return f"{printable(run.condition, 24)} {interval(run.success, low, high, 100)} %"
+    return f"{printable(run.condition, 24)} {PERCENT.interval(run.success, run.low, run.high)} %"

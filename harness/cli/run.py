@@ -13,7 +13,7 @@ import typer
 from harness.cli.estimates import console, table
 from harness.core import work
 from harness.core.errors import UserError, printable
-from harness.core.figures import interval
+from harness.core.figures import Unit, shown
 from harness.core.formats import WORK
 
 if TYPE_CHECKING:
@@ -40,8 +40,8 @@ class Column:
         if score is None or score.value is None:
             return "-"
         if self.interval:
-            return interval(score.value, score.low, score.high, self.scale)
-        return f"{score.value * self.scale:.1f}{self.unit}"
+            return shown(score, Unit(factor=self.scale))
+        return Unit(self.unit.strip(), factor=self.scale).text(score.value)
 
 
 @dataclass(frozen=True)

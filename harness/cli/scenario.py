@@ -9,7 +9,7 @@ from harness.cli.estimates import console, echo_json, echo_wrong, table
 from harness.cli.progress import bar
 from harness.core import resources
 from harness.core.errors import UserError, printable
-from harness.core.figures import as_mapping, interval, shown
+from harness.core.figures import Unit, as_mapping, shown
 from harness.core.seeds import FIRST, purpose, stated
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ def _print(found: "Audit") -> None:
 
     table(
         ("predicted from the ego's view", "AUC [95 % CI]"),
-        [(question, interval(auc.value, auc.low, auc.high, 1.0, 2)) for question, auc in found.auc.items()],
+        [(question, shown(auc, Unit(decimals=2))) for question, auc in found.auc.items()],
     )
     text = console()
     text.print(f"n = {found.layouts} layouts, {stated(found.seed, found.layouts)};")

@@ -11,7 +11,7 @@ from harness.cli.estimates import console, table
 from harness.cli.progress import bar
 from harness.core import extras
 from harness.core.errors import UserError, printable, unknown
-from harness.core.figures import shown
+from harness.core.figures import Unit, shown
 
 app = typer.Typer(help="Compare schedules (whom to ask, and when), or learn one.", no_args_is_help=True)
 
@@ -155,7 +155,7 @@ def compare(
                 (
                     printable(said(row), 24), shown(row.success), f"{row.play.means['messages']:.1f}",
                     *(f"{row.play.means['energy_j']:.0f}" for _ in joules),
-                    shown(row.over_paper), shown(row.closed, 100.0, 0),
+                    shown(row.over_paper), shown(row.closed, Unit("%", 0, 100.0)),
                 )
                 for row in run.rows
             ],

@@ -11,7 +11,7 @@ import typer
 from harness.cli.estimates import console, echo_json, table
 from harness.cli.run import Together, as_mapping, free_folder, origins
 from harness.core.errors import UserError, printable
-from harness.core.figures import interval
+from harness.core.figures import shown
 from harness.core.formats import SUITE, WORK
 
 if TYPE_CHECKING:
@@ -146,4 +146,4 @@ def _matrix(head: str, what: str, conditions: "Sequence[str]", lines: "Sequence[
 
 
 def _cell(score: "Score | None") -> str:
-    return "-" if score is None else interval(score.value, score.low, score.high, 100)
+    return "-" if score is None else shown(score)

@@ -12,7 +12,7 @@ from harness.cli.progress import bar
 from harness.cli.run import free_folder
 from harness.core import resources, work
 from harness.core.errors import printable, unknown
-from harness.core.figures import shown
+from harness.core.figures import Unit, shown
 
 if TYPE_CHECKING:
     from harness.studies.twins.scoring import Row
@@ -129,6 +129,7 @@ def command(
 
 def _cells(row: "Row") -> tuple[str, ...]:
     return (
-        row.twin.name, row.role, row.twin.holds, shown(row.invariance_rate, 100, 1),
-        shown(row.tv_distance, 1, 2), f"{100 * row.failed_rate.value:.1f}", str(row.invariance_rate.n),
+        row.twin.name, row.role, row.twin.holds, shown(row.invariance_rate),
+        shown(row.tv_distance, Unit(decimals=2)),
+        f"{100 * row.failed_rate.value:.1f}", str(row.invariance_rate.n),
     )  # fmt: skip

@@ -1,34 +1,93 @@
-"""Format estimates and intervals for people (text) and for machines (plain values)."""
+"""The one way in which a number is written for people, and plain values of estimates for machines."""
 
 import math
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Protocol
 
-if TYPE_CHECKING:  # commands that print nothing start without NumPy
-    from harness.core.statistics import Estimate
+DASH = "–"
 
 
-def known(value: float) -> float | None:
+class Bounded(Protocol):
+    """A value with the ends of its interval; what is not known is None or NaN."""
+
+    @property
+    def value(self) -> float | None: ...
+    @property
+    def low(self) -> float | None: ...
+    @property
+    def high(self) -> float | None: ...
+
+
+class Counted(Bounded, Protocol):
+    """A bounded value over n episodes, decisions or seeds."""
+
+    @property
+    def n(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class Unit:
+    """How a quantity is written. An unknown value is a dash, and no number is -0.
+
+    Attributes:
+        name: stands behind the number.
+        decimals: digits behind the point.
+        factor: what a stored value is multiplied by.
+    """
+
+    name: str = ""
+    decimals: int = 1
+    factor: float = 1.0
+
+    def number(self, value: float | None, sign: str = "", digits: int | None = None) -> str:
+        """Write a value without the unit's name.
+
+        Args:
+            value: in the unit in which it is stored.
+            sign: `+` writes the sign of a positive number too.
+            digits: the most significant digits, all in all.
+        """
+        if value is None or math.isnan(value):
+            return DASH
+        number, places = value * self.factor, self.decimals
+        if digits is not None:
+            places = min(places, digits - 1 - math.floor(math.log10(max(abs(number), 1e-9))))
+            number = round(number, places)
+        return f"{number:{sign}z.{max(places, 0)}f}"
+
+    def text(self, value: float | None) -> str:
+        """Write a value with the unit's name."""
+        known = value is not None and not math.isnan(value)
+        return f"{self.number(value)} {self.name}" if known and self.name else self.number(value)
+
+    def interval(
+        self, value: float | None, low: float | None, high: float | None, sign: str = "",
+        digits: int | None = None,
+    ) -> str:  # fmt: skip
+        """Write a value and its interval as `89.0 [81.4, 93.7]`; a dash where the value is not known."""
+        number, *ends = (self.number(each, sign, digits) for each in (value, low, high))
+        return number if number == DASH else f"{number} [{', '.join(ends)}]"
+
+    def ends(self, bounded: Bounded) -> str:
+        """Write an interval as `81.4 to 93.7 %`; empty where an end is not known."""
+        low, high = self.number(bounded.low), self.number(bounded.high)
+        return "" if DASH in (low, high) else f"{low} to {self.text(bounded.high)}"
+
+
+PERCENT, POINTS, PLAIN = Unit("%", 1, 100.0), Unit("points", 1, 100.0), Unit()
+
+
+def shown(bounded: Bounded, unit: Unit = PERCENT, sign: str = "") -> str:
+    """Write a value and its interval as `89.0 [81.4, 93.7]`, without the unit's name."""
+    return unit.interval(bounded.value, bounded.low, bounded.high, sign)
+
+
+def known(value: float | None) -> float | None:
     """Return the number; None if it is NaN."""
-    return None if math.isnan(value) else value
+    return None if value is None or math.isnan(value) else value
 
 
-def as_mapping(estimate: "Estimate") -> dict[str, float | int | None]:
+def as_mapping(estimate: Counted) -> dict[str, float | int | None]:
     """Return `value`, `low`, `high` and `n` by name; NaN becomes None."""
     ends = {end: known(getattr(estimate, end)) for end in ("value", "low", "high")}
     return {**ends, "n": estimate.n}
-
-
-def shown(estimate: "Estimate", scale: float = 100.0, decimals: int = 1) -> str:
-    """Format an estimate as `89.0 [81.4, 93.7]`, in percent unless `scale` is given; a dash if it is NaN."""
-    if math.isnan(estimate.value):
-        return "–"
-    return interval(estimate.value, estimate.low, estimate.high, scale, decimals)
-
-
-def interval(
-    value: float | None, low: float | None, high: float | None, scale: float = 1.0, decimals: int = 1
-) -> str:
-    """Format `value [low, high]`; a dash stands for each number that is not known."""
-    ends = (math.nan if number is None else number for number in (value, low, high))
-    numbers = ("–" if math.isnan(number) else f"{scale * number:z.{decimals}f}" for number in ends)
-    return "{} [{}, {}]".format(*numbers)

@@ -8,7 +8,7 @@ import numpy as np
 
 from harness.core import multiplicity
 from harness.core.errors import printable
-from harness.core.figures import interval as with_interval
+from harness.core.figures import PLAIN, Unit
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate, mean_of
 from harness.runs import metrics
@@ -140,7 +140,7 @@ def energy(m: Manifest, score: Callable[[str, str], Score | None]) -> Iterator[s
     for name in [str(condition["name"]) for condition in m.conditions]:
         total, helpers, radio = (score(name, metric) for metric in ("energy_j", "helpers_j", "radio_mj"))
         if total and helpers and radio and None not in (total.value, helpers.value, radio.value):
-            joules = with_interval(total.value, total.low, total.high)
+            joules = PLAIN.interval(total.value, total.low, total.high)
             yield (
                 f"{printable(name)}: {joules} J per decision, of which the helpers' inference takes "
                 f"{helpers.value:.1f} J and the radios {radio.value:.3g} mJ"
@@ -180,7 +180,7 @@ def pace(m: Manifest) -> Iterator[str]:
 def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:
     """With a decimal, or two below ten, and the interval."""
     low, high = ends or (None, None)
-    return with_interval(seconds, low, high, 1000.0, 1 if seconds >= 0.01 else 2)
+    return Unit("ms", 1 if seconds >= 0.01 else 2, 1000.0).interval(seconds, low, high)
 
 
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:

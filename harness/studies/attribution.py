@@ -20,6 +20,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable, unknown
+from harness.core.figures import Unit
 from harness.core.figures import shown as figure
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate, rate_interval
@@ -246,8 +247,9 @@ def headline(table: Sequence[Row]) -> str:
         "fusion": f"message of a {most.kind} of a {HIDDEN}",
     }[most.role]
     return (
-        f"The {what} moves answers most: without it, {figure(most.shift, 1, 2)} of the probability moves to "
-        f"other actions, and {figure(most.flips)} % of the most probable actions change (n = {most.shift.n})."
+        f"The {what} moves answers most: without it, {figure(most.shift, Unit(decimals=2))} of the "
+        f"probability moves to other actions, and {figure(most.flips)} % of the most probable actions "
+        f"change (n = {most.shift.n})."
     )
 
 

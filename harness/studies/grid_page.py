@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from harness.core.figures import shown
+from harness.core.figures import PERCENT, PLAIN, shown
 from harness.core.files import bytes_of, write_whole
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
@@ -59,7 +59,7 @@ def _said(grid: Grid, h: Halves) -> str:
 
 def text(metric: str, e: Estimate) -> str:
     """An estimate in a table: percent, or the metric's own unit; a dash where nothing is known."""
-    return shown(e, 100.0 if metric == SUCCESS else 1.0)
+    return shown(e, PERCENT if metric == SUCCESS else PLAIN)
 
 
 def front(cells: Sequence[Cell], condition: str) -> list[Cell]:

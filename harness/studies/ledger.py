@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.core.figures import interval
+from harness.core.figures import PLAIN
 from harness.core.files import text_of
 from harness.studies.calibrated import FITTED_ON
 
@@ -142,7 +142,7 @@ def shown(row: Any) -> dict[str, Any]:
         "id": row.id,
         "what": " ".join(filter(None, (row.condition, f"{row.variable}{value}", f"{row.metric}{unit}"))),
         "paper": theirs,
-        "ours": "" if cited else interval(row.ours, row.ci_low, row.ci_high),
+        "ours": "" if cited else PLAIN.interval(row.ours, row.ci_low, row.ci_high),
         "off": "" if cited else f"{row.difference:+z.1f}",
         "allowed": "" if cited else f"{row.allowed:.1f}",
         "kind": row.kind,

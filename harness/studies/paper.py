@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from harness.coordination.operating_point import POINTS
-from harness.core.figures import interval
+from harness.core.figures import PERCENT
 from harness.core.files import bytes_of, write_whole
 from harness.core.versions import versions
 from harness.report.library import picture
@@ -119,7 +119,7 @@ def equation_2(weights: "pd.DataFrame") -> str:
     """What the weights by distance do in the calibrated proxy, from the summary of their panel."""
     success = weights[weights.metric == "success_rate"].set_index("value")
     with_it, without = (
-        interval(*(100 * success.loc[metres, ["mean", "ci_low", "ci_high"]].to_numpy(dtype=float)))
+        PERCENT.interval(*success.loc[metres, ["mean", "ci_low", "ci_high"]].to_numpy(dtype=float))
         for metres in (1.0, EQUAL_M)
     )
     return (

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from harness.core.figures import shown
+from harness.core.figures import Unit, shown
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
@@ -25,7 +25,7 @@ MOST_POINTS = 12  # of those at which repeats disagree
 
 def nats(e: Estimate) -> str:
     """An entropy with its interval; a dash where it is not known."""
-    return shown(e, 1.0, 2)
+    return shown(e, Unit("nats", 2))
 
 
 def in_sentences(of: Repeats) -> list[str]:

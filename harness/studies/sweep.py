@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
-from harness.core.figures import interval
+from harness.core.figures import PERCENT
 from harness.core.files import bytes_of, write_whole
 from harness.core.versions import versions
 from harness.report.library import picture
@@ -162,11 +162,11 @@ def tables(summary: "pd.DataFrame") -> dict[str, list[Row]]:
         # Over episodes, but where a seed has episodes of its own.
         of = {row["metric"]: row for row in sorted(rows, key=_over_episodes)}
         success = of["success_rate"]
-        ends = (100 * success[name] for name in ("mean", "ci_low", "ci_high"))
+        ends = (success[name] for name in ("mean", "ci_low", "ci_high"))
         others = {name: f"{scale * of[metric]['mean']:.1f}" for name, metric, scale in COLUMNS}
         at = str(condition if panel == CORE else value if isinstance(value, str) else f"{value:g}")
         axis = "condition" if panel == CORE else str(panel)
-        found.setdefault(title, []).append(Row(axis, at, interval(*ends), others))
+        found.setdefault(title, []).append(Row(axis, at, PERCENT.interval(*ends), others))
     return found
 
 

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from harness.cli.estimates import table
-from harness.core.figures import interval
+from harness.core.figures import PERCENT
 from harness.runs.metrics import over_episodes
 
 
 def test_an_interval_that_nobody_knows_is_a_dash():
-    assert interval(0.5, 0.4, 0.6, 100) == "50.0 [40.0, 60.0]"
-    assert interval(0.5, math.nan, math.nan, 100) == "50.0 [–, –]"
-    assert interval(math.nan, math.nan, math.nan, 1) == "– [–, –]"
+    assert PERCENT.interval(0.5, 0.4, 0.6) == "50.0 [40.0, 60.0]"
+    assert PERCENT.interval(0.5, math.nan, None) == "50.0 [–, –]"
+    assert PERCENT.interval(math.nan, math.nan, math.nan) == PERCENT.text(None) == "–"
+    assert (PERCENT.text(-1e-9), PERCENT.number(0.5, "+")) == ("0.0 %", "+50.0")
 
 
 def test_a_name_that_leaves_no_room_for_its_row_stands_above_it(capsys: pytest.CaptureFixture[str]) -> None:
