@@ -141,7 +141,7 @@ TIED = replace(cards.resolve("proxy"), name="tied", engine="tied")
 def tied(monkeypatch: pytest.MonkeyPatch) -> Card:
     """Card of a model that says that all actions are alike."""
     opens = f"{__name__}:open_tied"
-    monkeypatch.setitem(registry.BUILT_IN, "tied", replace(registry.BUILT_IN["proxy"], opens=opens))
+    monkeypatch.setitem(registry.ENGINES._loaded, "tied", replace(registry.BUILT_IN["proxy"], opens=opens))
     return TIED
 
 

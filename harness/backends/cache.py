@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from harness.backends.base import Backend, Completion, Rendering, Request, Served, doubt, served, window
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.registry import capabilities
 from harness.core import kept
 from harness.core.errors import printable

@@ -1,18 +1,15 @@
-"""The model card: a record of a model, its engine, its weights and its latency, read from a TOML file."""
+"""The model card: a record of a model, its engine, its weights and its latency."""
 
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
 from harness.backends.base import Letters
 from harness.backends.failures import Failures
-from harness.backends.registry import engines, find, registrations
 from harness.backends.servers import Server
 from harness.backends.vision import Vision
-from harness.core.config import Count, Seconds, convert, toml
-from harness.core.errors import UserError, printable, unknown
+from harness.core.config import Count, Seconds
 
 Dtype = Literal["float32", "bfloat16", "auto"]
 Thinking = Literal["none", "switch", "always"]
@@ -123,83 +120,3 @@ class Card:
                 server["fields"] = dict(self.server.fields.changed)
             record["server"] = server
         return record
-
-
-@dataclass(frozen=True)
-class _File(Card):
-    """The content of a card file: a card, and what is different on other engines."""
-
-    engines: dict[str, Any] = field(default_factory=dict)
-
-
-# Keys that only some engines understand; a `Registration` says which.
-_ENGINE_KEYS = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation",
-                "failures", "privileged", "vision", "projector", "system")  # fmt: skip
-# Keys that a model may set again for each further engine.
-_PER_ENGINE = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
-               "server", "projector")  # fmt: skip
-
-
-def read(path: Path) -> list[Card]:
-    """Read the cards in a file: the model on each of its engines, its default engine first.
-
-    Raises:
-        UserError: the file has a mistake.
-    """
-    where = f"model card {path}"
-    table = _whole(toml(path, where))
-    others = convert(table, _File, where, name=path.stem).engines
-    table.pop("engines", None)
-    cards = [_card(table, where, path.stem)]
-    shared = {key: value for key, value in table.items() if key not in _PER_ENGINE}
-    if cards[0].latency.source == "paper":  # a declared latency does not hold for another engine
-        shared["latency"] = table["latency"]
-    for engine, settings in others.items():
-        at = f"{where} [engines.{printable(engine)}]"
-        other = None if engine == table["engine"] else find(engine)
-        if other is None or "weights" not in other.allowed_keys:
-            allowed = [name for name in _takers("weights") if name != table["engine"]]
-            raise unknown(f"engine in {where}", engine, allowed)
-        if not isinstance(settings, dict):
-            raise UserError(f"{at} = {printable(settings)!r}; allowed: a table")
-        for key in settings:
-            if key not in _PER_ENGINE:
-                raise unknown(f"key in {at}", key, _PER_ENGINE)
-        cards.append(_card(_whole({**shared, **settings, "engine": engine}), at, f"{path.stem}:{engine}"))
-    return cards
-
-
-def _whole(table: dict[str, Any]) -> dict[str, Any]:
-    """Add to a card's table the `inference_s` that is left out if no time is declared."""
-    latency = table.get("latency")
-    return {**table, "latency": {"inference_s": None, **latency}} if isinstance(latency, dict) else table
-
-
-def _card(table: dict[str, Any], where: str, name: str) -> Card:
-    card = convert(table, Card, where, name=name)
-    if (engine := find(card.engine)) is None:
-        raise unknown(f"engine in {where}", card.engine, engines())
-    for key in _ENGINE_KEYS:
-        lacking = key in engine.required_keys and key not in table
-        if lacking or (key in table and key not in engine.allowed_keys):
-            shown = f"[{key}]" if key in ("server", "failures", "vision") else key
-            takers = " or ".join(_takers(key))
-            raise UserError(f"{where}: {shown} goes with engine = {takers}, and only with it")
-    if "projector" in engine.allowed_keys and bool(card.vision) != bool(card.projector):
-        raise UserError(
-            f"{where}: [vision] and projector go together on {card.engine}: give the name of its mmproj "
-            "file, or leave both out"
-        )
-    if card.server and card.thinking == "switch" and not card.server.tells_thinking:
-        raise UserError(
-            f'{where} [server]: thinking = "switch" needs the kind vllm or llama-server, which a request can '
-            "tell; else set it at the server, and here none or always"
-        )
-    if card.failures and card.failures.slow_tail and card.latency.source != "card":
-        raise UserError(f'{where} [failures]: a slow tail goes with a latency whose source = "card"')
-    return card
-
-
-def _takers(key: str) -> list[str]:
-    """Return the engines that understand a key."""
-    return [engine for engine, registered in registrations().items() if key in registered.allowed_keys]

@@ -6,7 +6,7 @@ from contextlib import suppress
 from functools import cached_property
 from typing import Any
 
-from harness.backends.cards import Thinking
+from harness.backends.card import Thinking
 from harness.backends.chat_template import FIRST_USER, ChatTemplate, Refused, unsaid, with_system
 from harness.core.errors import UserError, printable
 from harness.prompts.readout import spelt

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from harness.backends.base import AnswerMode, Completion, Rendering, Request
-from harness.backends.cards import Thinking
+from harness.backends.card import Thinking
 from harness.backends.chat import Chat
 from harness.core.errors import UserError
 

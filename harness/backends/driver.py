@@ -5,7 +5,7 @@ from typing import Any
 
 from harness import __version__
 from harness.backends.base import Completion, Request, by_scenario
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, sha256_file
 from harness.world.drivers import CONSTANT, CONSTANTS, DRIVERS, UNIFORM, choices, constant

@@ -1,4 +1,4 @@
-"""What a GGUF file says of itself: the keys and values before its weights.
+"""What a GGUF file states of itself: the keys and values before its weights.
 
 The layout is that of https://github.com/ggml-org/ggml/blob/master/docs/gguf.md, versions 2 and 3.
 """
@@ -17,8 +17,8 @@ _TEXT, _ARRAY = 8, 9
 
 
 @dataclass(frozen=True)
-class Said:
-    """What a file says of its model; None or empty where it does not.
+class ModelFacts:
+    """What a file states of its model; None where it does not.
 
     Attributes:
         name: the model's name.
@@ -33,8 +33,8 @@ class Said:
     template: str | None = None
 
 
-def said(file: Path) -> Said:
-    """Return what a file says of its model; nothing if it is no GGUF, which loading it reports.
+def facts(file: Path) -> ModelFacts:
+    """Read what a file states of its model; nothing if it is no GGUF, which loading it reports.
 
     Raises:
         OSError: it cannot be opened.
@@ -42,17 +42,16 @@ def said(file: Path) -> Said:
     try:
         values = metadata(file)
     except ValueError:
-        return Said()
+        return ModelFacts()
 
     def text(key: str) -> str | None:
         value = values.get(key)
         return value if isinstance(value, str) else None
 
     context = values.get(f"{values.get('general.architecture')}.context_length")
-    return Said(
-        text("general.name"), text("general.license"), context if isinstance(context, int) else None,
-        text("tokenizer.chat_template"),
-    )  # fmt: skip
+    context_tokens = context if isinstance(context, int) else None
+    template = text("tokenizer.chat_template")
+    return ModelFacts(text("general.name"), text("general.license"), context_tokens, template)
 
 
 def metadata(file: Path, arrays: bool = False) -> Mapping[str, Any]:
@@ -89,9 +88,9 @@ def _value(head: bytes, at: int, kind: int, arrays: bool) -> tuple[Any, int]:
     if kind != _ARRAY:
         (number,) = _unpacked(f"<{_number(kind)}", head, at)
         return number, at + struct.calcsize(f"<{_number(kind)}")
-    of, count = _unpacked("<IQ", head, at)
+    element, count = _unpacked("<IQ", head, at)
     at += 12
-    if of == _TEXT:
+    if element == _TEXT:
         texts = []
         for _ in range(count):  # each has eight bytes at least, so that a false count ends with the bytes
             if arrays:
@@ -100,10 +99,10 @@ def _value(head: bytes, at: int, kind: int, arrays: bool) -> tuple[Any, int]:
             else:
                 at += 8 + _unpacked("<Q", head, at)[0]
         return texts if arrays else None, at
-    size = struct.calcsize(f"<{_number(of)}") * count
+    size = struct.calcsize(f"<{_number(element)}") * count
     if at + size > len(head):
         raise ValueError("an array is longer than the file")
-    return list(struct.unpack_from(f"<{count}{_number(of)}", head, at)) if arrays else None, at + size
+    return list(struct.unpack_from(f"<{count}{_number(element)}", head, at)) if arrays else None, at + size
 
 
 def _text(head: bytes, at: int) -> tuple[str, int]:

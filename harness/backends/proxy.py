@@ -10,7 +10,7 @@ from dataclasses import asdict
 from typing import Any
 
 from harness.backends.base import Completion, FinishReason, Request, by_scenario
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.failures import Failures, drawn, spoilt
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded

@@ -6,21 +6,17 @@ Importing this loads no engine. An external package adds one by an entry point o
 
 import os
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from importlib import import_module
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+from harness.backends.base import AnswerMode, Backend
+from harness.backends.card import Card
 from harness.core import extras
 from harness.core.errors import UserError, printable, unknown
-
-if TYPE_CHECKING:
-    from harness.backends.base import AnswerMode, Backend
-    from harness.backends.cards import Card
-
-GROUP = "swarmdrive.backends"
+from harness.core.plugins import Plugins
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,7 @@ class Capabilities:
     """
 
     language_model: bool = True
-    answer_modes: "tuple[AnswerMode, ...]" = ("json", "constrained", "readout")
+    answer_modes: tuple[AnswerMode, ...] = ("json", "constrained", "readout")
     thinks: Literal["always", "card", "never"] = "always"
     renders: bool = True
     has_weights: bool = False
@@ -131,67 +127,24 @@ BUILT_IN: Mapping[str, Registration] = {
 }
 
 
-def engines() -> list[str]:
-    """Return the names of all engines: built-in ones, then plug-ins."""
-    from importlib.metadata import entry_points
-
-    return list(dict.fromkeys([*BUILT_IN, *sorted(entry_points(group=GROUP).names)]))
-
-
-def find(engine: str) -> Registration | None:
-    """Return the registration of an engine; None if there is none of that name.
-
-    Raises:
-        UserError: a plug-in of that name does not load.
-    """
-    return BUILT_IN.get(engine) or _plug_in(engine)
-
-
-@cache
-def _plug_in(engine: str) -> Registration | None:
-    from importlib.metadata import entry_points
-
-    for entry in entry_points(group=GROUP, name=engine):
-        try:
-            loaded = entry.load()
-        except Exception as error:  # whatever a package's import may raise
-            raise UserError(
-                f"engine {printable(engine)!r}: {printable(entry.value)} does not load ({printable(error)}); "
-                "fix the package that registers it, or uninstall it"
-            ) from error
-        if isinstance(loaded, Registration):
-            return loaded
-        raise UserError(
-            f"engine {printable(engine)!r}: {printable(entry.value)} is a {type(loaded).__name__}; "
-            "it must be a harness.backends.registry.Registration"
-        )
-    return None
+ENGINES: Plugins[Registration] = Plugins("swarmdrive.backends", Registration, BUILT_IN)
 
 
 def registration(engine: str) -> Registration:
     """Return the registration of an engine. Raises UserError if there is none, or a plug-in fails."""
-    if (entry := find(engine)) is None:
-        raise unknown("engine", engine, engines())
+    if (entry := ENGINES.get(engine)) is None:
+        raise unknown("engine", engine, ENGINES)
     return entry
 
 
 def capabilities(engine: str) -> Capabilities:
-    """Return what an engine can do. Raises UserError if there is no such engine, or a plug-in fails."""
+    """Return what an engine can do. Raises what `registration` raises."""
     return registration(engine).capabilities
 
 
-def registrations() -> dict[str, Registration]:
-    """Return all engines by name, without plug-ins that do not load."""
-    loaded = {}
-    for engine in engines():
-        with suppress(UserError):
-            loaded[engine] = registration(engine)
-    return loaded
-
-
 def open_backend(
-    card: "Card", *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
-) -> "Backend":
+    card: Card, *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
+) -> Backend:
     """Open the backend of a card and load its weights. Engines without weights ignore the options.
 
     Args:
@@ -214,7 +167,7 @@ def open_backend(
     return backend
 
 
-def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> "Backend":
+def opened(card: Card, device: str | None, dtype: str | None, batch_size: int) -> Backend:
     """Return this process's backend of a card, opened once (see `open_backend`)."""
     return _opened_in(os.getpid(), card, device, dtype, batch_size)
 
@@ -222,9 +175,7 @@ def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int)
 # Keyed by the process: a forked one inherits its parent's backend, and two that use one pipe would read each
 # other's answers.
 @lru_cache(maxsize=8)
-def _opened_in(
-    process: int, card: "Card", device: str | None, dtype: str | None, batch_size: int
-) -> "Backend":  # fmt: skip
+def _opened_in(process: int, card: Card, device: str | None, dtype: str | None, batch_size: int) -> Backend:
     return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
 
 
@@ -240,7 +191,7 @@ def missing_package(engine: str) -> str | None:
     return next((package for module, package in packages.items() if find_spec(module) is None), None)
 
 
-def missing(card: "Card") -> str | None:
+def missing(card: Card) -> str | None:
     """Return what a card lacks to run here: the name of a package or `weights`; None if nothing."""
     if package := missing_package(card.engine):
         return package
@@ -252,7 +203,7 @@ def missing(card: "Card") -> str | None:
     return None
 
 
-def processor_tokens(card: "Card") -> int | None:
+def processor_tokens(card: Card) -> int | None:
     """Return how many tokens a card's image processor makes of a picture of the card's size.
 
     None if the processor is not installed here.

@@ -7,8 +7,9 @@ from typing import Any
 
 from harness.backends.base import AGAIN, Backend, Completion, Request, same_model
 from harness.backends.cache import cached, default_file
-from harness.backends.cards import Card, own
-from harness.backends.registry import find, open_backend
+from harness.backends.card import Card
+from harness.backends.cards import own
+from harness.backends.registry import ENGINES, open_backend
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_file
@@ -25,7 +26,7 @@ def open(card: Card, **_: Any) -> "Replay":
             lacks answers that no run can do without.
     """
     run = read(Path(card.weights or ""))
-    engine = find(str(run.manifest.model.get("engine")))
+    engine = ENGINES.get(str(run.manifest.model.get("engine")))
     if engine and not engine.capabilities.asks_helpers:
         raise UserError(
             f"{printable(run.path)} is a run of a driver; "

@@ -6,7 +6,7 @@ from typing import Any
 
 from harness.backends.base import Backend, Completion, Request, Served, served, window
 from harness.backends.cache import cached
-from harness.backends.cards import Card
+from harness.backends.card import Card
 
 
 class Swarm:

@@ -6,7 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.gguf import metadata
 from harness.core.errors import UserError, printable
 from harness.core.extras import OPTIONAL, without

@@ -74,8 +74,8 @@ class Vision:
         return width, height
 
 
-def of_checkpoint(config: Mapping[str, Any], processor: Mapping[str, Any]) -> Vision | None:
-    """Read a checkpoint's config.json and preprocessor_config.json; None for a model without vision.
+def vision_of(config: Mapping[str, Any], processor: Mapping[str, Any]) -> Vision | None:
+    """Return what a checkpoint's config.json and preprocessor_config.json state; None without vision.
 
     Its pictures have `WIDE` x `HIGH` tokens, unless it scales them to a size of its own.
 

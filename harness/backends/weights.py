@@ -6,10 +6,12 @@ Nothing else in the program downloads anything.
 import json
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from harness.backends import packages
-from harness.backends.cards import Card
+from harness.backends.card import Card
+from harness.backends.gguf import ModelFacts, facts
 from harness.backends.registry import capabilities, missing_package, registration, resolve
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, sha256_file, text_of
@@ -111,6 +113,44 @@ def held_to_digest(card: Card, file: Path) -> Path:
     return file
 
 
+def located(card: Card) -> Path:
+    """Return where the weights of a card lie for its engine. Raises UserError if they are not found."""
+    where: Path = resolve(registration(card.engine).finds)(card)
+    return where
+
+
+def contradictions(card: Card) -> Iterator[str]:
+    """Yield a line for each thing that a card says otherwise than its weights. The card holds.
+
+    A shorter context than that of the weights is a choice, and no contradiction.
+
+    Raises:
+        UserError: the weights are not found.
+    """
+    where = located(card)
+    stated = facts(where) if where.is_file() else ModelFacts(context_tokens=_context_tokens(where))
+    if card.licence and stated.licence and card.licence.casefold() != stated.licence.casefold():
+        yield (
+            f"licence {printable(card.licence)} by its card, {printable(stated.licence)} by its file; "
+            "correct the card, or ask who made the file"
+        )
+    if card.context_tokens and stated.context_tokens and card.context_tokens > stated.context_tokens:
+        yield (
+            f"context of {card.context_tokens} tokens by its card, {stated.context_tokens} by its weights: "
+            "what is longer was never trained; lower context_tokens"
+        )
+
+
+def _context_tokens(checkpoint: Path) -> int | None:
+    """Return the longest sequence that a checkpoint's config allows; None if it does not say."""
+    try:
+        config = json.loads(text_of(checkpoint / "config.json", "record"))
+        longest = config.get("text_config", config).get("max_position_embeddings")
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return None
+    return longest if isinstance(longest, int) else None
+
+
 def pull(card: Card) -> Path:
     """Download the files that a card's engine needs and that are missing, into a cache.
 
@@ -131,12 +171,6 @@ def pull(card: Card) -> Path:
         raise UserError(f"model {printable(card.name)!r} lies in {printable(here)}: nothing to pull")
     _download(card)
     return _prepared(card)
-
-
-def located(card: Card) -> Path:
-    """Return where the weights of a card lie for its engine. Raises UserError if they are not found."""
-    where: Path = resolve(registration(card.engine).finds)(card)
-    return where
 
 
 def _prepared(card: Card) -> Path:

@@ -125,7 +125,7 @@ def look(gpu: bool) -> dict[str, Any]:
         "memory_gib": _memory_gib(),
         "gpu": gpus() if gpu else _smi_gpus(),
         "meters": [meter.name for meter in counters()],
-        "engines": {engine: _package_remedy(engine) for engine in registry.engines()},
+        "engines": {engine: _package_remedy(engine) for engine in registry.ENGINES},
         "models": models,
         "cache": {"file": str(cache), "bytes": cache.stat().st_size if cache.is_file() else 0},
     }

@@ -226,15 +226,15 @@ def _paces(card: "Card") -> "list[Pace]":
 
 
 def _show(spec: "Spec", seen: "Checkup") -> None:
-    from harness.backends.at_odds import at_odds
     from harness.backends.registry import capabilities
+    from harness.backends.weights import contradictions
 
     card, what = spec.ego.card, seen.identity
     where = " on ".join(printable(what[key]) for key in ("dtype", "device") if what.get(key))
     typer.echo(f"model        {printable(card.name)}  {card.engine}  {where}")
     typer.echo(f"licence      {printable(card.licence or 'not in its card')}")
     if capabilities(card.engine).has_weights:
-        for difference in at_odds(card):
+        for difference in contradictions(card):
             typer.echo(f"warning      {difference}")
     if seen.tokens is None:
         typer.echo("tokens       not known here: the server renders the prompt and counts them")

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import msgspec
 
 from harness.backends.cards import Card, argument
-from harness.backends.registry import registrations
+from harness.backends.registry import ENGINES
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.schedules import SCHEDULES
@@ -162,7 +162,7 @@ class Spec:
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
             if value is not None and not any(agent.can.has_weights for agent in self.agents):
                 engines = [
-                    name for name, engine in registrations().items() if engine.capabilities.has_weights
+                    name for name, engine in ENGINES.usable().items() if engine.capabilities.has_weights
                 ]
                 raise UserError(
                     f"{flag} {printable(value)}: {printable(self.ego.card.name)} has no weights here "

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from harness.backends.registry import find
+from harness.backends.registry import ENGINES
 from harness.coordination.coordinate import TIE
 from harness.runs.folder import Run
 from harness.world.drivers import ALWAYS
@@ -47,7 +47,7 @@ class Commonest:
 
 def commonest(run: Run) -> Commonest | None:
     """Return what a language model's ego answers most often; None with fewer readable ones than `LEAST`."""
-    engine = find(run.manifest.model["engine"])
+    engine = ENGINES.get(run.manifest.model["engine"])
     if engine is None or not engine.capabilities.language_model:
         return None
     p = run.answered.ego

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
-from harness.backends.registry import find
+from harness.backends.registry import ENGINES
 from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
 from harness.report.words import shown
@@ -24,7 +24,7 @@ def driven(runs: Iterable[Run]) -> dict[str, Score]:
     """Return the success of each reference that some of these runs are of."""
     scores = {}
     for run in runs:
-        engine = find(str(run.manifest.model.get("engine")))
+        engine = ENGINES.get(str(run.manifest.model.get("engine")))
         if engine and engine.capabilities.reference:
             scores[str(run.manifest.model["name"])] = run.score(run.conditions[0], SUCCESS)
     return {name: score for name, score in scores.items() if score and score.value is not None}

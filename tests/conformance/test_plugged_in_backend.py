@@ -1,7 +1,7 @@
 """A backend of another package, registered by an entry point: it runs as one that is built in."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -41,7 +41,7 @@ basis = "declared: none"
 
 
 @pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A project with a card, and on the path a package that registers its engine."""
     site = tmp_path / "site"
     register(site, ENTRIES, echoing=MODULE)
@@ -50,15 +50,14 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (tmp_path / "models" / "echo-1.toml").write_text(CARD)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(site)
-    registry._plug_in.cache_clear()
-    yield tmp_path
-    registry._plug_in.cache_clear()
+    monkeypatch.setattr(registry.ENGINES, "_loaded", dict(registry.BUILT_IN))
+    return tmp_path
 
 
 def test_a_card_names_it_and_it_is_listed_and_run(
     project: Path, small_path: Path, harness: Callable[..., tuple[int, str, str]]
 ) -> None:
-    assert registry.engines() == [*registry.BUILT_IN, "bare", "echo", "gone", "odd"]
+    assert list(registry.ENGINES) == [*registry.BUILT_IN, "bare", "echo", "gone", "odd"]
     _, out, _ = harness("model", "list", "--json")
     [listed] = [card for card in json.loads(out) if card["name"] == "echo-1"]
     assert (listed["engine"], listed["missing"]) == ("echo", None)
@@ -87,8 +86,11 @@ def test_what_it_cannot_do_is_refused_by_its_capabilities(
             ('revision = "2"', "gated = true"),
             "gated goes with engine = transformers or llama-cpp, and only with",
         ),
-        (('"echo"', '"gone"'), "engine 'gone': no_such_module:ECHO does not load .*; fix the package"),
-        (('"echo"', '"odd"'), "engine 'odd': echoing:answer is a function; it must be a .*Registration"),
+        (
+            ('"echo"', '"gone"'),
+            r"plug-in 'gone' \(swarmdrive.backends\): no_such_module:ECHO does not load",
+        ),
+        (('"echo"', '"odd"'), "plug-in 'odd' .*: echoing:answer is of type function and no Registration"),
     ],
 )
 def test_a_mistake_is_one_line(project: Path, change: tuple[str, str], said: str) -> None:

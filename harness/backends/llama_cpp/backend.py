@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.backends.base import Request
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.chat import Chat
 from harness.backends.llama_cpp.child import Child
 from harness.backends.weights import find_gguf, held_to_digest

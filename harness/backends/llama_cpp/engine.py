@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from harness.backends.beginnings import alike
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.chat import Chat
 from harness.backends.engine import check_logits, common_length
 from harness.backends.language_model import LanguageModel

@@ -13,7 +13,7 @@ from threading import Thread, current_thread
 from typing import Any, TypeVar
 
 from harness.backends.base import Completion, Request, Served, per_token_s
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.openai.farm import Farm
 from harness.backends.openai.http import Client, Reply
 from harness.backends.openai.read import Reading

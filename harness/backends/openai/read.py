@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from harness.backends.base import Request
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.chat_template import FIRST_USER, Messages, unsaid
 from harness.backends.openai.http import Client
 from harness.backends.openai.shapes import body, digest_url

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from harness.backends.base import FinishReason, Request
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.chat import in_parts
 from harness.backends.chat_template import with_system
 from harness.backends.openai.constraint import broken, constraint

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 from warnings import catch_warnings, simplefilter
 
-from harness.backends.cards import Card, Dtype
+from harness.backends.card import Card, Dtype
 from harness.backends.chat import Chat
 from harness.backends.engine import Session
 from harness.backends.language_model import LanguageModel

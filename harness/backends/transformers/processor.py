@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.vision import Vision
 from harness.backends.weights import find_checkpoint
 from harness.core.errors import UserError, printable

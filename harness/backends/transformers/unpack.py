@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from warnings import catch_warnings, simplefilter
 
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.gguf import metadata
 from harness.backends.tokens import tokenizer
 from harness.core import kept

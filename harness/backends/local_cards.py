@@ -1,0 +1,167 @@
+"""Make the card of a model that has none: a directory, a GGUF file, a hub id or `replay:RUN_DIR`."""
+
+import json
+import os.path
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from harness.backends.base import Letters
+from harness.backends.card import Card, Latency, System, Thinking
+from harness.backends.gguf import facts
+from harness.backends.vision import Vision, vision_of
+from harness.core.config import convert
+from harness.core.errors import UserError, printable
+from harness.core.files import bytes_of, text_of
+
+DISTILLED = "training.json"  # stands beside weights that were distilled here
+PROJECTOR = "mmproj-"  # prefix of a projector's GGUF file
+_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+_TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
+_SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
+
+
+def local_card(text: str, engine: str | None) -> Card | None:
+    """Return the card of what a user wrote for a model; None if it is none of these.
+
+    Args:
+        text: `replay:RUN_DIR`, a path or a hub id.
+        engine: engine to run it on, if there is a choice; None for the default one.
+
+    Raises:
+        UserError: there is no such file or run, or it does not say how to open it.
+    """
+    kind, _, rest = text.partition(":")
+    if kind == "replay":
+        run = _path(rest)
+        if run is None or not run.is_dir():
+            raise UserError(
+                f"model {printable(text)!r}: no such run directory; give replay: and the directory of a run"
+            )
+        return _run_card(run)
+    path = _path(text)
+    if path is not None and path.is_dir():
+        return _directory_card(text, path, engine)
+    if path is not None and path.suffix == ".gguf":
+        return _gguf_card(text, path, engine)
+    if _HUB_ID.fullmatch(text) and not text.endswith(".gguf"):
+        return _new_card(text, "transformers", text, "Hub model without a card")
+    if "/" in text:
+        raise UserError(
+            f"model {printable(text)!r} is no directory, no .gguf file and no hub id; "
+            "give an existing path, or an id such as Qwen/Qwen3-4B"
+        )
+    return None
+
+
+def _new_card(name: str, engine: str, weights: str, description: str, **settings: Any) -> Card:
+    latency = Latency("paper", None, "none declared: the paper's")
+    return Card(name, engine, description, latency, weights=weights, **settings)
+
+
+def _run_card(run: Path) -> Card:
+    """Return the card of a run's answers; an unreadable run fails only when it is opened."""
+    stated: dict[str, Any] = {}
+    vision: Vision | None = None
+    letters: Letters = "raw"
+    with suppress(OSError, ValueError, UserError):
+        stated = json.loads(text_of(run / "run.json", "record"))
+    with suppress(TypeError, ValueError, LookupError, UserError):
+        table = stated["model"]["vision"]
+        vision = table and convert(table, Vision, "vision")
+    with suppress(AttributeError):
+        letters = "cyclic" if stated.get("letters") == "cyclic" else "raw"
+    name = f"replay:{run.name}"
+    return _new_card(name, "replay", str(run), "Answers of a run", vision=vision, letters=letters)
+
+
+def _directory_card(text: str, where: Path, engine: str | None) -> Card:
+    files = sorted(file for file in where.glob("*.gguf") if not file.name.startswith(PROJECTOR))
+    if (where / "config.json").is_file() and engine != "llama-cpp":
+        return _new_card(
+            where.name, "transformers", str(where), "Local directory", thinking=_thinking(where),
+            vision=_vision(text, where), system=_system(_template(where)), letters=_letters(where),
+        )  # fmt: skip
+    if len(files) == 1:
+        return _gguf_card(text, files[0], engine)
+    if files:
+        raise UserError(
+            f"model directory {printable(text)!r} holds {len(files)} .gguf files; give one of them"
+        )
+    raise UserError(
+        f"model directory {printable(text)!r} holds no config.json and no .gguf file; "
+        "give the directory of a transformers checkpoint, or a .gguf file"
+    )
+
+
+def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
+    """Make the card of a GGUF file, of what the file says of itself.
+
+    On llama-cpp the projector beside it goes with it, which has the same name behind its prefix.
+    """
+    stated = facts(file)
+    engine = "transformers" if engine == "transformers" else "llama-cpp"
+    projector = file.with_name(f"{PROJECTOR}{file.name}")
+    vision = _vision(text, file.parent) if engine == "llama-cpp" and projector.is_file() else None
+    return _new_card(
+        file.stem,
+        engine,
+        str(file),
+        f"Local GGUF file{f': {printable(stated.name)}' if stated.name else ''}",
+        thinking="switch" if _SWITCH in (stated.template or "").encode() else "none",
+        licence=stated.licence and printable(stated.licence),
+        system=_system(stated.template),
+        letters=_letters(file.parent),
+        vision=vision,
+        projector=projector.name if vision else None,
+    )
+
+
+def _path(text: str) -> Path | None:
+    """Return the absolute path of an existing file or folder; None for any other text."""
+    path = os.path.expanduser(text)
+    return Path(path).resolve() if os.path.exists(path) else None
+
+
+def _thinking(checkpoint: Path) -> Thinking:
+    """Return `switch` if a checkpoint's chat template has the thinking switch; reads the file's text only."""
+    files = (checkpoint / name for name in _TEMPLATE_FILES)
+    return "switch" if any(_SWITCH in bytes_of(f, "record") for f in files if f.is_file()) else "none"
+
+
+def _letters(weights: Path) -> Letters | None:
+    """Return `raw` for what was distilled here: its training used one order of the letters."""
+    return "raw" if (weights / DISTILLED).is_file() else None
+
+
+def _vision(text: str, checkpoint: Path) -> Vision | None:
+    """Return how a checkpoint takes pictures, from its config files. Raises UserError if they do not say."""
+    try:
+        config, processor = (
+            json.loads(text_of(file, "record")) if file.is_file() else {}
+            for file in (checkpoint / "config.json", checkpoint / "preprocessor_config.json")
+        )
+        return vision_of(config, processor)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"model directory {printable(text)!r}: its config does not say how it takes pictures "
+            f"({printable(repr(error), 120)}); write a card with a [vision] for it"
+        ) from None
+
+
+def _system(template: str | None) -> System | None:
+    """Return how a card made on the spot gives the system text, so that its chat template takes it."""
+    from harness.backends.chat_template import needs_first_user  # imports Jinja, as few cards do
+
+    return "first-user" if template and needs_first_user(template) else None
+
+
+def _template(checkpoint: Path) -> str | None:
+    """Return a checkpoint's chat template; None if its files do not say, which opening it reports."""
+    with suppress(OSError, ValueError):
+        if (file := checkpoint / _TEMPLATE_FILES[0]).is_file():
+            return text_of(file)
+        template = json.loads(text_of(checkpoint / _TEMPLATE_FILES[1], "record")).get("chat_template")
+        return template if isinstance(template, str) else None
+    return None
