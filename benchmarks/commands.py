@@ -29,11 +29,11 @@ AIMS = {  # CPU seconds, and MB of peak memory
     "eval, 1 440 decision points": (4.0, 250),
     "eval --limit 1": (1.2, None),
     "eval, 20 160 decision points": (35.0, 800),
-    "ls": (0.15, None),
+    "run ls": (0.15, None),
     "model list": (0.15, None),
     "--help": (0.15, None),
-    "campaign paper": (1.2, None),
-    "sweep, 100 points": (1.5, None),
+    "study paper": (1.2, None),
+    "study sweep, 100 points": (1.5, None),
 }
 CHILD = """
 import os, resource, subprocess, sys
@@ -61,10 +61,11 @@ def main() -> None:
             "model list": ["model", "list"],
             "eval --limit 1": [*proxy, "--limit", "1"],
             "eval, 1 440 decision points": proxy,
-            "ls": ["ls", "RUNS"],
-            "campaign paper": ["campaign", "paper", "--quiet", "--out", "STUDY"],
-            "sweep, 100 points": [
-                "sweep", "RUN", "--over", "tau", "--grid", "0.1:1.09:0.01", "--quiet", "--out", "STUDY",
+            "run ls": ["run", "ls", "RUNS"],
+            "study paper": ["study", "paper", "--quiet", "--out", "STUDY"],
+            "study sweep, 100 points": [
+                "study", "sweep", "RUN", "--over", "tau", "--grid", "0.1:1.09:0.01", "--quiet",
+                "--out", "STUDY",
             ],
         }  # fmt: skip
         if given.only in "eval, 20 160 decision points" and given.copies:

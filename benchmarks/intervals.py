@@ -29,7 +29,7 @@ from harness.core.statistics import (
 from harness.runs.metrics import SUCCESS, difference, over_episodes, over_seeds
 
 EPISODES, SEEDS, ANSWERS = (20, 60, 240), 5, (3, 9)  # an episode has so many answers, at least and at most
-TWINS = (12, 24, 40)  # episodes of `harness twins`
+TWINS = (12, 24, 40)  # episodes of `harness study twins`
 RATES = (0.54, 0.75, 0.9, 0.97, 0.99)
 PAIRS = ((0.54, 0.54), (0.54, 0.75), (0.75, 0.9), (0.9, 0.97), (0.97, 0.99), (0.97, 0.97))
 LOSSES = (0.012, 0.1, 0.5)
@@ -147,7 +147,7 @@ def seed_means(loss: float) -> Kind:
 
 
 def own_episodes(rate: float) -> Kind:
-    """A success rate over seeds of which each has episodes of its own, as in `harness campaign paper`."""
+    """A success rate over seeds of which each has episodes of its own, as in `harness study paper`."""
 
     def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
         for _ in range(runs):
@@ -181,7 +181,7 @@ def suite(families: Sequence[Kind]) -> Kind:
 
 
 def twin_kinds() -> Iterator[tuple[str, str, Kind]]:
-    """What is measured of `harness twins`."""
+    """What is measured of `harness study twins`."""
     for pairs in (6, 18):
         for alike in (0.1, 0.3, 0.6):
             for rate in (0.75, 0.9, 0.95):
@@ -229,7 +229,7 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--runs", type=int, default=2000)
     arguments.add_argument("--seed", type=int, default=0)
-    arguments.add_argument("--twins", action="store_true", help="those of `harness twins` alone")
+    arguments.add_argument("--twins", action="store_true", help="those of `harness study twins` alone")
     given = arguments.parse_args()
     began, found, before = perf_counter(), list[Cell](), ""
     of = TWINS if given.twins else EPISODES

@@ -3,7 +3,7 @@
     python benchmarks/ledger.py [--sets 10] [--coverage 100]
 
 Prints the ledger's counts on consecutive sets of five seeds at the paper's own sizes, each by
-`harness campaign paper --seeds`, and how often intervals over five other seeds hold the mean of all of them.
+`harness study paper --seeds`, and how often intervals over five other seeds hold the mean of all of them.
 """
 
 import argparse
@@ -43,7 +43,7 @@ def of_set(first: int) -> dict[str, object]:
     """The ledger's counts on five seeds, by the command."""
     seeds = f"{first}:{first + SEEDS}"
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "harness", "campaign", "paper", "--seeds", seeds, "--json"]
+        command = [sys.executable, "-m", "harness", "study", "paper", "--seeds", seeds, "--json"]
         said = subprocess.run([*command, "--out", folder], check=True, capture_output=True, text=True).stdout
     ledger = pd.read_json(StringIO(said), orient="records")
     counts = tally(ledger)

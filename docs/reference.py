@@ -12,6 +12,7 @@ from typer import Context
 from typer.main import get_command
 
 from harness.cli import app
+from harness.cli.commands import PANELS
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "commands.md"
@@ -69,12 +70,11 @@ def section(path: str, command: Any, example: str) -> str:
 
 def overview(found: list[tuple[str, Any]]) -> str:
     """Every command with the first sentence of its purpose, in the groups of `--help`."""
-    panels = {name: command.rich_help_panel for name, command in get_command(app).commands.items()}
     lines = ["| command | what it does |", "|---|---|"]
-    for panel in dict.fromkeys(panels.values()):
+    for panel, names in PANELS.items():
         lines.append(f"| **{panel}** | |")
         for path, command in found:
-            if panels[path.split()[1]] == panel:
+            if path.split()[1] in names:
                 purpose = _cell(re.split(r"\.\s", command.help)[0].rstrip("."))
                 lines.append(f"| [{path}](#{path.replace(' ', '-')}) | {purpose} |")
     return "\n".join([*lines, ""])

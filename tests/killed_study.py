@@ -27,23 +27,25 @@ RUN, DRIVEN, SEEDS = "run", "driven", ("--seeds", "0:4")
 POINTS = ("--condition", "single-local", "--condition", "6g")
 COMMANDS = {
     "trust": (
-        "trust", RUN, "--attacks", "liar,liar+spoof", "--rules", "median,trust", "--share", "1/3", *SEEDS,
+        "study", "trust", RUN, "--attacks", "liar,liar+spoof", "--rules", "median,trust",
+        "--share", "1/3", *SEEDS,
     ),
-    "sweep": ("sweep", RUN, "--over", "loss", "--grid", "0,0.5", *SEEDS),
-    "schedule": ("schedule", "compare", RUN, "--schedule", "entropy", *SEEDS),
-    "attribute": ("attribute", RUN, "--sample", "6"),
-    "fidelity": ("fidelity", RUN, DRIVEN, "--out", "out"),
-    "twins": ("twins", "--dataset", "data", "--sample", "3", "--workers", "1", "--out", "out"),
+    "sweep": ("study", "sweep", RUN, "--over", "loss", "--grid", "0,0.5", *SEEDS),
+    "schedule": ("study", "schedule", "compare", RUN, "--schedule", "entropy", *SEEDS),
+    "attribute": ("study", "attribute", RUN, "--sample", "6"),
+    "fidelity": ("study", "fidelity", RUN, DRIVEN, "--out", "out"),
+    "twins": ("study", "twins", "--dataset", "data", "--sample", "3", "--workers", "1", "--out", "out"),
     "grid": (
-        "grid", "--prompt", "v2,v3", "--helper-prompt", "v2", "--dataset", "data", *POINTS, "--out", "out",
+        "study", "grid", "--prompt", "v2,v3", "--helper-prompt", "v2", "--dataset", "data", *POINTS,
+        "--out", "out",
     ),
     "repeats": (
         "eval", "--repeats", "3", "--temperature", "0.7", "--model", "swarm-tiny", "--dataset", "data",
         *POINTS, "--no-cache", "--out", "out",
     ),
-    "paper": ("campaign", "paper", "--episodes", "10", "--sweep-episodes", "10", "--out", "out"),
+    "paper": ("study", "paper", "--episodes", "10", "--sweep-episodes", "10", "--out", "out"),
     "closed-loop": (
-        "campaign", "closed-loop", "--model", "proxy", "--episodes", "17", "--seeds", "0", "--workers", "1",
+        "study", "closed-loop", "--model", "proxy", "--episodes", "17", "--seeds", "0", "--workers", "1",
         "--out", "out",
     ),
 }  # fmt: skip
@@ -96,7 +98,7 @@ def typed(words: Sequence[str], here: Path, last: int | None = None) -> int:
         status = 1  # whatever happens, a child must not go on as its parent
         try:
             os.chdir(here)
-            sys.argv = ["harness", *words, "--quiet"] if words[0] != "fidelity" else ["harness", *words]
+            sys.argv = ["harness", *words, "--quiet"] if words[1] != "fidelity" else ["harness", *words]
             sys.addaudithook(writes := Writes(here, last))
             try:
                 cli.main()

@@ -1,4 +1,4 @@
-"""`harness attribute`: what answers and decisions become without one object, or one message."""
+"""`harness study attribute`: what answers and decisions become without one object, or one message."""
 
 import json
 import shutil
@@ -330,18 +330,18 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
 ) -> None:
     control = replace(SIXG, name="6g:messages=blind", messages="blind")
     run(spec_of(small, points=(control, SIXG)), tmp_path / "run")
-    code, out, _ = harness("attribute", "run", "--sample", "10")
+    code, out, _ = harness("study", "attribute", "run", "--sample", "10")
     assert code == 0
     assert max(map(len, out.splitlines())) <= 80
     assert out.splitlines()[1].startswith("The ")
     assert "10 of the " in out
     assert "decision points of 6g:loss=0, drawn with sample seed 0" in " ".join(out.split())
-    told = json.loads(harness("attribute", "run", "--sample", "10", "--json")[1])
+    told = json.loads(harness("study", "attribute", "run", "--sample", "10", "--json")[1])
     kept = folder.read(tmp_path / "run").attribution
     assert kept
     assert told["decision_points"] == kept.decision_points == 10
     assert sum(row["shift"]["n"] for row in told["rows"]) == len(kept.left_out)
-    assert harness("attribute", "run", "--condition", control.name, "--quiet")[:2] == (0, "")
+    assert harness("study", "attribute", "run", "--condition", control.name, "--quiet")[:2] == (0, "")
     assert harness("report", "run")[0] == 0
     page = Path("run/report.html").read_text()
     kept = folder.read(tmp_path / "run").attribution
@@ -352,7 +352,7 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
         ("run", "--condition", "7g"): "unknown condition '7g'",
         ("nowhere",): "nowhere is no finished run",
     }.items():
-        code, _, err = harness("attribute", *typed)
+        code, _, err = harness("study", "attribute", *typed)
         assert (code, err.count("\n")) == (2, 1)
         assert said in err
 

@@ -130,7 +130,7 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     page = unescape(Path("reports/mute/report.html").read_text())
     assert page.index(cause) < page.index("Under 6g, mute clears")
     assert page.index(UNREAD) < page.index("Under 6g, mute clears")
-    assert "none of the ego's answers could be read: it drives by the fallback" in harness("ls")[1]
+    assert "none of the ego's answers could be read: it drives by the fallback" in harness("run", "ls")[1]
     sound = ("--prompt", "v1", "--json", "--out", "reports/sound")
     code, out, err = harness("eval", "--model", "proxy", *options, *sound)
     assert json.loads(out)["caveats"] == [NO_PROMPT.replace("v2", "v1")]
@@ -155,5 +155,5 @@ def test_a_page_says_what_else_bounds_its_numbers(small: Dataset, tmp_path: Path
         "decision's page shows what its own helpers say.",
         "6g:messages=blind is a control: the ego hears helpers that are shown nothing.",
         "Under v2x, most decisions take longer than these frozen scenes assume: closed-loop success may "
-        "differ. harness fidelity compares the two.",
+        "differ. harness study fidelity compares the two.",
     ]

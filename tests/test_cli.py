@@ -108,8 +108,8 @@ def one_line(said: Said) -> str:
         (["prompt", "show", "v2", "--scene", "99999-9"], "unknown scene '99999-9'"),
         (["prompt", "show", "v2", "--scene", "00000-0", "--viewer", "v77"], "unknown viewer 'v77'"),
         (["prompt", "check", "v2", "--tokenizer", "absent.gguf"], "no tokenizer at absent.gguf"),
-        (["prompt", "lock", "v2"], "prompt v2 is released already; copy it to a new version"),
-        (["prompt", "lock", "v99"], "unknown prompt 'v99'"),
+        (["prompt", "release", "v2"], "prompt v2 is released already; copy it to a new version"),
+        (["prompt", "release", "v99"], "unknown prompt 'v99'"),
         (["prompt", "show", "v2", "--viewer"], "Option '--viewer' requires an argument"),
         (["model", "check"], "Missing argument 'name'"),
     ],
@@ -215,7 +215,7 @@ def test_what_says_json_is_json(harness: Harness, small_path: Path) -> None:
 def test_one_version_that_cannot_be_used_hides_no_other(harness: Harness, tmp_path: Path) -> None:
     harness("init", "mine")
     os.chdir("mine")
-    harness("prompt", "lock", "mine")
+    harness("prompt", "release", "mine")
     with Path("prompts/mine/ego.j2").open("a") as file:
         file.write("edited")
     for form, mark in (((), "{} "), (("--json",), '"version": "{}"')):

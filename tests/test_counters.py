@@ -133,7 +133,7 @@ def test_without_a_meter_it_says_what_is_missing(
 ):
     monkeypatch.setattr(readers, "SYS", tmp_path)
     monkeypatch.setattr(counters, "__defaults__", (tmp_path,))
-    code, _, err = harness("device", "measure")
+    code, _, err = harness("model", "device", "measure")
     assert code == 2
     assert "no meter can be read here" in err
     assert len(err.splitlines()) == 1

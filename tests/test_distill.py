@@ -374,7 +374,7 @@ def test_bad_input_writes_nothing(options: list[str], said: str, tmp_path: Path)
     with pytest.raises(UserError) as caught:
         CliRunner().invoke(
             app,
-            ["distill", "occluded-intersection", "--out", str(tmp_path / "m"), *options],
+            ["model", "distill", "occluded-intersection", "--out", str(tmp_path / "m"), *options],
             standalone_mode=False,
             catch_exceptions=False,
         )

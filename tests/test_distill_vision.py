@@ -199,7 +199,9 @@ def test_a_picture_is_answered_as_the_base_answers_the_same_scene_graph_in_words
 
 def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
     model = new_model(read_tokenizer(folder, sees=True), 0, sees=True)
-    with pytest.raises(UserError, match=r"--base .*give the folder of a model that `harness distill` made"):
+    with pytest.raises(
+        UserError, match=r"--base .*give the folder of a model that `harness model distill` made"
+    ):
         take_over(model, folder)
 
 

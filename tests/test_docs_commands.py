@@ -39,19 +39,19 @@ CUT = {
     "harness eval --model my-model": "--limit 1",
     **{line: "--limit 1" for line in TYPED if "--dataset suite:" in line},  # of each of six families
     "harness eval": "--limit 2",  # of 240 episodes; one has no interval to gate on
-    "harness grid": "--limit 1 --seeds 0:1",  # of 200 episodes
+    "harness study grid": "--limit 1 --seeds 0:1",  # of 200 episodes
     "harness drive": "--episodes 1 --seeds 0 --workers 1",  # of 240 with 5 seeds
-    "harness twins": "--sample 1 --workers 1",  # of 12 episodes
-    "harness attribute": "--sample 2",  # of 40 decision points
-    "harness trust": "--attacks liar+spoof --rules trust --share 1/3 --seeds 0:1",  # of 15, 10, 2 and 5
-    "harness campaign paper": "--episodes 10 --sweep-episodes 10",  # of 1500 and 300 a grid point
-    "harness campaign closed-loop": "--episodes 1 --seeds 0 --workers 1",  # of 300 layouts with 5 seeds
+    "harness study twins": "--sample 1 --workers 1",  # of 12 episodes
+    "harness study attribute": "--sample 2",  # of 40 decision points
+    "harness study trust": "--attacks liar+spoof --rules trust --share 1/3 --seeds 0:1",  # of 15, 10, 2 and 5
+    "harness study paper": "--episodes 10 --sweep-episodes 10",  # of 1500 and 300 a grid point
+    "harness study closed-loop": "--episodes 1 --seeds 0 --workers 1",  # of 300 layouts with 5 seeds
     "harness dataset build": "--episodes 2 --workers 1",  # of 40 and of 1000
-    "harness scenario check": "--episodes 2 --workers 1",  # of 100 and of 500
-    "harness scenario audit": "--layouts 24 --workers 1",  # of 300
-    "harness distill": "--layouts 2 --samples 16,16,16,16 --workers 1",  # of 240, and of 300 000 sequences
+    "harness dataset scenario drive": "--episodes 2 --workers 1",  # of 100 and of 500
+    "harness dataset scenario audit": "--layouts 24 --workers 1",  # of 300
+    "harness model distill": "--layouts 2 --samples 16,16,16,16 --workers 1",  # of 240 and 300 000
     "harness prompt check mine --tokenizer ../tokenizer.json": "--dataset ../few",  # 4 episodes of 240
-    "harness parity": "--prompts 1",  # of 64, on two engines
+    "harness model parity": "--prompts 1",  # of 64, on two engines
 }
 
 # Ends otherwise than its page shows, since what it reads was cut.
@@ -65,7 +65,7 @@ CUT_ENDS = {
 
 # Held against the program's options, and not run.
 NOT_RUN = {
-    "harness device measure --model swarm-tiny": "needs a meter of energy",
+    "harness model device measure --model swarm-tiny": "needs a meter of energy",
     "harness view": "serves until it is interrupted; tests/view starts it",
     "harness model pull qwen3-4b": "fetches weights from a hub",
     "harness model pull smollm2-135m": "fetches weights from a registry; tests/test_packages.py does",
@@ -73,14 +73,14 @@ NOT_RUN = {
     "harness prompt check v10 --model smollm2-135m": "needs those weights",
     "harness eval --model smollm2-135m --limit 4": "needs those weights",
     "harness eval --model smollm2-135m --engine llama-cpp --limit 4": "needs those weights",
-    "harness parity smollm2-135m --prompts 500 --read-outs": "needs those weights, and 12 CPU minutes",
+    "harness model parity smollm2-135m --prompts 500 --read-outs": "needs those weights, and 12 CPU minutes",
     "harness model check qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b": "needs those weights",
     "harness eval --model my-served --server http://gpu-1:8000/v1 --server http://gpu-2:8000/v1"
     " --batch-size 256": "needs servers; tests/test_servers.py has some",
     "harness eval --model qwen3-4b --engine llama-cpp": "needs weights from a hub",
     "harness eval --model swarm-tiny --latency measured": "a busy machine is refused",
-    "harness export reports/proxy-v2-occluded-intersection-v2 --inspect logs/run.eval": "needs inspect-ai",
+    "harness run export reports/proxy-v2-occluded-intersection-v2 --inspect logs/run.eval": "needs inspect",
     "harness dataset rank occluded-intersection-v2 --json": "long; docs/datasets.md ranks a small one",
 }
 OTHER_PROGRAMS = {
@@ -99,7 +99,7 @@ def name(page: Path) -> str:
 
 def parsed(args: list[str]) -> tuple[str, list[str]]:
     """The command that is meant, and what stands behind it. Fails if there is no such command."""
-    for words in (2, 1):
+    for words in (3, 2, 1):
         path = " ".join(["harness", *args[:words]])
         if path in COMMANDS:
             return path, args[words:]

@@ -60,13 +60,13 @@ def test_a_frozen_evaluation_and_what_is_done_with_it_need_no_extra(tmp_path: Pa
         "eval --model replay:a --limit 2 --quiet --out c",
         "report a b --out both.html",
         "compare a b",
-        "export a --csv",
-        "ls .",
+        "run export a --csv",
+        "run ls .",
         "prompt show v2 --scene 00000-0",
         "dataset check occluded-intersection-v2",
-        "scenario show occluded-intersection",
+        "dataset scenario show occluded-intersection",
         "model list",
-        "doctor",
+        "model doctor",
     )
     said = bare(tmp_path, *lines)
     assert re.findall(r"^exit (\S+)", said, re.MULTILINE) == ["0"] * len(lines), said
@@ -77,12 +77,12 @@ def test_a_frozen_evaluation_and_what_is_done_with_it_need_no_extra(tmp_path: Pa
     ("line", "package", "extra"),
     [
         ("drive --model proxy --episodes 1", "highway-env", "sim"),
-        ("scenario check occluded-intersection", "highway-env", "sim"),
+        ("dataset scenario drive occluded-intersection", "highway-env", "sim"),
         ("dataset build occluded-intersection --episodes 1 --out built", "highway-env", "sim"),
         ("dataset show occluded-intersection-v2 00000-0 --out scene.svg", "matplotlib", "report"),
-        ("campaign paper --out paper", "matplotlib", "report"),
+        ("study paper --out paper", "matplotlib", "report"),
         ("eval --model swarm-tiny", "llama-cpp-python", "llama-cpp"),
-        ("distill do-not-pass --out student", "torch", "transformers"),
+        ("model distill do-not-pass --out student", "torch", "transformers"),
     ],
 )
 def test_what_needs_an_extra_says_in_one_line_which(

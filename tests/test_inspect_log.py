@@ -1,4 +1,4 @@
-"""`harness export --inspect`: the log as Inspect AI itself reads it."""
+"""`harness run export --inspect`: the log as Inspect AI itself reads it."""
 
 import shutil
 from collections.abc import Callable
@@ -42,7 +42,7 @@ def run(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def log_of(run: Path, harness: Harness, file: str = "run.eval") -> Any:
-    code, out, err = harness("export", run, "--inspect", file)
+    code, out, err = harness("run", "export", run, "--inspect", file)
     assert (code, out, err) == (0, f"{file}\n", "")
     return inspect_log.read_eval_log(file)
 
@@ -101,7 +101,7 @@ def test_a_kept_prompt_is_in_the_log_once_the_version_is_gone(tmp_path: Path, ha
         assert digest(asked) == sample.metadata["prompt_sha256"]
     before = Path("run.eval").read_bytes()
     shutil.rmtree("run/sources")
-    code, out, err = harness("export", "run", "--inspect", "run.eval")
+    code, out, err = harness("run", "export", "run", "--inspect", "run.eval")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "run.eval is kept: a new page would lack its prompts" in err
     assert Path("run.eval").read_bytes() == before

@@ -109,7 +109,7 @@ def test_a_busy_machine_measures_nothing(
 ) -> None:  # fmt: skip
     monkeypatch.setattr(timing, "load_a_core", lambda: load)
     monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: pytest.fail("the model was opened"))
-    for command in (["eval"], ["drive"], ["campaign", "closed-loop"]):
+    for command in (["eval"], ["drive"], ["study", "closed-loop"]):
         code, out, err = harness(*command, "--model", LANGUAGE_MODEL, "--latency", "measured", "--quiet")
         assert (code, out) == (2, "")
         assert err.startswith(f"harness: --latency measured: {said}")

@@ -177,8 +177,9 @@ def test_a_mix_that_means_nothing_is_refused(
     [
         ("eval", "--helper-answer readout", "--helper-answer readout: proxy is no language model; use json"),
         ("drive", "--helper-answer readout", "--helper-answer readout: proxy is no language model; use json"),
-        ("grid", "--helper-answer readout", "--helper-answer readout: proxy is no language model; use json"),
-        ("grid", "--helper-model proxy,proxy", "--helper-model proxy,proxy: give different names"),
+        ("study grid", "--helper-answer readout",
+         "--helper-answer readout: proxy is no language model; use json"),
+        ("study grid", "--helper-model proxy,proxy", "--helper-model proxy,proxy: give different names"),
         ("eval", "--helper-thinking", "--helper-thinking: proxy cannot think; leave it out"),
         ("eval", "--model swarm-tiny --answer readout --helper-model proxy",
          "helpers: --answer readout: proxy is no language model; use json"),
@@ -188,7 +189,7 @@ def test_what_is_wrong_with_a_helper_names_the_option_that_was_typed(
     command: str, typed: str, said: str, harness: Callable[..., Any], small_path: Path
 ) -> None:
     data = () if command == "drive" else ("--dataset", small_path)
-    code, out, err = harness(command, *data, *typed.split())
+    code, out, err = harness(*command.split(), *data, *typed.split())
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"harness: {said}")
 

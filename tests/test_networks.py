@@ -123,7 +123,7 @@ def test_a_run_records_its_network_and_a_sweep_refuses_another(
     both = quiet.dropna()
     assert len(both)
     assert (both.iloc[:, 0] == both.iloc[:, 1]).all(), "paired"
-    sweep = ("sweep", run, "--over", "window", "--grid", "200", "--condition", "6g:round_trip=mine")
+    sweep = ("study", "sweep", run, "--over", "window", "--grid", "200", "--condition", "6g:round_trip=mine")
     assert harness(*sweep)[0] == 0
     mine.write_text(MINE.replace("60", "70"))
     code, _, err = harness(*sweep)

@@ -101,7 +101,7 @@ def test_no_command_but_pull_downloads(tmp_path: Path) -> None:
         said = refusal(harness(where, *command))
         assert "package some-weights 1.0 is not fetched yet; run `harness model pull mine`" in said
     assert "no: weights" in harness(where, "model", "list").stdout
-    assert "harness model pull mine" in harness(where, "doctor").stdout
+    assert "harness model pull mine" in harness(where, "model", "doctor").stdout
     assert not (tmp_path / "cache" / "weights").exists()
 
 

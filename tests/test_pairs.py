@@ -1,4 +1,4 @@
-"""`harness export --sft`: a run's questions, the answers that its trees ask for, and training on them."""
+"""`harness run export --sft`: a run's questions, the answers that its trees ask for, and training on them."""
 
 import json
 from collections.abc import Callable
@@ -46,7 +46,7 @@ def run(evaluated: Path, tmp_path: Path) -> Path:
 
 
 def lines_of(run: Path, harness: Harness, *options: str) -> list[dict[str, Any]]:
-    code, out, err = harness("export", run, "--sft", "pairs.jsonl", *options)
+    code, out, err = harness("run", "export", run, "--sft", "pairs.jsonl", *options)
     assert (code, out, err) == (0, "pairs.jsonl\n", "")
     return [json.loads(line) for line in Path("pairs.jsonl").read_text().splitlines()]
 
@@ -98,7 +98,7 @@ def test_helpers_with_a_prompt_and_answer_mode_of_their_own_have_their_own_pairs
 
 def test_layouts_that_numbers_are_of_become_no_training_data_silently(run: Path, harness: Harness) -> None:
     change(run, episode=lambda row: row.update(layout_seed=row["layout_seed"] + 199_897))
-    code, out, err = harness("export", run, "--sft", "pairs.jsonl")
+    code, out, err = harness("run", "export", run, "--sft", "pairs.jsonl")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "has layout seeds 199997 to 200000 (train and report), and a model that learns from them" in err
     assert err.endswith("or give --report-seeds-too\n")
@@ -112,7 +112,7 @@ def test_layouts_that_numbers_are_of_become_no_training_data_silently(run: Path,
 def test_what_is_not_here_as_it_was_is_one_line(key: str, said: str, run: Path, harness: Harness) -> None:
     stated = json.loads((run / "run.json").read_text())[key]
     configure(run, **{key: {**stated, "sha256": "1" * 64}})
-    code, out, err = harness("export", run, "--sft", "pairs.jsonl")
+    code, out, err = harness("run", "export", run, "--sft", "pairs.jsonl")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err
     assert not Path("pairs.jsonl").exists()
@@ -121,7 +121,7 @@ def test_what_is_not_here_as_it_was_is_one_line(key: str, said: str, run: Path, 
 def test_a_run_whose_prompts_showed_pictures_is_one_line(run: Path, harness: Harness) -> None:
     stated = json.loads((run / "run.json").read_text())["prompt"]
     configure(run, prompt={**stated, "version": "v7", "sha256": prompts.load("v7").sha256})
-    code, out, err = harness("export", run, "--sft", "pairs.jsonl")
+    code, out, err = harness("run", "export", run, "--sft", "pairs.jsonl")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "showed pictures by prompt v7" in err
     assert not Path("pairs.jsonl").exists()
@@ -141,7 +141,7 @@ def test_a_run_of_scenes_that_its_dataset_has_not_is_one_line(
     scene = next(iter(read(run).decisions.scenes))
     here = {"scene": scene, **({"viewer": "v2"} if name == "answer" else {})}
     change(run, **{name: lambda row: here.items() <= row.items() and row.update(changed)})
-    code, out, err = harness("export", run, "--sft", "pairs.jsonl", "--report-seeds-too")
+    code, out, err = harness("run", "export", run, "--sft", "pairs.jsonl", "--report-seeds-too")
     assert (code, out, err.count("\n")) == (2, "", 1), err
     assert said in err
     assert not Path("pairs.jsonl").exists()
@@ -149,7 +149,7 @@ def test_a_run_of_scenes_that_its_dataset_has_not_is_one_line(
 
 def test_a_driven_run_knows_no_best_action(tmp_path: Path, harness: Harness) -> None:
     made_up(tmp_path / "driven", closed_loop=True)
-    code, _, err = harness("export", "driven", "--sft", "pairs.jsonl")
+    code, _, err = harness("run", "export", "driven", "--sft", "pairs.jsonl")
     assert (code, err.count("\n")) == (2, 1)
     assert "driven was driven, and only frozen scenes know what each action leads to" in err
 

@@ -1,4 +1,4 @@
-"""`harness parity`: a tiny Qwen3 beside a GGUF file of its weights or of others, and a Llama's GGUF file."""
+"""`harness model parity`: a tiny Qwen3 beside a GGUF of its weights or of others, and a Llama's."""
 
 import json
 import shutil
@@ -90,7 +90,7 @@ def test_other_weights_are_found_to_differ_and_where_is_named(unlike: Path, smal
 
 
 def test_the_command_says_each_finding_in_a_line_and_exits_with_1(unlike: Path, small_path: Path) -> None:
-    arguments = ["parity", str(unlike), "--dataset", str(small_path), "--prompts", str(PROMPTS)]
+    arguments = ["model", "parity", str(unlike), "--dataset", str(small_path), "--prompts", str(PROMPTS)]
     said = CliRunner().invoke(app, arguments)
     assert said.exit_code == 1
     lines = said.stdout.splitlines()
@@ -103,7 +103,17 @@ def test_the_command_says_each_finding_in_a_line_and_exits_with_1(unlike: Path, 
 
 
 def test_a_version_with_examples_is_compared_too(tiny: Path, small_path: Path) -> None:
-    arguments = ["parity", str(tiny), "--dataset", str(small_path), "--prompts", "2", "--prompt", "v6"]
+    arguments = [
+        "model",
+        "parity",
+        str(tiny),
+        "--dataset",
+        str(small_path),
+        "--prompts",
+        "2",
+        "--prompt",
+        "v6",
+    ]
     said = CliRunner().invoke(app, [*arguments, "--json"])
     assert said.exception is None or isinstance(said.exception, SystemExit)
     assert len(json.loads(said.stdout)["findings"]) == 10
@@ -142,7 +152,7 @@ def test_read_outs_alone_need_no_text_and_what_was_left_out_is_said(
     llama: Path, small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path))
-    arguments = ["parity", str(llama), "--dataset", str(small_path), "--prompts", "3", "--read-outs"]
+    arguments = ["model", "parity", str(llama), "--dataset", str(small_path), "--prompts", "3", "--read-outs"]
     said = CliRunner().invoke(app, arguments)
     assert said.exit_code == 0, said.output
     *found, left_out, verdict = said.stdout.splitlines()

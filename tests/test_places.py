@@ -80,14 +80,14 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
           "--fail-if", "success_rate < -1")  # fmt: skip
     typed("compare", one, two, "--html", here.parent / "elsewhere/apart.html")
     Path("comment.md").write_text(typed("compare", one, two, "--markdown"))
-    typed("history", here / "reports", "--html", here / "history.html")
-    typed("fidelity", one, here / "reports/driven", "--out", here / "fidelity")
-    typed("export", two, "--csv", "--out", here / "text")
-    typed("export", two, "--jsonl", "--out", here / "text")
-    typed("export", two, "--junit", here / "episodes.xml")
-    typed("export", two, "--sft", here / "lessons.jsonl", "--report-seeds-too")
+    typed("run", "history", here / "reports", "--html", here / "history.html")
+    typed("study", "fidelity", one, here / "reports/driven", "--out", here / "fidelity")
+    typed("run", "export", two, "--csv", "--out", here / "text")
+    typed("run", "export", two, "--jsonl", "--out", here / "text")
+    typed("run", "export", two, "--junit", here / "episodes.xml")
+    typed("run", "export", two, "--sft", here / "lessons.jsonl", "--report-seeds-too")
     if find_spec("inspect_ai"):
-        typed("export", two, "--inspect", here / "log.json")
+        typed("run", "export", two, "--inspect", here / "log.json")
     assert [str(path) for path in found(here.parent.parent)] == []
     pages = here / "pair.html", here.parent / "elsewhere/apart.html", one / "x"
     places = [beside(page)(read(one)) for page in pages]
@@ -98,12 +98,12 @@ def test_no_page_of_studies_names_a_folder(typed: Callable[..., str]) -> None:
     here = Path.cwd()
     run = here / "reports/one"
     typed("eval", "--model", "proxy", *EVAL, "--dataset", here / "datasets/mine", "--out", run)
-    typed("sweep", run, "--over", "tau", "--grid", "0.7", "--quiet", "--out", here / "swept")
-    typed("trust", run, "--attacks", "liar", "--rules", "median", "--share", "1/3", "--quiet",
+    typed("study", "sweep", run, "--over", "tau", "--grid", "0.7", "--quiet", "--out", here / "swept")
+    typed("study", "trust", run, "--attacks", "liar", "--rules", "median", "--share", "1/3", "--quiet",
           "--out", here / "trust")  # fmt: skip
-    typed("schedule", "compare", run, "--schedule", "margin", "--quiet", "--out", here / "schedules")
-    typed("attribute", run, "--sample", "2", "--quiet")
+    typed("study", "schedule", "compare", run, "--schedule", "margin", "--quiet", "--out", here / "schedules")
+    typed("study", "attribute", run, "--sample", "2", "--quiet")
     typed("report", run)
-    typed("twins", "--model", "proxy", "--dataset", here / "datasets/mine", "--limit", "1",
+    typed("study", "twins", "--model", "proxy", "--dataset", here / "datasets/mine", "--limit", "1",
           "--quiet", "--out", here / "twins")  # fmt: skip
     assert [str(path) for path in found(here)] == []

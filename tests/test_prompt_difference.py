@@ -64,7 +64,7 @@ def test_settings_that_decide_what_is_asked_are_compared_and_notes_are_not() -> 
 
 def test_v2_and_v3_differ_only_for_an_ego_with_messages(small_path: Path, harness: Harness) -> None:
     tokenizer = resources.find("models", "swarm-tiny")
-    args = ("prompt", "diff", "v2", "v3", "--dataset", small_path)
+    args = ("prompt", "compare", "v2", "v3", "--dataset", small_path)
     code, out, err = harness(*args, "--tokenizer", tokenizer, "--json")
     assert (code, err) == (0, "")
     told = json.loads(out)
@@ -82,7 +82,7 @@ def test_v2_and_v3_differ_only_for_an_ego_with_messages(small_path: Path, harnes
 def test_every_hunk_is_of_what_prompt_show_prints(small_path: Path, harness: Harness) -> None:
     of = ("--scene", "00001-0", "--dataset", small_path)
     shown = [json.loads(harness("prompt", "show", version, *of, "--json")[1]) for version in ("v3", "v4")]
-    told = json.loads(harness("prompt", "diff", "v3", "v4", *of, "--json")[1])
+    told = json.loads(harness("prompt", "compare", "v3", "v4", *of, "--json")[1])
     assert told["scene"].startswith("00001-0-")
     alone = [sent for sent in told["sent"] if sent["role"] != "fusion"]
     for sent in alone:
@@ -98,7 +98,7 @@ def test_every_hunk_is_of_what_prompt_show_prints(small_path: Path, harness: Har
 
 
 def test_it_fits_a_terminal(small_path: Path, harness: Harness) -> None:
-    code, out, err = harness("prompt", "diff", "v3", "v4", "--dataset", small_path)
+    code, out, err = harness("prompt", "compare", "v3", "v4", "--dataset", small_path)
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     assert "  max_conflicts             none → 3\n" in out
@@ -108,7 +108,7 @@ def test_it_fits_a_terminal(small_path: Path, harness: Harness) -> None:
 def test_a_terminal_has_colours_and_a_pipe_has_none(
     small_path: Path, harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    args = ("prompt", "diff", "v3", "v4", "--dataset", small_path)
+    args = ("prompt", "compare", "v3", "v4", "--dataset", small_path)
     assert "\x1b" not in harness(*args)[1]
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")
@@ -118,7 +118,7 @@ def test_a_terminal_has_colours_and_a_pipe_has_none(
 
 
 def test_a_version_against_itself(small_path: Path, harness: Harness) -> None:
-    code, out, _ = harness("prompt", "diff", "v4", "v4", "--dataset", small_path)
+    code, out, _ = harness("prompt", "compare", "v4", "v4", "--dataset", small_path)
     assert (code, out.splitlines()[0]) == (0, "v4 → v4: the same settings and texts")
     assert "@@" not in out
 
@@ -134,6 +134,6 @@ def test_a_version_against_itself(small_path: Path, harness: Harness) -> None:
 def test_what_is_not_there_is_one_line(
     args: tuple[str, ...], said: str, small_path: Path, harness: Harness
 ) -> None:
-    code, out, err = harness("prompt", "diff", *args, "--dataset", small_path)
+    code, out, err = harness("prompt", "compare", *args, "--dataset", small_path)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err

@@ -114,10 +114,10 @@ def test_a_key_with_thousands_of_dots_is_refused_at_once() -> None:
 QUICK = ("eval", "--limit", "1", "--seeds", "0", "--dry-run")
 # Files of a project, and a command that reads each.
 READ: dict[str, tuple[str, ...]] = {
-    "channels/mine.toml": ("channel", "show", "mine"),
-    "channels/points.csv": ("channel", "show", "trace"),
+    "channels/mine.toml": ("radio", "show", "mine"),
+    "channels/points.csv": ("radio", "show", "trace"),
     "networks/mine.toml": (*QUICK, "--condition", "cloud:round_trip=mine"),
-    "devices/mine.toml": ("device", "show", "mine"),
+    "devices/mine.toml": ("model", "device", "show", "mine"),
     "schedules/mine.toml": (*QUICK, "--condition", "6g:schedule=mine"),
     "models/mine.toml": ("model", "list"),
     "models/folder/config.json": (*QUICK, "--model", "models/folder"),
@@ -127,9 +127,9 @@ READ: dict[str, tuple[str, ...]] = {
     "prompts/mine/examples.json": (*QUICK, "--prompt", "mine"),
     "prompts/mine/answer.json": (*QUICK, "--prompt", "mine"),
     "datasets/suites.toml": ("eval", "--dataset", "suite:mine", "--dry-run"),
-    "curves.csv": ("channel", "check", "mode4", "--against", "curves.csv"),
+    "curves.csv": ("radio", "check", "mode4", "--against", "curves.csv"),
     "config.json": ("drive", "--env", "merge-v0", "--env-config", "config.json", "--episodes", "1"),
-    "answer.txt": ("parse", "answer.txt"),
+    "answer.txt": ("prompt", "parse", "answer.txt"),
     "tokenizer.json": ("prompt", "check", "v2", "--tokenizer", "tokenizer.json"),
     "small/manifest.json": ("dataset", "check", "small"),
     "small/layouts.zip": ("dataset", "check", "small"),

@@ -238,7 +238,7 @@ def test_asking_whom_a_schedule_asks_is_the_same_exchange():
         ("6g:schedule=entrop", "unknown schedule 'entrop'; did you mean 'entropy'"),
         (
             "6g:schedule=oracle",
-            "schedule oracle looks at how scenes end; `harness schedule compare` plays it",
+            "schedule oracle looks at how scenes end; `harness study schedule compare` plays it",
         ),
         ("6g:threshold=0.5", "threshold is 0.5; it must be left out where schedule is entropy: its is tau_n"),
         ("6g:schedule=always,threshold=0.5", "it must be left out where schedule is always, which has none"),

@@ -57,8 +57,8 @@ def test_what_is_for_one_purpose_is_so_seed_by_seed(first: int, count: int) -> N
     "words",
     [
         "drive --model cruise --first-seed 99999 --episodes 2",
-        "campaign closed-loop --model cruise --first-seed 99999 --episodes 2",
-        "scenario check occluded-intersection --seed 199999 --episodes 2",
+        "study closed-loop --model cruise --first-seed 99999 --episodes 2",
+        "dataset scenario drive occluded-intersection --seed 199999 --episodes 2",
         "dataset build occluded-intersection --seed 99999 --episodes 2 --out built",
     ],
 )

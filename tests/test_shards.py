@@ -100,7 +100,7 @@ def copied(split: Path, to: Path, *names: str) -> list[Path]:
 
 def test_merged_shards_are_the_run_that_was_not_split(split: Path, harness: Typed, tmp_path: Path) -> None:
     shards = copied(split, tmp_path, "2", "3", "1")
-    assert harness("merge", *shards, "--out", "merged", "--quiet") == (0, "", "")
+    assert harness("run", "merge", *shards, "--out", "merged", "--quiet") == (0, "", "")
     whole, merged = split / "whole", tmp_path / "merged"
     for name in FILES:
         assert (merged / name).read_bytes() == (whole / name).read_bytes(), name
@@ -111,10 +111,10 @@ def test_merged_shards_are_the_run_that_was_not_split(split: Path, harness: Type
     assert shlex.split(ours["command"])[:-1] == shlex.split(theirs["command"])[:-1]
     assert {path.name for path in merged.iterdir()} == {*FILES, "run.json", "report.html", "sources"}
     assert read_sources(merged) == read_sources(whole) != {}
-    code, _, said = harness("merge", *shards, "--out", "merged")
+    code, _, said = harness("run", "merge", *shards, "--out", "merged")
     assert (code, "already holds a finished run" in said) == (2, True)
     (merged / ".work").mkdir()  # killed while it tidied up
-    assert harness("merge", *shards, "--out", "merged", "--quiet") == (0, "", "")
+    assert harness("run", "merge", *shards, "--out", "merged", "--quiet") == (0, "", "")
     assert not (merged / ".work").exists()
 
 
@@ -124,7 +124,7 @@ def test_a_shard_says_what_to_do_with_it_and_goes_on(split: Path, harness: Typed
     assert code == 0
     assert out == (
         f"wrote {shard}: 16 of 36 episodes, shard 2/3; merge all 3 shards with "
-        "`harness merge FOLDER... --out FOLDER`\n"
+        "`harness run merge FOLDER... --out FOLDER`\n"
     )
     for other in (["--shard", "1/3"], []):
         code, _, said = harness(*DRIVE, *other, "--out", shard)
@@ -133,7 +133,7 @@ def test_a_shard_says_what_to_do_with_it_and_goes_on(split: Path, harness: Typed
 
 def refused(harness: Typed, shards: list[Path]) -> str:
     """What is said where these are merged: one line, and nothing is made."""
-    code, out, said = harness("merge", *shards, "--out", "refused")
+    code, out, said = harness("run", "merge", *shards, "--out", "refused")
     assert (code, out, said.count("\n")) == (2, "", 1)
     assert not Path("refused").exists()
     return said
@@ -160,7 +160,7 @@ def test_the_same_shard_twice_is_taken_where_its_bytes_agree(
         refused(harness, [*shards, tmp_path / "again"]),
     )
     file.write_text(text)
-    assert harness("merge", *shards, tmp_path / "again", "--out", "merged", "--quiet")[0] == 0
+    assert harness("run", "merge", *shards, tmp_path / "again", "--out", "merged", "--quiet")[0] == 0
     assert (tmp_path / "merged/answers.jsonl").read_bytes() == (split / "whole/answers.jsonl").read_bytes()
 
 
@@ -212,7 +212,7 @@ def test_a_dataset_of_shards_is_the_one_that_was_not_split(harness: Typed, tmp_p
         assert (code, out.startswith(f"wrote shard-{n}: 1 of 2 layouts, shard {n}/2;")) == (0, True)
     assert "shards 2/2 are missing" in refused(harness, [Path("shard-1")])
     assert "differ in " in refused(harness, [Path("shard-1"), *_of_another_seed(tmp_path)])
-    code, out, _ = harness("merge", "shard-2", "shard-1", "--out", "merged/small")
+    code, out, _ = harness("run", "merge", "shard-2", "shard-1", "--out", "merged/small")
     assert (code, out.startswith("wrote merged/small: 2 layouts, ")) == (0, True)
     whole, merged = tmp_path / "whole/small", tmp_path / "merged/small"
     assert {path.name for path in merged.iterdir()} == {path.name for path in whole.iterdir()}

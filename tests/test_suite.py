@@ -244,7 +244,7 @@ def test_ls_lists_a_suite_above_its_runs_with_its_mean(evaluated: Harness) -> No
     suite, best = found[DONE.name], read(DONE).score(found[DONE.name].condition, "success_rate")
     assert (suite.kind, suite.state, suite.model, suite.prompt) == ("suite", "finished", "proxy", "v2 and v4")
     assert (suite.success, suite.low, suite.high) == (best.value, best.low, best.high)
-    assert "  suite proxy · v2 and v4 · json" in evaluated("ls")[1]
+    assert "  suite proxy · v2 and v4 · json" in evaluated("run", "ls")[1]
 
 
 @pytest.mark.parametrize(

@@ -502,7 +502,7 @@ def test_the_command_prints_writes_and_gates(
     harness: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
     code, out, err = harness(
-        "twins", "--model", "proxy-faulty", "--sample", "3", "--workers", "1", "--out", "faulty",
+        "study", "twins", "--model", "proxy-faulty", "--sample", "3", "--workers", "1", "--out", "faulty",
         "--fail-if", "order:invariance_rate < 0.99", "--fail-if", "ids:tv_distance > 0.5",
     )  # fmt: skip
     assert (code, err) == (1, "")
@@ -520,14 +520,14 @@ def test_the_command_prints_writes_and_gates(
     links.feed((tmp_path / "faulty" / "index.html").read_text())
     assert links.targets
     assert links.targets <= links.ids
-    code, _, err = harness("twins", "--model", "proxy-faulty", "--sample", "3", "--out", "faulty")
+    code, _, err = harness("study", "twins", "--model", "proxy-faulty", "--sample", "3", "--out", "faulty")
     assert code == 2
     assert "already holds finished twins" in err
 
 
 def test_workers_change_nothing(harness: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
     for workers in ("1", "2"):
-        harness("twins", "--sample", "3", "--workers", workers, "--out", workers, "--json")
+        harness("study", "twins", "--sample", "3", "--workers", workers, "--out", workers, "--json")
     for name in ("twins.json", "pairs.jsonl", "index.html"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
 
@@ -548,7 +548,7 @@ def test_workers_change_nothing(harness: Callable[..., tuple[int, str, str]], tm
 def test_bad_input_is_one_line(
     harness: Callable[..., tuple[int, str, str]], tmp_path: Path, typed: tuple[str, ...], said: str
 ) -> None:
-    code, out, err = harness("twins", *typed)
+    code, out, err = harness("study", "twins", *typed)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err
     assert not list(tmp_path.iterdir())

@@ -120,7 +120,7 @@ def test_a_server_that_refuses_everything_is_asked_little_and_its_words_stand_fi
     assert len(play.bodies) == FIRST
     assert not (tmp_path / "run/run.json").exists()
 
-    assert harness("export", "run", "--junit", "run.xml")[0] == 0
+    assert harness("run", "export", "run", "--junit", "run.xml")[0] == 0
     suite = ElementTree.parse(tmp_path / "run.xml").getroot()
     assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["errors"]) == ("1", "0", "1")
     [error] = suite.iter("error")
@@ -131,7 +131,7 @@ def test_a_server_that_refuses_everything_is_asked_little_and_its_words_stand_fi
     assert (code, out) == (2, "")
     assert err.startswith(f"harness: HTTP 404: {WORDS}")
     assert [e.tag for e in ElementTree.parse(tmp_path / "gates.xml").getroot()[0]] == ["error"]
-    code, _, err = harness("export", "run", "--csv")
+    code, _, err = harness("run", "export", "run", "--csv")
     assert code == 2
     assert f"run is no finished run, since its model could not be asked: HTTP 404: {WORDS}" in err
 
@@ -147,7 +147,7 @@ def test_repeats_that_could_not_be_asked_are_errors_in_junit(
     play.again(lambda asked: True)
     code, _, err = ask("eval", *EVAL, "--repeats", "2", "--temperature", "1", "--out", "several")
     assert code == 3, err
-    assert harness("export", "several", "--junit", "several.xml")[0] == 0
+    assert harness("run", "export", "several", "--junit", "several.xml")[0] == 0
     [error] = ElementTree.parse(tmp_path / "several.xml").getroot().iter("error")
     assert error.attrib["message"].startswith(f"HTTP 404: {WORDS}")
     code, _, err = harness("compare", "several", "several", "--fail-if", "success_rate < 0")
@@ -273,34 +273,34 @@ def test_a_shard_is_not_done_while_too_many_of_its_questions_have_no_answer(
     options = ("--episodes", "2", "--condition", "6g", "--seeds", "0:1", "--workers", "1", "--shard", "1/1")
     play.again(one_of(of_helper, 5))
     assert ask("drive", *options, "--out", "shard")[0] == 3
-    code, _, err = harness("merge", "shard", "--out", "run")
+    code, _, err = harness("run", "merge", "shard", "--out", "run")
     assert code == 2
     assert "shard" in err
     play.again()
     assert ask("drive", *options, "--out", "shard")[0] == 0
-    assert harness("merge", "shard", "--out", "run")[0] == 0
+    assert harness("run", "merge", "shard", "--out", "run")[0] == 0
 
 
 @pytest.mark.parametrize(
     ("command", "options"),
     [
         ("eval", ("--repeats", "2", "--temperature", "0.7", "--limit", "1", "--seeds", "0:1")),
-        ("twins", ("--limit", "1", "--workers", "1", "--twin", "order")),
-        ("grid", ("--prompt", "v1,v2", "--limit", "1", "--seeds", "0:1", "--condition", "6g")),
+        ("study twins", ("--limit", "1", "--workers", "1", "--twin", "order")),
+        ("study grid", ("--prompt", "v1,v2", "--limit", "1", "--seeds", "0:1", "--condition", "6g")),
     ],
 )
 def test_every_study_ends_the_same_way_and_goes_on(
     command: str, options: tuple[str, ...], ask: Typed, play: Play, tmp_path: Path
 ) -> None:
     play.again(one_of(of_ego, 2))
-    code, out, err = ask(command, *options, "--no-cache", "--out", "study")
+    code, out, err = ask(*command.split(), *options, "--no-cache", "--out", "study")
     assert (code, out) == (3, "")
     assert err.startswith(f"harness: HTTP 404: {WORDS}")
     assert re.search(r"no answer to \d+ of \d+ questions to the ego", err)
     assert not list((tmp_path / "study").glob("*.html"))
     before, refuses = set(play.bodies), play.refuses
     play.again()
-    code, _, err = ask(command, *options, "--no-cache", "--out", "study")
+    code, _, err = ask(*command.split(), *options, "--no-cache", "--out", "study")
     assert (code, err) == (0, "")
     assert set() < set(play.bodies) & before <= refused(refuses, before)
 
@@ -310,13 +310,13 @@ def test_what_a_study_asks_of_a_runs_model_is_kept_but_for_errors(
 ) -> None:
     assert ask("eval", *EVAL, "--out", "run")[0] == 0
     play.again(one_of(of_helper, 4))
-    code, out, err = harness("attribute", "run", "--sample", "3")
+    code, out, err = harness("study", "attribute", "run", "--sample", "3")
     assert (code, out) == (3, "")
     assert f"HTTP 404: {WORDS}" in err
     assert not (tmp_path / "run/attribution.json").exists()
     before, refuses = set(play.bodies), play.refuses
     play.again()
-    assert harness("attribute", "run", "--sample", "3")[0] == 0
+    assert harness("study", "attribute", "run", "--sample", "3")[0] == 0
     assert set(play.bodies) == refused(refuses, before)
 
 
@@ -351,7 +351,7 @@ def test_gates_refuse_a_finished_run_that_is_full_of_errors(
 
 
 def test_its_episodes_are_errors_in_junit(old: Path, harness: Typed, tmp_path: Path) -> None:
-    assert harness("export", old, "--junit", "old.xml")[0] == 0
+    assert harness("run", "export", old, "--junit", "old.xml")[0] == 0
     suite = ElementTree.parse(tmp_path / "old.xml").getroot()
     assert suite.attrib["errors"] == suite.attrib["tests"]
     assert suite.attrib["failures"] == "0"

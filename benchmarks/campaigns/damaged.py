@@ -31,12 +31,19 @@ def main() -> None:
         made(here)
         commands: dict[str, list[tuple[object, ...]]] = {
             "run": [
-                ("report", "it"), ("compare", "it", here / "run"), ("ls", "."), ("export", "it", "--csv"),
-                ("sweep", "it", "--over", "tau", "--no-model"), ("fidelity", "it", here / "driven"),
+                ("report", "it"), ("compare", "it", here / "run"), ("run", "ls", "."),
+                ("run", "export", "it", "--csv"),
+                ("study", "sweep", "it", "--over", "tau", "--no-model"),
+                ("study", "fidelity", "it", here / "driven"),
                 ("eval", "--model", "replay:it", "--dataset", here / "small", "--out", "again"),
             ],
-            "driven": [("report", "it"), ("video", "it", 0), ("fidelity", here / "run", "it"), ("ls", ".")],
-            "begun": [("eval", "--dataset", here / "small", "--seeds", "0", "--out", "it"), ("ls", ".")],
+            "driven": [
+                ("report", "it"), ("run", "video", "it", 0), ("study", "fidelity", here / "run", "it"),
+                ("run", "ls", "."),
+            ],
+            "begun": [
+                ("eval", "--dataset", here / "small", "--seeds", "0", "--out", "it"), ("run", "ls", "."),
+            ],
             "small": [("dataset", "check", "it"), ("eval", "--dataset", "it", "--seeds", "0")],
             "prompts": [("prompt", "check", "mine"), ("eval", "--prompt", "mine", "--limit", 1, "--dry-run")],
             "models": [("model", "list"), ("eval", "--model", "mine", "--limit", 1, "--dry-run")],

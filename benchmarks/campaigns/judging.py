@@ -191,13 +191,13 @@ def writing(here: Path, out: Path) -> dict[str, tuple[object, ...]]:
         "eval": ("eval", *one, "--out", out),
         "drive": (*drive, "--out", out),
         "dataset build": ("dataset", "build", SCENARIO, "--episodes", 1, "--out", out),
-        "sweep": ("sweep", run, "--over", "tau", "--grid", "0.2,0.7", "--out", out),
+        "sweep": ("study", "sweep", run, "--over", "tau", "--grid", "0.2,0.7", "--out", out),
         "report": ("report", run, "--out", out.with_suffix(".html")),
-        "export": ("export", run, "--csv", "--out", out),
-        "fidelity": ("fidelity", run, driven, "--out", out),
-        "video": ("video", driven, 0, "--out", out.with_suffix(".gif")),
-        "campaign paper": (
-            "campaign", "paper", "--episodes", 10, "--sweep-episodes", 10, "--seeds", "0:2", "--out", out,
+        "export": ("run", "export", run, "--csv", "--out", out),
+        "fidelity": ("study", "fidelity", run, driven, "--out", out),
+        "video": ("run", "video", driven, 0, "--out", out.with_suffix(".gif")),
+        "study paper": (
+            "study", "paper", "--episodes", 10, "--sweep-episodes", 10, "--seeds", "0:2", "--out", out,
         ),
         "init": ("init", out),
     }  # fmt: skip

@@ -173,7 +173,7 @@ def _project(project: Path) -> Iterator[Subject]:
         shutil.copy(folder("channels") / f"{shipped}.toml", project / f"channels/{name}.toml")
         drive = ("eval", "--limit", 1, "--seeds", "0", "--model", "cruise", "--condition", name, "--out",
                  "out")  # fmt: skip
-        yield of("channel", f"channels/{name}.toml", ("channel", "list"), ("channel", "show", name), drive)
+        yield of("channel", f"channels/{name}.toml", ("radio", "list"), ("radio", "show", name), drive)
     (project / "channels/trace.toml").write_text(
         'model = "trace"\ndescription = "d"\nsource = "s"\nstatus = "measured"\n'
         '[parameters]\nfile = "trace.csv"\n'
@@ -181,14 +181,14 @@ def _project(project: Path) -> Iterator[Subject]:
     )
     (project / "channels/trace.csv").write_text(TRACE)
     for name in ("trace.toml", "trace.csv"):
-        yield of("channel", f"channels/{name}", ("channel", "list"), ("channel", "show", "trace"))
+        yield of("channel", f"channels/{name}", ("radio", "list"), ("radio", "show", "trace"))
     (project / "curves.csv").write_text(CURVES)
-    yield of("curves", "curves.csv", ("channel", "check", "mode4", "--against", "curves.csv"))
+    yield of("curves", "curves.csv", ("radio", "check", "mode4", "--against", "curves.csv"))
     shutil.copy(folder("networks") / "5g-city.toml", project / "networks/mine.toml")
     quick = ("eval", "--limit", 1, "--seeds", "0", "--dry-run")
     yield of("network", "networks/mine.toml", (*quick, "--condition", "cloud:round_trip=mine"))
     shutil.copy(folder("devices") / "agx-orin.toml", project / "devices/mine.toml")
-    yield of("device", "devices/mine.toml", ("device", "list"), ("device", "show", "mine"))
+    yield of("device", "devices/mine.toml", ("model", "device", "list"), ("model", "device", "show", "mine"))
     shutil.copy(folder("schedules") / "learnt.toml", project / "schedules/mine.toml")
     yield of(
         "schedule", "schedules/mine.toml", (*quick, "--condition", "6g:schedule=mine"),
@@ -248,7 +248,7 @@ def _begun(where: Path) -> Iterator[Subject]:
     os.replace(where / "out", where / "stopped")
     cleared(where)
     for name in ("config.json", "answers.jsonl"):
-        yield Subject("begun", where / "out/.work" / name, (("ls", "."), command), where)
+        yield Subject("begun", where / "out/.work" / name, (("run", "ls", "."), command), where)
 
 
 def _suite(where: Path) -> Iterator[Subject]:
@@ -266,7 +266,7 @@ def _suite(where: Path) -> Iterator[Subject]:
     shutil.copytree(where / "all/suite", where / "all/other")
     yield Subject(
         "suite", where / "all/suite/suite.json",
-        (("ls", "all"), ("history", "all"), ("report", "all/suite", "--out", "out.html"),
+        (("run", "ls", "all"), ("run", "history", "all"), ("report", "all/suite", "--out", "out.html"),
          ("compare", "all/suite/do-not-pass-v1", "all/other/do-not-pass-v1")), where,
     )  # fmt: skip
 
@@ -279,7 +279,7 @@ def _runs(here: Path) -> Iterator[Subject]:
     conditions = ("--condition", "single-local", "--condition", "6g:attack=liar", "--condition",
                   "mode4:density_per_km=90", "--condition", "cloud:round_trip=5g-city",
                   "--condition", "v2x:schedule=learnt")  # fmt: skip
-    fused = ("sweep", "all/words", "--over", "consensus", "--grid", "ego-prompt")
+    fused = ("study", "sweep", "all/words", "--over", "consensus", "--grid", "ego-prompt")
     for command in (
         ("eval", "--dataset", small, *seeds, *conditions, "--out", "all/it"),
         (
@@ -294,7 +294,7 @@ def _runs(here: Path) -> Iterator[Subject]:
             "--out",
             "all/words",
         ),
-        ("attribute", "all/it", "--sample", 2),
+        ("study", "attribute", "all/it", "--sample", 2),
         (*fused, "--out", "all/words/fused"),
         ("drive", "--episodes", 1, "--first-seed", 0, *conditions[:6], *seeds, "--out", "all/driven"),
     ):
@@ -302,16 +302,18 @@ def _runs(here: Path) -> Iterator[Subject]:
         assert ended.code == 0, (command, ended.err)
     shutil.copytree(where / "all", where / "sound")
     shutil.copytree(where / "all/it", where / "all/other")
-    every = (("ls", "all"), ("history", "all"))
+    every = (("run", "ls", "all"), ("run", "history", "all"))
     grid = ("--over", "tau", "--grid", "0.3", "--no-model", "--out", "out")
     reads = (
         *(("report", "all/it", "--out", "out.html"),) * 3,
         ("compare", "all/it", "sound/it", "--html", "out.html"),
-        ("export", "all/it", "--csv", "--out", "out"), ("export", "all/it", "--junit", "out.html"),
-        ("sweep", "all/it", *grid), ("trust", "all/it", "--no-model", "--share", "1/3", "--attacks", "liar",
+        ("run", "export", "all/it", "--csv", "--out", "out"),
+        ("run", "export", "all/it", "--junit", "out.html"),
+        ("study", "sweep", "all/it", *grid),
+        ("study", "trust", "all/it", "--no-model", "--share", "1/3", "--attacks", "liar",
                                      "--rules", "linear", "--out", "out"),
-        ("fidelity", "all/it", "sound/driven", "--out", "out"),
-        ("schedule", "compare", "all/it", "--out", "out"),
+        ("study", "fidelity", "all/it", "sound/driven", "--out", "out"),
+        ("study", "schedule", "compare", "all/it", "--out", "out"),
         ("eval", "--model", "replay:all/it", "--dataset", "small", *seeds, "--condition", "6g",
          "--out", "out"),
     )  # fmt: skip
@@ -324,8 +326,8 @@ def _runs(here: Path) -> Iterator[Subject]:
         yield Subject("run", where / "all/words" / name, (*every, told, (*fused, "--out", "out")), where)
     drives = (
         ("report", "all/driven", "--out", "out.html"), ("compare", "all/driven", "sound/driven"),
-        ("fidelity", "sound/it", "all/driven", "--out", "out"),
-        ("export", "all/driven", "--csv", "--out", "out"),
+        ("study", "fidelity", "sound/it", "all/driven", "--out", "out"),
+        ("run", "export", "all/driven", "--csv", "--out", "out"),
     )  # fmt: skip
     for name in ("run.json", "decisions.parquet", "episodes.csv"):
         yield Subject("driven", where / "all/driven" / name, (*every, *drives), where)

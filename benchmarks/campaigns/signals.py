@@ -77,13 +77,13 @@ def main() -> None:
         assert typed("eval", "--dataset", small, "--seeds", "0", "--out", run).code == 0
         commands = {
             "--help": ("--help",),
-            "ls": ("ls", here),
+            "ls": ("run", "ls", here),
             "model list": ("model", "list"),
-            "channel show": ("channel", "show", "mode4"),
+            "radio show": ("radio", "show", "mode4"),
             "eval": ("eval", "--dataset", small, "--seeds", "0:2"),
             "drive": ("drive", "--episodes", 16, "--seeds", "0", "--condition", "6g", "--workers", 2),
             "report": ("report", run),
-            "sweep": ("sweep", run, "--over", "tau", "--grid", "0.2,0.7"),
+            "sweep": ("study", "sweep", run, "--over", "tau", "--grid", "0.2,0.7"),
             "dataset build": ("dataset", "build", "occluded-intersection", "--episodes", 2, "--workers", 2),
         }  # fmt: skip
         writes = {"eval", "drive", "sweep", "dataset build"}

@@ -10,7 +10,6 @@ import os
 import shlex
 import sys
 from functools import cache
-from importlib import import_module
 from typing import Any
 
 import typer
@@ -22,29 +21,9 @@ from harness.core import extras
 from harness.core.errors import EXIT_CODES, UserError, printable
 from harness.core.process import Stop
 
-PANELS = {
-    "Evaluate": (
-        "eval",
-        "drive",
-        "merge",
-        "grid",
-        "sweep",
-        "schedule",
-        "compare",
-        "twins",
-        "attribute",
-        "trust",
-        "fidelity",
-        "campaign",
-    ),
-    "Look": ("ls", "history", "view", "report", "export", "video", "parse"),
-    "Data": ("init", "prompt", "dataset", "scenario", "channel"),
-    "Models": ("model", "device", "distill", "parity", "doctor"),
-}
-
 app = typer.Typer(
     name="harness",
-    cls=shell.Map,
+    cls=shell.Group,
     no_args_is_help=True,
     rich_markup_mode=None,
     epilog=f"Exit codes: {'; '.join(f'{code} {meaning}' for code, meaning in EXIT_CODES.items())}.",
@@ -65,14 +44,6 @@ def common(
 ) -> None:
     """Evaluate prompts and parsing in cooperative driving."""
 
-
-for panel, names in PANELS.items():
-    for name in names:
-        module = import_module(f"harness.cli.{name}")
-        if hasattr(module, "app"):
-            app.add_typer(module.app, name=name, rich_help_panel=panel)
-        else:
-            app.command(name, rich_help_panel=panel)(module.command)
 
 # What is wrong with the machine and not with the program: disks that are full, read-only, broken or not ours.
 MACHINE = frozenset({

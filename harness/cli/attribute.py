@@ -1,4 +1,4 @@
-"""`harness attribute`: what moved a run's answers and decisions."""
+"""`harness study attribute`: what moved a run's answers and decisions."""
 
 from pathlib import Path
 from textwrap import fill

@@ -1,4 +1,4 @@
-"""`harness campaign`: whole studies."""
+"""`harness study paper` and `harness study closed-loop`: whole studies."""
 
 from pathlib import Path
 from textwrap import fill
@@ -13,12 +13,9 @@ from harness.cli.sweep import show_tables
 from harness.core.errors import UserError, printable
 from harness.core.seeds import FIRST, purpose
 
-app = typer.Typer(help="Run a whole study: the paper's, or its panels closed-loop.", no_args_is_help=True)
-
 MOST_EPISODES = 1_000_000
 
 
-@app.command("paper")
 def paper(
     out: Path = typer.Option(
         Path("reports/paper"), help="Folder to write; a study that is there is replaced."
@@ -69,7 +66,6 @@ def paper(
     typer.echo(f"wrote {printable(out / 'index.html')}")
 
 
-@app.command("closed-loop")
 def closed_loop(
     model: options.Model = "swarm-tiny",
     prompt: options.Prompt = "v2",

@@ -1,4 +1,4 @@
-"""`harness channel`: the radios that a condition can name, what each rests on, and how far it reaches."""
+"""`harness radio`: the radios that a condition can name, what each rests on, and how far it reaches."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +15,6 @@ from harness.core.figures import Unit, as_mapping, known, shown
 if TYPE_CHECKING:
     from harness.radio.channel import Channel
 
-app = typer.Typer(help="List radios, show one, or check one against published curves.", no_args_is_help=True)
 
 MOST_TRIPS = 100_000  # at each distance
 Name = typer.Argument(
@@ -23,7 +22,6 @@ Name = typer.Argument(
 )
 
 
-@app.command("list")
 def list_channels(as_json: options.Json = False) -> None:
     """List the channel profiles. Each name is also a condition that --condition takes."""
     from harness.radio.profiles import CHANNELS
@@ -44,7 +42,6 @@ def list_channels(as_json: options.Json = False) -> None:
         typer.echo(f"  {printable(profile.description, 78)}")
 
 
-@app.command()
 def show(name: str = Name, as_json: options.Json = False) -> None:
     """Print a profile, and its reception by distance.
 
@@ -93,7 +90,6 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
         typer.echo(f"channel busy ratio {busy:.3f} under the background load")
 
 
-@app.command()
 def check(
     name: str = Name,
     n: int = typer.Option(2000, "-n", help="Number of messages to simulate at each distance, 100 to 100000."),
@@ -218,7 +214,6 @@ def check(
         typer.echo(f"wrote {printable(out)}")
 
 
-@app.command()
 def crowd(
     names: list[str] | None = typer.Argument(
         None, help="Channel profiles. Default: all whose load can be set."
@@ -303,5 +298,5 @@ def _of(text: str) -> "tuple[str, Channel]":
 
     point = named_point(text)
     if point.profile is None:
-        raise UserError(f"{printable(text)} has no channel; `harness channel list` shows those there are")
+        raise UserError(f"{printable(text)} has no channel; `harness radio list` shows those there are")
     return point.profile, innermost(point.channel)

@@ -17,17 +17,15 @@ from harness.core.figures import PLAIN, as_mapping, shown
 if TYPE_CHECKING:
     from harness.studies.rank import Standing
 
-app = typer.Typer(help="Build, check, show and rank frozen datasets.", no_args_is_help=True)
 
 Dataset = Annotated[
     str, typer.Argument(help="Folder of a dataset, or the name of a shipped one.", metavar="DIR")
 ]
 
 
-@app.command()
 def build(
     name: str | None = typer.Argument(
-        None, help="Scenario to freeze; `harness scenario list` shows them.", show_default=False
+        None, help="Scenario to freeze; `harness dataset scenario list` shows them.", show_default=False
     ),
     env: options.Env = None,
     env_config: options.EnvConfig = None,
@@ -72,7 +70,6 @@ def build(
     )
 
 
-@app.command()
 def check(dataset: Dataset, as_json: options.Json = False) -> None:
     """Check every file and every decision point of a dataset. Exit code 1 if something is wrong."""
     from harness.dataset import load, verify
@@ -101,7 +98,6 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
         raise typer.Exit(1)
 
 
-@app.command()
 def show(
     dataset: Dataset,
     scene: str = typer.Argument(help="Scene id, such as 00003-0."),
@@ -142,7 +138,6 @@ def show(
     typer.echo(f"wrote {printable(out)}")
 
 
-@app.command("rank")
 def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: options.Json = False) -> None:
     """Compare the reference drivers, frozen and in closed loop.
 
@@ -180,4 +175,6 @@ def _table(episodes: int, standings: dict[str, "Standing"]) -> None:
     table(heads, rows)
     text = console()
     text.print(f"n = {episodes} episodes; same: share of them that end alike, frozen and in closed loop")
-    text.print("these few drivers give no rank correlation: compare runs of models with `harness fidelity`")
+    text.print(
+        "these few drivers give no rank correlation: compare runs of models with `harness study fidelity`"
+    )

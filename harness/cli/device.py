@@ -1,4 +1,4 @@
-"""`harness device`: the computers that a vehicle can have, what each rests on, and what fits the window."""
+"""`harness model device`: the computers of a vehicle, what each rests on, and what fits the window."""
 
 import textwrap
 from pathlib import Path
@@ -17,11 +17,10 @@ if TYPE_CHECKING:
     from harness.core.statistics import Estimate
     from harness.runs.records import Constant, Device, DeviceRow
 
-app = typer.Typer(help="List on-board computers, show or check one, or measure energy.", no_args_is_help=True)
 
 MOST_TOKENS = 1_000_000
 MOST_MS = 60_000
-Name = typer.Argument(help="Device profile; `harness device list` shows them.", metavar="NAME")
+Name = typer.Argument(help="Device profile; `harness model device list` shows them.", metavar="NAME")
 Model = typer.Option(
     None,
     "--device-model",
@@ -29,7 +28,6 @@ Model = typer.Option(
 )
 
 
-@app.command("list")
 def list_devices(as_json: options.Json = False) -> None:
     """List the device profiles, which --device-profile takes."""
     from harness.backends import devices
@@ -50,7 +48,6 @@ def list_devices(as_json: options.Json = False) -> None:
         typer.echo(f"  {printable(device.description, 78)}")
 
 
-@app.command()
 def show(
     name: str = Name,
     model: str | None = Model,
@@ -120,7 +117,6 @@ def show(
     _origins(device, rows)
 
 
-@app.command()
 def check(
     name: str = Name,
     run: Path = typer.Argument(help="Folder of a run made with --batch-size 1 --no-cache.", metavar="RUN"),
@@ -166,7 +162,6 @@ def check(
     _origins(device, [row])
 
 
-@app.command()
 def measure(
     model: str = typer.Option("swarm-tiny", help="Model: a card name, or a folder of weights."),
     engine: options.Engine = None,
@@ -178,7 +173,7 @@ def measure(
 ) -> None:
     """Measure the energy of a model's answers on this machine.
 
-    The meters are NVML, RAPL and a Jetson's rails; `harness doctor` lists those that can be read here. Each
+    The meters are NVML, RAPL and a Jetson's rails; `harness model doctor` lists those that can be read. Each
     measurement first idles, then asks one question after the other for as long.
     """
     from dataclasses import asdict
@@ -202,7 +197,7 @@ def measure(
     meters = counters()
     if not meters:
         raise UserError(
-            "harness device measure: no meter can be read here: NVML needs an NVIDIA GPU and the package "
+            "harness model device measure: no meter can be read here: NVML needs an NVIDIA GPU and the "
             "nvidia-ml-py, RAPL needs root; state joules in devices/NAME.toml with their source"
         )
     data = load.load(load.find(DATASET), 10)

@@ -1,4 +1,4 @@
-"""`harness distill`: train a small language model in some scenarios."""
+"""`harness model distill`: train a small language model in some scenarios."""
 
 import time
 from pathlib import Path
@@ -17,7 +17,9 @@ BATCH = 16
 
 
 def command(
-    scenario: list[str] = typer.Argument(help="Scenarios to learn; `harness scenario list` shows them."),
+    scenario: list[str] = typer.Argument(
+        help="Scenarios to learn; `harness dataset scenario list` shows them."
+    ),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the model's name."),
     prompt: list[str] = typer.Option(
         ["v2", "v4"], help="Prompt version to learn; it is used in the scenarios that it fits. Repeatable."
@@ -46,14 +48,14 @@ def command(
     """
     from harness.prompts import versions as prompts
 
-    extras.need("harness distill", "torch", "transformers", "highway_env")
+    extras.need("harness model distill", "torch", "transformers", "highway_env")
     for flag, value, least in (("--batch", batch, 1), ("--threads", threads, 1), ("--seed", seed, 0)):
         if value is not None and value < least:
             raise UserError(f"{flag} {value}: give {least} or more")
     if base and not all((base / name).is_file() for name in ("model.safetensors", "tokenizer.json")):
         raise UserError(
             f"--base {printable(base)}: no model.safetensors with a tokenizer.json; give the folder of a "
-            "model that `harness distill` made"
+            "model that `harness model distill` made"
         )
     versions = [prompts.load(version) for version in dict.fromkeys(prompt)]
     driven = [ready_to_drive(name, layouts, first_seed) for name in dict.fromkeys(scenario)]

@@ -1,4 +1,4 @@
-"""`harness doctor`: versions, machine, models and what they lack, completion cache."""
+"""`harness model doctor`: versions, machine, models and what they lack, completion cache."""
 
 import json
 import os
@@ -100,7 +100,7 @@ def _lacking(remedies: list[tuple[str, str]]) -> None:
 
 
 def look(gpu: bool) -> dict[str, Any]:
-    """What `harness doctor --json` prints.
+    """What `harness model doctor --json` prints.
 
     Args:
         gpu: ask torch for GPUs too, which takes seconds to load.

@@ -1,4 +1,4 @@
-"""`harness export`: a run for other programs."""
+"""`harness run export`: a run for other programs."""
 
 from pathlib import Path
 from typing import Annotated

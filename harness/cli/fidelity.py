@@ -1,4 +1,4 @@
-"""`harness fidelity`: frozen against closed-loop."""
+"""`harness study fidelity`: frozen against closed-loop."""
 
 from pathlib import Path
 

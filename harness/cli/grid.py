@@ -1,4 +1,4 @@
-"""`harness grid`: every combination of ego and helper agents."""
+"""`harness study grid`: every combination of ego and helper agents."""
 
 from collections.abc import Mapping
 from itertools import product
@@ -63,7 +63,7 @@ def command(
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
 
-    extras.need("harness grid", "matplotlib")
+    extras.need("harness study grid", "matplotlib")
     frozen = load.load(load.find(dataset), limit)
     options.say_all(limit, [frozen])
     prompt = prompt or frozen.scenario.prompt

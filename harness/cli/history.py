@@ -1,4 +1,4 @@
-"""`harness history`: a metric over the runs in a folder."""
+"""`harness run history`: a metric over the runs in a folder."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING

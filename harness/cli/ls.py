@@ -1,4 +1,4 @@
-"""`harness ls`: the runs in a folder."""
+"""`harness run ls`: the runs in a folder."""
 
 from dataclasses import asdict
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`harness merge`: one run, or one dataset, of its shards."""
+"""`harness run merge`: one run, or one dataset, of its shards."""
 
 from pathlib import Path
 from typing import Annotated

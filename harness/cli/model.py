@@ -24,13 +24,11 @@ if TYPE_CHECKING:
     from harness.evaluate.pace import Pace
     from harness.evaluate.spec import Spec
 
-app = typer.Typer(help="List models, download one, or test one before a run.", no_args_is_help=True)
 
 PROMPT, IMAGE_PROMPT = "v2", "v7"  # what a check asks
 _WIDTH = 100  # of lines of tokens
 
 
-@app.command("list")
 def list_models(as_json: options.Json = False) -> None:
     """List the model cards, and whether they can run here.
 
@@ -68,7 +66,6 @@ def list_models(as_json: options.Json = False) -> None:
             typer.echo(f"  {printable(card.description, 78)}")
 
 
-@app.command()
 def pull(
     name: str = typer.Argument(help="Card name or hub id."),
     engine: options.Engine = None,
@@ -88,7 +85,6 @@ def pull(
     typer.echo(f"{printable(card.name)} lies in {printable(where, 1000)}, {size / 1e6:.0f} MB{licence}")
 
 
-@app.command()
 def check(
     name: str = typer.Argument(help="Model: a card name, a checkpoint directory, a .gguf file or a hub id."),
     engine: options.Engine = None,

@@ -42,7 +42,7 @@ RunModel = Annotated[
         "id. Nothing that only a run names is opened or asked. Repeatable, for several models.",
     ),
 ]
-Scenario = Annotated[str, Argument(help="Scenario name; `harness scenario list` shows them.")]
+Scenario = Annotated[str, Argument(help="Scenario name; `harness dataset scenario list` shows them.")]
 Env = Annotated[
     str | None,
     Option(
@@ -92,7 +92,7 @@ Attacks = Annotated[
     Option(
         "--attack",
         help="Beside each condition with a channel, also score it under attack: liar:share=1/3 makes a "
-        "third of the helpers lie; liar+spoof combines two attacks. `harness trust --help` lists them. "
+        "third of the helpers lie; liar+spoof combines two attacks. `harness study trust --help` lists them. "
         "Repeatable.",
     ),
 ]
@@ -196,8 +196,8 @@ Shard = Annotated[
     str | None,
     Option(
         metavar="I/N",
-        help="Do only part I of N, such as 3/16; `harness merge` joins the parts. auto/N takes I from the "
-        "task number of a Slurm or Kubernetes job.",
+        help="Do only part I of N, such as 3/16; `harness run merge` joins the parts. auto/N takes I from "
+        "the task number of a Slurm or Kubernetes job.",
     ),
 ]
 Device = Annotated[
@@ -221,8 +221,8 @@ Latency = Annotated[
 DeviceProfile = Annotated[
     str | None,
     Option(
-        help="Computer in every vehicle, such as agx-orin (`harness device list`). It times each answer by "
-        "its tokens; use it instead of --latency."
+        help="Computer in every vehicle, such as agx-orin (`harness model device list`). It times each "
+        "answer by its tokens; use it instead of --latency."
     ),
 ]
 DeviceModel = Annotated[
@@ -325,7 +325,7 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     from harness.world.environments import environment
 
     if (name is None) == (env is None):
-        raise UserError("give either a scenario or --env; `harness scenario list` lists scenarios")
+        raise UserError("give either a scenario or --env; `harness dataset scenario list` lists scenarios")
     if name is not None:
         if env_config is not None:
             raise UserError("--env-config changes an environment; give --env as well")
@@ -371,7 +371,7 @@ def say_shard(shard: "shards.Shard", out: Path, what: str) -> None:
     """Say that a shard is done, and what is done with it."""
     echo(
         f"wrote {printable(out)}: {what}, shard {shard}; merge all {shard.of} shards with "
-        "`harness merge FOLDER... --out FOLDER`"
+        "`harness run merge FOLDER... --out FOLDER`"
     )
 
 

@@ -1,4 +1,4 @@
-"""`harness parity`: one model through two engines."""
+"""`harness model parity`: one model through two engines."""
 
 from dataclasses import asdict
 from math import isfinite

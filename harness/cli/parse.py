@@ -1,4 +1,4 @@
-"""`harness parse`: how one answer is parsed. A failed verdict is data, so the exit code is 0."""
+"""`harness prompt parse`: how one answer is parsed. A failed verdict is data, so the exit code is 0."""
 
 import os
 import sys

@@ -25,7 +25,6 @@ REPAIR = "repair"  # any of them with the turn that follows an answer that canno
 NOT_COUNTED = "tokens not counted: give --tokenizer (tokenizer.json, its folder, or a GGUF)"
 COLOURS = {"same": "", "removed": "red", "added": "green"}
 
-app = typer.Typer(help="List prompt versions; show, check, compare or release them.", no_args_is_help=True)
 
 Version = Annotated[str, typer.Argument(help="Prompt version; `harness prompt list` shows them.")]
 Tokenizer = Annotated[
@@ -44,7 +43,6 @@ Asked = Annotated[
 ]
 
 
-@app.command("list")
 def list_prompts(as_json: options.Json = False) -> None:
     """List the prompt versions, released or draft. Exit code 2 if one of them cannot be used."""
     from harness.prompts import versions as prompts
@@ -69,7 +67,6 @@ def list_prompts(as_json: options.Json = False) -> None:
         raise UserError("; ".join(wrong))
 
 
-@app.command()
 def show(
     version: Version,
     scene: str = typer.Option(..., help="Scene id, such as 00003-0."),
@@ -134,7 +131,6 @@ def show(
                 typer.echo(printable(line, len(line) * 10))
 
 
-@app.command()
 def examples(
     version: Version,
     scenario: Annotated[str, typer.Option(help="Scenario to take the examples from.")],
@@ -169,7 +165,6 @@ def examples(
     typer.echo(f"wrote {printable(file)}: {drawn}")
 
 
-@app.command()
 def check(
     version: Version,
     dataset: options.Dataset = resources.DATASET,
@@ -270,8 +265,7 @@ def check(
         raise typer.Exit(1)
 
 
-@app.command()
-def diff(
+def compare(
     a: Annotated[str, typer.Argument(help="Prompt version to compare with.", metavar="A")],
     b: Annotated[str, typer.Argument(help="Prompt version to compare.", metavar="B")],
     scene: str | None = typer.Option(
@@ -333,8 +327,7 @@ def _changed(what: str, text: "TextChange") -> None:
         console().print(Text.assemble(*((piece, COLOURS[kind]) for kind, piece in marked(hunk))))
 
 
-@app.command()
-def lock(version: Version) -> None:
+def release(version: Version) -> None:
     """Release a prompt version: any later change of it is an error."""
     from harness.prompts import versions as prompts
 

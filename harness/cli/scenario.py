@@ -1,4 +1,4 @@
-"""`harness scenario`: the scenarios, and how hard each is for the reference drivers."""
+"""`harness dataset scenario`: the scenarios, and how hard each is for the reference drivers."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +16,7 @@ if TYPE_CHECKING:
     from harness.world.audit import Audit
     from harness.world.scenario import Scenario
 
-app = typer.Typer(help="List scenarios, show one, drive or audit it.", no_args_is_help=True)
 
-
-@app.command("list")
 def list_scenarios(as_json: options.Json = False) -> None:
     """List the scenarios, each with a summary."""
     from harness.world import scenarios
@@ -39,7 +36,6 @@ def list_scenarios(as_json: options.Json = False) -> None:
             typer.echo(f"{name}: {each.summary}")
 
 
-@app.command()
 def show(name: options.Scenario, as_json: options.Json = False) -> None:
     """Print a scenario's actions and its parameters, with meanings."""
     from harness.cli.docstrings import echo_fields
@@ -58,8 +54,7 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
     echo_fields(scenario.parameters)
 
 
-@app.command()
-def check(
+def drive(
     name: options.Scenario,
     episodes: int = typer.Option(500, help="Number of episodes; every driver drives each."),
     seed: options.FirstSeed = 0,
@@ -81,7 +76,6 @@ def check(
         _table(episodes, seed, outcomes)
 
 
-@app.command()
 def audit(
     name: options.Scenario,
     layouts: int = typer.Option(300, help="Number of layouts to look at."),

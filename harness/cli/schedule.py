@@ -1,4 +1,4 @@
-"""`harness schedule`: whom to ask and when, compared over stored runs; and one that is learnt from them."""
+"""`harness study schedule`: compare whom to ask and when over stored runs; learn it from them."""
 
 import shlex
 import sys
@@ -13,14 +13,11 @@ from harness.core import extras
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import Unit, shown
 
-app = typer.Typer(help="Compare schedules (whom to ask, and when), or learn one.", no_args_is_help=True)
-
 TrainRuns = typer.Argument(
     help="One or more folders of finished runs on train layouts (seeds 100000 to 199999).", metavar="RUN..."
 )
 
 
-@app.command()
 def learn(
     runs: list[Path] = TrainRuns,
     tune: list[Path] = typer.Option(
@@ -60,7 +57,6 @@ def learn(
         typer.echo(f"wrote {printable(out)}: threshold {made.threshold:g}, the best on tune layouts")
 
 
-@app.command()
 def compare(
     runs: options.Runs,
     tune: list[Path] = typer.Option(
@@ -101,7 +97,7 @@ def compare(
     from harness.studies.stored import Stored
     from harness.studies.sweep import point_of
 
-    extras.need("harness schedule compare", "matplotlib")
+    extras.need("harness study schedule compare", "matplotlib")
     names = list(dict.fromkeys(schedule or SCHEDULES.usable()))
     for name in names:
         if name not in SCHEDULES:

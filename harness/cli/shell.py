@@ -1,14 +1,18 @@
-"""Changes to typer: commands are listed in groups, and plain values are read without pydantic."""
+"""Changes to typer: commands load when they are named, and plain values are read without pydantic."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
-from typer import Context, echo
+from typer import Context, Typer, echo
 from typer.core import TyperGroup
+from typer.main import get_command
+
+from harness.cli.commands import COMMANDS, GROUPS, OLD, PANELS, SHORT
 
 UNREAD = object()
 DIGITS = 18  # most of a number that is read here
@@ -18,8 +22,44 @@ class Stopped(Exception):
     """A command was interrupted, of which typer would say nothing; the cause is the KeyboardInterrupt."""
 
 
-class Map(TyperGroup):
-    """A group whose help lists its commands by panel, in one column."""
+class Branch(Mapping[str, Any]):
+    """The commands and groups below a path, by name; each is loaded when it is looked up."""
+
+    def __init__(self, path: str) -> None:
+        depth = len(path.split())
+        paths = [words for words in map(str.split, COMMANDS) if words[:depth] == path.split()]
+        self.paths = {words[depth]: " ".join(words[: depth + 1]) for words in paths}
+        self.loaded: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        path = self.paths[name]
+        if name not in self.loaded:
+            self.loaded[name] = Group(path, name=name) if path in GROUPS else _command(name, COMMANDS[path])
+            hasten(self.loaded[name])
+        return self.loaded[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.paths)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+
+def _command(name: str, place: str) -> Any:
+    module, _, function = place.partition(":")
+    app = Typer(add_completion=False, rich_markup_mode=None)
+    app.command(name)(getattr(import_module(f"harness.cli.{module}"), function or "command"))
+    return get_command(app)
+
+
+class Group(TyperGroup):
+    """A group of the table's commands; its help lists them in one column, and the first screen in panels."""
+
+    def __init__(self, path: str = "", **attributes: Any) -> None:
+        below: Any = Branch(path)
+        attributes |= {"commands": below, "no_args_is_help": True, "rich_markup_mode": None}
+        super().__init__(**{"help": GROUPS.get(path), **attributes})
+        self.path = path
 
     def invoke(self, ctx: Any) -> Any:
         """Invoke the command. Raises Stopped if it is interrupted."""
@@ -28,18 +68,50 @@ class Map(TyperGroup):
         except KeyboardInterrupt as stopped:
             raise Stopped from stopped
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command that is typed. Of an old spelling, a line on stderr says the new one."""
+        old, new = ("", "") if self.path else respelt(args)
+        if new and old not in SHORT and not ctx.resilient_parsing:
+            echo(
+                f"harness: `harness {old}` is now `harness {new}`; the old spelling works until 0.4.0",
+                err=True,
+            )
+        args = new.split() + args[len(old.split()) :]
+        if args[0] not in self.commands and not args[0].startswith("-") and not ctx.resilient_parsing:
+            last = {words.split()[-1]: words for words in (*COMMANDS, *OLD.values())}
+            near = get_close_matches(args[0], [*self.commands, *last])
+            meant = dict.fromkeys(
+                f"{self.path} {name}".strip() if name in self.commands else last[name] for name in near
+            )
+            ctx.fail(
+                f"No such command {args[0]!r}."
+                + (f" Did you mean {', '.join(f'`harness {words}`' for words in meant)}?" if meant else "")
+            )
+        return super().resolve_command(ctx, args)
+
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write each panel's commands, each with the first sentence of its help."""
-        commands: dict[str, Any] = dict(self.commands)
-        width = max(map(len, commands))
-        for panel in dict.fromkeys(command.rich_help_panel for command in commands.values()):
-            rows = [
-                (f"{name:<{width}}", command.get_short_help_str(formatter.width - width - 6))
-                for name, command in commands.items()
-                if command.rich_help_panel == panel
-            ]
+        width = max(map(len, self.commands))
+        for panel, names in {"Commands": tuple(self.commands)}.items() if self.path else PANELS.items():
             with formatter.section(panel):
-                formatter.write_dl(rows)
+                formatter.write_dl(
+                    [
+                        (
+                            f"{name:<{width}}",
+                            self.commands[name].get_short_help_str(formatter.width - width - 6),
+                        )
+                        for name in names
+                    ]
+                )
+
+
+def respelt(args: list[str]) -> tuple[str, str]:
+    """Return the old or short spelling with which arguments begin, and what it stands for; empty if none."""
+    spellings = {**OLD, **SHORT}
+    for n in (2, 1):
+        if (typed := " ".join(args[:n])) in spellings:
+            return typed, spellings[typed]
+    return "", ""
 
 
 def keep_encoding() -> None:
@@ -53,13 +125,11 @@ def _never(stream: object) -> bool:
 
 
 def hasten(command: Any) -> None:
-    """Have a command, and those below it, read plain values without pydantic.
+    """Have a command read plain values without pydantic.
 
     Typer converts every value with pydantic, a missing one too, and loading that takes a tenth of a second.
     What is not plainly right is left to typer, which words the error.
     """
-    for inner in getattr(command, "commands", {}).values():
-        hasten(inner)
     for parameter in command.get_params(Context(command)):  # `--help` is one
         if hasattr(parameter, "type_descriptor"):
             parameter.process_value = partial(_value, parameter, parameter.process_value)

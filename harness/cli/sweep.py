@@ -1,4 +1,4 @@
-"""`harness sweep`: finished runs at other operating points."""
+"""`harness study sweep`: finished runs at other operating points."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""`harness trust`: what consensus rules make of helpers that lie or fail."""
+"""`harness study trust`: what consensus rules make of helpers that lie or fail."""
 
 from pathlib import Path
 from textwrap import fill

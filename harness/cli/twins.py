@@ -1,4 +1,4 @@
-"""`harness twins`: metamorphic tests of a prompt."""
+"""`harness study twins`: metamorphic tests of a prompt."""
 
 from pathlib import Path
 from textwrap import fill

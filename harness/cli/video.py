@@ -1,4 +1,4 @@
-"""`harness video`: an episode of a closed-loop run as a video."""
+"""`harness run video`: an episode of a closed-loop run as a video."""
 
 from pathlib import Path
 

@@ -159,7 +159,7 @@ class OperatingPoint:
         if self.schedule == ORACLE:
             raise UserError(
                 f"operating point {printable(self.name)!r}: schedule {ORACLE} looks at how scenes end; "
-                f"`harness schedule compare` plays it, and others are {', '.join(SCHEDULES)}"
+                f"`harness study schedule compare` plays it, and others are {', '.join(SCHEDULES)}"
             )
         if str(self.schedule) not in SCHEDULES:
             raise unknown("schedule", str(self.schedule), SCHEDULES)
@@ -445,7 +445,7 @@ def pairs(text: str) -> dict[str, str]:
     return {key: value for key, _, value in (pair.partition("=") for pair in text.split(",") if pair)}
 
 
-# Short names of settings, as in `harness sweep --over`, each with the factor from its unit to the setting's.
+# Short names of settings, as in `harness study sweep --over`, each with the factor to the setting's unit.
 SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("latency_s", 1e-3)}
 SETTINGS = tuple(f.name for f in fields(OperatingPoint) if f.name not in ("name", "profile", "radio"))
 

@@ -1,7 +1,7 @@
 """Find schedules by name: formulas, files `schedules/*.toml` and those that other packages add.
 
-A file holds a learnt schedule and what it was learnt from; `harness schedule learn` writes it. A package adds
-a schedule by an entry point in the group `swarmdrive.schedules`.
+A file holds a learnt schedule and what it was learnt from; `harness study schedule learn` writes it. A
+package adds a schedule by an entry point in the group `swarmdrive.schedules`.
 """
 
 from functools import lru_cache

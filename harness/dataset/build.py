@@ -53,7 +53,7 @@ def build(
     progress: Callable[[int], None], audits: bool = True, more: Callable[[int], None] = lambda count: None,
     shard: Shard | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Build a dataset in `out`, or freeze a shard of one, which `harness merge` combines.
+    """Build a dataset in `out`, or freeze a shard of one, which `harness run merge` combines.
 
     Args:
         scenario: the scenario to freeze.
@@ -278,8 +278,8 @@ def _readme(name: str, command: str, config: dict[str, Any], forest: Forest, aud
         auc = audited.auc["danger"]
         audit_text = (
             "Whether there is a hidden danger can be told from what the ego sees with an AUC of "
-            f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness scenario audit`, n = {auc.n} "
-            "layouts; .50 is a guess)."
+            f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness dataset scenario audit`, n = "
+            f"{auc.n} layouts; .50 is a guess)."
         )
     return f"""# {name}
 

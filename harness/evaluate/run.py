@@ -116,7 +116,7 @@ def evaluate_shard(
     spec: Spec, out: Path, shard: Shard, progress: Callable[[int], None], more: Callable[[int], None],
     workers: Workers = 1,
 ) -> int:  # fmt: skip
-    """Drive one shard of a closed-loop run, which `harness merge` combines; a stopped shard resumes.
+    """Drive one shard of a closed-loop run, which `harness run merge` combines; a stopped shard resumes.
 
     Args:
         spec: the whole run.

@@ -314,7 +314,9 @@ def lock(version: str, where: Path | None = None) -> str:
     prompt = load(version, where)
     base = _base(version, where)
     pins = _released(base) | {version: prompt.sha256}
-    head = "# Digests of released prompt versions (`harness prompt lock`). A changed text is a new version.\n"
+    head = (
+        "# Digests of released prompt versions (`harness prompt release`). A changed text is a new version.\n"
+    )
     lines = [f'{canonical_json(v)} = "{d}"\n' for v, d in sorted(pins.items())]  # quoted: v1.1 is one key
     write_whole(base / "released.toml", head + "".join(lines))
     return prompt.sha256

@@ -120,7 +120,7 @@ def of_run(run: Run) -> Iterator[str]:
     if off:
         yield (
             f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
-            "closed-loop success may differ. harness fidelity compares the two."
+            "closed-loop success may differ. harness study fidelity compares the two."
         )
 
 

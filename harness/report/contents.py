@@ -57,7 +57,7 @@ def examples(runs: Runs) -> list[dict[str, Any]]:
 
 
 def attributions(runs: Runs) -> list[dict[str, Any]]:
-    """Of each run whose decision points `harness attribute` drew: how many, and where most moved."""
+    """Of each run whose decision points `harness study attribute` drew: how many, and where most moved."""
     found = []
     for n, run in enumerate(runs.runs):
         if a := run.attribution:

@@ -226,7 +226,7 @@ def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
 
 
 def _left_out(run: Run) -> dict[str, list[dict[str, Any]]]:
-    """What was left out of each decision point that `harness attribute` drew, what moved most first."""
+    """What was left out of each decision point that `harness study attribute` drew, what moved most first."""
     of: dict[str, list[dict[str, Any]]] = {}
     if run.attribution:
         for each in sorted(run.attribution.left_out, key=lambda each: -(each.shift or 0.0)):

@@ -61,7 +61,7 @@ def history(
     """The finished runs in a folder, the group whose last run is the newest first.
 
     Args:
-        folder: is looked through as `harness ls` does.
+        folder: is looked through as `harness run ls` does.
         metric: a metric of `summary.csv`.
         condition: of the values; None for the last of those that most of a group's runs have.
         dataset: name of the dataset, or of the scenario of driven runs; None for all.

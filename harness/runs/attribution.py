@@ -1,4 +1,4 @@
-"""The file of a run's attribution, which `harness attribute` writes: what moved its answers."""
+"""The file of a run's attribution, which `harness study attribute` writes: what moved its answers."""
 
 from pathlib import Path
 from typing import Literal

@@ -187,7 +187,7 @@ class Run:
 
     @cached_property
     def attribution(self) -> Attribution | None:
-        """The content of `attribution.json`; None if `harness attribute` did not write one."""
+        """The content of `attribution.json`; None if `harness study attribute` did not write one."""
         exists = (self.path / attribution.FILE).is_file()
         return self._read(attribution.FILE, attribution.load) if exists else None
 

@@ -1,4 +1,4 @@
-"""`harness attribute`: what moved a run's answers and decisions, by leaving out one thing at a time.
+"""`harness study attribute`: what moved a run's answers and decisions, by leaving out one thing at a time.
 
 An object is left out as if no sensor of the viewer had reported it: its line, its conflict, what it hides.
 The viewer's model is asked again. A message is left out as if it had been lost: the consensus rule fuses the

@@ -1,4 +1,4 @@
-"""`harness campaign closed-loop`: the paper's panels where a car can crash, driven by any model.
+"""`harness study closed-loop`: the paper's panels where a car can crash, driven by any model.
 
 All grid points are conditions of one live run. Their episodes share worlds for as long as they go the same
 way (docs/decisions/0014), so a grid costs far less than its points one by one.

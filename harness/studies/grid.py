@@ -1,4 +1,4 @@
-"""`harness grid`: every ego agent with every helper agent, and what each choice is worth.
+"""`harness study grid`: every ego agent with every helper agent, and what each choice is worth.
 
 A full factorial design: a cell is a run of one ego agent with one helper agent. Cells share answers, so each
 agent is asked in each role once about a decision point, whatever cell comes to it. All cells have the same

@@ -1,4 +1,4 @@
-"""`harness schedule learn`: what asking a helper is worth, learnt from where decisions lead on train layouts.
+"""`harness study schedule learn`: learn what asking a helper is worth from where train decisions lead.
 
 At every decision point that some choice of helpers leads to, asking one helper alone has a gain: success with
 it less success without, the rest of the course decided as the schedule decides. The network learns the gain,

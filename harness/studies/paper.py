@@ -1,4 +1,4 @@
-"""`harness campaign paper`: operating points, swarm size, packet loss and entropy threshold, by the proxy."""
+"""`harness study paper`: operating points, swarm size, packet loss and entropy threshold, by the proxy."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -125,5 +125,5 @@ def equation_2(weights: "pd.DataFrame") -> str:
     return (
         f"Equation 2 in the calibrated proxy: 6g succeeds in {with_it} % with weights by distance, and in "
         f"{without} % with equal ones. The distances are declared so that the witness decides: this is no "
-        f"evidence for the equation. For a run: harness sweep RUN --over {WEIGHTS} --grid 1,{EQUAL_M:g}"
+        f"evidence for the equation. For a run: harness study sweep RUN --over {WEIGHTS} --grid 1,{EQUAL_M:g}"
     )

@@ -1,4 +1,4 @@
-"""`harness schedule compare`: schedules on stored answers, between asking nobody and the oracle.
+"""`harness study schedule compare`: schedules on stored answers, between asking nobody and the oracle.
 
 All schedules decide the same episodes with the same draws, so what they differ in is whom they ask, and when.
 A schedule's settings are its threshold and how many helpers it asks at most. Which setting is best is chosen

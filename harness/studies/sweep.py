@@ -1,4 +1,4 @@
-"""`harness sweep`: stored answers at every point of a grid."""
+"""`harness study sweep`: stored answers at every point of a grid."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""`harness trust`: what every consensus rule makes of every attack, and what it costs while nobody attacks.
+"""`harness study trust`: every consensus rule under every attack, and its cost while nobody attacks.
 
 A stored run's answers are walked again under each rule, attack and share of attackers; no model is asked
 what the run has. All cells have the same episodes, channel draws and attackers, so contrasts are paired by
@@ -296,8 +296,9 @@ def run_bench(
         raise UserError(f"--condition {printable(condition)}: no attack changes anything: {why}")
     if point.attack or EGO_PROMPT in rules:
         raise UserError(
-            "harness trust: give a condition without attack, and rules that are arithmetic; a fusion call is "
-            f"attacked by `harness eval --condition {condition}:consensus={EGO_PROMPT} --attack injection`"
+            "harness study trust: give a condition without attack, and rules that are arithmetic; a fusion "
+            f"call is attacked by `harness eval --condition {condition}:consensus={EGO_PROMPT} --attack "
+            "injection`"
         )
     of = {"sources": [{"name": stored.name}], "dataset": stored.run.source, "condition": condition}
     refuse_other(out, "trust", of)

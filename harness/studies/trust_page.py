@@ -1,4 +1,4 @@
-"""What the folder of `harness trust` has: a heat map, tables and a page."""
+"""What the folder of `harness study trust` has: a heat map, tables and a page."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -144,8 +144,8 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
     return f"""# {name}
 
 A {kind} of {facts["parameters"]:,} parameters and {facts["vocabulary"]} tokens, trained {begins}
-by `harness distill` to imitate one planner in the scenarios below. It shows the harness with a real language
-model that fits beside the source; it says nothing about Qwen3-4B or any other model.
+by `harness model distill` to imitate one planner in the scenarios below. It shows the harness with a real
+language model that fits beside the source; it says nothing about Qwen3-4B or any other model.
 
 - Data: {facts["layouts"]} layouts a scenario from seed {facts["first_seed"]}, decision points drawn from each
   level of their trees; prompts {", ".join(facts["prompts"])}; every viewer, and the ego with messages.

@@ -111,7 +111,7 @@ def take_over(model: Any, base: Path) -> None:
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise UserError(
             f"--base {printable(base)}: {printable(str(error), 160)}; give the folder of a model that "
-            "`harness distill` made of text prompts"
+            "`harness model distill` made of text prompts"
         ) from None
 
 

@@ -1,4 +1,4 @@
-"""`harness channel` as typed, and physical radios from the command line to the page."""
+"""`harness radio` as typed, and physical radios from the command line to the page."""
 
 import json
 from collections.abc import Callable
@@ -19,24 +19,24 @@ PHYSICAL = [name for name in ("mode4", "mode2", "its-g5") if isinstance(CHANNELS
 
 
 def test_list_says_what_each_radio_rests_on(harness: Callable[..., Said]) -> None:
-    code, out, _ = harness("channel", "list")
+    code, out, _ = harness("radio", "list")
     assert code == 0
     assert "v2x · constant · assumed" in out
     assert "mode4 · lte-v2x-mode4 · modelled" in out
     assert max(map(len, out.splitlines())) <= 80
-    listed = json.loads(harness("channel", "list", "--json")[1])
+    listed = json.loads(harness("radio", "list", "--json")[1])
     assert {"6g", "v2x", "density-coupled", *PHYSICAL} <= {profile["name"] for profile in listed}
     assert all(profile["source"] for profile in listed)
 
 
 @pytest.mark.parametrize("name", PHYSICAL)
 def test_show_has_settings_sources_and_the_reach(harness: Callable[..., Said], name: str) -> None:
-    code, out, err = harness("channel", "show", name)
+    code, out, err = harness("radio", "show", name)
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     assert "source: " in out
     assert "density_per_km = 100\n" in out
-    told = json.loads(harness("channel", "show", f"{name}:density_per_km=0", "--json")[1])
+    told = json.loads(harness("radio", "show", f"{name}:density_per_km=0", "--json")[1])
     assert told["busy_ratio"] == 0
     reach = told["reception"]
     for sight in ("clear", "vehicle", "building"):
@@ -48,15 +48,15 @@ def test_show_has_settings_sources_and_the_reach(harness: Callable[..., Said], n
 
 def test_show_says_where_settings_leave_what_the_source_tried(harness: Callable[..., Said]) -> None:
     said = "density_per_km = 1000 is outside what its model was held against, 100 to 300."
-    assert said in " ".join(harness("channel", "show", "mode4:density_per_km=1000")[1].split())
-    assert "outside" not in harness("channel", "show", "mode4")[1]
+    assert said in " ".join(harness("radio", "show", "mode4:density_per_km=1000")[1].split())
+    assert "outside" not in harness("radio", "show", "mode4")[1]
 
 
 def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: Callable[..., Said]) -> None:
     rows = '10,0.97,"power_dbm=20,rate_hz=20",they\n100,0.5,"power_dbm=20,rate_hz=20",they\n10,0.9,,they\n'
     Path("theirs.csv").write_text(f"distance_m,reception,configuration,source\n{rows}")
     code, out, err = harness(
-        "channel", "check", "mode4", "-n", "400", "--against", "theirs.csv", "--out", "m.svg"
+        "radio", "check", "mode4", "-n", "400", "--against", "theirs.csv", "--out", "m.svg"
     )
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
@@ -64,7 +64,7 @@ def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: 
     assert "2 curves, " in out
     assert "wrote m.svg" in out
     assert "others' curves, %" in Path("m.svg").read_text()
-    told = json.loads(harness("channel", "check", "mode4", "-n", "2000", "--json")[1])
+    told = json.loads(harness("radio", "check", "mode4", "-n", "2000", "--json")[1])
     for point in told["messages"]:
         assert point["crossing"]["low"] - 0.02 <= point["model"] <= point["crossing"]["high"] + 0.02
         assert point["round_trip"]["value"] <= point["crossing"]["value"]
@@ -73,7 +73,7 @@ def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: 
 def test_check_says_how_long_a_receiver_waits_for_the_next_packet(harness: Callable[..., Said]) -> None:
     """The mean wait is about 1 / (rate x reception); less where little arrives, as shadowing has spells."""
     for name in PHYSICAL:
-        told = json.loads(harness("channel", "check", name, "-n", "2000", "--json")[1])
+        told = json.loads(harness("radio", "check", name, "-n", "2000", "--json")[1])
         assert 0.05 < told["busy_ratio"] < 0.5
         for wait in told["waits"]:
             mean, p95, alone = wait["mean_s"]["value"], wait["p95_s"]["value"], wait["independent_s"]
@@ -83,7 +83,7 @@ def test_check_says_how_long_a_receiver_waits_for_the_next_packet(harness: Calla
             assert mean < 1.08 * alone
             assert mean > 0.92 * alone or alone > 0.2
             assert p95 >= 0.1
-    often = json.loads(harness("channel", "check", "mode4:rate_hz=50", "-n", "500", "--json")[1])["waits"][0]
+    often = json.loads(harness("radio", "check", "mode4:rate_hz=50", "-n", "500", "--json")[1])["waits"][0]
     assert 0.02 < often["mean_s"]["value"] < 0.05
 
 
@@ -94,10 +94,10 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
     }  # fmt: skip
     configuration = ",".join(f"{key}={value}" for key, value in settings.items())
     Path("nr.csv").write_text(f'distance_m,reception,configuration\n50,.9,"{configuration}"\n50,0.9,\n')
-    code, out, err = harness("channel", "check", "mode2", "-n", "200", "--against", "nr.csv", "--json")
+    code, out, err = harness("radio", "check", "mode2", "-n", "200", "--against", "nr.csv", "--json")
     assert (code, err) == (0, "")
     own, usual = (curve["mean_difference"] for curve in json.loads(out)["curves"])
-    there = json.loads(harness("channel", "show", f"mode2:{configuration}", "--json")[1])
+    there = json.loads(harness("radio", "show", f"mode2:{configuration}", "--json")[1])
     assert own == pytest.approx(abs(there["reception"]["clear"][2] - 0.9), abs=0.1)
     assert own != usual
 
@@ -108,7 +108,7 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
         (("show", "mode5"), "unknown operating point 'mode5'; did you mean"),
         (("show", "mode4:density=3"), "did you mean one of density_coupled, density_per_km?"),
         (("show", "mode4:density_per_km=-1"), "density_per_km = -1.0; allowed: a number from 0 to 10000"),
-        (("show", "single-local"), "has no channel; `harness channel list` shows"),
+        (("show", "single-local"), "has no channel; `harness radio list` shows"),
         (("check", "6g"), "loses the same at every distance"),
         (("check", "mode4", "--out", "x.gif"), "known: .pdf, .png, .svg"),
         (("check", "mode4", "--against", "bad.csv"), "bad.csv, line 3: Expected `float` <= 1.0"),
@@ -119,7 +119,7 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
 def test_a_mistake_is_one_line(harness: Callable[..., Said], arguments: tuple[str, ...], says: str) -> None:
     Path("bad.csv").write_text("distance_m,reception\n10,0.9\n20,1.9\n")
     Path("other.csv").write_text("distance_m,reception,configuration\n10,0.9,rat_hz=10\n")
-    code, out, err = harness("channel", *arguments)
+    code, out, err = harness("radio", *arguments)
     assert (code, out) == (2, "")
     assert says in err
     assert err.count("\n") == 1
@@ -135,7 +135,7 @@ def test_a_sweep_over_a_radios_setting_gives_what_a_run_at_it_gives(
     harness: Callable[..., Said], done: Path
 ) -> None:
     over = ("--over", "density_per_km", "--grid", "100,1000", "--condition", "mode4", "--out", "swept")
-    code, _, err = harness("sweep", done, *over)
+    code, _, err = harness("study", "sweep", done, *over)
     assert (code, err) == (0, "")
     swept = pd.read_csv("swept/conditions.csv")
     run = pd.read_csv(done / "summary.csv")
@@ -162,15 +162,17 @@ def test_a_sweep_refuses_a_run_whose_radio_has_changed_since(
     )
     mine.write_text(text)
     run = evaluate(spec_of(small, points=(named_point("mine"),)), tmp_path / "run").out
-    assert harness("sweep", run, "--over", "rate_hz", "--grid", "10", "--condition", "mine")[0] == 0
+    assert harness("study", "sweep", run, "--over", "rate_hz", "--grid", "10", "--condition", "mine")[0] == 0
     mine.write_text(text.replace("50", "60"))
-    code, _, err = harness("sweep", run, "--over", "rate_hz", "--grid", "10", "--condition", "mine")
+    code, _, err = harness("study", "sweep", run, "--over", "rate_hz", "--grid", "10", "--condition", "mine")
     assert code == 2
     assert "channel profile mine has changed since; restore it or run again" in err
 
 
 def test_no_messages_is_a_control_of_a_physical_radio_too(harness: Callable[..., Said], done: Path) -> None:
-    code, out, _ = harness("sweep", done, "--over", "loss", "--grid", "1", "--condition", "its-g5", "--json")
+    code, out, _ = harness(
+        "study", "sweep", done, "--over", "loss", "--grid", "1", "--condition", "its-g5", "--json"
+    )
     assert code == 0
     run = pd.read_csv(done / "summary.csv")
     alone = run[(run.condition == "single-local") & (run.metric == "success_rate")].value

@@ -1,4 +1,4 @@
-"""`harness device`: what fits the window by declared or a run's tokens; a profile beside a run's times."""
+"""`harness model device`: what fits the window by declared or real tokens; a profile beside times."""
 
 import json
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def test_written_json_does_not_fit_200_ms_on_an_orin_and_a_read_out_does(
     harness: Callable[..., Said],
 ) -> None:
     """300 / 2687.9 + 40 / 50.7 s; joules at 60 W, which is an upper bound."""
-    code, out, _ = harness("device", "show", "agx-orin", "--device-model", "qwen3-4b", "--json")
+    code, out, _ = harness("model", "device", "show", "agx-orin", "--device-model", "qwen3-4b", "--json")
     readout, written = json.loads(out)["fits"]
     assert code == 0
     seconds = 300 / 2687.9 + np.array([1, 40]) / 50.7
@@ -40,17 +40,17 @@ def test_written_json_does_not_fit_200_ms_on_an_orin_and_a_read_out_does(
     assert [readout["joules"]["value"], written["joules"]["value"]] == pytest.approx(60 * seconds)
     assert [readout["in_time"]["value"], written["in_time"]["value"]] == [1, 0]
     options = ("--device-model", "qwen3-4b", "--answer-tokens", "4")
-    code, out, _ = harness("device", "show", "agx-orin", *options)
+    code, out, _ = harness("model", "device", "show", "agx-orin", *options)
     assert "qwen3-4b written 300 + 4 191 yes 11.43" in " ".join(out.split())
     assert "J: modelled (60 W over the rate: the module's cap by its data sheet: an upper" in out
 
 
 def test_what_is_not_known_is_said(harness: Callable[..., Said]) -> None:
-    code, out, _ = harness("device", "show", "h200")
+    code, out, _ = harness("model", "device", "show", "h200")
     assert code == 0
     assert "llama-3.1-8b  readout   300 + 1  unknown    unknown  unknown" in out
     assert "J: unknown, since nobody states them" in out
-    _, out, _ = harness("device", "show", "h200", "--json")
+    _, out, _ = harness("model", "device", "show", "h200", "--json")
     assert json.loads(out)["fits"][0]["ms"] is None
 
 
@@ -64,7 +64,7 @@ def test_a_runs_own_tokens(alone: Path, harness: Callable[..., Said]) -> None:
     assert as_written.seconds == pytest.approx(np.median(took))
     assert as_written.in_time.value == np.mean(np.array(took) <= 0.2)
     assert (as_read_out.output_tokens, as_read_out.in_time.value) == (1, 1)
-    code, out, _ = harness("device", "show", "agx-orin", "--run", alone)
+    code, out, _ = harness("model", "device", "show", "agx-orin", "--run", alone)
     assert code == 0
     assert f"n = {len(egos)} answers of swarm-tiny for the ego" in " ".join(out.split())
 
@@ -87,18 +87,20 @@ def test_a_profile_is_held_against_a_run(alone: Path, harness: Callable[..., Sai
         np.median([a.prompt_tokens / a.first_token_s for a in asked])
     )
     assert prefill.stated == 45000
-    code, out, _ = harness("device", "check", "laptop-cpu", alone)
+    code, out, _ = harness("model", "device", "check", "laptop-cpu", alone)
     assert code == 0
     assert "laptop-cpu says" in out
-    code, out, _ = harness("device", "check", "agx-orin", alone, "--device-model", "qwen3-4b", "--json")
+    code, out, _ = harness(
+        "model", "device", "check", "agx-orin", alone, "--device-model", "qwen3-4b", "--json"
+    )
     assert [each["stated"] for each in json.loads(out) if each["what"] == "decode_tokens_per_s"] == [50.7] * 2
 
 
 def test_every_profile_is_listed(harness: Callable[..., Said]) -> None:
-    code, out, _ = harness("device", "list")
+    code, out, _ = harness("model", "device", "list")
     assert code == 0
     assert [line.split(" ·")[0] for line in out.splitlines()[::2]] == devices.names()
-    _, out, _ = harness("device", "list", "--json")
+    _, out, _ = harness("model", "device", "list", "--json")
     assert [each["name"] for each in json.loads(out)] == devices.names()
 
 
@@ -129,7 +131,7 @@ def test_a_run_without_times_or_tokens_is_refused(small: Dataset, tmp_path: Path
     ],
 )
 def test_mistakes_are_one_line(options: tuple[str, ...], says: str, harness: Callable[..., Said]) -> None:
-    code, out, err = harness("device", *options)
+    code, out, err = harness("model", "device", *options)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert says in err
 

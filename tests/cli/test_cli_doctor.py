@@ -1,4 +1,4 @@
-"""`harness doctor`: what is here to run with."""
+"""`harness model doctor`: what is here to run with."""
 
 import json
 import os
@@ -14,7 +14,7 @@ import pytest
 from harness.backends.cards import load_all
 
 Said = tuple[int, str, str]
-DOCTOR = "import harness.cli as c; sys.argv = ['harness', 'doctor', *sys.argv[1:]]\ntry: c.main()\n"
+DOCTOR = "import harness.cli as c; sys.argv = ['harness', 'model', 'doctor', *sys.argv[1:]]\ntry: c.main()\n"
 
 
 def apart(before: str, *args: str, after: str = "raise") -> str:
@@ -28,7 +28,7 @@ def test_it_tells_versions_machine_models_and_cache(
 ) -> None:
     monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path))
     (tmp_path / "completions.sqlite").write_bytes(b"1234567")
-    code, out, err = harness("doctor", "--json")
+    code, out, err = harness("model", "doctor", "--json")
     told = json.loads(out)
     assert (code, err) == (0, "")
     assert told["versions"]["python"] == platform.python_version()
@@ -40,7 +40,7 @@ def test_it_tells_versions_machine_models_and_cache(
 
 
 def test_people_read_it_in_eighty_columns(harness: Callable[..., Said]) -> None:
-    code, out, err = harness("doctor")
+    code, out, err = harness("model", "doctor")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     heads = [line.split()[0] for line in out.splitlines() if not line.startswith(" ")]

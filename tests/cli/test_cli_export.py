@@ -1,4 +1,4 @@
-"""`harness export`: decisions and answers as text, and episodes as test cases."""
+"""`harness run export`: decisions and answers as text, and episodes as test cases."""
 
 import csv
 import json
@@ -44,7 +44,7 @@ def test_a_spreadsheet_finds_no_formula(tmp_path: Path, harness: Callable[..., S
 
     run = made_up(tmp_path / "run", answer=spoil)
     before = (run / "answers.jsonl").read_bytes()
-    assert harness("export", run, "--csv")[0] == 0
+    assert harness("run", "export", run, "--csv")[0] == 0
     with (run / "answers.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     written = [row["raw"] for row in rows[: len(texts)]]
@@ -56,7 +56,7 @@ def test_a_spreadsheet_finds_no_formula(tmp_path: Path, harness: Callable[..., S
 
 
 def test_csv_has_every_decision_and_answer(run: Path, harness: Callable[..., Said]) -> None:
-    code, out, err = harness("export", run, "--csv")
+    code, out, err = harness("run", "export", run, "--csv")
     assert (code, err) == (0, "")
     assert out.splitlines() == [str(run / "decisions.csv"), str(run / "answers.csv")]
     with (run / "decisions.csv").open(newline="") as file:
@@ -92,7 +92,7 @@ def test_jsonl_has_an_object_a_decision(
     run: Path, harness: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(export, "AT_ONCE", 5)
-    code, out, err = harness("export", run, "--jsonl", "--out", "text")
+    code, out, err = harness("run", "export", run, "--jsonl", "--out", "text")
     assert (code, out, err) == (0, "text/decisions.jsonl\n", "")
     lines = Path("text/decisions.jsonl").read_text().splitlines()
     assert [json.loads(line, parse_constant=pytest.fail) for line in lines] == rows_of(run)
@@ -106,7 +106,7 @@ def test_junit_has_a_case_an_episode_and_condition(tmp_path: Path, harness: Call
             row |= {"success": False, "failure": "col\x1blision"} if failed else {}
 
     run = made_up(tmp_path / "run", episode=end)
-    code, out, err = harness("export", run, "--junit", "run.xml")
+    code, out, err = harness("run", "export", run, "--junit", "run.xml")
     assert (code, out, err) == (0, "run.xml\n", "")
     suite = ElementTree.parse("run.xml").getroot()
     assert (suite.tag, suite.get("tests"), suite.get("failures")) == ("testsuite", "8", "2")
@@ -151,17 +151,17 @@ def test_csv_in_pieces_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytes
 def test_bad_options_are_one_line(
     options: tuple[str, ...], said: str, run: Path, harness: Callable[..., Said]
 ) -> None:
-    code, out, err = harness("export", run, *options)
+    code, out, err = harness("run", "export", run, *options)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err
 
 
 def test_a_folder_that_is_no_run_or_broken_is_one_line(run: Path, harness: Callable[..., Said]) -> None:
-    code, out, err = harness("export", "nowhere", "--csv")
+    code, out, err = harness("run", "export", "nowhere", "--csv")
     assert (code, out) == (2, "")
     assert "nowhere is no finished run: it has no run.json" in err
     (run / "decisions.parquet").write_text("PAR1")
-    code, out, err = harness("export", run, "--csv")
+    code, out, err = harness("run", "export", run, "--csv")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "decisions.parquet is broken" in err
     assert not (run / "decisions.csv").exists()

@@ -1,4 +1,4 @@
-"""`harness history`: a metric over runs, which only compare on the same scenes."""
+"""`harness run history`: a metric over runs, which only compare on the same scenes."""
 
 import json
 import re
@@ -47,7 +47,7 @@ def reports(tmp_path: Path) -> Path:
 
 
 def test_a_metric_by_date_of_the_condition_that_most_runs_have(reports: Path, harness: Harness) -> None:
-    code, out, err = harness("history", "--json")
+    code, out, err = harness("run", "history", "--json")
     assert (code, err) == (0, "")
     groups = json.loads(out, parse_constant=pytest.fail)
     assert [(g["scenes"], g["condition"]) for g in groups] == [
@@ -63,7 +63,7 @@ def test_a_metric_by_date_of_the_condition_that_most_runs_have(reports: Path, ha
 
 
 def test_the_table_fits_and_says_what_does_not_compare(reports: Path, harness: Harness) -> None:
-    code, out, err = harness("history", reports)
+    code, out, err = harness("run", "history", reports)
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     lines = out.split("made-up 000000000000, 6g\n")[1].splitlines()
@@ -76,7 +76,16 @@ def test_the_table_fits_and_says_what_does_not_compare(reports: Path, harness: H
 
 
 def test_another_metric_condition_and_dataset(reports: Path, harness: Harness) -> None:
-    asked = ("history", "--metric", "latency_proxy_ms", "--condition", "single-local", "--dataset", "made-up")
+    asked = (
+        "run",
+        "history",
+        "--metric",
+        "latency_proxy_ms",
+        "--condition",
+        "single-local",
+        "--dataset",
+        "made-up",
+    )
     code, out, _ = harness(*asked)
     assert code == 0
     assert out.startswith("latency_proxy_ms with its 95 % interval\n")
@@ -84,14 +93,14 @@ def test_another_metric_condition_and_dataset(reports: Path, harness: Harness) -
     frozen = out.split("made-up 000000000000, single-local\n")[1].splitlines()
     assert ["145.0" in line for line in frozen[:3]] == [True, True, False]
     assert frozen[2].split()[-3:] == ["–", "n", "–"], "the third has no such condition"
-    groups = json.loads(harness("history", "--metric", "strict_rate_ego", "--json")[1])
+    groups = json.loads(harness("run", "history", "--metric", "strict_rate_ego", "--json")[1])
     assert {group["condition"] for group in groups} == {"all"}
 
 
 def test_the_page_has_each_run_with_its_link_and_picture(reports: Path, harness: Harness) -> None:
     (reports / "second" / "report.html").touch()
     configure(reports / "first", model={"name": "<script>alert(1)</script>", "engine": "proxy"})
-    assert harness("history", "--html", "page.html")[0] == 0
+    assert harness("run", "history", "--html", "page.html")[0] == 0
     source = Path("page.html").read_text()
     assert "<script" not in source
     page = unescape(source)
@@ -118,6 +127,6 @@ def test_the_page_has_each_run_with_its_link_and_picture(reports: Path, harness:
 def test_what_cannot_be_shown_is_one_line(
     args: tuple[str, ...], said: str, reports: Path, harness: Harness
 ) -> None:
-    code, out, err = harness("history", *args)
+    code, out, err = harness("run", "history", *args)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err

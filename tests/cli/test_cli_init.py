@@ -83,7 +83,7 @@ def test_a_name_that_ships_is_refused(harness: Harness, project: Path) -> None:
 
 def test_a_prompt_is_released_in_its_project(harness: Harness, project: Path) -> None:
     shipped = (resources.folder("prompts") / "released.toml").read_bytes()
-    assert harness("prompt", "lock", "mine")[0] == 0
+    assert harness("prompt", "release", "mine")[0] == 0
     assert prompts.load("mine").released
     assert (project / "prompts/released.toml").is_file()
     assert (resources.folder("prompts") / "released.toml").read_bytes() == shipped
@@ -94,7 +94,7 @@ def test_a_prompt_is_released_in_its_project(harness: Harness, project: Path) ->
 
 def test_a_card_with_a_mistake_is_what_a_doctor_tells(harness: Harness, project: Path) -> None:
     (project / "models/my-model.toml").write_text("engine = 3")
-    code, out, err = harness("doctor", "--json")
+    code, out, err = harness("model", "doctor", "--json")
     [told] = [m for m in json.loads(out)["models"] if m["name"] == "my-model"]
     assert (code, err, told["missing"]) == (0, "", "a sound card")
     assert "engine = 3; allowed: str" in told["remedy"]

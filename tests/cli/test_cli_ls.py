@@ -1,4 +1,4 @@
-"""`harness ls`: what a folder of runs holds."""
+"""`harness run ls`: what a folder of runs holds."""
 
 import json
 import os
@@ -74,7 +74,7 @@ def test_success_is_that_of_the_best_condition_over_episodes(folder: Path) -> No
 def test_people_read_it_in_eighty_columns(harness: Callable[..., Said], folder: Path) -> None:
     (folder / "frozen").rename(folder / ("long-" * 40))
     changed(folder / "live/run.json", model={"name": "\x1b[31mred" * 30})
-    code, out, err = harness("ls")
+    code, out, err = harness("run", "ls")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     assert "\x1b" not in out
@@ -83,7 +83,7 @@ def test_people_read_it_in_eighty_columns(harness: Callable[..., Said], folder: 
 
 
 def test_json_has_every_field_whole(harness: Callable[..., Said], folder: Path) -> None:
-    code, out, _ = harness("ls", folder, "--json")
+    code, out, _ = harness("run", "ls", folder, "--json")
     told = {one["name"]: one for one in json.loads(out, parse_constant=pytest.fail)}
     assert code == 0
     assert list(told["live"]) == [
@@ -108,7 +108,7 @@ def test_an_unfinished_run_says_that_the_same_command_goes_on(
         "the same command continues it",
         "proxy",
     )
-    assert "unfinished: the same command continues it\n" in harness("ls", folder)[1]
+    assert "unfinished: the same command continues it\n" in harness("run", "ls", folder)[1]
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_a_run_of_an_older_format_is_broken_and_says_why(
     changed(folder / "frozen/run.json", format=old)
     [one] = [one for one in runs(folder) if one.name == "frozen"]
     assert (one.kind, one.state, one.why) == ("run", "broken", "run.json: format of harness 0.1")
-    assert "broken: run.json: format of harness 0.1\n" in harness("ls", folder)[1]
+    assert "broken: run.json: format of harness 0.1\n" in harness("run", "ls", folder)[1]
 
 
 def test_listing_needs_no_array_and_no_table() -> None:
@@ -188,9 +188,9 @@ def test_what_is_no_run_is_not_listed(folder: Path) -> None:
 
 
 def test_no_folder_is_one_line_and_an_empty_one_says_so(harness: Callable[..., Said], tmp_path: Path) -> None:
-    code, out, err = harness("ls")
+    code, out, err = harness("run", "ls")
     assert (code, out) == (2, "")
     assert err.startswith("harness: reports is no folder; give one that holds runs")
     (tmp_path / "reports").mkdir()
-    assert harness("ls") == (0, "no runs in reports; `harness eval` makes one\n", "")
-    assert harness("ls", "--json")[1] == "[]\n"
+    assert harness("run", "ls") == (0, "no runs in reports; `harness eval` makes one\n", "")
+    assert harness("run", "ls", "--json")[1] == "[]\n"

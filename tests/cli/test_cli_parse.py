@@ -1,4 +1,4 @@
-"""`harness parse`, run as a user does."""
+"""`harness prompt parse`, run as a user does."""
 
 import io
 import json
@@ -23,7 +23,7 @@ def parse(harness: Callable[..., tuple[int, str, str]], monkeypatch: pytest.Monk
 
     def typed(*arguments: str, stdin: bytes = b"") -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(stdin)))
-        return harness("parse", *arguments)
+        return harness("prompt", "parse", *arguments)
 
     return typed
 
@@ -88,7 +88,7 @@ def test_a_failed_verdict_is_data_and_exits_with_zero(parse: Parse) -> None:
 
 
 def test_bytes_that_are_no_utf8_are_replaced_and_said_so() -> None:
-    command = [sys.executable, "-m", "harness", "parse", "-"]
+    command = [sys.executable, "-m", "harness", "prompt", "parse", "-"]
     said = b'\xff{"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}'
     done = subprocess.run(command, input=said, capture_output=True)
     assert done.returncode == 0

@@ -15,23 +15,24 @@ DRIVE = ("--episodes", "1", "--seeds", "0", "--workers", "1")
 
 def test_quiet_prints_nothing_and_writes_the_same(harness: Callable[..., Said], small_path: Path) -> None:
     once = ("eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--out")
-    sweep = ("sweep", "run", "--over", "tau", "--grid", "0.2,0.9", "--out")
+    sweep = ("study", "sweep", "run", "--over", "tau", "--grid", "0.2,0.9", "--out")
     for args in (once, ("drive", *DRIVE, "--condition", "6g", "--out"), sweep):
+        name = args[1] if args[0] == "study" else args[0]
         code, out, err = harness(*args, "loud" if args is not once else "run")
         assert (code, err) == (0, "")
         assert "wrote" in out
-        assert harness(*args, f"quiet-{args[0]}", "--quiet") == (0, "", "")
-        assert {p.name for p in Path(f"quiet-{args[0]}").iterdir()} >= {
+        assert harness(*args, f"quiet-{name}", "--quiet") == (0, "", "")
+        assert {p.name for p in Path(f"quiet-{name}").iterdir()} >= {
             "eval": {"run.json", "report.html"}, "drive": {"run.json"}, "sweep": {"sweep.json", "index.html"},
-        }[args[0]]  # fmt: skip
+        }[name]  # fmt: skip
         if args is not once:
-            Path("loud").rename(f"loud-{args[0]}")
+            Path("loud").rename(f"loud-{name}")
     assert harness("eval", "--dataset", small_path, "--dry-run", "--quiet") == (0, "", "")
 
 
 @pytest.mark.slow
 def test_the_papers_campaign_is_quiet(harness: Callable[..., Said]) -> None:
-    paper = ("campaign", "paper", "--episodes", "10", "--sweep-episodes", "10", "--out", "paper", "--quiet")
+    paper = ("study", "paper", "--episodes", "10", "--sweep-episodes", "10", "--out", "paper", "--quiet")
     assert harness(*paper) == (0, "", "")
     assert Path("paper/index.html").is_file()
 
@@ -39,7 +40,7 @@ def test_the_papers_campaign_is_quiet(harness: Callable[..., Said]) -> None:
 @pytest.mark.slow
 def test_the_closed_loop_campaign_is_quiet(harness: Callable[..., Said]) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
-    assert harness("campaign", "closed-loop", *DRIVE, "--out", "closed", "--quiet") == (0, "", "")
+    assert harness("study", "closed-loop", *DRIVE, "--out", "closed", "--quiet") == (0, "", "")
     assert Path("closed/closed-loop.json").is_file()
 
 
@@ -62,6 +63,8 @@ def completed(line: str) -> list[str]:
 
 
 def test_a_shell_completes_commands_and_options() -> None:
-    assert sorted(completed("harness d")) == ["dataset", "device", "distill", "doctor", "drive"]
+    assert sorted(completed("harness d")) == ["dataset", "drive"]
     assert completed("harness eval --qu") == ["--quiet"]
-    assert completed("harness campaign cl") == ["closed-loop"]
+    assert completed("harness study cl") == ["closed-loop"]
+    assert completed("harness run hi") == ["history"]
+    assert completed("harness campaign cl") == ["closed-loop"], "the old spelling is understood, and silent"

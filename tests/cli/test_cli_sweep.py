@@ -1,4 +1,4 @@
-"""`harness sweep` and `harness campaign paper` as typed."""
+"""`harness study sweep` and `harness study paper` as typed."""
 
 import json
 import re
@@ -23,7 +23,7 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_without_an_axis_it_draws_the_papers_panels_beside_the_proxys(
     harness: Callable[..., Said], done: Path
 ) -> None:
-    code, out, err = harness("sweep", done, "--proxy", "--out", "swept")
+    code, out, err = harness("study", "sweep", done, "--proxy", "--out", "swept")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     assert out.splitlines()[-1] == "wrote swept/index.html"
@@ -48,7 +48,7 @@ def test_conditions_stand_side_by_side_and_times_may_be_the_papers(
 ) -> None:
     """On demand the helpers' 145 ms come after the ego's; serial replies of 25 ms each follow."""
     options = ("--over", "window", "--grid", "400", "--condition", "v2x", "--condition", "v2x:on_demand=true")
-    code, out, err = harness("sweep", done, *options, "--latency", "paper", "--json")
+    code, out, err = harness("study", "sweep", done, *options, "--latency", "paper", "--json")
     assert (code, err) == (0, "")
     table = pd.DataFrame(json.loads(out))
     p99 = table[table.metric == "latency_p99_ms"].set_index("condition")["mean"]
@@ -72,7 +72,7 @@ def test_conditions_stand_side_by_side_and_times_may_be_the_papers(
 def test_what_cannot_be_is_one_line_and_nothing_is_written(
     options: tuple[str, ...], said: str, harness: Callable[..., Said], done: Path
 ) -> None:
-    code, out, err = harness("sweep", done, *options, "--out", "swept")
+    code, out, err = harness("study", "sweep", done, *options, "--out", "swept")
     assert (code, out) == (2, "")
     assert said in err
     assert err.count("\n") == 1
@@ -80,7 +80,7 @@ def test_what_cannot_be_is_one_line_and_nothing_is_written(
 
 
 def test_the_papers_study_ends_with_how_many_numbers_it_met(harness: Callable[..., Said]) -> None:
-    code, out, err = harness("campaign", "paper", "--episodes", "20", "--sweep-episodes", "20", "--out", "p")
+    code, out, err = harness("study", "paper", "--episodes", "20", "--sweep-episodes", "20", "--out", "p")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     assert "of 30 numbers within the aim" in out

@@ -9,7 +9,7 @@ import pytest
 from run_on_disk import made_up
 
 SPEAK = (
-    ("--help",), ("eval", "--help"), ("ls", "."), ("compare", "run", "run"), ("doctor",),
+    ("--help",), ("eval", "--help"), ("run", "ls", "."), ("compare", "run", "run"), ("model", "doctor"),
     ("prompt", "show", "v2", "--scene", "00000-0"), ("eval", "--limit", "1", "--seeds", "0"),
 )  # fmt: skip
 
@@ -30,12 +30,12 @@ def test_nobody_reads(command: tuple[str, ...], tmp_path: Path) -> None:
 
 
 def test_nobody_hears_what_is_wrong(tmp_path: Path) -> None:
-    process = started(tmp_path, ("ls", "nowhere"))
+    process = started(tmp_path, ("run", "ls", "nowhere"))
     process.stderr.close()
     assert process.wait(60) == 141
 
 
-@pytest.mark.parametrize("command", [("ls", "."), ("eval", "--help")])
+@pytest.mark.parametrize("command", [("run", "ls", "."), ("eval", "--help")])
 def test_a_full_disk(command: tuple[str, ...], tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         process = started(tmp_path, command, stdout=full)

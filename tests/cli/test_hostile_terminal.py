@@ -34,7 +34,7 @@ def test_doctor(harness: Callable[..., Said], project: Path, monkeypatch: pytest
     program.write_text(f"#!/bin/sh\necho 'GPU {HOSTILE}'\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
-    code, out, err = harness("doctor")
+    code, out, err = harness("model", "doctor")
     assert (code, err) == (0, "")
     assert out.isascii()
     assert all(line.isprintable() for line in out.splitlines())

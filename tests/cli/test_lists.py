@@ -11,9 +11,9 @@ from run_on_disk import made_up
 Typed = Callable[..., tuple[int, str, str]]
 # What is listed, by which command, what else it must have, and a command that needs the wrong one.
 LISTS = {
-    "channels": (("channel", "list"), "mode4", ("channel", "show", "bad")),
+    "channels": (("radio", "list"), "mode4", ("radio", "show", "bad")),
     "models": (("model", "list"), "proxy", ("eval", "--model", "bad")),
-    "devices": (("device", "list"), "agx-orin", ("device", "show", "bad")),
+    "devices": (("model", "device", "list"), "agx-orin", ("model", "device", "show", "bad")),
 }
 
 
@@ -49,10 +49,10 @@ def test_a_wrong_file_stands_in_its_list(kind: str, project: Path, harness: Type
 def test_what_needs_another_file_does_not_fail(project: Path, harness: Typed, small_path: Path) -> None:
     assert harness("eval", "--dataset", small_path, "--seeds", "0", "--out", "run", "--quiet")[0] == 0
     for command in (
-        ("sweep", "run", "--over", "reliability", "--grid", "1"),
-        ("sweep", "run", "--over", "loss", "--grid", "0"),
-        ("channel", "crowd"),
-        ("schedule", "compare", "run"),
+        ("study", "sweep", "run", "--over", "reliability", "--grid", "1"),
+        ("study", "sweep", "run", "--over", "loss", "--grid", "0"),
+        ("radio", "crowd"),
+        ("study", "schedule", "compare", "run"),
     ):
         code, _, said = harness(*command)
         assert "bad.toml" not in said, command
@@ -75,13 +75,13 @@ def test_a_broken_run_takes_no_history_with_it(tmp_path: Path, harness: Typed) -
     (tmp_path / "reports/bad/summary.csv").write_text(
         (tmp_path / "reports/bad/summary.csv").read_text() + "not,a,row\n"
     )
-    code, said, _ = harness("history")
+    code, said, _ = harness("run", "history")
     assert code == 0
     assert "bad · wrong" in said
-    code, said, _ = harness("history", "--json")
+    code, said, _ = harness("run", "history", "--json")
     *groups, wrong = json.loads(said)
     assert (code, [run["run"] for group in groups for run in group["runs"]]) == (0, ["good"])
     assert wrong["run"] == "bad"
     assert "summary.csv" in wrong["error"]
     shutil.rmtree(tmp_path / "reports/bad")
-    assert "wrong" not in harness("history")[1]
+    assert "wrong" not in harness("run", "history")[1]

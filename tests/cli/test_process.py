@@ -63,7 +63,7 @@ def test_a_signal_at_any_moment_of_a_command(tmp_path: Path) -> None:
     made_up(tmp_path / "run")
     for n in range(8):
         process = subprocess.Popen(
-            [*HARNESS, "ls", "."], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+            [*HARNESS, "run", "ls", "."], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         )
         time.sleep(0.04 * (n + 1))
         process.send_signal(signal.SIGTERM)
@@ -87,7 +87,7 @@ def test_a_console_that_lacks_a_character_gets_another(env: dict[str, str], tmp_
     done = ended("prompt", "list", cwd=tmp_path, env=env)
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"?" in done.stdout
-    done = ended("ls", "nowhere-…", cwd=tmp_path, env=env)
+    done = ended("run", "ls", "nowhere-…", cwd=tmp_path, env=env)
     assert done.returncode == 2
     assert b"Traceback" not in done.stderr
 
@@ -110,14 +110,14 @@ def test_a_run_without_streams_is_whole(closed: tuple[int, ...], tmp_path: Path)
 
 
 def test_what_nobody_hears_still_has_its_exit_code(tmp_path: Path) -> None:
-    done = ended("ls", "nowhere", cwd=tmp_path, prepare=lambda: os.close(2), stdout=subprocess.PIPE)
+    done = ended("run", "ls", "nowhere", cwd=tmp_path, prepare=lambda: os.close(2), stdout=subprocess.PIPE)
     assert (done.returncode, done.stdout) == (2, b""), "an error is no output"
 
 
 # -- surroundings ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", [("ls", "."), ("prompt", "list"), ("--help",)], ids=" ".join)
+@pytest.mark.parametrize("command", [("run", "ls", "."), ("prompt", "list"), ("--help",)], ids=" ".join)
 def test_a_folder_that_is_gone(command: tuple[str, ...], tmp_path: Path) -> None:
     here = tmp_path / "gone"
     here.mkdir()
@@ -151,7 +151,7 @@ def test_memory_that_runs_out_is_one_line(error: str, tmp_path: Path) -> None:
     """Wherever it does: here the first package that the command line imports cannot be loaded."""
     (tmp_path / "typer").mkdir()
     (tmp_path / "typer/__init__.py").write_text(f"raise {error}")
-    done = ended("ls", cwd=tmp_path, env={"PYTHONPATH": f"{tmp_path}:{os.pathsep.join(sys.path)}"})
+    done = ended("run", "ls", cwd=tmp_path, env={"PYTHONPATH": f"{tmp_path}:{os.pathsep.join(sys.path)}"})
     said = b"harness: memory ran out; give this command more, or less to do\n"
     assert (done.returncode, done.stderr) == (2, said)
 

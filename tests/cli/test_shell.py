@@ -1,5 +1,6 @@
 """What typer does otherwise: commands in groups, and plain values read without pydantic."""
 
+import json
 import re
 import subprocess
 import sys
@@ -11,7 +12,8 @@ import pytest
 import typer
 from typer.main import get_command
 
-from harness.cli import PANELS, app
+from harness.cli import app
+from harness.cli.commands import COMMANDS, GROUPS, OLD, PANELS, SHORT
 from harness.cli.shell import UNREAD, plain
 from harness.coordination.attacks import ATTACKS
 from harness.coordination.rules import RULES
@@ -55,7 +57,7 @@ def test_a_path_that_cannot_be_read_is_left_to_typer(tmp_path: Path, monkeypatch
     assert plain(Path, str(tmp_path / "absent")) == tmp_path / "absent"
 
 
-@pytest.mark.parametrize("args", [["ls"], ["eval", "--help"], ["prompt", "list", "--help"]])
+@pytest.mark.parametrize("args", [["run", "ls"], ["eval", "--help"], ["prompt", "list", "--help"]])
 def test_neither_pydantic_nor_an_array_is_loaded_for(args: list[str], tmp_path: Path) -> None:
     (tmp_path / "reports").mkdir()
     code = (
@@ -67,9 +69,7 @@ def test_neither_pydantic_nor_an_array_is_loaded_for(args: list[str], tmp_path: 
     assert (done.returncode, done.stderr) == (0, "[]\n")
 
 
-@pytest.mark.parametrize(
-    "group", ["", "campaign", "channel", "dataset", "device", "model", "prompt", "scenario", "schedule"]
-)
+@pytest.mark.parametrize("group", ["", *GROUPS])
 def test_help_says_each_command_whole_in_eighty_columns(harness: Callable[..., Said], group: str) -> None:
     code, out, err = harness(*group.split(), "--help")
     assert (code, err) == (0, "")
@@ -82,8 +82,41 @@ def test_the_map_has_every_command_under_its_panel(harness: Callable[..., Said])
     shown = {head: {line.split()[0] for line in lines} for head, *lines in blocks if lines}
     for panel, commands in PANELS.items():
         assert shown[f"{panel}:"] == set(commands)
+    assert {name for names in PANELS.values() for name in names} == {path.split()[0] for path in COMMANDS}
+    assert sum(map(len, PANELS.values())) <= 15
+
+
+@pytest.mark.parametrize(("old", "new"), OLD.items())
+def test_an_old_spelling_works_and_says_the_new_one(harness: Callable[..., Said], old: str, new: str) -> None:
+    code, out, err = harness(*old.split(), "--help")
+    assert (code, out) == (0, harness(*new.split(), "--help")[1])
+    assert err == f"harness: `harness {old}` is now `harness {new}`; the old spelling works until 0.4.0\n"
+
+
+def test_a_short_spelling_is_for_good(harness: Callable[..., Said]) -> None:
+    for short, path in SHORT.items():
+        assert harness(short, "--help") == harness(*path.split(), "--help")
+
+
+def test_what_machines_read_stays_json_under_an_old_spelling(harness: Callable[..., Said]) -> None:
+    code, out, err = harness("channel", "list", "--json")
+    assert (code, err.count("\n")) == (0, 1)
+    assert json.loads(out) == json.loads(harness("radio", "list", "--json")[1])
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("evl", "`harness eval`"), ("pull", "`harness model pull`"), ("sweeps", "`harness study sweep`"),
+        ("study fidelty", "`harness study fidelity`"), ("models", "`harness model`"),
+    ],
+)  # fmt: skip
+def test_a_slip_is_answered_with_what_was_meant(harness: Callable[..., Said], typed: str, meant: str) -> None:
+    code, out, err = harness(*typed.split())
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert f"No such command {typed.split()[-1]!r}. Did you mean {meant}" in err
 
 
 def test_the_help_of_trust_names_every_attack_and_rule(harness: Callable[..., Said]) -> None:
-    said = set(re.findall(r"[a-z-]+", re.sub(r"-\n +", "-", harness("trust", "--help")[1])))
+    said = set(re.findall(r"[a-z-]+", re.sub(r"-\n +", "-", harness("study", "trust", "--help")[1])))
     assert {*ATTACKS, *RULES} <= said

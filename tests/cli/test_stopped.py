@@ -44,7 +44,7 @@ def test_a_stopped_trust_study_says_what_it_keeps(
 ) -> None:
     options = ("--dataset", small_path, "--condition", "6g", "--seeds", "0:1", "--out", tmp_path / "run")
     assert harness("eval", "--model", "proxy", *options)[0] == 0
-    typed = ("trust", "run", "--out", "study")
+    typed = ("study", "trust", "run", "--out", "study")
     process = started(*typed, cwd=tmp_path)
     kept = tmp_path / "study/cells.jsonl"
     while not kept.is_file() and process.poll() is None:

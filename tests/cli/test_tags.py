@@ -36,9 +36,9 @@ def test_tags_are_recorded_listed_and_repeated_by_the_command(
         manifest = json.loads((Path(str(typed[-1])) / "run.json").read_text())
         assert manifest["tags"] == ["nightly", "for the paper"]
         assert "--tag nightly --tag 'for the paper' --out" in manifest["command"]
-    told = harness("ls")[1]
+    told = harness("run", "ls")[1]
     assert told.count("\n        tags: nightly, for the paper\n") == 2
-    assert [one["tags"] for one in json.loads(harness("ls", "--json")[1])] == [
+    assert [one["tags"] for one in json.loads(harness("run", "ls", "--json")[1])] == [
         ["nightly", "for the paper"]
     ] * 2
 

@@ -163,7 +163,7 @@ def test_helpers_with_a_prompt_of_their_own_have_their_own_difference(
     assert texts["helper.j2"]["added"] > 50
     said = " ".join(harness("compare", *runs)[1].split())
     assert "ego's prompt v2 → v2, helper's v2 → v4: ego.j2 the same, helper.j2 " in said
-    assert "more changes: `harness prompt diff v2 v4`" in said
+    assert "more changes: `harness prompt compare v2 v4`" in said
     assert "max_answer_tokens.helper: 128 → 160" in said
     assert "max_answer_tokens.ego" not in said
 

@@ -168,10 +168,10 @@ HOSTILE: dict[str, Sequence[str]] = {
     "helper_prompt": ["evil"], "version": ["evil"], "condition": ["evil"], "env_config": ["evil.json"],
     "against": ["evil.csv"], "tokenizer": ["models/evil-weights"], "base": ["models/evil-weights"],
     "file": ["evil.txt"], "names": ["evil"],
-    "grid model": ["proxy,evil", "proxy,models/evil-weights"], "campaign closed-loop model": ["evil"],
-    "history dataset": [],
-    "channel show name": ["evil"], "channel check name": ["evil"], "model check name": ["evil", "mine"],
-    "model pull name": ["evil"], "prompt diff a": ["evil"], "prompt diff b": ["evil"],
+    "study grid model": ["proxy,evil", "proxy,models/evil-weights"], "study closed-loop model": ["evil"],
+    "run history dataset": [],
+    "radio show name": ["evil"], "radio check name": ["evil"], "model check name": ["evil", "mine"],
+    "model pull name": ["evil"], "prompt compare a": ["evil"], "prompt compare b": ["evil"],
 }  # fmt: skip
 # What a command needs, and what keeps it short; a folder that it writes is its own each time.
 PLAIN: dict[str, str] = {
@@ -179,24 +179,24 @@ PLAIN: dict[str, str] = {
     "folders": "reports/served", "tune": "reports/served", "folder": "reports", "dataset": "base/dataset",
     "version": "v2", "file": "evil.txt", "episode": "0", "scenario": "occluded-intersection",
     "names": "evil", "scene": "00000-0",
-    "prompt diff a": "v2", "prompt diff b": "v4", "init folder": "new",
+    "prompt compare a": "v2", "prompt compare b": "v4", "init folder": "new",
     "dataset build name": "occluded-intersection",
-    "scenario show name": "do-not-pass", "scenario check name": "do-not-pass",
-    "scenario audit name": "do-not-pass", "channel show name": "6g", "channel check name": "mode4",
-    "model check name": "proxy", "model pull name": "proxy", "device show name": "laptop-cpu",
-    "device check name": "laptop-cpu", "parity model": "models/evil-weights", "port": "0",
+    "dataset scenario show name": "do-not-pass", "dataset scenario drive name": "do-not-pass",
+    "dataset scenario audit name": "do-not-pass", "radio show name": "6g", "radio check name": "mode4",
+    "model check name": "proxy", "model pull name": "proxy", "model device show name": "laptop-cpu",
+    "model device check name": "laptop-cpu", "model parity model": "models/evil-weights", "port": "0",
     "limit": "1", "episodes": "1", "seeds": "0:1", "workers": "1", "layouts": "20",
-    "attribute sample": "2", "count": "1", "over": "consensus", "grid": "ego-prompt", "attacks": "jump",
+    "study attribute sample": "2", "count": "1", "over": "consensus", "grid": "ego-prompt", "attacks": "jump",
     "rules": "linear", "share": "1/3", "twin": "mirrored", "schedule": "entropy", "samples": "1,1,1,1",
     "prompts": "1", "window_s": "1", "out": "written",
-    "video out": "written/video.gif", "dataset show out": "written/scene.svg",
+    "run video out": "written/video.gif", "dataset show out": "written/scene.svg",
     "prompt show out": "written.png",
-    "eval workers": "", "scenario audit layouts": "2", "prompt check dataset": "base/dataset",
-    "grid model": "proxy,mine", "trust run": "reports/served", "campaign paper episodes": "10",
-    "sweep_episodes": "10", "schedule learn out": "written.toml", "export out": "written/file",
+    "eval workers": "", "dataset scenario audit layouts": "2", "prompt check dataset": "base/dataset",
+    "study grid model": "proxy,mine", "study trust run": "reports/served", "study paper episodes": "10",
+    "sweep_episodes": "10", "study schedule learn out": "written.toml", "run export out": "written/file",
     "report out": "written/page.html",
 }  # fmt: skip
-ALWAYS = {"export": ["--csv"], "fidelity": ["base/run"], "dataset build": ["--no-audit"]}
+ALWAYS = {"run export": ["--csv"], "study fidelity": ["base/run"], "dataset build": ["--no-audit"]}
 
 
 def change(file: Path, **values: Any) -> None:

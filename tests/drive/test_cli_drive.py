@@ -42,7 +42,7 @@ def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(h
     assert driven.grid.episodes == frozen.grid.episodes
     assert [e.layout_seed for e in driven.episodes] == [e.layout_seed for e in frozen.episodes]
     assert " --sample 2 --sample-seed 3 " in driven.manifest.command
-    assert harness("fidelity", run, tmp_path / "frozen", "--out", tmp_path / "fidelity")[0] == 0
+    assert harness("study", "fidelity", run, tmp_path / "frozen", "--out", tmp_path / "fidelity")[0] == 0
     code, _, err = harness("drive", *draw, *of, "--condition", "6g", "--sample-seed", 4, "--out", run)
     assert (code, "already holds a finished run" in err) == (2, True)
 

@@ -11,7 +11,7 @@ from harness.studies.closed_loop import panels
 
 Said = tuple[int, str, str]
 OPTIONS = (
-    "campaign",
+    "study",
     "closed-loop",
     "--model",
     "proxy",

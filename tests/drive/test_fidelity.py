@@ -73,11 +73,11 @@ def test_a_driver_drives_as_its_frozen_scenes_say(runs: list[Path]) -> None:
 def test_the_command_writes_a_page_and_says_the_largest_difference(
     runs: list[Path], harness: Callable[..., Said]
 ) -> None:
-    code, out, err = harness("fidelity", *runs, "--out", "told")
+    code, out, err = harness("study", "fidelity", *runs, "--out", "told")
     assert (code, err) == (0, "")
     assert "rank correlation of 5 models and conditions" in out
     assert "Largest difference, frozen minus closed" in out
-    few = harness("fidelity", *(run for run in runs if "proxy" in str(run)), "--out", "few")[1]
+    few = harness("study", "fidelity", *(run for run in runs if "proxy" in str(run)), "--out", "few")[1]
     assert "Spearman" not in few
     assert re.search(
         r"No rank correlation: \d different models and conditions are too few; at least 5 are needed\.", few
@@ -89,7 +89,7 @@ def test_the_command_writes_a_page_and_says_the_largest_difference(
         "episodes.jsonl",
         "index.html",
     }
-    assert len(json.loads(harness("fidelity", *runs, "--json")[1])) == 12
+    assert len(json.loads(harness("study", "fidelity", *runs, "--json")[1])) == 12
 
 
 def test_what_cannot_be_compared_is_one_line(runs: list[Path], harness: Callable[..., Said]) -> None:
@@ -104,7 +104,7 @@ def test_what_cannot_be_compared_is_one_line(runs: list[Path], harness: Callable
             fidelity(folders)
     shutil.copytree(runs[1], "torn")
     Path("torn/episodes.csv").write_text("model,prompt\n")
-    code, out, err = harness("fidelity", runs[0], "torn")
+    code, out, err = harness("study", "fidelity", runs[0], "torn")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "torn/episodes.csv is broken (" in err
     assert not Path("reports").exists()

@@ -57,7 +57,7 @@ def typed(monkeypatch, capsys, *words):
 def drawn(out, tmp_path_factory):
     """A GIF of its first episode by the command, and what that said."""
     picture = tmp_path_factory.mktemp("drawn") / "episode.gif"
-    done = CliRunner().invoke(app, ["video", str(out), "0", "--out", str(picture)])
+    done = CliRunner().invoke(app, ["run", "video", str(out), "0", "--out", str(picture)])
     return picture, (done.exit_code, done.stdout, done.stderr)
 
 

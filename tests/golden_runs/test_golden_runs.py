@@ -70,23 +70,23 @@ CLOSED = {
 }  # fmt: skip
 STUDIES = {
     "sweep-axes": [
-        "sweep", "{frozen-proxy}", "--seeds", "0:2", *conditions("6g", "v2x:on_demand=true"),
+        "study", "sweep", "{frozen-proxy}", "--seeds", "0:2", *conditions("6g", "v2x:on_demand=true"),
         "--over", "tau", "--grid", "0.5,0.7,0.9", "--over", "loss", "--grid", "0,0.2",
         "--over", "size", "--grid", "1:3", "--over", "window", "--grid", "150,250",
         "--over", "latency", "--grid", "0,100",
     ],
-    "sweep-usual": ["sweep", "{frozen-faulty}", "--seeds", "0:2"],
+    "sweep-usual": ["study", "sweep", "{frozen-faulty}", "--seeds", "0:2"],
     "sweep-tiny": [
-        "sweep", "{frozen-tiny-json}", "{frozen-tiny-readout}", "--over", "tau", "--grid", "0.6,0.9",
+        "study", "sweep", "{frozen-tiny-json}", "{frozen-tiny-readout}", "--over", "tau", "--grid", "0.6,0.9",
     ],
     "sweep-ego-prompt": [
-        "sweep", "{frozen-tiny-json}", "--over", "consensus", "--grid", "linear,log-pool,ego-prompt",
+        "study", "sweep", "{frozen-tiny-json}", "--over", "consensus", "--grid", "linear,log-pool,ego-prompt",
     ],
-    "paper": ["campaign", "paper", "--episodes", "10", "--sweep-episodes", "10"],
+    "paper": ["study", "paper", "--episodes", "10", "--sweep-episodes", "10"],
     "closed-loop": [
-        "campaign", "closed-loop", "--workers", "1", "--model", "proxy", "--episodes", "2", "--seeds", "0:2",
+        "study", "closed-loop", "--workers", "1", "--model", "proxy", "--episodes", "2", "--seeds", "0:2",
     ],
-    "fidelity": ["fidelity", "{frozen-proxy}", "{closed-proxy}"],
+    "fidelity": ["study", "fidelity", "{frozen-proxy}", "{closed-proxy}"],
 }  # fmt: skip
 TABLES = {
     **dict.fromkeys(STUDIES, ("conditions", "episodes")),
@@ -110,7 +110,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
         if not (folder / name).exists():
             command = [run(part[1:-1]) if part[0] == "{" else part for part in RUNS[name]]
             missing.clear()
-            quiet = [] if command[0] == "fidelity" else ["--quiet"]  # which has no such option
+            quiet = [] if command[1] == "fidelity" else ["--quiet"]  # which has no such option
             adapter.typed(*command, *quiet, "--out", folder / name)
             assert not missing, f"{name} asks what no completion is stored for, first:\n{missing[0]}"
         return folder / name

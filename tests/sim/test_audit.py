@@ -131,16 +131,16 @@ def test_a_scenario_that_hides_nothing_has_nothing_to_audit():
 
 
 def test_too_few_layouts_are_refused(harness):
-    code, out, err = harness("scenario", "audit", NAME, "--layouts", 6, "--workers", 1)
+    code, out, err = harness("dataset", "scenario", "audit", NAME, "--layouts", 6, "--workers", 1)
     assert (code, out) == (2, "")
     assert "an audit needs 5, give more with --layouts" in err
-    code, _, err = harness("scenario", "audit", NAME, "--layouts", 0)
+    code, _, err = harness("dataset", "scenario", "audit", NAME, "--layouts", 0)
     assert (code, err) == (2, "harness: --layouts 0 is out of range; give 1 to 100000\n")
 
 
 def test_without_scikit_learn_one_line_says_what_to_install(harness, monkeypatch):
     monkeypatch.setitem(sys.modules, "sklearn", None)
-    code, out, err = harness("scenario", "audit", NAME)
+    code, out, err = harness("dataset", "scenario", "audit", NAME)
     assert (code, out) == (2, "")
     install = "pip install 'swarmdrive-harness[audit]'"
     assert err == f"harness: an audit needs scikit-learn, which is not installed; run `{install}`\n"
@@ -148,7 +148,7 @@ def test_without_scikit_learn_one_line_says_what_to_install(harness, monkeypatch
 
 @pytest.mark.slow
 def test_the_command_says_the_same_to_people_and_to_machines(harness):
-    words = ("scenario", "audit", NAME, "--layouts", 40, "--seed", 0, "--workers", 1)
+    words = ("dataset", "scenario", "audit", NAME, "--layouts", 40, "--seed", 0, "--workers", 1)
     code, out, err = harness(*words, "--json")
     found = json.loads(out)
     assert err == ""

@@ -1,4 +1,4 @@
-"""`harness scenario` and `harness dataset` as they are typed."""
+"""`harness dataset scenario` and `harness dataset` as they are typed."""
 
 import json
 import shutil
@@ -11,19 +11,19 @@ NAME = "occluded-intersection"
 
 
 def test_scenarios_are_listed_and_shown_for_people_and_machines(harness):
-    code, out, _ = harness("scenario", "list")
+    code, out, _ = harness("dataset", "scenario", "list")
     assert code == 0
     listed = [line.partition(": ")[0] for line in out.splitlines()]
     assert NAME in listed
-    assert [s["name"] for s in json.loads(harness("scenario", "list", "--json")[1])] == listed
-    _, out, _ = harness("scenario", "show", NAME)
+    assert [s["name"] for s in json.loads(harness("dataset", "scenario", "list", "--json")[1])] == listed
+    _, out, _ = harness("dataset", "scenario", "show", NAME)
     assert "actions: SLOWER, IDLE, FASTER" in out
     assert "ego_start_m = 61, 69\n    distance from the start to the centroid of the conflict zone." in out
     assert max(map(len, out.splitlines())) <= 110
 
 
 def test_every_parameter_is_shown_with_value_and_meaning(harness):
-    shown = json.loads(harness("scenario", "show", NAME, "--json")[1])
+    shown = json.loads(harness("dataset", "scenario", "show", NAME, "--json")[1])
     assert shown["actions"] == ["SLOWER", "IDLE", "FASTER"]
     assert shown["parameters"]["time_limit_s"]["value"] == 10.0
     assert shown["parameters"]["corner_m"]["value"] == [8.0, 15.0]
@@ -31,7 +31,7 @@ def test_every_parameter_is_shown_with_value_and_meaning(harness):
 
 
 def test_the_answer_schemas_of_a_scenario_are_shown_and_hold(harness):
-    schemas = json.loads(harness("scenario", "show", NAME, "--json")[1])["answer_schema"]
+    schemas = json.loads(harness("dataset", "scenario", "show", NAME, "--json")[1])["answer_schema"]
     one = {"action_distribution": {"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}}
     jsonschema.validate(one, schemas["ego"])
     jsonschema.validate({"evidence": "v6 from left", "risk": "high", **one}, schemas["helper"])
@@ -41,7 +41,7 @@ def test_the_answer_schemas_of_a_scenario_are_shown_and_hold(harness):
 
 def test_a_scenario_check_states_rates_intervals_and_n(harness):
     code, out, err = harness(
-        "scenario", "check", NAME, "--episodes", 3, "--seed", 178, "--workers", 1, "--json"
+        "dataset", "scenario", "drive", NAME, "--episodes", 3, "--seed", 178, "--workers", 1, "--json"
     )
     found = json.loads(out)
     assert (code, err) == (0, "")
@@ -50,7 +50,9 @@ def test_a_scenario_check_states_rates_intervals_and_n(harness):
     assert success.keys() == {"value", "low", "high", "n"}
     assert (success["value"], success["high"], success["n"]) == (1.0, 1.0, 3)
     assert found["drivers"]["brake"]["time_out"]["value"] == 1.0
-    code, out, _ = harness("scenario", "check", NAME, "--episodes", 3, "--seed", 178, "--workers", 2)
+    code, out, _ = harness(
+        "dataset", "scenario", "drive", NAME, "--episodes", 3, "--seed", 178, "--workers", 2
+    )
     assert code == 0
     assert "n = 3 episodes, layout seeds 178 to 180 (tune)" in out
     assert max(map(len, out.splitlines())) <= 80
@@ -117,11 +119,14 @@ def test_a_dataset_of_other_actions_is_refused(harness, small_folder, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("scenario show occluded-crossing", "unknown scenario 'occluded-crossing'"),
-        ("scenario check nowhere --episodes 1", "unknown scenario 'nowhere'"),
-        (f"scenario check {NAME} --episodes 0", "--episodes 0 is out of range; give 1 to 100000"),
-        (f"scenario check {NAME} --episodes 1 --workers 0", "--workers 0: give 1 to 256 processes, or ray"),
-        (f"scenario check {NAME} --episodes 1 --seed -1", "--seed -1 is out of range"),
+        ("dataset scenario show occluded-crossing", "unknown scenario 'occluded-crossing'"),
+        ("dataset scenario drive nowhere --episodes 1", "unknown scenario 'nowhere'"),
+        (f"dataset scenario drive {NAME} --episodes 0", "--episodes 0 is out of range; give 1 to 100000"),
+        (
+            f"dataset scenario drive {NAME} --episodes 1 --workers 0",
+            "--workers 0: give 1 to 256 processes, or ray",
+        ),
+        (f"dataset scenario drive {NAME} --episodes 1 --seed -1", "--seed -1 is out of range"),
         ("dataset build nowhere --out OUT", "unknown scenario 'nowhere'"),
         (f"dataset build {NAME} --episodes 0 --out OUT", "--episodes 0 is out of range"),
         (

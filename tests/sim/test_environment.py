@@ -451,7 +451,7 @@ def test_classes_of_highway_env_need_no_listing(monkeypatch):
 
 def test_what_is_typed_may_be_imported_and_what_a_file_names_may_not(harness, folder, monkeypatch):
     monkeypatch.delenv("SWARMDRIVE_IMPORTS")
-    assert harness("scenario", "show", OWN)[0] == 0
+    assert harness("dataset", "scenario", "show", OWN)[0] == 0
     for command in ("check", "rank"):
         code, _, err = harness("dataset", command, folder)
         assert (code, err.count("\n")) == (2, 1)

@@ -125,9 +125,9 @@ def test_it_is_drawn(frozen):
 
 
 def test_the_command_drives_and_evaluates_it_and_reports(harness, folder):
-    shown = harness("scenario", "show", NAME)
+    shown = harness("dataset", "scenario", "show", NAME)
     assert (shown[0], "decisions = 4\n" in shown[1]) == (0, True)
-    checked = harness("scenario", "check", NAME, "--episodes", "2", "--workers", "1")
+    checked = harness("dataset", "scenario", "drive", NAME, "--episodes", "2", "--workers", "1")
     assert checked[0] == 0
     ran = harness("eval", "--model", "proxy", "--dataset", folder, "--out", "run")
     assert ran[0] == 0, ran

@@ -177,10 +177,10 @@ def test_letters_are_those_of_the_agents_that_read_out(
 ) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     few = ("--dataset", str(small_path), "--limit", "1", "--seeds", "0:1", "--condition", "single-local")
-    asked = ("grid", "--model", "swarm-tiny", "--answer", "json,readout", "--helper-answer", "json")
+    asked = ("study", "grid", "--model", "swarm-tiny", "--answer", "json,readout", "--helper-answer", "json")
     code, _, err = harness(*asked, "--letters", "cyclic", *few, "--out", str(tmp_path / "grid"), "--quiet")
     assert code == 0, err
     stated = [json.loads(file.read_text()) for file in sorted((tmp_path / "grid").rglob("run.json"))]
     assert {(of["answer"], of.get("letters")) for of in stated} == {("json", "raw"), ("readout", "cyclic")}
-    code, _, err = harness("grid", "--prompt", "v1,v2", "--letters", "cyclic", *few)
+    code, _, err = harness("study", "grid", "--prompt", "v1,v2", "--letters", "cyclic", *few)
     assert (code, err) == (2, "harness: --letters cyclic: no agent reads out; add --answer readout\n")

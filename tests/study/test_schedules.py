@@ -234,13 +234,15 @@ def test_schedules_are_compared_from_the_command_line(
 ):
     out = tmp_path / "out"
     chosen = ("--schedule", "entropy", "--schedule", "coverage", "--schedule", "learnt", "--out", out)
-    code, said, _ = harness("schedule", "compare", stored.run.path, "--tune", stored.run.path, *chosen)
+    code, said, _ = harness(
+        "study", "schedule", "compare", stored.run.path, "--tune", stored.run.path, *chosen
+    )
     assert code == 0
     assert max(map(len, said.splitlines()[:-1])) <= 80, "but for the path"
     names = {"index.html", "schedule.json"}
     names |= {f"{table}.{kind}" for table in ("schedules", "settings") for kind in ("csv", "jsonl")}
     assert {path.name for path in out.iterdir()} == names | {f"fronts.{k}" for k in ("svg", "pdf", "png")}
-    again = ("schedule", "compare", stored.run.path, *chosen, "--json", "--seeds", "0:1")
+    again = ("study", "schedule", "compare", stored.run.path, *chosen, "--json", "--seeds", "0:1")
     code, said, err = harness(*again)
     assert (code, said, err.count("\n")) == (2, "", 1)
     assert f"{out} holds another schedule, with other sources, seeds; name another folder" in err
@@ -274,7 +276,7 @@ def test_the_same_twice(stored: Stored):
 )
 def test_bad_input_is_one_line(stored: Stored, harness: Callable[..., Any], args: Any, says: str):
     given = [stored.run.path if a == "RUN" else a for a in args]
-    code, _, err = harness("schedule", "compare", stored.run.path, *given)
+    code, _, err = harness("study", "schedule", "compare", stored.run.path, *given)
     assert code == 2
     assert says in err
     assert err.count("\n") == 1
@@ -296,7 +298,16 @@ def test_a_schedule_is_learnt_and_then_one_of_its_name(
     stored: Stored, train: Stored, harness: Callable[..., Any], tmp_path: Path
 ):
     (tmp_path / MARKER).touch()
-    typed = ("schedule", "learn", train.run.path, "--tune", stored.run.path, "--out", "schedules/mine.toml")
+    typed = (
+        "study",
+        "schedule",
+        "learn",
+        train.run.path,
+        "--tune",
+        stored.run.path,
+        "--out",
+        "schedules/mine.toml",
+    )
     assert harness(*typed)[0] == 0
     text = toml(Path("schedules/mine.toml"), "it")
     assert text["learnt_from"] == [layouts(train, "train")]
@@ -311,7 +322,9 @@ def test_a_schedule_is_learnt_and_then_one_of_its_name(
     Path("schedules/mine.toml").unlink()
     assert harness(*typed)[0] == 0
     assert Path("schedules/mine.toml").read_text() == once
-    code, _, err = harness("schedule", "learn", stored.run.path, "--tune", stored.run.path, "--out", "x.toml")
+    code, _, err = harness(
+        "study", "schedule", "learn", stored.run.path, "--tune", stored.run.path, "--out", "x.toml"
+    )
     assert code == 2
     assert "(tune), 4 layouts" not in err
     assert "give a run on train layouts" in err

@@ -171,7 +171,7 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
 ) -> None:
     monkeypatch.setattr(resources, "DATASET", str(small_path))
     typed = (
-        *("trust", "--model", "proxy", "--prompt", "v4", "--attacks", "liar", "--rules", "trust"),
+        *("study", "trust", "--model", "proxy", "--prompt", "v4", "--attacks", "liar", "--rules", "trust"),
         *("--share", "0,1/3", "--out", "bench"),
     )
     code, out, _ = harness(*typed)
@@ -185,8 +185,11 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
     assert code == 2
     assert "was begun with another seeds" in err
     for wrong in (
-        ("trust",),
-        ("trust", "bench/run", "--prompt", "v4"),
+        (
+            "study",
+            "trust",
+        ),
+        ("study", "trust", "bench/run", "--prompt", "v4"),
     ):
         code, _, err = harness(*wrong)
         assert code == 2

@@ -115,7 +115,7 @@ def pair(a: Path, b: Path) -> Pair:
     if one.world != other.world:
         raise UserError(
             f"{shown}: one was made by `harness eval` and one by `harness drive`; give two of a kind, or "
-            "see `harness fidelity`"
+            "see `harness study fidelity`"
         )
     side_a, side_b = _side(one), _side(other)
     if scenes_of(one) != scenes_of(other):

@@ -246,7 +246,7 @@ def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
     if len(hunks) > most:
         stated = [side.run.manifest.agent(place)["prompt"] for side in (pair.a, pair.b) for place in (0, 1)]
         here = all(as_it_was(prompt["version"], prompt["sha256"]) for prompt in stated)
-        seen = dict.fromkeys(f"`harness prompt diff {a} {b}`" for a, b in (ego, helper) if a != b)
+        seen = dict.fromkeys(f"`harness prompt compare {a} {b}`" for a, b in (ego, helper) if a != b)
         shown = " and ".join(seen) if here and seen else "the page of --html has them"
         said.append(f"  {len(hunks) - most} more changes: {shown}")
     return said

@@ -186,7 +186,7 @@ class DecisionPage {
     const { world } = this.detail, { ground } = this.about, [id] = this.index.scenes[this.n];
     if (!world) {
       return h("p", { class: "picture" }, "No picture: the page has pictures of the most telling moments only, and only "
-        + "of those that could be played again here. `harness video` draws the whole episode.");
+        + "of those that could be played again here. `harness run video` draws the whole episode.");
     }
     const [drawing, said] = birdsEye(world, ground, this.viewer, this.chosen?.messages ?? [], this.params.get("zoom"));
     const save = (kind) => small(`Save as ${kind.toUpperCase()}`, () => saved(drawing, id, kind));
@@ -198,7 +198,7 @@ class DecisionPage {
     const { world, cameras } = this.detail, { framed, scenes, live } = this.index;
     if (!world) return null;
     if (!cameras) {
-      const drawn = live ? "`harness video` draws them" : "`harness dataset show --camera` draws any other";
+      const drawn = live ? "`harness run video` draws them" : "`harness dataset show --camera` draws any other";
       return h("p", { class: "quiet" }, `This page has camera pictures of ${framed} of ${scenes.length} `
         + `${live ? "moments" : "decisions, those that lost an episode first"}; ${drawn}.`);
     }
