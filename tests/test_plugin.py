@@ -133,7 +133,7 @@ def test_the_rule_remembers_from_step_to_step(kind: str, condition: str, request
 
 
 def test_the_channel_takes_its_time_and_loses_with_distance(frozen: Tables, small: Dataset):
-    """An answer takes 10 ms, its way 10 ms more; one crossing is lost with 1 % a metre."""
+    """An answer takes 10 ms, its way 10 ms more; one transmission is lost with 1 % a metre."""
     asked_scenes = small.scenes(frozen.answers.scene.unique().tolist())
     range_m = {(s.id, v): known_m for s in asked_scenes for v, known_m in s.record["range_m"].items()}
     for condition, farthest_m in (("fog", 100.0), (CLOSE, 60.0)):

@@ -262,7 +262,7 @@ def crowd(
         from harness.studies.figures import crowds
 
         between = {"clear": "in sight", "vehicle": "behind a car", "building": "behind a building"}[sight]
-        title = f"one crossing over {distance_m:g} m {between}, vehicles within {radius_m:g} m"
+        title = f"one transmission over {distance_m:g} m {between}, vehicles within {radius_m:g} m"
         save(crowds(vehicles, losses, line, title), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
         echo_json({

@@ -75,7 +75,7 @@ class OperatingPoint:
         consensus: consensus rule, or `ego-prompt`.
         request_bits: size of the ego's request. The default is 50 bytes: who asks whom and until when, as
             compact JSON without a signature or headers. Replies are counted in the same way.
-        loss: probability that one crossing is lost; None keeps that of the profile or of the link.
+        loss: probability that one transmission is lost; None keeps that of the profile or of the link.
         latency_s: nominal seconds of one exchange; None keeps the profile's.
         density_coupled: whether loss follows the number of active vehicles, instead of the profile's loss.
         helper_rounds: whether a helper whose entropy is above tau opens a round of its own, which loads the

@@ -51,8 +51,8 @@ class Known:
         may_ask: which helpers are in the radius and would answer, `(..., H)`.
         range_m: distance to the ego, `(..., H)`.
         distance_m: distance to the conflict zone, `(..., 1+H)`, the ego first.
-        in_time: probability that request and reply cross and the reply arrives within the window, `(..., H)`,
-            by the channel's model for such links, if all who may be asked are asked.
+        in_time: probability that request and reply are received within the window, `(..., H)`, by the
+            channel's model for such links, if all who may be asked are asked.
         outlook: what the ego sees, and what helpers would add.
         lot: a draw in [0, 1), new at each decision, `(...)`.
     """

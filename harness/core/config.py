@@ -299,17 +299,14 @@ def _items(hint: Any, index: str) -> list[Any]:
 
 
 def _names(info: Any) -> list[str]:
-    """Return the choices of a type; none if it has no list of them."""
     return [str(name) for name in getattr(_plain(info), "values", ())]
 
 
 def _fields(kind: Any) -> dict[str, Any]:
-    """Return the types of a record's fields by name; empty for any other type."""
     return {field.encode_name: field.type for field in getattr(_plain(kind), "fields", ())}
 
 
 def _item(kind: Any) -> Any:
-    """Return the type of the items of a list, or of the values of a mapping; None for any other type."""
     plain = _plain(kind)
     return getattr(plain, "item_type", None) or getattr(plain, "value_type", None)
 
@@ -323,6 +320,5 @@ def _plain(kind: Any) -> Any:
 
 
 def _description(kind: Any) -> str | None:
-    """Return the text of a type's `Meta(description=...)`."""
     description: str | None = (getattr(kind, "extra_json_schema", None) or {}).get("description")
     return description or next(filter(None, map(_description, getattr(kind, "types", ()))), None)

@@ -28,7 +28,6 @@ class Image:
         return sha256_bytes(repr(self.pixels.shape).encode() + self.pixels.tobytes())
 
     def png(self) -> bytes:
-        """Encode the picture as a PNG file."""
         height, width, _ = self.pixels.shape
         # Every line begins with 0, which means no filter: pictures with few colours are smallest so.
         lines = np.pad(self.pixels.reshape(height, -1), ((0, 0), (1, 0)))

@@ -34,7 +34,6 @@ class Plugins(Mapping[str, T], Generic[T]):
         return self._loaded[name]
 
     def usable(self) -> dict[str, T]:
-        """Return those that work, by name."""
         found = resources.each(self, self.__getitem__)
         return {name: plugin for name, plugin in found.items() if not isinstance(plugin, UserError)}
 

@@ -25,7 +25,6 @@ class Stop(KeyboardInterrupt):
 
     @property
     def said(self) -> str:
-        """What happened, in a word."""
         return STOPS[self.args[0]]
 
     @property

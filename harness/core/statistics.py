@@ -260,7 +260,6 @@ def _effective_n(rate: float, totals: Floats, sizes: Floats, level: float) -> fl
 
 
 def _clusters(values: Floats, episodes: Ints | None) -> tuple[Floats, Floats]:
-    """Return the sum and the number of each episode's values, both (C,)."""
     if episodes is None:
         return values, np.ones(len(values))
     place: Ints = np.unique(episodes, return_inverse=True)[1]

@@ -180,12 +180,10 @@ def _formatted(text: str, *values: Any) -> None:
 
 
 def _replaced(text: str, old: str, new: str) -> None:
-    """Pay for a text in which each `old` becomes `new`."""
     spend((len(text) + (text.count(old) if old else len(text) + 1) * len(new)) >> 3)
 
 
 def _filter(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a filter that pays."""
     at = int(hasattr(function, "jinja_pass_arg"))  # the context comes before the value
 
     @wraps(function)
@@ -209,8 +207,6 @@ def _filter(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _test(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a test that pays."""
-
     @wraps(function)
     def paid(*given: Any) -> Any:
         for value in given:
@@ -370,7 +366,6 @@ class Sandbox(ImmutableSandboxedEnvironment):
         self.globals |= {"lipsum": _lorem_ipsum, "namespace": _Namespace}
 
     def add_filter(self, name: str, function: Callable[..., Any]) -> None:
-        """Add a filter, which pays."""
         self.filters[name] = function if name in _FREE else _filter(name, function)
 
     def _parse(self, source: str, name: str | None, filename: str | None) -> nodes.Template:

@@ -1,7 +1,7 @@
-"""The interface of a V2V channel: which replies cross it, and when they arrive.
+"""The interface of a V2V channel: which replies arrive, and when.
 
-A consultation is a round trip, so the request and the reply must both cross. A new model is a file beside
-this one, with a frozen dataclass that has `request` and `deliver`; profiles are read by `profiles.py`.
+A consultation is a round trip: the request and the reply must both be received. A new model is a file beside this
+one, with a frozen dataclass that has `request` and `deliver`; profiles are read by `profiles.py`.
 """
 
 from collections.abc import Mapping
@@ -44,7 +44,6 @@ class Site:
 
     @property
     def distance_m(self) -> Floats:
-        """Distance between the ego and each helper, `(..., H)`."""
         apart: Floats = np.linalg.norm(self.xy_m[..., 1:, :] - self.xy_m[..., :1, :], axis=-1)
         return apart
 
@@ -124,7 +123,7 @@ class Draws:
 
     @cached_property
     def requested(self) -> "Draws":
-        """The same draws, but with requests that always cross, whatever the loss."""
+        """The same draws, but with requests that are always received, whatever the loss."""
         given = self._uniforms.copy()
         given[..., 1::2] = 1.0
         return replace(self, given=given)
@@ -187,12 +186,12 @@ class Broadcast(NamedTuple):
 class Delivery(NamedTuple):
     """What becomes of the replies on a channel."""
 
-    up: Bools  # whether request and reply cross, `(..., H)`; anything for helpers that were not asked
+    up: Bools  # whether request and reply are received, `(..., H)`; anything for helpers that were not asked
     # seconds from the request to the end of the reply's slot, `(..., H)`; inf for helpers that were not
     # asked. A lost reply keeps its slot
     delay_s: Floats
-    # probability that one crossing (request or reply) is lost, `(..., H)`, or `(..., 1)` if it is the same on
-    # all links
+    # probability that one transmission, a request or a reply, is lost, `(..., H)`; `(..., 1)` if all links
+    # have the same
     loss: Floats
     # seconds that the reply occupies the medium, `(..., H)`; anything for helpers that were not asked, NaN if
     # the model does not know it

@@ -20,7 +20,7 @@ class Radio:
     """A channel with a nominal latency and one loss for all links."""
 
     latency_s: Seconds  # nominal seconds of one exchange, the request included, without serialisation
-    # probability that one crossing is lost. If helpers open rounds of their own, it is the loss with that
+    # probability that one transmission is lost. If helpers open rounds of their own, it is the loss with that
     # many active vehicles, if that is larger
     loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")]
     # bits per second while a message is on air
@@ -55,7 +55,7 @@ class Radio:
 
 
 def density_coupled_loss(n_active: Ints) -> Floats:
-    """Return the loss of one crossing if `n_active` vehicles `(...)`, the ego included, share the channel.
+    """Return the loss of one transmission if `n_active` vehicles `(...)`, with the ego, share the channel.
 
     It is the line through the paper's panel 4 (0.6 % at 2, 6.6 % at 4, 18.6 % at 8 active vehicles), clipped
     to [0, 1]; a single vehicle loses nothing.
@@ -64,11 +64,11 @@ def density_coupled_loss(n_active: Ints) -> Floats:
 
 
 def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bools:
-    """Return which helpers' request and reply both cross, `(..., H)`; the probability is (1 - loss)^2.
+    """Return which helpers' request and reply are both received, `(..., H)`; the probability is (1 - loss)^2.
 
     Args:
         uniforms: draws in [0, 1), `(..., H, 2)`: the request's and the reply's.
-        loss: probability that one crossing is lost, `(..., H)` or `(..., 1)`.
+        loss: probability that one transmission is lost, `(..., H)` or `(..., 1)`.
         roadside_edge: whether a reply has a second path, so that it is lost with probability loss^2.
     """
     return (uniforms[..., 0] >= loss) & (uniforms[..., 1] >= (loss**2 if roadside_edge else loss))

@@ -32,7 +32,6 @@ class Trips:
     links: str = ""  # name of the links; empty for those among vehicles
 
     def take(self, at: Any) -> "Trips":
-        """Select trips by places of the leading dimension."""
         return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps, self.links)
 
     def uniforms(self, helpers: int) -> Floats:

@@ -86,7 +86,6 @@ class ItsG5(Transceiver):
     curve: str = "11p-goubet"
 
     def __post_init__(self) -> None:
-        """Raise UserError for impossible settings."""
         numbers = {
             "density_per_km": (0.0, 10_000.0), "rate_hz": (0.0, 1000.0), "packet_bytes": (1, 2304),
             "header_bytes": (0, 2304), "aifs_slots": (0, 15), "contention_window": (1, 1023),
@@ -120,11 +119,9 @@ class ItsG5(Transceiver):
 
     @property
     def packet_s(self) -> float:
-        """Time on air of a background packet."""
         return float(self.airtime_s(self.packet_bytes + self.header_bytes))
 
     def message_s(self, bits: Floats | float) -> Floats:
-        """Return the time on air of a message of so many bits, with its header."""
         return self.airtime_s(np.ceil(np.asarray(bits) / 8) + self.header_bytes)
 
     def busy_ratio(self) -> float:
@@ -137,7 +134,6 @@ class ItsG5(Transceiver):
         return (-0.2481 * load + 0.913) * load + 0.003844 * (load > 0)
 
     def lost_share(self, sinr_db: Floats) -> Floats:
-        """Return the share of frames lost at these ratios of signal to interference and noise."""
         if self.curve == BY_BIT:
             more_db = 10 * math.log10(self.data_rate_mbps * 1e6 / BANDWIDTH_HZ)
         else:
@@ -185,7 +181,6 @@ class ItsG5(Transceiver):
         return sensed * (1 - self.lost_share(sinr_db)) * np.exp(-before), during_hz
 
     def wait_s(self, uniforms: Floats) -> Floats:
-        """Return the seconds from the wish to send until the medium is taken: quantiles at these draws."""
         return np.interp(
             uniforms, *back_off.access(self.busy_ratio(), self.packet_s, self.aifs_s, self.contention_window)
         )

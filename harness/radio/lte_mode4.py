@@ -27,7 +27,6 @@ class LteMode4(Sidelink):
     ranks: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Raise UserError for impossible settings."""
         super().__post_init__()
         if self.subchannels not in CODINGS:
             raise UserError(f"subchannels is {self.subchannels}: block errors are known for 2 and 4")

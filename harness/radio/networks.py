@@ -25,7 +25,6 @@ class Network:
     quantiles_ms: dict[str, float]  # quantiles of the round trips by percentage, from 0 to 100
 
     def round_trip_s(self, uniforms: Floats) -> Floats:
-        """Return the quantiles at these draws, interpolated linearly."""
         shares = [float(percent) / 100 for percent in self.quantiles_ms]
         return np.interp(uniforms, shares, [ms / 1000 for ms in self.quantiles_ms.values()])
 

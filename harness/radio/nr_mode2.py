@@ -59,7 +59,6 @@ class NrMode2(Sidelink):
     ranks: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Raise UserError for impossible settings."""
         super().__post_init__()
         numbers = {
             "mcs": (0, 28), "packet_bytes": (1, 10_000), "subchannel_blocks": (10, 100),
@@ -111,7 +110,6 @@ class NrMode2(Sidelink):
 
     @property
     def _subchannels(self) -> int:
-        """Number of sub-channels that a packet takes."""
         return math.ceil(8 * self.packet_bytes / self._subchannel_bits)
 
 

@@ -53,7 +53,6 @@ class Profiles(FilesAndPlugins[Channel]):
     folder = "channels"
 
     def read(self, file: Path) -> Channel:
-        """Read the channel of a file."""
         return _read(file, written_ns(file))[1]
 
     def profile(self, name: str) -> Profile:
@@ -102,7 +101,6 @@ def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) 
 
 
 def _number(value: object) -> float:
-    """Convert a number or its text to a float; anything else becomes NaN."""
     try:
         return float(value) if isinstance(value, str | int | float) else np.nan
     except ValueError:
@@ -130,5 +128,5 @@ def _read(path: Path, mtime_ns: int) -> tuple[Profile, Channel]:
 
 CHANNELS = Profiles("swarmdrive.channels", Channel, {})
 
-# A vehicle without a radio: comparisons with a NaN loss are false, so nothing ever crosses.
+# A vehicle without a radio: comparisons with a NaN loss are false, so nothing is ever received.
 NO_CHANNEL = Radio(latency_s=0.0, loss=np.nan, bandwidth_bps=np.inf, access="parallel", jitter_s=0.0)

@@ -27,7 +27,7 @@ EGO, HELPERS = slice(0, 1), slice(1, None)  # a unit's link to the ego, and thos
 class Relay(Wrapped):
     """A channel with a unit that sends replies once more; requests go directly.
 
-    A reply arrives if it crosses to the ego, or to the unit and from there to the ego. The ego takes the one
+    A reply arrives if it reaches the ego, or the unit and from there the ego. The ego takes the one
     that comes first, which is the direct one. Copies are sent whether or not the ego needs them, since the
     unit cannot know, and do not wait for other messages.
     """
@@ -63,7 +63,7 @@ class Consulted(NamedTuple):
     """Result of a consultation, in seconds from the ego's request."""
 
     asked: Bools  # which helpers were asked, `(..., H)`; with a unit none if the ego's request to it was lost
-    up: Bools  # whether request and reply crossed, `(..., H)`; with a unit also its policy, if it sent one
+    up: Bools  # whether request and reply were received, and a unit's policy if it sent one, `(..., H)`
     end_s: Floats  # end of each reply at the place of fusion, `(..., H)`; inf for helpers that were not asked
     fused: Bools  # which replies may be part of the policy, `(..., H)`
     acts_s: Floats  # when the ego has heard all that it waits for, `(...)`, or gives up waiting for a policy
@@ -138,5 +138,5 @@ def by_unit(
 
 
 def loss_of(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
-    """Return the probability that one crossing of so many bits is lost on each link, `(..., H)`."""
+    """Return the probability that one transmission of so many bits is lost on each link, `(..., H)`."""
     return channel.loss(site, draws.shadow(site.xy_m, channel.decorrelation_m), bits)

@@ -52,7 +52,6 @@ class Sidelink(Transceiver):
     """Whether vehicles rank the remaining resources by received power (Step 3 of Mode 4)."""
 
     def __post_init__(self) -> None:
-        """Raise UserError for impossible settings."""
         least = {
             "density_per_km": 0.0, "rate_hz": 0.1, "keep": 0.0, "transmissions": 1, "t1_slots": 0,
             "t2_slots": self.t1_slots, "antenna_m": self.environment_height_m + 0.1,
@@ -76,11 +75,10 @@ class Sidelink(Transceiver):
     @property
     @abstractmethod
     def block_bits(self) -> int:
-        """Bits in one block; a larger message takes several blocks, and each must cross."""
+        """Bits in one block; a larger message takes several blocks, and each must be received."""
 
     @property
     def packet_bits(self) -> int:
-        """Size of a background packet: one block."""
         return self.block_bits
 
     @property
@@ -94,7 +92,6 @@ class Sidelink(Transceiver):
         """Block error rate as a function of the signal-to-interference-and-noise ratio."""
 
     def busy_ratio(self) -> float:
-        """Return the channel busy ratio under the background load (34)."""
         return self._scheduling().busy_ratio
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
@@ -111,7 +108,6 @@ class Sidelink(Transceiver):
         return np.asarray(np.sum(self._shares(distance_m, sight) * received, axis=-1))
 
     def wait_s(self, uniforms: Floats) -> Floats:
-        """Return the time from the wish to send to the start of the chosen slot."""
         return (self.t1_slots + np.floor(uniforms * self._window)) * self.slot_s
 
     def message_s(self, bits: Floats | float) -> Floats:
@@ -142,7 +138,6 @@ class Sidelink(Transceiver):
         return 1 - (1 - fate) ** self._blocks(bits)
 
     def _fate(self, distance_m: Floats, power_dbm: Floats) -> Floats:
-        """Return the probability that all copies of a block are lost."""
         success = self._read(_success(self), distance_m, power_dbm, STEP_DB / 2)
         copies = np.where(power_dbm >= self.sensing_dbm, (1 - success) ** self.transmissions, 1.0)
         return np.clip(copies, 0.0, 1.0)

@@ -40,7 +40,6 @@ class Scheduling:
 
     @property
     def busy_ratio(self) -> float:
-        """Channel busy ratio (34)."""
         return self._taken(self.threshold_dbm, 1) / self.resources
 
     def same_by_exclusion(self, apart_m: Floats) -> Floats:

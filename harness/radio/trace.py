@@ -63,15 +63,12 @@ class Trace:
     decorrelation_m: ClassVar[float] = math.inf
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the share of packets received at these distances; in clear sight unless given."""
         return self._at(distance_m, CLEAR if sight is None else sight, "reception")
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Return the probability that one crossing is lost, `(..., H)`."""
         return 1 - self._at(site.distance_m, site.sight, "reception")
 
     def busy_ratio(self) -> float:
-        """Return NaN, since a table of receptions has no channel busy ratio."""
         return math.nan
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
@@ -79,14 +76,12 @@ class Trace:
         return Broadcast(max(self._latency_s(p) for p in self.receptions.points), math.nan)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Each link has the loss and the latency of its distance."""
         loss = self.loss(links.where, np.zeros(()), links.payload_bits)
         latency_s = self._at(links.where.distance_m, links.where.sight, "latency_s")
         delay_s = np.where(links.asked, links.ready_s + latency_s, np.inf)
         return Delivery(link_up(draws.packet, loss), delay_s, loss, np.full_like(loss, np.nan))
 
     def idle(self, setting: str | None) -> str | None:
-        """Return why a setting changes nothing, whatever its value; None if it may change something."""
         received = [point for point in self.receptions.points if point.reception > 0]
         if setting == "latency_s" and all(point.latency_s is not None for point in received):
             return f"its table {printable(self.receptions.file)} has latencies of its own"
@@ -95,7 +90,6 @@ class Trace:
         return None
 
     def _last(self) -> list[Point]:
-        """Return the last row of each curve, the rows of a sight."""
         return list({point.sight: point for point in self.receptions.points}.values())
 
     def _latency_s(self, point: Point) -> float:

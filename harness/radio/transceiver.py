@@ -88,7 +88,6 @@ class Transceiver(Propagation):
         return Broadcast(self.wait_s(draws.wait) + airtime_s, airtime_s)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Each reply waits for its own turn."""
         fate = self._fate_at(links.where, draws.shadow(links.where.xy_m, self.decorrelation_m))
         request_loss, loss = (self._lost(fate, bits) for bits in (links.request_bits, links.payload_bits))
         airtime_s = self.message_s(links.payload_bits)
@@ -98,7 +97,6 @@ class Transceiver(Propagation):
         return Delivery(replied & (draws.packet[..., 1] >= loss) & clear, end_s, loss, airtime_s)
 
     def received_dbm(self, path_loss_db: Floats) -> Floats:
-        """Return the received power for a path loss."""
         return self.power_dbm + 2 * self.gain_dbi - path_loss_db
 
     def _fate_at(self, site: Site, shadow: Floats) -> Any:

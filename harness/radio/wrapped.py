@@ -16,27 +16,21 @@ class Wrapped:
 
     @property
     def decorrelation_m(self) -> float:
-        """The channel's."""
         return self.channel.decorrelation_m
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """The channel's."""
         return self.channel.request(bits, draws)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """The channel's."""
         return self.channel.deliver(links, draws)
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """The channel's."""
         return self.channel.reception(distance_m, sight)
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """The channel's."""
         return self.channel.loss(site, shadow, bits)
 
     def busy_ratio(self) -> float:
-        """The channel's."""
         return self.channel.busy_ratio()
 
 
@@ -47,24 +41,20 @@ def innermost(channel: Channel) -> Channel:
 
 @dataclass(frozen=True)
 class AtLoss(Wrapped):
-    """A physical channel that loses every crossing with one probability, wherever its ends are."""
+    """A physical channel that loses every transmission with one probability, wherever its ends are."""
 
-    probability: float  # probability that one crossing is lost
+    probability: float  # probability that one transmission is lost
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Replies arrive when the channel says, but do not affect each other otherwise."""
         _, delay_s, loss, airtime_s = self.channel.deliver(links, draws)
         up = np.all(draws.packet >= self.probability, axis=-1)
         return Delivery(up, delay_s, np.full_like(loss, self.probability), airtime_s)
 
     def idle(self, setting: str | None) -> str | None:
-        """Return why a setting changes nothing, whatever its value; None if it may change something."""
         return "its loss is given" if setting == "beyond" else None
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the same share at any distance, whatever stands between."""
         return np.full(np.shape(distance_m), 1 - self.probability)
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Return the same probability for every link."""
         return np.full(site.sight.shape, self.probability)

@@ -279,7 +279,7 @@ def reception(
 
 @styled
 def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], line: Floats, title: str) -> Figure:
-    """Loss of one crossing against vehicles in the radius: radios beside the paper's line.
+    """Loss of one transmission against vehicles in the radius: radios beside the paper's line.
 
     Args:
         vehicles: `(n,)`, sender and receiver included.

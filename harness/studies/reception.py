@@ -35,7 +35,7 @@ class Drawn:
 
     Attributes:
         distance_m: between ego and helper.
-        crossing: share of single crossings that succeed, over shadowing.
+        crossing: share of single transmissions that succeed, over shadowing.
         round_trip: share of requests that come back answered.
         delay_s: mean seconds from the request to the end of the reply, for helpers that have their answer.
     """
@@ -220,7 +220,7 @@ def compared(channel: Channel, curve: Curve, where: str) -> Compared:
 def crowded(
     channel: Channel, vehicles: Sequence[int], radius_m: float, distance_m: float, sight: str
 ) -> Floats:
-    """Loss of one crossing when so many vehicles stand within a radius and nobody else does, `(n,)`.
+    """Loss of one transmission when so many vehicles stand within a radius and nobody else does, `(n,)`.
 
     Those other than sender and receiver are the background's load, evenly along one road through the radius.
 

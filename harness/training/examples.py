@@ -42,7 +42,6 @@ class Question:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """What the answer chooses from."""
         return self.scenario.actions
 
     @property

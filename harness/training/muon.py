@@ -23,7 +23,6 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def step(self, closure: Callable[[], float] | None = None) -> None:
-        """Move every matrix by its gradient."""
         for group in self.param_groups:
             lr, momentum = group["lr"], group["momentum"]
             matrices = [p for p in group["params"] if p.grad is not None]

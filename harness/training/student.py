@@ -189,7 +189,6 @@ class Student:
         return facts
 
     def read(self, samples: Sequence[Sample]) -> list[Floats]:
-        """Read-outs of some samples, (A,) each."""
         return read_out(self.model, samples, self.letters)
 
     def _sample(

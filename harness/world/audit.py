@@ -52,12 +52,10 @@ class Audit:
 
     @property
     def worst(self) -> str:
-        """The question with the highest AUC."""
         return max(self.auc, key=lambda question: self.auc[question].value)
 
     @property
     def tells(self) -> bool:
-        """Whether the scenario gives its danger away."""
         return self.auc[self.worst].value > MOST_AUC
 
 
@@ -220,7 +218,6 @@ def judge(moments: Moments, sectors: tuple[str, ...]) -> tuple[dict[str, Estimat
 
 
 def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
-    """Shuffle the values of a column within each step."""
     shuffled, draws = column.copy(), noise.generator("audit", name)
     for k in np.unique(step):
         at = np.flatnonzero(step == k)
@@ -254,7 +251,6 @@ class Ranks:
 
     @property
     def auc(self) -> float:
-        """Share of pairs in which the layout with the danger ranks higher."""
         return float(self.above.sum() / self.pairs.sum())
 
     def estimate(self) -> Estimate:

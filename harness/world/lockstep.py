@@ -236,7 +236,6 @@ class Fleet:
         self.section[at] = v.route.index(v.target_lane_index)
 
     def keep(self, rows: Bools) -> None:
-        """Keep only some of the worlds."""
         self.worlds = [world for world, kept in zip(self.worlds, rows.tolist(), strict=True) if kept]
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray) and name != "ways":
@@ -303,7 +302,6 @@ class Fleet:
         return np.clip(steering, -self.most_steering, self.most_steering)
 
     def _acceleration(self) -> Floats:
-        """Return the acceleration by `speed_control` of the traffic and of the ego."""
         found = np.zeros_like(self.speed)
         faster = (self.lane_now[:, :, None] == self.lane_now[:, None]) & (
             self.speed[:, :, None] > self.speed[:, None]
@@ -326,7 +324,6 @@ class Fleet:
         return found
 
     def _move(self) -> None:
-        """Do what `Vehicle.step` does."""
         steering, acceleration = self.steering, self.acceleration
         if self.crashed.any():
             steering = np.where(self.crashed, 0.0, steering)

@@ -35,7 +35,6 @@ class Outcome:
 
     @property
     def ended(self) -> bool:
-        """Whether the episode is decided."""
         return self.result != "running"
 
     @property
@@ -51,7 +50,6 @@ class Outcome:
         return replace(self, result="late") if late else self
 
     def ending(self, result: Result, time_s: float, **how: str) -> "Outcome":
-        """Return the outcome with the episode decided."""
         gap = 0.0 if result == "collision" else self.least_gap_m
         return replace(self, result=result, time_s=time_s, least_gap_m=gap, **how)  # type: ignore[arg-type]
 

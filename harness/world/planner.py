@@ -59,12 +59,10 @@ class Rollouts:
 
     @cached_property
     def speed_mps(self) -> Floats:
-        """Speed in each step, (motions, steps)."""
         return np.asarray(np.diff(self.travelled_m, axis=1, prepend=self.travelled_m[:, :1]) / STEP_S)
 
     @cached_property
     def fastest_mps(self) -> float:
-        """Highest speed of any motion."""
         return float(self.speed_mps.max())
 
 
@@ -128,7 +126,6 @@ def _too_fast(way: Path, at_m: float, tried: Rollouts, under_way: Bools | bool) 
 
 
 def _way(road: Road, ego: Mapping[str, Any]) -> PathKey:
-    """Return the key of the ego's way."""
     return (road.ego[0], ego["route"]) if "route" in ego else road.ego
 
 
@@ -157,7 +154,6 @@ def _levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
 def _rollouts(
     actions: tuple[str, ...], starts: Sequence[Start], parameters: Parameters
 ) -> dict[Start, Rollouts]:
-    """Play every sequence through from each start."""
     alike: dict[tuple[int, tuple[int, int]], list[Start]] = {}
     for start in dict.fromkeys(starts):
         alike.setdefault(start[2:], []).append(start)

@@ -83,7 +83,6 @@ class Path:
 
     @cached_property
     def sharpest(self) -> float:
-        """Largest of `bends`, 1/m."""
         return float(self.bends.max())
 
     @cached_property
@@ -122,11 +121,9 @@ class Path:
         return x, y, self.headings_rad[np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1)]
 
     def section(self, arc_m: float) -> int:
-        """Return the index of the section at an arc length."""
         return bisect_right(self.ends_m, arc_m)
 
     def lane_role(self, arc_m: float) -> str:
-        """Return the role of the section at an arc length."""
         return self.roles[self.section(arc_m)]
 
 
@@ -247,7 +244,6 @@ class Road:
 
     @cached_property
     def ego_path(self) -> Path:
-        """The ego's path."""
         return self.paths[self.ego]
 
     @cached_property

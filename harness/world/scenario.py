@@ -110,7 +110,6 @@ class Parameters:
 
     @property
     def light(self) -> Ambient:
-        """The light and weather that `ambient` names."""
         return AMBIENTS[self.ambient]
 
     def stated(self) -> dict[str, Any]:
@@ -164,11 +163,9 @@ class Draws:
     seed: int
 
     def share(self, what: str) -> float:
-        """Draw uniformly from [0, 1)."""
         return float(noise.uniforms((1,), self.scenario, self.seed, what)[0])
 
     def between(self, what: str, bounds: tuple[float, float]) -> float:
-        """Draw uniformly between two bounds."""
         return bounds[0] + self.share(what) * (bounds[1] - bounds[0])
 
     def numbers(self, count: int) -> list[int]:
@@ -239,7 +236,6 @@ class Scenario:
 
     @property
     def summary(self) -> str:
-        """One line on what happens."""
         return self.description.strip().splitlines()[0].partition(": ")[2]
 
     def __hash__(self) -> int:

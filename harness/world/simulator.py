@@ -95,7 +95,6 @@ class _OnRoute:
         self.braking = self.action["acceleration"] < -LAMPS_MPS2
 
     def follow_road(self: Any) -> None:
-        """Take the next lane of the route near the end of the present one."""
         if self.road.network.get_lane(self.target_lane_index).after_end(self.position):
             rest = self.route[self.route.index(self.target_lane_index) + 1 :]
             if rest:
@@ -140,7 +139,6 @@ class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
     standoff_m = 2.0
 
     def speed_control(self, target_speed: float) -> float:
-        """Return the acceleration in m/s²: it brakes once the remaining room requires it, never speeds up."""
         if self.spawn.brakes_at_s is not None and self.road.time_s >= self.spawn.brakes_at_s:
             above = max(self.speed - self.spawn.brakes_to_mps, 0.0)
             if above > 0:
@@ -193,7 +191,6 @@ class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
         return abs(float(self.road.network.get_lane(lane).local_coordinates(self.position)[1]))
 
     def speed_control(self, target_speed: float) -> float:
-        """Return the acceleration in m/s²."""
         least, most = self.limits_mps2
         return float(min(max(super().speed_control(target_speed), least), most))
 

@@ -44,7 +44,6 @@ class World:
 
     @classmethod
     def start(cls, scenario: Scenario, seed: int) -> "World":
-        """Start an episode."""
         if scenario.start is not None:
             begun: World = scenario.start(scenario, seed)
             return begun
@@ -61,7 +60,6 @@ class World:
 
     @property
     def vehicles(self) -> Sequence[Any]:
-        """highway-env's vehicles, the ego first."""
         vehicles: Sequence[Any] = self.road.vehicles
         return vehicles
 
@@ -71,7 +69,6 @@ class World:
         return self.frame / self.scenario.parameters.simulation_hz
 
     def branch(self) -> "World":
-        """Return an independent copy."""
         return replace(self, road=copied(self.road))
 
     def snapshot(self) -> Snapshot:
@@ -166,7 +163,6 @@ class World:
         return target
 
     def advance(self, until_frame: int) -> None:
-        """Simulate until frame `until_frame`, or until the episode is decided."""
         frames, speed_mps = [], float(self.vehicles[0].speed)
         while self.frame < until_frame and not self.outcome.ended:
             self._step()
@@ -217,7 +213,6 @@ class World:
         )  # fmt: skip
 
     def _move(self) -> None:
-        """Simulate a frame."""
         self.road.time_s = self.time_s
         self.road.act()
         self.road.step(1 / self.scenario.parameters.simulation_hz)
@@ -239,7 +234,6 @@ class World:
         self.judge(standing)
 
     def _cleared(self) -> bool:
-        """Whether the ego has reached its goal."""
         vehicles = self.vehicles
         xy_m, approaches = [v.position for v in vehicles], [v.spawn.approach for v in vehicles]
         return bool(self.scenario.cleared(np.array(xy_m), np.array(approaches), self.scenario.parameters))

@@ -43,7 +43,7 @@ class Fog:
 
     Attributes:
         latency_s: seconds of one exchange, the request included.
-        loss_per_m: probability, a metre between ego and helper, that one crossing is lost.
+        loss_per_m: probability, a metre between ego and helper, that one transmission is lost.
     """
 
     latency_s: float = 0.01

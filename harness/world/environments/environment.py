@@ -219,7 +219,6 @@ class Constants:
 
     @classmethod
     def now(cls) -> "Constants":
-        """Read the present values."""
         from highway_env.vehicle import behavior, controller, kinematics
 
         kinds = {
@@ -237,5 +236,4 @@ class Constants:
 
 @lru_cache(maxsize=1)
 def _constants() -> Constants:
-    """Return highway-env's own values, read before the first environment is created here."""
     return Constants.now()

@@ -45,7 +45,6 @@ def examine(scenario: Scenario, seed: int) -> None:
 
 
 def _stepped(scenario: Scenario, seed: int, actions: Sequence[str]) -> list[Places]:
-    """Return the poses of all vehicles after each decision."""
     env, found = reset(scenario.name, seed), []
     kind = meta_actions(scenario.name, env)
     for action in actions:

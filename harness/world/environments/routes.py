@@ -53,7 +53,6 @@ class Routes:
 
 
 def _together(ahead: Route, lanes: Sequence[Lane]) -> int:
-    """Return how many of the roads ahead a path takes."""
     streets = [lane[:2] for lane in lanes]
     rest = streets[streets.index(ahead[0]) :]
     return sum(a == b for a, b in zip(ahead, rest, strict=False))
@@ -160,7 +159,6 @@ def _lanes(network: Any, street: Street) -> Sequence[Any]:
 
 
 def _apart_m(lane: Any, following: Any) -> float:
-    """Return the distance from the end of a lane to the beginning of another."""
     return float(np.hypot(*(lane.position(lane.length, 0.0) - following.position(0.0, 0.0))))
 
 

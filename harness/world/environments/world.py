@@ -70,7 +70,6 @@ class EnvironmentWorld(World):
 
     @property
     def vehicles(self) -> Sequence[Any]:
-        """highway-env's vehicles, the ego first."""
         return self.everybody
 
     @property
@@ -100,7 +99,6 @@ class EnvironmentWorld(World):
             v.spawn = replace(v.spawn, approach=approach, route=route)
 
     def branch(self) -> "EnvironmentWorld":
-        """Return an independent copy."""
         network = self.road.network
         shared = (
             self.scenario, self.layout, self.here, self.beacons, self.constants, self.taken, network,
@@ -113,7 +111,6 @@ class EnvironmentWorld(World):
         return {"frame": self.frame, "taken": list(map(list, self.taken))}
 
     def take(self, action: str) -> None:
-        """Set the ego's target by a meta-action."""
         kind = meta_actions(self.scenario.name, self.env)
         kind.act(kind.actions_indexes[action])
         self.action, self.taken = action, (*self.taken, (self.frame, action))
@@ -127,7 +124,6 @@ class EnvironmentWorld(World):
         return " ".join(map(str, aim)), int(ego.speed_index)
 
     def target_after(self, action: str) -> Target:
-        """Return the target that the ego would have if it took an action now."""
         ego, kept = self.everybody[0], (self.action, self.taken)
         own = {name: list(value) if isinstance(value, list) else value for name, value in vars(ego).items()}
         self.take(action)
@@ -137,7 +133,6 @@ class EnvironmentWorld(World):
         return target
 
     def advance(self, until_frame: int) -> None:
-        """Simulate until frame `until_frame`, or until the episode is decided."""
         while self.frame < until_frame and not self.outcome.ended:
             super().advance(min(until_frame, (self.frame // self.period + 1) * self.period))
             self._recast()
