@@ -7,8 +7,9 @@ from functools import cache
 
 import numpy as np
 
+from harness.world.parameters import Parameters
 from harness.world.road import Ground, Path, Road, crossings
-from harness.world.scenario import Layout, Parameters, Scenario, Spawn
+from harness.world.scenario import Layout, Scenario, Spawn
 
 REACH_M, HALF_M = 100.0, 2.0
 

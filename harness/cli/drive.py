@@ -119,7 +119,7 @@ def command(
         extras.need("--save-video", "matplotlib")
     names = POINTS if condition in (None, [], [ALL]) else condition
     source = LiveSource(first_seed, episodes, name, sample, sample_seed)
-    if source.scenario.start:
+    if source.scenario.is_environment:
         examine(source.scenario, first_seed)
     driven = len(source.numbers)
     options.in_range("--save-video", save_video, 0, driven)

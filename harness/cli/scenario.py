@@ -88,7 +88,7 @@ def audit(
     A classifier tries to predict the danger from the ego's view alone; above chance, the scenario leaks it.
     """
     scenario, who = ready_to_drive(name, layouts, seed, "--layouts"), options.workers_of(workers)
-    if scenario.start:
+    if scenario.is_environment:
         raise UserError(
             f"{printable(name)} is an environment without a known danger, so there is nothing to audit; "
             "give a scenario"

@@ -73,7 +73,9 @@ def build(
         UserError: the folder holds a finished dataset, or one begun with other settings, or something else;
             the seeds are for several purposes; or the audit needs a package that is missing.
     """
-    audits = audits and episodes >= LEAST_AUDITED and not scenario.start  # an environment states no danger
+    audits = (
+        audits and episodes >= LEAST_AUDITED and not scenario.is_environment
+    )  # an environment states no danger
     if audits and not shard:
         extras.need("an audit", "sklearn")
     config = {
@@ -87,7 +89,7 @@ def build(
             "harness": __version__,
             **{name: version(name) for name in ("highway-env", "numpy", "shapely")},
         },
-        **({"environment": environment.config(scenario.name)} if scenario.start else {}),
+        **({"environment": environment.config(scenario.name)} if scenario.is_environment else {}),
     }
     if not re.fullmatch(FILE_NAME, out.absolute().name):
         raise UserError(
@@ -108,7 +110,7 @@ def build(
     own_episodes = shard.part(range(episodes)) if shard else range(episodes)
     if begun := work.begun(out, work.Begun):
         work.same(out, {**config, "shard": part}, {**begun.settings, "shard": begun.shard})
-    elif scenario.start:
+    elif scenario.is_environment:
         examine(scenario, seed)
     with work.working(out, begun or work.Begun(settings=config, shard=part)) as place:
         _freeze_missing(scenario, place, seed, own_episodes, workers, progress)
@@ -259,7 +261,7 @@ def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
     default, p = scenarios.get(scenario.name).parameters, scenario.parameters
     dials = [
         f"{dial}={canonical_json(getattr(p, dial))}"
-        for dial in scenarios.dials(scenario) if getattr(p, dial) != getattr(default, dial)
+        for dial in scenario.dials if getattr(p, dial) != getattr(default, dial)
     ]  # fmt: skip
     name = shlex.quote(environment.joined(scenario.name, dials))
     lag = f" --lag {p.decision_lag_s:g}" if p.decision_lag_s != default.decision_lag_s else ""

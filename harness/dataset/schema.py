@@ -327,7 +327,7 @@ def record_type(scenario: Scenario) -> type[Record]:
         danger=_narrowed(Danger, sector=sector | None),
         state=_narrowed(State, vehicles=Annotated[_list(vehicle), Meta(min_length=1)]),
         graphs=GenericAlias(dict, (VehicleId, graph)),
-        snapshot=Taken if scenario.start else _narrowed(Snapshot, sections=_list(section)),
+        snapshot=Taken if scenario.is_environment else _narrowed(Snapshot, sections=_list(section)),
     )
     return kind
 

@@ -73,7 +73,7 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
             yield f"[parameters]: {name} = {printable(value)}; wanted is a value such as {expected[name]}"
     if missing := scenario.parameters.stated().keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"
-    if scenario.start and manifest.environment != (here := environment.config(scenario.name)):
+    if scenario.is_environment and manifest.environment != (here := environment.config(scenario.name)):
         differing = sorted(k for k, v in here.items() if (manifest.environment or {}).get(k, here) != v)
         yield f"[environment]: here its configuration has another {', '.join(differing) or 'set of keys'}"
 

@@ -15,7 +15,8 @@ from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World
 from harness.runs.records import Episode, FrozenScenes
-from harness.world.scenario import Scenario, frames
+from harness.world.parameters import frames
+from harness.world.scenario import Scenario
 
 
 @dataclass(frozen=True)

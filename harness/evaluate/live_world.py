@@ -25,7 +25,8 @@ from harness.runs.records import ClosedLoop, Episode
 from harness.world import reference, scenarios
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import Outcome
-from harness.world.scenario import Scenario, frames
+from harness.world.parameters import frames
+from harness.world.scenario import Scenario
 from harness.world.world import World
 
 

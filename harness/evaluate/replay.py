@@ -15,7 +15,8 @@ from harness.evaluate.live_world import look
 from harness.runs.folder import Run, read
 from harness.runs.records import ClosedLoop, Decision, Manifest
 from harness.world import scenarios
-from harness.world.scenario import Parameters, Scenario
+from harness.world.parameters import Parameters
+from harness.world.scenario import Scenario
 from harness.world.state import WorldState
 from harness.world.world import World
 

@@ -1,7 +1,7 @@
 """The interface of a V2V channel: which replies arrive, and when.
 
-A consultation is a round trip: the request and the reply must both be received. A new model is a file beside this
-one, with a frozen dataclass that has `request` and `deliver`; profiles are read by `profiles.py`.
+A consultation is a round trip: the request and the reply must both be received. A new model is a file beside
+this one, with a frozen dataclass that has `request` and `deliver`; profiles are read by `profiles.py`.
 """
 
 from collections.abc import Mapping

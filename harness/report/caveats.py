@@ -16,7 +16,7 @@ from harness.runs.metrics import ALL
 from harness.runs.records import ClosedLoop, Manifest, Score
 from harness.runs.unanswered import tally
 from harness.world.drivers import BLIND
-from harness.world.scenario import Parameters
+from harness.world.parameters import Parameters
 
 FEW = 100  # episodes; with fewer a page warns of wide intervals
 OFF_LAG = 0.5  # least share of decisions that act in another frame of which a page warns

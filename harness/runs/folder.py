@@ -46,7 +46,7 @@ from harness.runs.records import (
     Speed,
     Variant,
 )
-from harness.world.scenario import MOST_DECISIONS
+from harness.world.parameters import MOST_DECISIONS
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)

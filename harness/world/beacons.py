@@ -34,7 +34,7 @@ import numpy as np
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.radio.fading import Trips
-from harness.world.scenario import Parameters, beacon_radio
+from harness.world.parameters import Parameters, beacon_radio
 from harness.world.sight_lines import site
 from harness.world.state import Beacon, VehicleState, WorldState
 

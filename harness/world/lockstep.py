@@ -46,7 +46,7 @@ def advance(worlds: Sequence[World], until_frames: Sequence[int]) -> None:
         if world.frame < until and not world.outcome.ended
     ]
     scenario = worlds[0].scenario if worlds else None
-    lanes = _lanes(scenario.road) if scenario and not scenario.start else None
+    lanes = _lanes(scenario.road) if scenario and not scenario.is_environment else None
     if lanes is None or len(going) <= ALONE:
         for world, until in going:
             world.advance(until)

@@ -8,8 +8,8 @@ import numpy as np
 from shapely import Polygon
 from shapely.ops import nearest_points
 
+from harness.world.parameters import Parameters
 from harness.world.road import Path, PathKey
-from harness.world.scenario import Parameters
 from harness.world.state import VehicleState
 
 Result = Literal["running", "cleared", "late", "collision", "time_out", "off_road"]

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.world.parameters import Parameters
 from harness.world.road import Path, PathKey, Road
-from harness.world.scenario import Parameters, Scenario
+from harness.world.scenario import Scenario
 from harness.world.state import SIZES_M
 
 SPEED = {"FASTER": 1, "SLOWER": -1}  # levels by which an action changes the target speed

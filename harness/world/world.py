@@ -44,9 +44,11 @@ class World:
 
     @classmethod
     def start(cls, scenario: Scenario, seed: int) -> "World":
-        if scenario.start is not None:
-            begun: World = scenario.start(scenario, seed)
-            return begun
+        return (scenario.world or World).begun(scenario, seed)
+
+    @classmethod
+    def begun(cls, scenario: Scenario, seed: int) -> "World":
+        """Start an episode in this kind of world."""
         layout = scenario.layout(seed, scenario.parameters)
         world = cls(scenario, seed, layout, populated(scenario, layout))
         poses = beacons.lead_in(scenario.parameters, world._in_road_frame(world._poses()))
@@ -87,14 +89,11 @@ class World:
     @classmethod
     def thaw(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot) -> "World":
         """Restore the world that `state` and `snapshot` were taken from, if its episode was undecided."""
-        if scenario.start is not None:
-            world = cls.start(scenario, state.episode_seed)
-            for frame, action in snapshot["taken"]:
-                world.advance(frame)
-                world.take(action)
-            world.advance(snapshot["frame"])
-            world.step = state.step
-            return world
+        return (scenario.world or World).resumed(scenario, state, snapshot)
+
+    @classmethod
+    def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot) -> "World":
+        """Do what `thaw` says, in this kind of world."""
         layout, road = scenario.layout(state.episode_seed, scenario.parameters), new_road(scenario)
         for v, section in zip(state.vehicles, snapshot["sections"], strict=True):
             spawn = spawn_of(scenario, layout, v)

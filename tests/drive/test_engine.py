@@ -21,7 +21,7 @@ from harness.evaluate.walk import walk
 from harness.runs.decisions import Decisions
 from harness.world import reference as live
 from harness.world.drivers import DRIVERS
-from harness.world.scenario import frames
+from harness.world.parameters import frames
 from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 

@@ -24,7 +24,7 @@ from harness.world import scenarios
 from harness.world.drivers import DRIVERS
 from harness.world.environments.environment import named, reset
 from harness.world.environments.examination import examine
-from harness.world.environments.scenario import CAREFUL_FIRST
+from harness.world.environments.place import CAREFUL_FIRST
 from harness.world.environments.world import EnvironmentWorld
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.reference import drive

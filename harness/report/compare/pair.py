@@ -19,7 +19,7 @@ from harness.runs.folder import Run, read
 from harness.runs.metrics import by_episode, metrics_of
 from harness.runs.percentiles import Decided
 from harness.runs.records import Episode, FrozenScenes
-from harness.world.scenario import DIALS
+from harness.world.parameters import DIALS
 
 SETTINGS = (
     "model", "prompt", "answer", "thinking", "image", "letters", "sums", "flip", "temperature",

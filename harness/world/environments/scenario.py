@@ -1,61 +1,16 @@
-"""Make a scenario of an environment: its parameters, its road, and the ego's goal."""
+"""Make a scenario of an environment."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
-from harness.core.errors import UserError, printable
-from harness.world.environments import environment
-from harness.world.environments.environment import lane_of, reset
-from harness.world.environments.routes import Routes, routes
-from harness.world.road import ONE_LANE_M, Lane, Path, PathKey, Road, crossings, ground
+from harness.world.environments.place import place
+from harness.world.environments.world import EnvironmentWorld
+from harness.world.parameters import DIALS
+from harness.world.road import Road
 from harness.world.scenario import Layout, Scenario
-from harness.world.scenario import Parameters as Common
-
-DIALS = ("decisions", "helpers", "time_limit_s", "delay_allowance_s")
-CAREFUL_FIRST = ("SLOWER", "IDLE", "FASTER", "LANE_LEFT", "LANE_RIGHT")
-MOST_HZ = 1000
-AFTER, LIMIT = 2, 5  # decision periods after the last decision: to the goal by cruising, to the time limit
-REACH_M = 500.0  # paths are built up to this distance from the middle of an episode
-BEHIND_M, BEYOND_M = 30.0, 40.0  # watched parts of the ego's ways, behind its start and beyond its goal
-BEFORE_M = (5.0, 45.0)  # watched part of a path that meets the ego's, before that point
-HALFWAY = 0.4  # share of the way to the goal at which the origin lies, the middle of pictures
-
-
-@dataclass(frozen=True)
-class Parameters(Common):
-    """The parameters of an environment."""
-
-    braking_mps2: float = 20.0  # hardest braking; highway-env's own controller has no limit
-    acceleration_mps2: float = 20.0
-    helpers: int = 3  # number of helpers: other controlled vehicles first, then those nearest to the ego
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("decisions", "helpers"):
-            if not 0 < getattr(self, name) <= 9:
-                raise UserError(f"scenario: {name} is {getattr(self, name)}; it must be from 1 to 9")
-
-    @property
-    def goal_s(self) -> float:
-        """Time in which the ego would reach its goal at its first target speed; it defines the goal."""
-        return (self.decisions + AFTER) * self.decision_period_s
-
-
-@dataclass(frozen=True)
-class Place:
-    """The properties of an environment that are the same for every seed."""
-
-    routes: Routes  # the paths of its network
-    ends: Mapping[Lane, tuple[float, ...]]  # where the network's lanes begin and end, m
-    road: Road  # the harness's road
-    actions: tuple[str, ...]  # the ego's actions
-    parameters: Parameters  # the scenario's parameters
-    kind: str  # name of the environment's class
 
 
 @lru_cache(maxsize=16)
@@ -73,7 +28,8 @@ def scenario(name: str) -> Scenario:
         cleared=_nobody,
         words={"task": f"follow your road, {where}, and keep up speed", "hiding": "other vehicles"},
         brake_lamps=True,
-        start=_start,
+        dials=(*DIALS, "decisions", "helpers", "time_limit_s", "delay_allowance_s"),
+        world=EnvironmentWorld,
     )
 
 
@@ -89,115 +45,3 @@ def _layout(seed: int, parameters: Any) -> Layout:
 def _nobody(xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
     """Return false: `EnvironmentWorld` itself decides whether the ego has reached its goal."""
     return np.zeros(xy_m.shape[:-2], dtype=bool)
-
-
-def _start(scenario: Scenario, seed: int) -> Any:
-    from harness.world.environments.world import EnvironmentWorld
-
-    return EnvironmentWorld.begun(scenario, seed)
-
-
-def first_target_mps(ego: Any) -> float:
-    """Return the ego's target speed, or the highest possible one if that is 0."""
-    return float(ego.target_speed) or float(max(ego.target_speeds))
-
-
-def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
-    """Return where a network's lanes begin and end, m."""
-    return {
-        (a, b, n): tuple(np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3).ravel().tolist())
-        for a, nodes in network.graph.items() for b, lanes in nodes.items() for n, lane in enumerate(lanes)
-    }  # fmt: skip
-
-
-@lru_cache(maxsize=16)
-def place(name: str) -> Place:
-    """Return the properties that are the same for every seed, from seed 0."""
-    env = reset(name, 0)
-    ego, network = env.vehicle, env.road.network
-    available = environment.meta_actions(name, env).actions.values()
-    p, lane = _parameters(name, env, len(available)), lane_of(ego)
-    goal = partial(_goal_m, first_target_mps(ego))
-
-    whole = routes(name, network, lane[:2])
-    key = whole.keys(lane, ego.route)[0]
-    way = whole.paths[key]
-    origin = way.at(way.project(*ego.position)[0] + HALFWAY * goal(0.0, p))[:2]
-    found = routes(name, network, lane[:2], origin, REACH_M)
-    ways = next((ways for ways in found.ways.values() if key in ways), (key,))
-    begin_m = found.paths[key].project(*(ego.position - origin))[0]
-    goal_m = goal(begin_m, p)
-    meetings = {
-        other: at for way in (*ways, key) for other, at in crossings(found.paths, way).items()
-        if begin_m < at.ego_arc_m < goal_m + BEYOND_M
-    }  # fmt: skip
-    zone_m = min((goal_m, *(at.ego_arc_m for at in meetings.values())))
-    road = Road(
-        facts={"kind": type(env).__name__, "ego": "/".join(key)},
-        paths=found.paths,
-        ego=key,
-        crossings=meetings,
-        zone_m=found.paths[key].at(zone_m)[:2],
-        sectors=_sectors(found.paths, ways, meetings, (begin_m - BEHIND_M, goal_m + BEYOND_M)),
-        network=lambda: network,
-        ground=partial(ground, network, origin_m=origin),
-        ways=ways,
-        origin_m=origin,
-        goal_m=partial(goal, begin_m),
-    )
-    actions = tuple(action for action in CAREFUL_FIRST if action in available)
-    return Place(found, ends_of(network), road, actions, p, type(env).__name__)
-
-
-def _goal_m(speed_mps: float, begin_m: float, parameters: Parameters) -> float:
-    return begin_m + parameters.goal_s * speed_mps
-
-
-def _parameters(name: str, env: Any, actions: int) -> Parameters:
-    hz, decisions_hz = (env.config[f"{kind}_frequency"] for kind in ("simulation", "policy"))
-    for kind, value in (("simulation", hz), ("policy", decisions_hz)):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= MOST_HZ:
-            raise UserError(
-                f"{environment.shown(name)}: {kind}_frequency is {printable(repr(value))}; set a number "
-                f"above 0, at most {MOST_HZ}, in its config"
-            )
-    if hz % decisions_hz:
-        raise UserError(
-            f"{environment.shown(name)}: simulation_frequency {hz:g} is no multiple of policy_frequency "
-            f"{decisions_hz:g}; set one in its config"
-        )
-    period_s = 1 / decisions_hz
-    # A tree has about a hundred decision points: three actions lead to 2.4 new ones each, five to 3.4.
-    decisions = 6 if actions == 3 else 4
-    return Parameters(
-        target_speeds_mps=tuple(float(speed) for speed in env.vehicle.target_speeds),
-        decisions=decisions,
-        decision_period_s=period_s,
-        decision_lag_s=min(Common.decision_lag_s, period_s / 2),
-        simulation_hz=int(hz),
-        time_limit_s=(decisions + LIMIT) * period_s,
-        delay_allowance_s=period_s,
-        beacon_hz=min(Common.beacon_hz, hz),
-    )
-
-
-def _sectors(
-    paths: Mapping[PathKey, Path], ways: Sequence[PathKey], meetings: Mapping[PathKey, Any],
-    watched_m: tuple[float, float],
-) -> dict[str, Floats]:  # fmt: skip
-    """Return the points that must be seen: of the ego's ways, and of paths before they meet it."""
-    sectors: dict[str, Floats] = {}
-    for key in ways:
-        points = _points(paths[key], np.linspace(*watched_m, 15))
-        before = np.concatenate([*sectors.values(), np.full((1, 2), np.inf)])
-        apart_m = np.hypot(*(points[:, None] - before).T).min(axis=0)
-        if (own := points[apart_m > ONE_LANE_M]).size:  # of a way that parts later only what is its own
-            sectors[key[1]] = own
-    for key, at in meetings.items():
-        if key[0] not in sectors:
-            sectors[key[0]] = _points(paths[key], at.other_arc_m - np.linspace(*BEFORE_M, 9))
-    return sectors
-
-
-def _points(path: Path, arcs_m: Floats) -> Floats:
-    return np.array([path.at(arc_m)[:2] for arc_m in arcs_m])

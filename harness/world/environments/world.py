@@ -16,11 +16,11 @@ import numpy as np
 from harness.core.errors import UserError
 from harness.world import beacons
 from harness.world.environments.environment import Constants, lane_of, meta_actions, numbered, reset, shown
-from harness.world.environments.scenario import Parameters, ends_of, first_target_mps, place
+from harness.world.environments.place import Parameters, ends_of, first_target_mps, place
 from harness.world.road import PathKey
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.simulator import DECIMALS, LAMPS_MPS2
-from harness.world.state import SIZES_M, Building, Kind, Part
+from harness.world.state import SIZES_M, Building, Kind, Part, WorldState
 from harness.world.world import Snapshot, Target, World
 
 MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # limits of the ids in a record
@@ -66,6 +66,16 @@ class EnvironmentWorld(World):
             world._enter(v, "helper" if n < p.helpers else "other")
         poses = beacons.lead_in(p, world._in_road_frame(world._poses()))
         world._broadcast(poses, 1 - len(poses))
+        return world
+
+    @classmethod
+    def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot) -> "World":
+        world = cls.begun(scenario, state.episode_seed)
+        for frame, action in snapshot["taken"]:
+            world.advance(frame)
+            world.take(action)
+        world.advance(snapshot["frame"])
+        world.step = state.step
         return world
 
     @property

@@ -3,6 +3,7 @@
 Other packages add theirs by an entry point of the group `swarmdrive.scenarios`; `env:ID` is an environment.
 """
 
+import copyreg
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import cache
@@ -14,8 +15,8 @@ from typing import Any
 from harness.core.config import convert, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.world.environments import environment
-from harness.world.environments import scenario as environments
-from harness.world.scenario import DIALS, Parameters, Scenario
+from harness.world.parameters import Parameters
+from harness.world.scenario import Scenario
 
 GROUP = "swarmdrive.scenarios"
 DEFAULT = "occluded-intersection"  # taken if none is named
@@ -43,14 +44,9 @@ def get(text: str) -> Scenario:
     return replace(scenario, parameters=replace(scenario.parameters, **changed))
 
 
-def dials(scenario: Scenario) -> tuple[str, ...]:
-    """Return the parameters that a name may set: `NAME:beacon_loss=0.3`, `NAME:ambient=fog`."""
-    return (*DIALS, *(environments.DIALS if scenario.start else ()))
-
-
 def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
     key, _, value = text.partition("=")
-    shown, known = printable(scenario.name), dials(scenario)
+    shown, known = printable(scenario.name), scenario.dials
     if key not in known:
         raise unknown(f"setting of scenario {shown}", key, known, f"; as in {shown}:perfect_knowledge=true")
     usual = getattr(scenario.parameters, key)
@@ -63,7 +59,9 @@ def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
 
 def _named(name: str) -> Scenario:
     if name.startswith(environment.PREFIX):
-        return environments.scenario(name)
+        from harness.world.environments.scenario import scenario as of_environment  # imports highway-env
+
+        return of_environment(name)
     if is_here(name):
         scenario: Scenario = import_module(f"{__name__}.{name.replace('-', '_')}").SCENARIO
         return scenario
@@ -104,6 +102,9 @@ def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
 def restore(name: str, parameters: Parameters) -> Scenario:
     """Restore a pickled scenario."""
     return replace(get(name), parameters=parameters)
+
+
+copyreg.pickle(Scenario, lambda scenario: (restore, (scenario.name, scenario.parameters)))
 
 
 @cache  # called for every answer of the proxy

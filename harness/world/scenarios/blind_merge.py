@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
+from harness.world.parameters import Parameters as Common
 from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
-from harness.world.scenario import Parameters as Common
 from harness.world.state import Building
 
 NAME = "blind-merge"

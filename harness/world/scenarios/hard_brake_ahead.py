@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
+from harness.world.parameters import Parameters as Common
 from harness.world.road import Path, PathKey, Road, ground
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
-from harness.world.scenario import Parameters as Common
 from harness.world.state import SIZES_M, Kind
 
 NAME = "hard-brake-ahead"

@@ -16,8 +16,8 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.crossroads import JUNCTION_M, SECTORS, road
+from harness.world.parameters import Parameters as Common
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
-from harness.world.scenario import Parameters as Common
 from harness.world.state import SIZES_M, Building, Kind
 
 NAME = "occluded-intersection"

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
+from harness.world.parameters import Parameters as Common
 from harness.world.road import Lane, Path, Road, crossings, ground
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
-from harness.world.scenario import Parameters as Common
 from harness.world.state import Building
 
 NAME = "roundabout-entry"

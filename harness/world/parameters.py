@@ -1,0 +1,143 @@
+"""The parameters that every scenario has: times, limits of the ego, and what vehicles know of each other."""
+
+import math
+from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
+from typing import Any, Literal, get_args
+
+from harness.core.config import changed
+from harness.core.errors import UserError, printable, unknown
+from harness.radio.channel import Physical
+from harness.radio.profiles import CHANNELS
+from harness.world.ambient import AMBIENTS, DAY, Ambient
+
+BeaconRule = Literal["fixed", "cam"]
+MOST_DECISIONS, MOST_SPEEDS = 10, 20
+MOST_FRAMES = 20_000  # in an episode; each takes time and memory
+# What a parameter may be at least and at most, by the unit at the end of its name. Places, and times that are
+# offsets, may lie before their origin.
+BOUNDS = {
+    "noise_m": (0.0, 100.0), "noise_mps": (0.0, 100.0), "offset_s": (-100.0, 100.0),
+    "_s": (0.0, MOST_FRAMES), "_m": (-1000.0, 1000.0), "_mps": (0.0, 200.0), "_mps2": (0.0, 200.0),
+    "_hz": (0.0, 1000.0), "_share": (0.0, 1.0), "_shares": (0.0, 1.0),
+}  # fmt: skip
+ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
+
+
+def frames(latency_s: float, simulation_hz: int) -> int:
+    """Return the number of whole frames that a decision takes."""
+    return math.ceil(latency_s * simulation_hz - ROUNDING_FRAMES)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The parameters that every scenario has; a scenario adds its own in a subclass."""
+
+    # the levels that SLOWER, IDLE and FASTER step through
+    target_speeds_mps: tuple[float, ...] = (0.0, 7.0, 14.0)
+    braking_mps2: float = 8.0  # hardest braking
+    acceleration_mps2: float = 3.0  # hardest acceleration
+    decisions: int = 6  # number of decisions in an episode
+    decision_period_s: float = 1.0  # seconds between two decisions
+    # seconds from seeing to acting, below the period, in decision trees and for reference drivers: the
+    # paper's inference. Until then the ego keeps to its last action
+    decision_lag_s: float = 0.145
+    simulation_hz: int = 50  # frames a second
+    time_limit_s: float = 10.0  # an ego that has not reached its goal by then has failed
+    delay_allowance_s: float = 1.0  # how much later than the full-view driver an ego may reach its goal
+    # whether the ego and the helpers know each other's true state instead of beacons
+    perfect_knowledge: bool = False
+    # when a vehicle sends a beacon: `fixed`, or `cam`, depending on its motion (ETSI EN 302 637-2);
+    # `harness.world.beacons` has the sources of these parameters
+    beacon_rule: BeaconRule = "fixed"
+    beacon_hz: float = 10.0  # beacons a second; under `cam`, checks a second whether one is due
+    beacon_delay_s: float = 0.02  # time from a beacon's pose until receivers have it
+    beacon_loss: float = 0.08  # probability that a receiver does not receive a beacon
+    # physical radio that gives this loss on each link instead, with settings of its own:
+    # `its-g5+density_per_km=120+rate_hz=20`
+    beacon_channel: str = ""
+    beacon_noise_m: float = 0.2  # standard deviation of a beacon's position on each axis
+    beacon_noise_mps: float = 0.1  # standard deviation of a beacon's speed
+    beacon_noise_rad: float = 0.0035  # standard deviation of a beacon's heading
+    ambient: str = DAY  # light and weather, one of `harness.world.ambient`
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "target_speeds_mps": (
+                0 < len(self.target_speeds_mps) <= MOST_SPEEDS,
+                f"1 to {MOST_SPEEDS} speeds",
+            ),
+            "decisions": (1 <= self.decisions <= MOST_DECISIONS, f"from 1 to {MOST_DECISIONS}"),
+            "decision_period_s": (self.decision_period_s > 0, "seconds above 0"),
+            "simulation_hz": (0 < self.simulation_hz <= 1000, "from 1 to 1000"),
+            "time_limit_s": (
+                0 < self.time_limit_s * self.simulation_hz <= MOST_FRAMES,
+                f"above 0, and {MOST_FRAMES} frames at most",
+            ),
+            "ambient": (self.ambient in AMBIENTS, " or ".join(AMBIENTS)),
+            "beacon_rule": (self.beacon_rule in get_args(BeaconRule), " or ".join(get_args(BeaconRule))),
+            "perfect_knowledge": (isinstance(self.perfect_knowledge, bool), "true or false"),
+            "beacon_hz": (0 < self.beacon_hz <= self.simulation_hz, f"above 0, at most {self.simulation_hz}"),
+            "beacon_delay_s": (0 <= self.beacon_delay_s <= 1, "seconds from 0 to 1"),
+            "beacon_loss": (0 <= self.beacon_loss < 1, "a probability from 0, below 1"),
+            "beacon_noise_rad": (0 <= self.beacon_noise_rad <= 7, "from 0 to 7"),
+        }
+        for field in fields(self):
+            value = getattr(self, field.name)
+            least, most = next((BOUNDS[unit] for unit in BOUNDS if field.name.endswith(unit)), (None, None))
+            if least is not None and bounds.get(field.name, (True, ""))[0]:
+                each = value if isinstance(value, tuple) else (value,)
+                bounds[field.name] = (
+                    all(least <= one <= most for one in each),
+                    f"from {least:g} to {most:g}",
+                )
+        for name, (fits, allowed) in bounds.items():
+            if not fits:
+                raise UserError(f"scenario: {name} is {printable(getattr(self, name))}; it must be {allowed}")
+        beacon_radio(self.beacon_channel)
+
+    @property
+    def light(self) -> Ambient:
+        return AMBIENTS[self.ambient]
+
+    def stated(self) -> dict[str, Any]:
+        """Return all parameters as plain values; those of `LATER` only if they differ from that value."""
+        return {k: v for k, v in asdict(self).items() if (k, v) not in LATER}
+
+    @property
+    def lag_frames(self) -> int:
+        """`decision_lag_s` in whole frames."""
+        return frames(self.decision_lag_s, self.simulation_hz)
+
+    def due_frame(self, step: int) -> int:
+        """Return the frame in which a decision is due; after the last decision, that of the time limit."""
+        due_s = self.time_limit_s if step >= self.decisions else step * self.decision_period_s
+        return round(due_s * self.simulation_hz)
+
+
+# Parameters that were added later, with the values of the earlier behaviour.
+LATER = (("ambient", DAY), ("beacon_rule", "fixed"), ("beacon_channel", ""))
+
+
+@lru_cache(maxsize=64)
+def beacon_radio(text: str) -> Physical | None:
+    """Return the radio that `beacon_channel` names; None if it is empty. Raises UserError if it is wrong."""
+    if not text:
+        return None
+    name, *settings = text.split("+")
+    if name not in CHANNELS:
+        raise unknown("beacon_channel", name, CHANNELS)
+    given = {key: value for key, _, value in (each.partition("=") for each in settings)}
+    radio = changed(CHANNELS[name], given, f"beacon_channel {name}")
+    if not isinstance(radio, Physical):
+        raise UserError(
+            f"scenario: beacon_channel is {printable(text)}, which has one loss for all links; "
+            "it must be a physical radio, or set beacon_loss"
+        )
+    return radio
+
+
+# Parameters that change neither the vehicles nor their driving, but only what is known of them.
+DIALS = tuple(
+    field.name for field in fields(Parameters) if field.name.startswith(("beacon_", "perfect_", "ambient"))
+)
