@@ -73,9 +73,8 @@ def build(
         UserError: the folder holds a finished dataset, or one begun with other settings, or something else;
             the seeds are for several purposes; or the audit needs a package that is missing.
     """
-    audits = (
-        audits and episodes >= LEAST_AUDITED and not scenario.is_environment
-    )  # an environment states no danger
+    # An environment states no danger.
+    audits = audits and episodes >= LEAST_AUDITED and not scenario.is_environment
     if audits and not shard:
         extras.need("an audit", "sklearn")
     config = {
