@@ -195,6 +195,13 @@ def test_the_nearest_helper_within_half_the_way_is_asked(frozen: Tables, small: 
     assert 0 < asked < len(decisions)
 
 
+def test_the_metric_is_in_the_summary(frozen: Tables):
+    table = frozen.summary[(frozen.summary.metric == "sure_rate") & (frozen.summary.interval == "episodes")]
+    decisions = frozen.decisions[frozen.decisions.condition == "fog"]
+    by_episode = (decisions.normalised_entropy < 0.5).groupby([decisions.seed, decisions.episode]).mean()
+    assert table[table.condition == "fog"].value.item() == pytest.approx(by_episode.mean(), abs=1e-6)
+
+
 def test_a_sweep_plays_the_rule_on_what_is_stored(project: Path, frozen: Tables):
     over = ("--over", "consensus", "--grid", "linear,smoothing", "--condition", "6g", "--condition", "fog")
     typed(project, "sweep", "frozen", *over, "--quiet")

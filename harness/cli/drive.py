@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 ALL = "all"
 COLUMNS = (
-    Column("success % [95 % CI]", "success_rate", 100, interval=True),
-    Column("crash", "collision_rate", 100, " %"),
-    Column("late", "late_rate", 100, " %"),
-    Column("latency", "latency_proxy_ms", unit=" ms"),
-    Column("missed", "deadline_miss_rate", 100, " %"),
-    Column("gap", "least_gap_m", unit=" m"),
-    Column("clear", "time_to_clear_s", unit=" s"),
+    Column("success % [95 % CI]", "success_rate", interval=True),
+    Column("crash", "collision_rate"),
+    Column("late", "late_rate"),
+    Column("latency", "latency_proxy_ms"),
+    Column("missed", "deadline_miss_rate"),
+    Column("gap", "least_gap_m"),
+    Column("clear", "time_to_clear_s"),
 )
 
 

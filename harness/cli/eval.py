@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from harness.evaluate.spec import Spec
 
 COLUMNS = (
-    Column("success % [95 % CI]", "success_rate", 100, interval=True),
-    Column("gain, points", "success_gain_over_single-local", 100, interval=True),
-    Column("latency", "latency_proxy_ms", unit=" ms"),
-    Column("trigger", "trigger_rate", 100, " %"),
+    Column("success % [95 % CI]", "success_rate", interval=True),
+    Column("gain, points", "success_gain_over_single-local", interval=True),
+    Column("latency", "latency_proxy_ms"),
+    Column("trigger", "trigger_rate"),
     Column("msgs", "messages_per_episode"),
 )
 

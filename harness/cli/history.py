@@ -8,7 +8,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import WIDTH, echo_json, echo_wrong
 from harness.core.errors import UserError, printable
-from harness.core.figures import Unit, shown
+from harness.core.figures import DASH
 from harness.runs.listing import SUCCESS
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def command(
     Runs on the same scenes are grouped, since only those compare.
     """
     from harness.report import history
-    from harness.runs.metrics import unit
+    from harness.runs.metrics import entry, written
 
     wrong: dict[str, UserError] = {}
     groups = history.history(folder, metric, condition, dataset, wrong.__setitem__)
@@ -47,14 +47,14 @@ def command(
             for group in groups
         ] + [{"run": name, "error": str(error)} for name, error in wrong.items()])  # fmt: skip
         return
-    factor, suffix, decimals = unit(metric)
-    typer.echo(f"{metric}{suffix if suffix.strip() == '%' else ''} with its 95 % interval")
+    percent = " %" if entry(metric).unit.name == "%" else ""
+    typer.echo(f"{metric}{percent} with its 95 % interval")
     for group in groups:
         typer.echo(f"\n{printable(f'{group.of}, {group.condition}', WIDTH)}")
         for line in group.lines:
-            value = n = "–"
+            value = n = DASH
             if score := line.score:
-                value, n = shown(score, Unit(suffix.strip(), decimals, factor)), str(score.n)
+                value, n = written(score), str(score.n)
             who = printable(line.run.manifest.variant, VARIANT)
             typer.echo(f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}")
     for name, error in wrong.items():

@@ -13,7 +13,6 @@ import typer
 from harness.cli.estimates import console, table
 from harness.core import work
 from harness.core.errors import UserError, printable
-from harness.core.figures import Unit, shown
 from harness.core.formats import WORK
 
 if TYPE_CHECKING:
@@ -27,21 +26,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a run's table: the metric, and how it is written. `interval`: with its ends."""
+    """A column of a run's table: its head and its metric, whose unit or whose `interval` it shows."""
 
     head: str
     metric: str
-    scale: float = 1.0
-    unit: str = ""
     interval: bool = False
 
     def cell(self, score: "Score | None") -> str:
         """The metric's score; a dash if there is none."""
         if score is None or score.value is None:
             return "-"
-        if self.interval:
-            return shown(score, Unit(factor=self.scale))
-        return Unit(self.unit.strip(), factor=self.scale).text(score.value)
+        from harness.runs.metrics import entry, written
+
+        return written(score) if self.interval else entry(score.metric).unit.text(score.value)
 
 
 @dataclass(frozen=True)
@@ -295,5 +292,5 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: st
             yield f"{role} read-outs: {read}; mass on the letters {mass.value or 0:.2f}{means}"
         for when in ("at_first", "after_repair"):
             if turn := figures.get(("all", f"valid_{when}_rate_{role}")):
-                share = Column("", turn.metric, 100, interval=True).cell(turn)
+                share = Column("", turn.metric, interval=True).cell(turn)
                 yield f"{role} answers valid {when.replace('_', ' ')}: {share} % of {turn.n}{means}"

@@ -100,7 +100,7 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     from harness.report import caveats
     from harness.report.constancy import ignores_input
     from harness.report.suite import seeds_of
-    from harness.runs.summary import BASELINE
+    from harness.runs.metrics import BASELINE
     from harness.world.drivers import ALWAYS
 
     text, m = console(), done.variant

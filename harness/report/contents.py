@@ -6,8 +6,8 @@ from harness.core.files import bytes_of
 from harness.report import words
 from harness.report.library import picture
 from harness.report.runs import Runs
-from harness.runs import metrics
 from harness.runs.folder import Run
+from harness.runs.metrics import entry
 
 EXAMPLES = 3  # of each status of answers
 MOVED = 5  # decision points whose answers moved most
@@ -27,8 +27,8 @@ def summary(run: Run) -> list[dict[str, Any]]:
     """A run's summary: a metric a line, with its value in each condition."""
     return [
         {
-            "name": metrics.label(metric),
-            "meaning": metrics.meaning(metric),
+            "name": entry(metric).label,
+            "meaning": entry(metric).meaning,
             "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in run.conditions],
         }
         for metric in dict.fromkeys(s.metric for s in run.scores if s.condition != "all")
@@ -39,8 +39,7 @@ def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
     """What does not depend on the condition: a metric a line, with its value in each run."""
     names = dict.fromkeys(s.metric for run in runs.runs for s in run.scores if s.condition == "all")
     return [
-        (metrics.label(m), [(s := run.score("all", m)) and words.shown(s) for run in runs.runs])
-        for m in names
+        (entry(m).label, [(s := run.score("all", m)) and words.shown(s) for run in runs.runs]) for m in names
     ]
 
 

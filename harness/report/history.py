@@ -15,7 +15,7 @@ from harness.report.drawing import colours
 from harness.report.page import environment, save
 from harness.runs.folder import Run, read
 from harness.runs.listing import runs as listed
-from harness.runs.metrics import ALL, label
+from harness.runs.metrics import ALL, entry
 from harness.runs.records import Score
 
 WIDTH, HEIGHT = 240, 22  # of the picture of a line
@@ -121,7 +121,7 @@ def write(groups: Sequence[Group], metric: str, out: Path) -> None:
 def render(groups: Sequence[Group], metric: str, place: Place) -> str:
     """The page; `place` gives the link to a run's own."""
     return environment().get_template("history.html.j2").render(
-        groups=[(group, _picture(group)) for group in groups], metric=label(metric), place=place,
+        groups=[(group, _picture(group)) for group in groups], metric=entry(metric).label, place=place,
         palette=Markup(colours.variables()),
     )  # fmt: skip
 

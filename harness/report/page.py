@@ -16,6 +16,7 @@ from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
 from harness.core.errors import UserError, printable
+from harness.core.figures import Unit
 from harness.core.files import opened, replacing
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each
@@ -220,7 +221,8 @@ def environment(*more: Path) -> Environment:
         finalize=visible,
     )
     templates.filters |= {
-        "number": words.number, "facts": words.facts, "shown": words.shown, "p_value": words.p_value,
+        "number": lambda value, decimals: Unit(decimals=decimals).number(value),
+        "facts": words.facts, "shown": words.shown, "p_value": words.p_value,
         "latency_source": words.latency_source, "answer_times": words.answer_times, "pace": words.pace,
         "mapping": _mapping, "columns": _table, "nameless": text,
     }  # fmt: skip

@@ -16,10 +16,9 @@ from harness.report.drawing import colours
 from harness.report.page import environment, save
 from harness.report.references import in_trees
 from harness.runs.folder import Run, dataset_of
-from harness.runs.metrics import GAIN, SUCCESS, label, meaning
+from harness.runs.metrics import BASELINE, GAIN, SUCCESS, entry
 from harness.runs.records import Score
 from harness.runs.suite import SuiteRun, mean
-from harness.runs.summary import BASELINE
 
 WIDTH, STEP = 130, 9  # of the picture of a line: pixels from 0 to 100 %, and from a condition to the next
 MEAN = "mean over families"
@@ -82,7 +81,7 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
     def cells(name: str, of: Run | SuiteRun) -> dict[str, Cell]:
         found = {}
         for c in suite.conditions:
-            gain, p = of.score(c, GAIN + BASELINE), corrected.get((name, c), 1.0)
+            gain, p = of.score(c, GAIN), corrected.get((name, c), 1.0)
             better = "better" if gain and (gain.value or 0.0) > 0 else "worse"
             found[c] = Cell(of.score(c, SUCCESS), gain, better if p <= LEVEL else "")
         return found
@@ -139,14 +138,14 @@ def _figures(suite: SuiteRun) -> list[dict[str, str]]:
     """Success under each condition, and the gain of the best."""
     best, base = words.compared(suite)
     found = {f"success with {c}": suite.score(c, SUCCESS) for c in suite.conditions}
-    found[f"more with {best} than with {base}"] = suite.score(best, GAIN + base)
+    found[f"more with {best} than with {base}"] = suite.score(best, GAIN) if base == BASELINE else None
     return [{"what": what, **words.shown(score)} for what, score in found.items() if score]
 
 
 def _metrics(suite: SuiteRun) -> list[tuple[str, str, list[Score | None]]]:
     """Means over families of every metric: its name, its meaning, its value in each condition."""
     names = dict.fromkeys(s.metric for s in suite.scores if s.condition != "all")
-    return [(label(m), meaning(m), [suite.score(c, m) for c in suite.conditions]) for m in names]
+    return [(entry(m).label, entry(m).meaning, [suite.score(c, m) for c in suite.conditions]) for m in names]
 
 
 def _picture(line: Line, of_conditions: Mapping[str, str]) -> Markup:

@@ -13,32 +13,18 @@ from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate, mean_of
 from harness.runs import metrics
 from harness.runs.folder import Run
-from harness.runs.metrics import GAIN, LATENCY, SUCCESS, unit
+from harness.runs.metrics import BASELINE, GAIN, LATENCY, SUCCESS, entry
 from harness.runs.records import Latency, Manifest, Score, Times
 from harness.runs.suite import SuiteRun
 
 
-def number(value: float | None, digits: int = 2) -> str:
-    """A number with so many decimals, never -0; a dash for None."""
-    return "–" if value is None else f"{value:z.{digits}f}"
-
-
 def shown(score: Score) -> dict[str, str]:
     """Value, interval and n of a score, for a cell of the table."""
-    factor, suffix, digits = unit(score.metric)
-    value = "–" if score.value is None else number(score.value * factor, digits) + suffix
+    unit = entry(score.metric).unit
     n = f"n = {score.n} {score.interval}"
     if score.n_excluded:
         n += f", {score.n_excluded} excluded"
-    return {"value": value, "interval": interval(score), "n": n}
-
-
-def interval(score: Score) -> str:
-    """`low to high` in the metric's unit; empty where there is none."""
-    if score.low is None or score.high is None:
-        return ""
-    factor, suffix, digits = unit(score.metric)
-    return f"{number(score.low * factor, digits)} to {number(score.high * factor, digits)}{suffix}"
+    return {"value": unit.text(score.value), "interval": unit.ends(score), "n": n}
 
 
 def headline(run: Run | SuiteRun) -> str:
@@ -54,8 +40,8 @@ def headline(run: Run | SuiteRun) -> str:
         several = len(run.conditions) > 1
         return text + (", and no other condition does better." if several else ".")
     text += f"; under {base}, {_success(run, base)}"
-    gain = run.score(best, GAIN + base)
-    if gain is not None and interval(gain):
+    gain = run.score(best, GAIN) if base == BASELINE else None
+    if gain is not None and gain.low is not None:
         p = p_values(run, base)
         corrected = dict(zip(p, holm(list(p.values())), strict=True))[best]
         clear = "a clear difference" if corrected <= LEVEL else "the difference may be chance"
@@ -80,7 +66,7 @@ def figures(run: Run) -> list[dict[str, str]]:
     best, base = compared(run)
     wanted = [
         (f"success under {best}", run.score(best, SUCCESS)),
-        (f"gain over {base}", run.score(best, GAIN + base) if base else None),
+        (f"gain over {base}", run.score(best, GAIN) if base == BASELINE else None),
         (f"unsafe episodes under {best}", run.score(best, "unsafe_rate")),
         (f"latency of a decision under {best}", run.score(best, LATENCY)),
         ("ego's answers that could not be read", run.score(metrics.ALL, "failed_rate_ego")),

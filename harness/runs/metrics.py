@@ -1,13 +1,22 @@
-"""The registry of metrics: each one's meaning, and its values from decisions or episodes."""
+"""The registry of metrics: all that is known of each, and their values from decisions, episodes or answers.
 
-from collections.abc import Callable, Mapping, Sequence
+A package adds a metric by an entry point in the group `swarmdrive.metrics`.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from functools import lru_cache
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
+from msgspec import UNSET
 
 from harness.core import multiplicity
 from harness.core.arrays import Floats, Ints
+from harness.core.errors import UserError, printable
+from harness.core.figures import PERCENT, POINTS, Unit, shown
+from harness.core.plugins import Plugins
 from harness.core.statistics import (
     Estimate,
     brier,
@@ -20,14 +29,20 @@ from harness.core.statistics import (
     seed_interval,
     seed_rate_interval,
 )
+from harness.parsing.status import Repair
 from harness.runs.decisions import Decisions
-from harness.runs.records import Episode
+from harness.runs.records import Answer, AnswerFacts, Episode, Role, Score
 
 World = Literal["frozen", "closed-loop"]
-SUCCESS, LATENCY = "success_rate", "latency_proxy_ms"
-GAIN = "success_gain_over_"  # followed by the name of the other condition
+Better = Literal["higher", "lower", "neither"]
+Answers = Sequence[Answer | AnswerFacts]
+BASELINE = "single-local"  # the condition without V2V
+SUCCESS, LATENCY, GAIN = "success_rate", "latency_proxy_ms", f"success_gain_over_{BASELINE}"
 PERCENTILES = (50, 95, 99)
 ALL = "all"  # the condition of a figure that is the same in all of them
+ROLES: tuple[Role, ...] = get_args(Role)
+MS, SECONDS, METRES, JOULES, NATS = Unit("ms"), Unit("s", 2), Unit("m"), Unit("J", 2), Unit("nats", 3)
+COUNT, MEAN_COUNT, SCORE = Unit(decimals=1), Unit(decimals=2), Unit(decimals=3)
 
 
 class Columns(Protocol):
@@ -38,14 +53,22 @@ class Columns(Protocol):
 
 @dataclass(frozen=True)
 class Metric:
-    """One metric.
+    """One metric, 0 or more. It has one function, or is computed where the summary is.
 
     Attributes:
         name: its name in tables, with the unit at the end.
         meaning: its meaning, in words for people.
-        decisions: returns its values for decisions (n,), whose mean is the episode's; None for a metric of
-            episodes.
-        episodes: returns an episode's value; None for a metric of decisions.
+        unit: how it is written.
+        better: which change is better.
+        interval: `rate` for a share of events, whose interval is Wilson's; `mean` for Student's t.
+        most: the greatest value that it can have.
+        primary: whether the p of its differences is corrected (decision 0084); all others are exploratory.
+        label: its name for people; by default the name with spaces.
+        decisions: returns its values for decisions (n,), whose mean is the episode's.
+        episodes: returns an episode's value; None where unknown.
+        answers: returns its values for the answers (n,) of one role; NaN where unknown.
+        role: whose answers.
+        percentile: the percent of all decisions whose latency is at most so long.
         total: whether an episode has the sum over its decisions instead of the mean.
         world: the world in which it is known; None for every world.
         optional: whether a run in which it is nowhere known has no row of it.
@@ -53,15 +76,55 @@ class Metric:
 
     name: str
     meaning: str
+    unit: Unit
+    better: Better
+    interval: Literal["rate", "mean"] = "mean"
+    most: float = math.inf
+    primary: bool = False
+    label: str = ""
     decisions: Callable[[Any], Floats] | None = None
     episodes: Callable[[Episode], Any] | None = None
+    answers: Callable[[Answers], Floats] | None = None
+    role: Role | None = None
+    percentile: int | None = None
     total: bool = False
     world: World | None = None
     optional: bool = False
 
+    def __post_init__(self) -> None:
+        if not self.label:
+            object.__setattr__(self, "label", self.name.replace("_", " "))
 
-def _rate(name: str, meaning: str, happened: Callable[[Episode], bool]) -> Metric:
-    return Metric(name, meaning, episodes=happened)
+    @property
+    def compared(self) -> bool:
+        """Whether two runs are compared in it, as in any that is known of an episode or of all decisions."""
+        return bool(self.decisions or self.episodes or self.percentile)
+
+
+class Metrics(Plugins[Metric]):
+    """Metrics by name."""
+
+    def _load(self, name: str) -> Metric:
+        metric = super()._load(name)
+        functions = [each for each in (metric.decisions, metric.episodes) if each]
+        if metric.name != name or not name.isidentifier() or len(functions) != 1:
+            raise UserError(
+                f"plug-in {printable(name)!r} ({self.group}) is the metric {printable(metric.name)!r} with "
+                f"{len(functions)} functions; give it the name of its entry point, of letters, digits and _, "
+                "and one function, of decisions or of episodes"
+            )
+        return metric
+
+
+def _rate(
+    name: str, meaning: str, happened: Callable[[Episode], bool], better: Better = "lower", **more: Any
+) -> Metric:
+    return Metric(name, meaning, PERCENT, better, "rate", 1.0, episodes=happened, **more)
+
+
+def _share(name: str, meaning: str, column: str, better: Better = "lower", **more: Any) -> Metric:
+    """Build the metric of a share of decisions, one column of their table."""
+    return Metric(name, meaning, PERCENT, better, "rate", 1.0, decisions=_column(column), **more)
 
 
 def _fails(*failures: str) -> Callable[[Episode], bool]:
@@ -76,108 +139,185 @@ def _column(name: str) -> Callable[[Columns], Floats]:
     return lambda d: d[name]
 
 
-METRICS = {
-    metric.name: metric
-    for metric in (
-        _rate(SUCCESS, "share of episodes in which the ego clears the intersection within the allowed time",
-              _field("success")),
-        _rate("unsafe_rate", "share of episodes that end in a collision, by time-out or off the road",
-              lambda e: not e.success and e.failure != "late"),
-        _rate("collision_rate", "share of episodes that end in a collision", _fails("collision")),
-        _rate("at_fault_rate", "share of episodes that end in a collision in which the ego had to give way",
-              lambda e: e.fault == "ego"),
-        _rate("late_rate", "share of episodes that the ego clears, but too long after the full-view driver",
-              _fails("late")),
-        _rate("time_out_rate", "share of episodes in which time runs out before the ego clears the "
-              "intersection",
-              _fails("time_out")),
-        _rate("off_road_rate", "share of episodes in which the ego leaves the road", _fails("off_road")),
-        Metric("regret_rate", "share of decisions that gave success away, of those in which it was still "
-               "possible",
-               _column("regret"), world="frozen"),
-        Metric("delay_s", "time that a safe decision adds to the earliest possible success",
-               _column("delay_s"), world="frozen"),
-        Metric("off_lag_rate", "share of decisions so fast or slow that they would act in another frame "
-               "than the dataset assumes",
-               _column("off_lag"), world="frozen"),
-        Metric("time_to_clear_s", "time until the ego has cleared the intersection; only episodes in which "
-               "it does, late or not",
-               episodes=lambda e: e.time_s if e.failure in ("", "late") else None),
-        Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision",
-               episodes=_field("least_gap_m")),
-        Metric("hard_brakings_per_episode", "number of times that the ego begins to brake harder than 4 m/s²",
-               episodes=_field("hard_brakings")),
-        Metric("other_crashes_per_episode", "number of vehicles that crash without the ego",
-               episodes=_field("other_crashes")),
-        Metric("decisions_per_episode", "number of decisions begun", episodes=_field("decisions")),
-        Metric("skipped_per_episode", "number of decisions not begun because the one before was still open",
-               episodes=_field("skipped"), world="closed-loop"),
-        Metric("never_acted_per_episode", "number of decisions that were not ready when the episode ended",
-               episodes=_field("never_acted"), world="closed-loop"),
-        Metric("messages_per_episode", "number of scheduled replies; requests do not count",
-               _column("messages"),
-               total=True),
-        Metric("requests_per_episode", "number of broadcast requests; one request asks several helpers",
-               _column("requests"), total=True),
-        Metric("bits_per_episode", "bits of all requests and scheduled replies",
-               lambda d: d["request_bits"] + d["reply_bits"], total=True),
-        Metric("airtime_ms", "total time on air of an episode's requests and scheduled replies",
-               _column("airtime_ms"), total=True),
-        Metric("busy_ratio", "share of the time that the radio's channel is busy with background traffic",
-               _column("busy_ratio"), optional=True),
-        Metric("energy_j", "energy of a decision: inference of the ego, of the helpers that infer and of a "
-               "fusion call, and their radios; known only with a device profile",
-               lambda d: d["inference_j"] + d["radio_mj"] / 1000, optional=True),
-        Metric("helpers_j", "energy of a decision: the part of the helpers' inference", _column("helpers_j"),
-               optional=True),
-        Metric("radio_mj", "energy of a decision: the part of the radios",
-               _column("radio_mj"), optional=True),
-        Metric("waiting_j", "energy that the ego's computer draws while it waits for messages; not part of "
-               "energy_j",
-               _column("waiting_j"), optional=True),
-        Metric(LATENCY, "time from the start of a decision to the end of the exchange and of fusion, with "
-               "all inference", _column("latency_ms")),
-        Metric("deadline_miss_rate", "share of decisions that took longer than the decision window",
-               _column("deadline_missed")),
-        Metric("trigger_rate", "share of decisions in which the ego asked helpers", _column("triggered")),
-        Metric("effective_loss", "packet loss: probability that one transmission was lost",
-               _column("effective_loss")),
-        Metric("observed_reply_loss", "share of scheduled replies that did not arrive; the request or the "
-               "reply was lost", _column("observed_loss")),
-        Metric("entropy_nats", "entropy of the ego's own intent", _column("entropy_nats")),
-        Metric("normalised_entropy", "entropy of the ego's own intent from 0 (sure) to 1 (undecided)",
-               _column("normalised_entropy")),
-        Metric("brier", "Brier score of the fused policy against the safe actions; 0 best, 2 worst",
-               lambda d: brier(d.of_actions("fused"), safe_target(d.of_actions("safe") == 1.0)),
-               world="frozen"),
-        Metric("negative_log_likelihood", "negative log-likelihood of the safe actions in the fused policy; "
-               "0 best",
-               lambda d: negative_log_likelihood(d.of_actions("fused"), d.of_actions("safe") == 1.0),
-               world="frozen"),
-        Metric("fallback_rate", "share of decisions in which the ego's own answer could not be read",
-               _column("own_failed")),
-        Metric("fusion_ms", "part of the latency that fusion takes: 0 for a rule, which is arithmetic; "
-               "ego-prompt calls the model again", _column("fusion_ms")),
-        Metric("merge_failed_rate", "share of answers to fusion calls that could not be read; the ego then "
-               "kept its own intent", _column("fusion_failed")),
-    )
-}  # fmt: skip
-# Meanings of the figures in a summary that are not metrics.
-DERIVED = {
-    "message_count": "number of scheduled replies in the whole run; requests do not count",
-    **{f"latency_p{p}_ms": f"{p} % of all decisions are at most this slow" for p in PERCENTILES},
-}
+def _stated(name: str) -> Callable[[Answers], Floats]:
+    """Build the function of one field of answers, NaN where it is not stated."""
+
+    def values(answers: Answers) -> Floats:
+        stated = [getattr(answer, name) for answer in answers]
+        return np.array([np.nan if v is None or v is UNSET else v for v in stated], dtype=float)
+
+    return values
+
+
+def _verdict(verdict: str) -> Callable[[Answers], Floats]:
+    return lambda answers: np.array([answer.verdict == verdict for answer in answers], dtype=float)
+
+
+def _divided(answers: Answers) -> Floats:
+    divided = np.array([Repair.DIVIDED in answer.repairs for answer in answers], dtype=float)
+    return divided if divided.any() else np.full(len(answers), np.nan)
+
+
+def _valid(turns: int) -> Callable[[Answers], Floats]:
+    """Build the function of the answers that are valid after so many turns, where any needed two."""
+
+    def values(answers: Answers) -> Floats:
+        if all(answer.turns == 1 for answer in answers):
+            return np.full(len(answers), np.nan)
+        return np.array([a.verdict != "failed" and a.turns <= turns for a in answers], dtype=float)
+
+    return values
+
+
+def _of_answers() -> Iterator[Metric]:
+    """Yield the metrics of each role's answers, in the order of a summary's rows."""
+    rates: tuple[tuple[tuple[str, str, Better, Callable[[Answers], Floats]], ...], ...] = (
+        (
+            ("strict_rate", "share of answers that fit the schema as they are", "higher", _verdict("strict")),
+            ("recovered_rate", "share of answers that were read after repairs", "neither",
+             _verdict("recovered")),
+            ("failed_rate", "share of answers that could not be read", "lower", _verdict("failed")),
+            ("divided_rate", "share of answers whose numbers were divided by their sum", "lower", _divided),
+            ("flip_rate", "share of read-outs whose likeliest action changes with the order of the list",
+             "lower", _stated("flipped")),
+        ),
+        (
+            ("valid_at_first_rate", "share of answers that could be read without a repair turn", "higher",
+             _valid(1)),
+            ("valid_after_repair_rate", "share of answers that could be read after the repair turn", "higher",
+             _valid(2)),
+        ),
+    )  # fmt: skip
+    for group in rates:
+        for role in ROLES:
+            for name, meaning, better, values in group:
+                yield Metric(
+                    f"{name}_{role}", meaning, PERCENT, better, "rate", 1.0, answers=values, role=role
+                )
+    lengths: tuple[tuple[str, str, Unit, Better, float], ...] = (
+        ("prompt_tokens", "tokens of a prompt", COUNT, "lower", math.inf),
+        ("completion_tokens", "tokens of an answer", COUNT, "lower", math.inf),
+        ("label_mass", "probability of the letters together, in a read-out", SCORE, "higher", 1.0),
+        ("letter_share", "part of a read-out that follows the letter and not the action", SCORE, "lower",
+         1.0),
+        ("follows_letter", "share of read-outs in which one letter is the likeliest in every order", SCORE,
+         "lower", 1.0),
+    )  # fmt: skip
+    for role in ROLES:
+        for name, meaning, unit, better, most in lengths:
+            values = _stated(name)
+            yield Metric(f"{name}_{role}", meaning, unit, better, most=most, answers=values, role=role)
+
+
+BUILT_IN = (
+    _rate(SUCCESS, "share of episodes in which the ego clears the intersection within the allowed time",
+          _field("success"), "higher", primary=True),
+    _rate("unsafe_rate", "share of episodes that end in a collision, by time-out or off the road",
+          lambda e: not e.success and e.failure != "late", primary=True),
+    _rate("collision_rate", "share of episodes that end in a collision", _fails("collision")),
+    _rate("at_fault_rate", "share of episodes that end in a collision in which the ego had to give way",
+          lambda e: e.fault == "ego"),
+    _rate("late_rate", "share of episodes that the ego clears, but too long after the full-view driver",
+          _fails("late")),
+    _rate("time_out_rate", "share of episodes in which time runs out before the ego clears the intersection",
+          _fails("time_out")),
+    _rate("off_road_rate", "share of episodes in which the ego leaves the road", _fails("off_road")),
+    _share("regret_rate", "share of decisions that gave success away, of those in which it was still "
+           "possible", "regret", world="frozen"),
+    Metric("delay_s", "time that a safe decision adds to the earliest possible success", SECONDS, "lower",
+           label="delay", decisions=_column("delay_s"), world="frozen"),
+    _share("off_lag_rate", "share of decisions so fast or slow that they would act in another frame than the "
+           "dataset assumes", "off_lag", "neither", world="frozen"),
+    Metric("time_to_clear_s", "time until the ego has cleared the intersection; only episodes in which it "
+           "does, late or not", SECONDS, "lower", label="time to clear",
+           episodes=lambda e: e.time_s if e.failure in ("", "late") else None),
+    Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision", METRES,
+           "higher", label="least gap", episodes=_field("least_gap_m")),
+    Metric("hard_brakings_per_episode", "number of times that the ego begins to brake harder than 4 m/s²",
+           MEAN_COUNT, "lower", episodes=_field("hard_brakings")),
+    Metric("other_crashes_per_episode", "number of vehicles that crash without the ego", MEAN_COUNT, "lower",
+           episodes=_field("other_crashes")),
+    Metric("decisions_per_episode", "number of decisions begun", MEAN_COUNT, "neither",
+           episodes=_field("decisions")),
+    Metric("skipped_per_episode", "number of decisions not begun because the one before was still open",
+           MEAN_COUNT, "lower", episodes=_field("skipped"), world="closed-loop"),
+    Metric("never_acted_per_episode", "number of decisions that were not ready when the episode ended",
+           MEAN_COUNT, "lower", episodes=_field("never_acted"), world="closed-loop"),
+    Metric("messages_per_episode", "number of scheduled replies; requests do not count", COUNT, "lower",
+           decisions=_column("messages"), total=True),
+    Metric("requests_per_episode", "number of broadcast requests; one request asks several helpers", COUNT,
+           "lower", decisions=_column("requests"), total=True),
+    Metric("bits_per_episode", "bits of all requests and scheduled replies", Unit("bit", 0), "lower",
+           decisions=lambda d: d["request_bits"] + d["reply_bits"], total=True),
+    Metric("airtime_ms", "total time on air of an episode's requests and scheduled replies", MS, "lower",
+           label="airtime", decisions=_column("airtime_ms"), total=True),
+    Metric("busy_ratio", "share of the time that the radio's channel is busy with background traffic",
+           PERCENT, "lower", most=1.0, decisions=_column("busy_ratio"), optional=True),
+    Metric("energy_j", "energy of a decision: inference of the ego, of the helpers that infer and of a "
+           "fusion call, and their radios; known only with a device profile", JOULES, "lower", label="energy",
+           decisions=lambda d: d["inference_j"] + d["radio_mj"] / 1000, optional=True),
+    Metric("helpers_j", "energy of a decision: the part of the helpers' inference", JOULES, "lower",
+           label="helpers", decisions=_column("helpers_j"), optional=True),
+    Metric("radio_mj", "energy of a decision: the part of the radios", Unit("mJ", 3), "lower", label="radio",
+           decisions=_column("radio_mj"), optional=True),
+    Metric("waiting_j", "energy that the ego's computer draws while it waits for messages; not part of "
+           "energy_j", JOULES, "lower", label="waiting", decisions=_column("waiting_j"), optional=True),
+    Metric(LATENCY, "time from the start of a decision to the end of the exchange and of fusion, with all "
+           "inference", MS, "lower", primary=True, label="latency proxy", decisions=_column("latency_ms")),
+    _share("deadline_miss_rate", "share of decisions that took longer than the decision window",
+           "deadline_missed"),
+    _share("trigger_rate", "share of decisions in which the ego asked helpers", "triggered", "neither"),
+    # A computed probability and no share of events, so that its interval is a mean's.
+    Metric("effective_loss", "packet loss: probability that one transmission was lost", PERCENT, "neither",
+           most=1.0, decisions=_column("effective_loss")),
+    _share("observed_reply_loss", "share of scheduled replies that did not arrive; the request or the reply "
+           "was lost", "observed_loss"),
+    Metric("entropy_nats", "entropy of the ego's own intent", NATS, "neither", label="entropy",
+           decisions=_column("entropy_nats")),
+    Metric("normalised_entropy", "entropy of the ego's own intent from 0 (sure) to 1 (undecided)", SCORE,
+           "neither", decisions=_column("normalised_entropy")),
+    Metric("brier", "Brier score of the fused policy against the safe actions; 0 best, 2 worst", SCORE,
+           "lower", world="frozen",
+           decisions=lambda d: brier(d.of_actions("fused"), safe_target(d.of_actions("safe") == 1.0))),
+    Metric("negative_log_likelihood", "negative log-likelihood of the safe actions in the fused policy; "
+           "0 best", SCORE, "lower", world="frozen",
+           decisions=lambda d: negative_log_likelihood(d.of_actions("fused"), d.of_actions("safe") == 1.0)),
+    _share("fallback_rate", "share of decisions in which the ego's own answer could not be read",
+           "own_failed"),
+    Metric("fusion_ms", "part of the latency that fusion takes: 0 for a rule, which is arithmetic; "
+           "ego-prompt calls the model again", MS, "lower", label="fusion", decisions=_column("fusion_ms")),
+    _share("merge_failed_rate", "share of answers to fusion calls that could not be read; the ego then kept "
+           "its own intent", "fusion_failed"),
+    Metric("message_count", "number of scheduled replies in the whole run; requests do not count", COUNT,
+           "lower"),
+    *(Metric(f"latency_p{p}_ms", f"{p} % of all decisions are at most this slow", MS, "lower",
+             label=f"latency p{p}", percentile=p) for p in PERCENTILES),
+    Metric(GAIN, "success rate less that of the condition without V2V, in the same episodes", POINTS,
+           "higher", "rate", 1.0),
+    *_of_answers(),
+    Metric("agreement_rate", "share of episodes that end alike, frozen and in closed loop", PERCENT,
+           "higher", "rate", 1.0),
+)  # fmt: skip
+METRICS = Metrics("swarmdrive.metrics", Metric, {metric.name: metric for metric in BUILT_IN})
 
 
 def metrics_of(world: World) -> tuple[Metric, ...]:
-    """Return the metrics that are known in a world."""
-    return tuple(metric for metric in METRICS.values() if metric.world in (None, world))
+    """Return the metrics of decisions and of episodes that are known in a world.
+
+    Raises:
+        UserError: a package's metric does not work.
+    """
+    own = (metric for metric in METRICS.values() if metric.decisions or metric.episodes)
+    return tuple(metric for metric in own if metric.world in (None, world))
 
 
-def meaning(name: str) -> str:
-    """Return the meaning of a figure; empty if its name needs no explanation."""
-    metric = METRICS.get(name)
-    return metric.meaning if metric else DERIVED.get(name, "")
+@lru_cache(1024)
+def entry(name: str) -> Metric:
+    """Return a metric; of a name that is not registered, as an older run may have it, a plain one."""
+    try:
+        return METRICS[name]
+    except (KeyError, UserError):
+        return Metric(name, "", SCORE, "neither")
 
 
 @dataclass(frozen=True)
@@ -264,7 +404,7 @@ def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
 
 def over_seeds(name: str, values: Floats) -> Estimate:
     """Return the interval over seeds of a metric's values (S, E), for these episodes."""
-    if is_rate(name):
+    if entry(name).interval == "rate":
         return in_range(name, seed_rate_interval(values))
     return in_range(name, seed_interval(known_mean(values, axis=1)))
 
@@ -272,12 +412,14 @@ def over_seeds(name: str, values: Floats) -> Estimate:
 def over_episodes(name: str, values: Floats) -> Estimate:
     """Return the interval over episodes of a metric's values (S, E)."""
     means = known_mean(values, axis=0)
-    return rate_interval(means) if is_rate(name) else in_range(name, episode_interval(means))
+    rate = entry(name).interval == "rate"
+    return rate_interval(means) if rate else in_range(name, episode_interval(means))
 
 
 def difference(name: str, a: Floats, b: Floats, level: float = 0.95) -> Estimate:
     """Return the interval over episodes of the difference a - b of a metric, both (E, S)."""
-    return rate_difference(a, b, level) if is_rate(name) else episode_interval(a - b, level=level)
+    rate = entry(name).interval == "rate"
+    return rate_difference(a, b, level) if rate else episode_interval(a - b, level=level)
 
 
 def p_value(name: str, a: Floats, b: Floats) -> float | None:
@@ -285,18 +427,9 @@ def p_value(name: str, a: Floats, b: Floats) -> float | None:
     return multiplicity.p_value(lambda level: difference(name, a, b, level))
 
 
-def is_rate(name: str) -> bool:
-    """Whether a metric is a share of events; `effective_loss` is not, it is a computed probability."""
-    return name.endswith(("_rate", "_reply_loss"))
-
-
 def in_range(name: str, e: Estimate) -> Estimate:
-    """Cut an interval to the range of its metric: 0 or more, and at most 1 for a share.
-
-    Student's t may go beyond.
-    """
-    greatest = 1.0 if name.endswith(("_rate", "_ratio", "_loss", "_mass", "_share", "_letter")) else np.inf
-    low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, greatest))
+    """Cut an interval to the range of its metric, beyond which Student's t may go."""
+    low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, entry(name).most))
     return Estimate(e.value, low, high, e.n, e.n_excluded)
 
 
@@ -306,27 +439,9 @@ def percentiles(latency_ms: Floats) -> Floats:
     return np.percentile(measured, PERCENTILES) if len(measured) else np.full(len(PERCENTILES), np.nan)
 
 
-def unit(name: str) -> tuple[float, str, int]:
-    """Return how to show a metric: the factor on its value, its unit, and the number of decimals."""
-    if "_gain_" in name:
-        return 100.0, " points", 1
-    if "_rate" in name or name.endswith(("_ratio", "_loss")):
-        return 100.0, " %", 1
-    endings: Mapping[str, tuple[str, int]] = {
-        "_ms": (" ms", 1), "_mj": (" mJ", 3), "_j": (" J", 2), "_nats": (" nats", 3), "_s": (" s", 2),
-        "_m": (" m", 1), "bits_per_episode": (" bit", 0), "_per_episode": ("", 2),
-    }  # fmt: skip
-    for ending, (suffix, digits) in endings.items():
-        if name.endswith(ending):
-            return 1.0, suffix, digits
-    return 1.0, "", 1 if "message" in name or "tokens" in name else 3
-
-
-def label(name: str) -> str:
-    """Return a metric's name in words, without the unit, which is shown with the value."""
-    for suffix in ("_ms", "_mj", "_j", "_nats", "_s", "_m"):
-        name = name.removesuffix(suffix)
-    return name.replace("_", " ")
+def written(score: Score) -> str:
+    """Write a score and its interval as its metric is written, without the unit."""
+    return shown(score, entry(score.metric).unit)
 
 
 def _position(values: Ints, names: Sequence[int]) -> Ints:

@@ -6,7 +6,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from msgspec import UNSET, structs
+from msgspec import structs
 
 from harness.core.arrays import Floats
 from harness.core.statistics import (
@@ -16,18 +16,20 @@ from harness.core.statistics import (
     seed_interval,
     seed_rate_interval,
 )
-from harness.parsing.status import Repair
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import (
     ALL,
+    BASELINE,
     GAIN,
     LATENCY,
     METRICS,
     PERCENTILES,
+    ROLES,
     SUCCESS,
     Grid,
     World,
     by_episode,
+    entry,
     in_range,
     mean_by_place,
     metrics_of,
@@ -36,10 +38,7 @@ from harness.runs.metrics import (
     percentiles,
     sum_by_place,
 )
-from harness.runs.records import Answer, AnswerFacts, Episode, Role, Score
-
-BASELINE = "single-local"
-ROLES: tuple[Role, ...] = ("ego", "helper", "merge", "blind")
+from harness.runs.records import Answer, AnswerFacts, Episode, Score
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class Figures:
         """Return every score."""
         values = {
             name: v for name, v in self.values.items()
-            if not (METRICS[name].optional and np.isnan(v).all())
+            if not (entry(name).optional and np.isnan(v).all())
         }  # fmt: skip
         return [
             *of_conditions(self.grid.conditions, values),
@@ -114,59 +113,41 @@ def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
 
     `latency_ms` has the decisions' latencies for each condition and seed, in the order of the grid.
     """
+    names = {m.percentile: m.name for m in METRICS.values() if m.percentile}
     all_percentiles = np.array([percentiles(latencies) for latencies in latency_ms])
     for index, condition in enumerate(grid.conditions):
         own = all_percentiles[index * len(grid.seeds) : (index + 1) * len(grid.seeds)]
         for percent, values in zip(PERCENTILES, own.T, strict=True):
-            estimate = in_range(LATENCY, seed_interval(values))
-            yield Score.of(condition, f"latency_p{percent}_ms", estimate, "seed means")
+            yield Score.of(condition, names[percent], in_range(LATENCY, seed_interval(values)), "seed means")
 
 
 def _gains(conditions: Sequence[str], success: Floats) -> Iterator[Score]:
     """Yield each condition's gain over `BASELINE`, from success (C, S, E)."""
     if BASELINE in conditions:
-        for index, condition in enumerate(conditions):
+        baseline = success[conditions.index(BASELINE)]
+        for condition, own in zip(conditions, success, strict=True):
             if condition != BASELINE:
-                own, baseline, name = success[index], success[conditions.index(BASELINE)], GAIN + BASELINE
-                yield Score.of(condition, name, seed_rate_interval(own - baseline), "seed means")
-                yield Score.of(condition, name, rate_difference(own.T, baseline.T), "episodes")
+                yield Score.of(condition, GAIN, seed_rate_interval(own - baseline), "seed means")
+                yield Score.of(condition, GAIN, rate_difference(own.T, baseline.T), "episodes")
 
 
 def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator[Score]:
-    """Yield by role how answers were parsed, and how long they and their prompts are.
+    """Yield each metric of a role's answers.
 
     Intervals are over episodes, since the answers of one episode are not independent.
     """
-    of_roles = {role: [(a, episode) for a, episode in answers if a.role == role] for role in ROLES}
-    by_role = {role: tuple(zip(*of_role, strict=True)) for role, of_role in of_roles.items() if of_role}
-    for role, (role_answers, episodes) in by_role.items():
-        for verdict in ("strict", "recovered", "failed"):
-            hits = np.array([float(answer.verdict == verdict) for answer in role_answers])
-            yield Score.of(ALL, f"{verdict}_rate_{role}", rate_interval(hits, np.array(episodes)), "answers")
-        if any(divided := [Repair.DIVIDED in answer.repairs for answer in role_answers]):
-            hits = np.array(divided, dtype=float)
-            yield Score.of(ALL, f"divided_rate_{role}", rate_interval(hits, np.array(episodes)), "answers")
-        flipped = np.array([np.nan if a.flipped is UNSET else float(a.flipped) for a in role_answers])
-        if not np.isnan(flipped).all():
-            yield Score.of(ALL, f"flip_rate_{role}", rate_interval(flipped, np.array(episodes)), "answers")
-    for role, (role_answers, episodes) in by_role.items():
-        if any(answer.turns > 1 for answer in role_answers):
-            after = np.array([answer.verdict != "failed" for answer in role_answers])
-            before = after & np.array([answer.turns == 1 for answer in role_answers])
-            for when, hits in (("at_first", before), ("after_repair", after)):
-                estimate = rate_interval(hits.astype(float), np.array(episodes))
-                yield Score.of(ALL, f"valid_{when}_rate_{role}", estimate, "answers")
-    for role, (role_answers, episodes) in by_role.items():
-        for what in ("prompt_tokens", "completion_tokens", "label_mass", "letter_share", "follows_letter"):
-            counts = [
-                (value, episode)
-                for answer, episode in zip(role_answers, episodes, strict=True)
-                if (value := getattr(answer, what)) is not None and value is not UNSET
-            ]
-            if counts:
-                values, episode = np.array(counts, dtype=float).T
-                estimate = in_range(what, episode_interval(values, episode.astype(int)))
-                yield Score.of(ALL, f"{what}_{role}", estimate, "answers")
+    pairs = {role: [(a, episode) for a, episode in answers if a.role == role] for role in ROLES}
+    by_role = {role: tuple(zip(*pairs[role], strict=True)) for role in ROLES if pairs[role]}
+    for metric in METRICS.values():
+        if metric.answers and metric.role in by_role:
+            role_answers, numbers = by_role[metric.role]
+            values, episodes = metric.answers(role_answers), np.array(numbers)
+            if (known := ~np.isnan(values)).any():
+                if metric.interval == "rate":
+                    estimate = rate_interval(values, episodes)
+                else:
+                    estimate = in_range(metric.name, episode_interval(values[known], episodes[known]))
+                yield Score.of(ALL, metric.name, estimate, "answers")
 
 
 def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> list[Episode]:

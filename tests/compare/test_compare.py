@@ -19,7 +19,6 @@ from harness.core.paired import SuccessTest
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
-from harness.report.compare.gate import NAMES
 from harness.report.compare.pair import pair
 from harness.runs.metrics import METRICS
 from harness.world.scenarios.occluded_intersection import SCENARIO
@@ -27,6 +26,7 @@ from harness.world.scenarios.occluded_intersection import SCENARIO
 Said = tuple[int, str, str]
 SOME = {"time_to_clear_s", "regret_rate", "delay_s"}  # which not every episode has
 OPTIONAL = {name for name, metric in METRICS.items() if metric.optional}
+NAMES = {name for name, metric in METRICS.items() if metric.compared}
 LIVE = {name for name, metric in METRICS.items() if metric.world == "closed-loop"}
 
 

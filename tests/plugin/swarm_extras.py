@@ -15,8 +15,10 @@ from harness.coordination.consensus import Fused, Messages, linear_pool
 from harness.coordination.intents import Intents
 from harness.coordination.scheduling import Formula, Known
 from harness.core.arrays import Floats
+from harness.core.figures import PERCENT
 from harness.radio.channel import Broadcast, Delivery, Draws, Links
 from harness.radio.constant import link_up
+from harness.runs.metrics import Metric
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,10 @@ SMOOTHING = Smoothing()
 FOG = Fog()
 MUMBLE = Mumble()
 NEAR = Formula(near, 0.5)
+SURE = Metric(
+    "sure_rate", "share of decisions whose own intent is nearly certain", PERCENT, "neither", "rate", 1.0,
+    decisions=lambda d: (d["normalised_entropy"] < 0.5).astype(float),
+)  # fmt: skip
 CAUTIOUS = Registration(
     "swarm_extras:opened",
     Capabilities(language_model=False, answer_modes=("json",), thinks="never", renders=False),

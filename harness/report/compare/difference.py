@@ -15,7 +15,7 @@ from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.flips import LOST_BY, DecisionFlip, flips
 from harness.report.compare.pair import Pair
 from harness.runs import percentiles
-from harness.runs.metrics import SUCCESS, difference, metrics_of, p_value
+from harness.runs.metrics import METRICS, SUCCESS, difference, metrics_of, p_value
 from harness.runs.sources import prompt_of
 
 
@@ -192,9 +192,10 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
         _difference(metric.name, *(pair.values(side, metric.name, condition) for side in (pair.a, pair.b)))
         for metric in metrics_of(pair.a.run.world)
     ]
+    names = {metric.percentile: metric.name for metric in METRICS.values()}
     differences += [
         Difference(
-            f"latency_p{percent}_ms", before, after, change,
+            names[percent], before, after, change,
             p_of_bootstrap(change.value, change.low, change.high),
         )
         for percent, before, after, change in percentiles.differences(

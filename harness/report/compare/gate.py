@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 from harness.core.errors import UserError, printable, unknown
 from harness.report.compare.difference import Comparison
-from harness.runs.metrics import METRICS, PERCENTILES
+from harness.runs.metrics import METRICS
 
-NAMES = (*METRICS, *(f"latency_p{percent}_ms" for percent in PERCENTILES))
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
 }  # fmt: skip
@@ -51,14 +50,14 @@ class Verdict:
 
 
 def gate(
-    text: str, names: Sequence[str] = NAMES, place: str = "CONDITION",
+    text: str, names: Sequence[str] = (), place: str = "CONDITION",
     example: str = "6g:success_rate < -0.01",
 ) -> Gate:  # fmt: skip
     """A gate from `success_rate < -0.01`, `6g:success_rate < -0.01` or `success_rate.high < 0`.
 
     Args:
         text: as it was typed.
-        names: the metrics there are.
+        names: the metrics there are; without any, those that runs are compared in.
         place: what stands before the colon, and
         example: of a gate, both for the error.
 
@@ -75,6 +74,7 @@ def gate(
             f"--fail-if {printable(text)!r} cannot be read; give [{place}:]METRIC[.low|.high] OP NUMBER "
             f"with OP one of {' '.join(OPERATORS)}, such as {example!r}"
         )
+    names = names or [name for name, m in METRICS.items() if m.compared]
     if match["metric"] not in names:
         raise unknown("metric of --fail-if", match["metric"], names)
     if match["end"] not in (None, *ENDS):

@@ -18,7 +18,7 @@ from harness.report.compare.pair import Side
 from harness.report.drawing import colours
 from harness.report.page import environment
 from harness.runs.folder import Run
-from harness.runs.metrics import is_rate
+from harness.runs.metrics import entry
 
 TEMPLATES = Path(__file__).parent / "templates"
 WIDTH, HEIGHT = 240, 22  # of one line of the forest plot
@@ -88,7 +88,7 @@ def _forest(comparison: Comparison) -> Callable[[Difference], Markup]:
     """Draws a line of the forest plot: rates on one scale, any other metric on its own in all conditions."""
 
     def scale(metric: str) -> str:
-        return "rate" if is_rate(metric) else metric
+        return "rate" if entry(metric).interval == "rate" else metric
 
     reach: dict[str, float] = {}
     for d in (d for c in comparison.conditions for d in c.differences):

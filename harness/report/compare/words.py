@@ -14,14 +14,8 @@ from harness.report.compare.flips import LOST_BY, DecisionFlip
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.words import p_value, pace
-from harness.runs.metrics import SUCCESS, unit
+from harness.runs.metrics import SUCCESS, entry
 
-# Of all other metrics less is better.
-MORE_IS_BETTER = {"success_rate", "least_gap_m"}
-NEITHER = {
-    "off_lag_rate", "decisions_per_episode", "trigger_rate", "effective_loss", "entropy_nats",
-    "normalised_entropy",
-}  # fmt: skip
 BETTER, WORSE = "better", "worse"
 SIGNS = {BETTER: "✓", WORSE: "✗", "": ""}
 HUNKS = 3  # changes of a prompt's text that are shown beside the numbers
@@ -54,35 +48,23 @@ class Line:
 
 def line(d: Difference) -> Line:
     """A difference as text; shares in percent."""
-    factor, suffix, digits = unit(d.metric)
-
-    def figures(value: float, sign: str = "") -> str:
-        """Four figures at most."""
-        if value != value:
-            return "–"
-        least = 3 - math.floor(math.log10(max(abs(value * factor), 1e-9)))
-        places = min(digits, least)
-        return f"{round(value * factor, places):{sign}z.{max(places, 0)}f}"
-
-    def signed(value: float) -> str:
-        return figures(value, "+")
-
-    e = d.change
+    unit, e = entry(d.metric).unit, d.change
+    interval = "–" if math.isnan(e.low) else f"[{', '.join(unit.number(x, '+', 4) for x in (e.low, e.high))}]"
     return Line(
-        verdict(d), f"{d.metric}{' %' if suffix == ' %' else ''}", figures(d.a), figures(d.b),
-        signed(e.value), "–" if e.low != e.low else f"[{signed(e.low)}, {signed(e.high)}]",
+        verdict(d), f"{d.metric}{' %' if unit.name == '%' else ''}",
+        unit.number(d.a, digits=4), unit.number(d.b, digits=4), unit.number(e.value, "+", 4), interval,
         "–" if d.p_corrected is None else p_value(d.p_corrected).removeprefix("= "),
     )  # fmt: skip
 
 
 def verdict(d: Difference) -> str:
     """`better` or `worse` where the difference is beyond chance and large enough to be shown; else empty."""
-    factor, _, digits = unit(d.metric)
-    if d.p_corrected is None or d.p_corrected > LEVEL or d.metric in NEITHER:
+    metric = entry(d.metric)
+    if d.p_corrected is None or d.p_corrected > LEVEL or metric.better == "neither":
         return ""
-    if round(d.change.value * factor, digits) == 0:
+    if round(d.change.value * metric.unit.factor, metric.unit.decimals) == 0:
         return ""
-    return BETTER if (d.change.value > 0) == (d.metric in MORE_IS_BETTER) else WORSE
+    return BETTER if (d.change.value > 0) == (metric.better == "higher") else WORSE
 
 
 def findings(comparison: Comparison) -> list[tuple[str, str]]:

@@ -1,0 +1,129 @@
+"""Every metric is whole: what a table, a page, a comparison and a gate ask of it is in its entry."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from packaged import register
+from run_on_disk import Row, made_up
+
+from harness.core.errors import UserError
+from harness.core.figures import Unit
+from harness.report.compare.difference import compare
+from harness.report.compare.gate import gate, judge
+from harness.report.compare.pair import pair
+from harness.report.compare.text import terminal
+from harness.runs.decisions import Decisions
+from harness.runs.folder import Run, read
+from harness.runs.metrics import BUILT_IN, METRICS, Metric, entry, metrics_of
+from harness.runs.records import Score
+
+GOLDEN = Path(__file__).parent / "golden_runs" / "data"
+PACKAGE = """
+from harness.core.figures import Unit
+from harness.runs.metrics import Metric
+
+SURE = Metric("sure_rate", "share of decisions that are sure", Unit("%", 1, 100.0), "higher", "rate", 1.0,
+              decisions=lambda d: (d["entropy_nats"] < 0.1).astype(float))
+OTHER = Metric("other", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"])
+NOTHING = Metric("nothing", "", Unit(), "lower")
+"""
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package with a metric that also wants the name of a built-in one."""
+    plugged_in(tmp_path, monkeypatch, "sure_rate = by_hand:SURE\nsuccess_rate = by_hand:SURE\n")
+
+
+def plugged_in(site: Path, monkeypatch: pytest.MonkeyPatch, entries: str) -> None:
+    register(site / "site", f"[swarmdrive.metrics]\n{entries}", by_hand=PACKAGE)
+    monkeypatch.syspath_prepend(site / "site")
+    monkeypatch.setattr(METRICS, "_loaded", dict(METRICS.built_in))
+    entry.cache_clear()
+
+
+def run_of(folder: Path, closed_loop: bool = False) -> Run:
+    def differ(row: Row) -> None:
+        row["entropy_nats"] = 0.0 if row["episode"] % 2 else 0.5
+
+    return read(made_up(folder, decision=differ, closed_loop=closed_loop))
+
+
+@pytest.mark.parametrize("metric", BUILT_IN, ids=lambda metric: metric.name)
+def test_an_entry_says_all_that_is_shown(metric: Metric) -> None:
+    assert metric.label
+    assert metric.meaning
+    assert not metric.meaning.endswith(".")
+    assert metric.most == 1.0 or metric.interval == "mean"
+    assert metric.compared or not metric.primary
+    assert sum(map(bool, (metric.decisions, metric.episodes, metric.answers, metric.percentile))) <= 1
+    assert metric.unit.name != "%" or metric.most == 1.0
+
+
+@pytest.mark.parametrize("file", GOLDEN.glob("*/summary.csv"), ids=lambda file: file.parent.name)
+def test_every_row_of_a_summary_has_an_entry(file: Path) -> None:
+    with file.open() as rows:
+        assert {row["metric"] for row in csv.DictReader(rows)} <= set(METRICS)
+
+
+@pytest.mark.parametrize("closed_loop", [False, True])
+@pytest.mark.usefixtures("installed")
+def test_every_metric_of_decisions_and_episodes_keeps_its_range(tmp_path: Path, closed_loop: bool) -> None:
+    """And values of some decisions are those of all, since workers see parts."""
+    run = run_of(tmp_path / "run", closed_loop)
+    part = Decisions(run.decisions.table.slice(3, 7), run.actions, run.decisions.helpers)
+    metrics = metrics_of(run.world)
+    assert "sure_rate" in {metric.name for metric in metrics}
+    for metric in metrics:
+        if metric.decisions:
+            values = np.asarray(metric.decisions(run.decisions), dtype=float)
+            assert values.shape == (len(run.decisions.table),)
+            np.testing.assert_array_equal(metric.decisions(part), values[3:10])
+        else:
+            assert metric.episodes
+            ended = [metric.episodes(episode) for episode in run.episodes]
+            values = np.array([np.nan if value is None else value for value in ended], dtype=float)
+        assert np.nanmin([*values, 0.0]) >= 0, metric.name
+        assert np.nanmax([*values, 0.0]) <= metric.most, metric.name
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_package_adds_a_metric_and_replaces_none(tmp_path: Path) -> None:
+    """It is in the summary, it is compared, and a gate takes it."""
+    assert METRICS["success_rate"].primary
+    scores = [score for score in run_of(tmp_path / "run").scores if score.metric == "sure_rate"]
+    assert {(score.condition, score.value) for score in scores} == {("single-local", 0.5), ("6g", 0.5)}
+    made_up(tmp_path / "other", decision=lambda row: row.update(entropy_nats=0.0))
+    comparison = compare(pair(tmp_path / "run", tmp_path / "other"))
+    assert "sure_rate %" in terminal(comparison, [], 3)
+    assert judge(gate("6g:sure_rate > 0.1"), comparison).failed == (("6g", 0.5),)
+    with pytest.raises(UserError, match="did you mean 'sure_rate'"):
+        gate("6g:sur_rate > 0.1")
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("gone = by_hand:GONE", "'gone' .*does not load"),
+        ("odd = by_hand:PACKAGE", "'odd' .*does not load"),
+        ("mine = by_hand:OTHER", "'mine' .* is the metric 'other' with 1 functions; give it the name of"),
+        ("nothing = by_hand:NOTHING", "'nothing' .* with 0 functions; give it .* one function"),
+    ],
+)
+def test_a_metric_that_does_not_work_is_one_line(
+    line: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plugged_in(tmp_path, monkeypatch, f"{line}\n")
+    with pytest.raises(UserError, match=says) as error:
+        metrics_of("frozen")
+    assert "\n" not in str(error.value)
+
+
+def test_a_metric_that_nobody_knows_is_written_plainly() -> None:
+    old = entry("old_rate")
+    score = Score("6g", "old_rate", 0.25, 0.1, None, 4, 0, "episodes")
+    assert (old.label, old.meaning, old.better, old.primary) == ("old rate", "", "neither", False)
+    assert old.unit == Unit(decimals=3)
+    assert old.unit.interval(score.value, score.low, score.high) == "0.250 [0.100, –]"
