@@ -8,9 +8,10 @@ import math
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
+from typing import Any
 
-from harness.backends.base import FinishReason, Request, per_token_s
+from harness.backends.base import Completion, FinishReason, Request, per_token_s
 from harness.backends.drafts import Drafts
 from harness.backends.engine import Engine, Session, common_length
 from harness.backends.orders import averaged
@@ -19,34 +20,6 @@ from harness.backends.skeleton import Filled, Skeleton, filled, tokens_after
 from harness.core.errors import UserError, printable
 from harness.prompts.answer_schema import Shape
 from harness.prompts.readout import letters, stated
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A model's answer to one prompt.
-
-    Attributes:
-        text: the answer without the stop token.
-        tokens: number of written tokens, with the fixed ones of a skeleton and the stop token.
-        finish_reason: `stop` or `length`.
-        label_mass: total probability of the letters in a read-out.
-        seconds: time of an answer that was asked alone; None in a batch, as are the next two.
-        first_token_s: time until its first token was chosen; for a read-out, until it was complete.
-        token_s: time for each token chosen after the first (`per_token_s`).
-        letter_share: how much of a read-out over several orders follows the letter; None otherwise, like the
-            next.
-        follows_letter: whether one letter is the likeliest in every order.
-    """
-
-    text: str
-    tokens: int
-    finish_reason: FinishReason
-    label_mass: float | None = None
-    seconds: float | None = None
-    first_token_s: float | None = None
-    token_s: float | None = None
-    letter_share: float | None = None
-    follows_letter: bool | None = None
 
 
 class Decoding:
@@ -61,8 +34,7 @@ class Decoding:
     def room(self, request: Request) -> int:
         """Return the most tokens that the answer can take after the prompt.
 
-        Raises:
-            UserError: the tokenizer or the request's `max_tokens` leaves no room for this answer mode.
+        Raises UserError if the tokenizer or `max_tokens` leaves no room for this answer mode.
         """
         if request.answer == "constrained":
             return self._skeleton(request).most_tokens
@@ -74,13 +46,16 @@ class Decoding:
     def answer(
         self, requests: Sequence[Request], prompts: Sequence[Sequence[int]],
         further: Sequence[Sequence[list[int]]] = (),
-    ) -> list[Answer]:  # fmt: skip
-        """Return one answer for each request, in order.
+    ) -> list[Completion]:  # fmt: skip
+        """Answer requests of one answer mode, for each of which there is `room`.
 
         Args:
-            requests: requests of one answer mode, for each of which there is `room`.
+            requests: the requests.
             prompts: their rendered messages, in tokens.
             further: of a read-out over several orders, those of each request's other orders, equally many.
+
+        Returns:
+            Completions in order, without prompt tokens. A read-out's first token comes when it is complete.
         """
         start_s = time.perf_counter()
         choice = Choice(requests, prompts)
@@ -97,7 +72,7 @@ class Decoding:
         token_s = per_token_s(seconds, first_s, choice.rounds)
         return [replace(answers[0], seconds=seconds, first_token_s=first_s, token_s=token_s)]
 
-    def _free(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Answer]:
+    def _free(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Completion]:
         written: list[list[int]] = [[] for _ in requests]
         # An answer that is asked alone is timed, token by token.
         drafts = self._drafts(requests) if len(requests) > 1 and not choice.draws else None
@@ -110,7 +85,13 @@ class Decoding:
                 self._follow(session, drafts, {i: (requests[i], written[i]) for i in live})
             elif live:
                 session.advance([written[i][-1:] for i in live])
-        return [self._ended(tokens) for tokens in written]
+        completions = []
+        for request, tokens in zip(requests, written, strict=True):
+            stopped = tokens[-1] in self._engine.stops
+            text = self._chat.decode(tokens[:-1] if stopped else tokens)
+            reason: FinishReason = "stop" if stopped else "length"
+            completions.append(_completion(request, text, len(tokens), len(requests), reason))
+        return completions
 
     def _drafts(self, requests: Sequence[Request]) -> Drafts:
         """Return guesses that know the fixed text of what each kind of request asks for."""
@@ -139,12 +120,9 @@ class Decoding:
     def _over(self, tokens: list[int], request: Request) -> bool:
         return tokens[-1] in self._engine.stops or len(tokens) == request.max_tokens
 
-    def _ended(self, tokens: list[int]) -> Answer:
-        if tokens[-1] in self._engine.stops:
-            return Answer(self._chat.decode(tokens[:-1]), len(tokens), "stop")
-        return Answer(self._chat.decode(tokens), len(tokens), "length")
-
-    def _constrained(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Answer]:
+    def _constrained(
+        self, session: Session, requests: Sequence[Request], choice: Choice
+    ) -> list[Completion]:  # fmt: skip
         walks = [self._skeleton(request).walk() for request in requests]
         asks = [next(walk) for walk in walks]
         done: dict[int, Filled] = {}
@@ -158,7 +136,7 @@ class Decoding:
                 except StopIteration as end:
                     done[i] = end.value
             live = _narrow(session, live, [i not in done for i in live])
-        return [Answer(done[i].text, done[i].tokens, "stop") for i in range(len(requests))]
+        return [_completion(r, *done[i], len(requests)) for i, r in enumerate(requests)]
 
     def _skeleton(self, request: Request) -> Skeleton:
         shape = request.shape
@@ -175,10 +153,10 @@ class Decoding:
     def _read_out(
         self, requests: Sequence[Request], prompts: Sequence[Sequence[int]],
         further: Sequence[Sequence[list[int]]],
-    ) -> list[Answer]:  # fmt: skip
+    ) -> list[Completion]:  # fmt: skip
         # Requests may have different numbers of actions: each column stands for one letter's token.
         spellings = {r.actions: self._letter_tokens(r.actions) for r in requests}
-        tokens = sorted({token for of in spellings.values() for tokens in of for token in tokens})
+        tokens = sorted({t for per_letter in spellings.values() for own in per_letter for t in own})
         column = {token: j for j, token in enumerate(tokens)}
         others = further or [()] * len(prompts)
         orders = [[list(prompt), *rest] for prompt, rest in zip(prompts, others, strict=True)]
@@ -186,19 +164,18 @@ class Decoding:
             with closing(self._engine.begin(prompts, tokens)) as session:
                 readings = session.log_probs(tokens)[:, None]
         else:  # what all orders of a question begin with is read once, and then the rest of each
-            shared = [common_length(of) for of in orders]
-            heads = [of[0][:length] for of, length in zip(orders, shared, strict=True)]
+            shared = [common_length(each) for each in orders]
+            heads = [each[0][:length] for each, length in zip(orders, shared, strict=True)]
+            rests = [[ids[length:] for ids in each] for each, length in zip(orders, shared, strict=True)]
             with closing(self._engine.begin(heads, tokens)) as session:
-                rests = [[ids[length:] for ids in of] for of, length in zip(orders, shared, strict=True)]
                 readings = session.ends(rests, tokens)
-        answers = []
-        for i, request in enumerate(requests):
-            log_p = [
-                [[float(reading[column[token]]) for token in of] for of in spellings[request.actions]]
-                for reading in readings[i]
-            ]
-            answers.append(_read(request.actions, log_p))
-        return answers
+        return [
+            _completion_of_letters(request, len(requests), [
+                [[float(row[column[token]]) for token in own] for own in spellings[request.actions]]
+                for row in rows
+            ])
+            for request, rows in zip(requests, readings, strict=True)
+        ]  # fmt: skip
 
     def _letter_tokens(self, actions: tuple[str, ...]) -> list[list[int]]:
         """Return the tokens of each letter, in all its spellings: with a blank before it, and without."""
@@ -217,14 +194,23 @@ class Decoding:
         return self._letters[actions]
 
 
-def _read(actions: Sequence[str], log_p: Sequence[Sequence[Sequence[float]]]) -> Answer:
-    """Return a read-out as an answer, from the log-probabilities of each letter's tokens in each order."""
+def _completion(
+    request: Request, text: str, tokens: int, batch_size: int, reason: FinishReason = "stop", **others: Any
+) -> Completion:
+    return Completion(request.id, text, None, tokens, reason, None, batch_size, **others)
+
+
+def _completion_of_letters(
+    request: Request, batch_size: int, log_p: Sequence[Sequence[Sequence[float]]]
+) -> Completion:
+    """Return a read-out, from the log-probabilities of each letter's tokens in each order."""
     if len(log_p) > 1:
-        p = [[math.fsum(map(math.exp, of)) for of in letters_log_p] for letters_log_p in log_p]
-        return Answer(tokens=1, finish_reason="stop", **asdict(averaged(actions, p)))
+        p = [[math.fsum(map(math.exp, own)) for own in letters_log_p] for letters_log_p in log_p]
+        return _completion(request, tokens=1, batch_size=batch_size, **asdict(averaged(request.actions, p)))
     largest = max(map(max, log_p[0]))
-    weights = [math.fsum(math.exp(x - largest) for x in of) for of in log_p[0]]
-    return Answer(stated(actions, weights), 1, "stop", min(1.0, math.exp(largest) * sum(weights)))
+    weights = [math.fsum(math.exp(x - largest) for x in own) for own in log_p[0]]
+    mass = min(1.0, math.exp(largest) * sum(weights))
+    return _completion(request, stated(request.actions, weights), 1, batch_size, label_mass=mass)
 
 
 def _narrow(session: Session, live: list[int], unfinished: list[bool]) -> list[int]:

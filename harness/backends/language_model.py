@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from itertools import groupby
 from typing import Any, NamedTuple
 
 from harness.backends.base import Completion, Request
-from harness.backends.decoding import Answer, Decoding
+from harness.backends.decoding import Decoding
 from harness.backends.engine import Engine, common_length
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
@@ -28,13 +29,7 @@ class _Prompt(NamedTuple):
 
 
 class LanguageModel:
-    """A backend that asks an engine in batches.
-
-    Attributes:
-        engine: the loaded model.
-        chat: its tokenizer and chat template.
-        batch_size: most requests that go through the engine together.
-    """
+    """A backend that asks an engine in batches of at most `batch_size` requests."""
 
     def __init__(self, engine: Engine, batch_size: int) -> None:
         self.engine = engine
@@ -46,11 +41,8 @@ class LanguageModel:
         """Return one completion per request, in the same order.
 
         `completion_tokens` counts all written tokens, with the stop token and fixed tokens and without
-        padding. If a batch fails, its requests are asked again one at a time.
-
-        Raises:
-            UserError: the tokenizer or `max_tokens` leaves no room for the answer mode, or the template
-                refuses the messages.
+        padding. If a batch fails, its requests are asked again one at a time. Raises UserError if the
+        tokenizer or `max_tokens` leaves no room for the answer mode, or the template refuses the messages.
         """
         done: dict[int, Completion] = {}
         fitting = []
@@ -59,8 +51,11 @@ class LanguageModel:
             room = self._decoding.room(request)
             further = tuple(self.tokens(request.alike(messages=messages)) for messages in request.orders)
             longest = max(len(ids), *map(len, further), 0)
-            if longest + room > self.engine.context_tokens:
-                done[position] = _failed(request, longest, self._overflow(longest, room))
+            if longest + room > (most := self.engine.context_tokens):
+                error = (
+                    f"context overflow: {longest + room} tokens > {most} ({longest} in the prompt, {room} for"
+                )
+                done[position] = _failed(request, longest, f"{error} the answer)")
             else:
                 fitting.append(_Prompt(position, request, ids, further))
         for batch in self._batches(fitting):
@@ -85,10 +80,7 @@ class LanguageModel:
         return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]
 
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
-        """Return the natural log-probabilities of the first `vocabulary` tokens after each prompt.
-
-        Shape (n, vocabulary).
-        """
+        """Return the log-probabilities of the first tokens of the vocabulary, (n, vocabulary)."""
         with closing(self.engine.begin([self.tokens(request) for request in requests])) as session:
             return session.log_probs(range(vocabulary))
 
@@ -110,24 +102,16 @@ class LanguageModel:
             for start in range(0, len(same_mode), self.batch_size):
                 yield same_mode[start : start + self.batch_size]
 
-    def _overflow(self, prompt_tokens: int, room: int) -> str:
-        return (
-            f"context overflow: {prompt_tokens + room} tokens > {self.engine.context_tokens} "
-            f"({prompt_tokens} in the prompt, {room} for the answer)"
-        )
-
     def _answer(self, batch: list[_Prompt]) -> list[Completion]:
         answers = self._try(batch)
         if isinstance(answers, list):
             return answers
         # `_try` has returned, so nothing refers to the failed batch and an engine can free its memory.
-        completions = []
-        for prompt in batch:
-            single = self._try([prompt])
-            completions += (
-                single if isinstance(single, list) else [_failed(prompt.request, len(prompt.ids), single)]
-            )
-        return completions
+        alone = [self._try([prompt]) for prompt in batch]
+        return [
+            a[0] if isinstance(a, list) else _failed(p.request, len(p.ids), a)
+            for p, a in zip(batch, alone, strict=True)
+        ]
 
     def _try(self, batch: list[_Prompt]) -> list[Completion] | str:
         """Return the completions of a batch, or the engine's error message."""
@@ -137,24 +121,7 @@ class LanguageModel:
             )
         except Exception as error:  # an engine may fail in any way; its message is data
             return f"{type(error).__name__}: {printable(' '.join(str(error).split()), 200)}"
-        return [_completion(p, answer, len(batch)) for p, answer in zip(batch, answers, strict=True)]
-
-
-def _completion(prompt: _Prompt, answer: Answer, batch_size: int) -> Completion:
-    return Completion(
-        request_id=prompt.request.id,
-        text=answer.text,
-        prompt_tokens=prompt.read,
-        completion_tokens=answer.tokens,
-        finish_reason=answer.finish_reason,
-        seconds=answer.seconds,
-        batch_size=batch_size,
-        label_mass=answer.label_mass,
-        first_token_s=answer.first_token_s,
-        token_s=answer.token_s,
-        letter_share=answer.letter_share,
-        follows_letter=answer.follows_letter,
-    )
+        return [replace(answer, prompt_tokens=p.read) for p, answer in zip(batch, answers, strict=True)]
 
 
 def _failed(request: Request, prompt_tokens: int, error: str) -> Completion:
