@@ -224,7 +224,7 @@ def lm_eval(
         from lm_eval.models.huggingface import HFLM
     except ImportError:
         return None
-    wrapped = HFLM(pretrained=model, tokenizer=chat.tokenizer, batch_size=batch_size, max_length=2048)
+    wrapped = HFLM(pretrained=model, tokenizer=chat.tokenizer.hub, batch_size=batch_size, max_length=2048)
     arguments = {"until": ["<|im_end|>"], "do_sample": False, "max_gen_toks": asked[0].max_tokens}
     instances = [
         Instance(request_type="generate_until", doc={}, arguments=(text, arguments), idx=i)

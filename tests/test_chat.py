@@ -14,8 +14,8 @@ from test_gguf_chat import Words
 
 from harness.backends import cards
 from harness.backends.base import Request
+from harness.backends.chat import Chat
 from harness.backends.chat_template import needs_first_user, unsaid, with_system
-from harness.backends.llama_cpp.chat import GgufChat
 from harness.backends.openai.shapes import body
 from harness.core.errors import UserError
 from harness.core.resources import find
@@ -43,7 +43,7 @@ CHAT = (
 
 
 def test_all_is_said_whatever_white_space_is_around_it() -> None:
-    chat = GgufChat("good", Words(TURNS + OPENING))
+    chat = Chat("good", Words(TURNS + OPENING))
     prompt = chat.render(CHAT, thinking=False)
     assert prompt.endswith("a lorry ahead.<|im_end|>\n<|im_start|>assistant\n")
     assert unsaid(CHAT, prompt) is None
@@ -51,7 +51,7 @@ def test_all_is_said_whatever_white_space_is_around_it() -> None:
 
 def test_a_thought_of_an_earlier_turn_may_be_left_out() -> None:
     forgets = TURNS.replace("| trim", ".split('</think>')[-1] | trim").replace("m.content .", "m.content.")
-    assert "hm" not in GgufChat("forgets", Words(forgets)).render(CHAT, thinking=False)
+    assert "hm" not in Chat("forgets", Words(forgets)).render(CHAT, thinking=False)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_a_template_that_leaves_out_changes_or_moves_a_text_is_refused(template:
     with pytest.raises(
         UserError, match="model 'bad': its chat template leaves out or changes the text"
     ) as refused:
-        GgufChat("bad", Words(template)).render(CHAT, thinking=False)
+        Chat("bad", Words(template)).render(CHAT, thinking=False)
     assert said in str(refused.value)
     assert str(refused.value).isprintable()
 
@@ -72,13 +72,13 @@ def test_a_template_that_leaves_out_changes_or_moves_a_text_is_refused(template:
 @pytest.mark.parametrize(("template", "helps"), [(REFUSES, True), (DROPS, True), ("", False), (CUTS, False)])
 def test_the_way_out_is_named_where_it_helps(template: str, helps: bool) -> None:
     with pytest.raises(UserError) as refused:
-        GgufChat("bad", Words(template)).render(CHAT, thinking=False)
+        Chat("bad", Words(template)).render(CHAT, thinking=False)
     assert ('a card with system = "first-user"' in str(refused.value)) == helps
 
 
 @pytest.mark.parametrize("template", [REFUSES, DROPS])
 def test_the_system_text_begins_the_first_user_turn_where_the_card_says_so(template: str) -> None:
-    prompt = GgufChat("old", Words(template), system="first-user").render(CHAT, thinking=False)
+    prompt = Chat("old", Words(template), system="first-user").render(CHAT, thinking=False)
     text = "user\nYou drive car v1. Answer with JSON only.\n\n\nScene 1: nothing in sight.<|im_end|>"
     assert prompt.startswith(f"<|im_start|>{text}")
     assert with_system(CHAT[1:], "first-user") == CHAT[1:]
@@ -118,7 +118,7 @@ def test_an_answer_ends_at_the_token_that_the_template_writes_after_it(
         def pieces(self, ids: Sequence[int]) -> list[str]:
             return [end or "?" if i == 7 else chr(i) for i in ids]
 
-    assert GgufChat("m", Marked(template)).turn_end == (7 if end else None)
+    assert Chat("m", Marked(template)).turn_end == (7 if end else None)
 
 
 # -- real weights --------------------------------------------------------------------------------------------

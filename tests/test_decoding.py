@@ -23,7 +23,7 @@ from run_on_disk import UNTIMED
 from harness.backends import decoding, sampling
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.cards import resolve
-from harness.backends.chat import Chat
+from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.decoding import Decoding
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import open_backend
@@ -328,7 +328,8 @@ def test_the_spellings_of_a_letter_are_found_in_any_vocabulary(texts: list[str],
         decoders.ByteLevel() if decoder == "ByteLevel"
         else decoders.Sequence([decoders.ByteFallback(), decoders.Metaspace(), decoders.Fuse()])
     )  # fmt: skip
-    chat = Chat("any", PreTrainedTokenizerFast(tokenizer_object=made, chat_template="{{ messages }}"))
+    hub = PreTrainedTokenizerFast(tokenizer_object=made, chat_template="{{ messages }}")
+    chat = Chat("any", HubTokenizer(hub))
     found = chat.spellings("ABC")
     assert {letter: sorted(ids) for letter, ids in found.items()} == {
         "A": [0, 1, 2], "B": [3, 4], "C": [8] if decoder == "Metaspace" else [],

@@ -140,7 +140,7 @@ def test_an_engine_reads_what_the_model_learnt_from(
 
     model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
     student = Student([lessons], PLAN, tmp_path, "cpu")
-    student.tokenizer = model.chat.tokenizer.backend_tokenizer
+    student.tokenizer = model.chat.tokenizer.hub.backend_tokenizer
     student.letters = [student.tokenizer.token_to_id(x) for x in readout.letters(SCENARIO.actions)]
     # What training reads out; an untaught model also likes the letters with a blank before them.
     spelt = dict(zip(readout.letters(SCENARIO.actions), [[n] for n in student.letters], strict=True))
@@ -149,7 +149,7 @@ def test_an_engine_reads_what_the_model_learnt_from(
     )
     state = model.engine.model.state_dict()
     assert all(torch.equal(p, p.half().float()) for p in state.values()), "as F16 holds them"
-    if student.model.get_input_embeddings().num_embeddings == len(model.chat.tokenizer):
+    if student.model.get_input_embeddings().num_embeddings == len(model.chat.tokenizer.hub):
         student.model.load_state_dict(state)
     else:
         student.model = model.engine.model
@@ -229,6 +229,6 @@ def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Q
 def test_the_picture_is_what_two_prompts_that_say_the_same_differ_in(folder: Path, asked: list[Question]):
     model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
     one, other = asked[0], next(q for q in asked if q.image and q.image.sha256 != asked[0].image.sha256)
-    vocabulary = len(model.chat.tokenizer)
+    vocabulary = len(model.chat.tokenizer.hub)
     p = model.next_log_probs([request(one), replace(request(one), image=other.image)], vocabulary)
     assert np.abs(p[0] - p[1]).max() > 1e-4

@@ -12,9 +12,8 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 
 import tiny_qwen3
 
-from harness.backends.chat import Chat
+from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.chat_template import ChatTemplate
-from harness.backends.llama_cpp.chat import GgufChat
 from harness.core.errors import UserError
 
 MESSAGES = (
@@ -40,6 +39,9 @@ class Words:
 
     def pieces(self, ids: Sequence[int]) -> list[str]:
         return [chr(byte) for byte in ids]
+
+    def candidates(self, letters: str) -> Sequence[int]:
+        return range(self.vocabulary)
 
 
 @pytest.fixture(scope="module")
@@ -83,31 +85,31 @@ def test_a_template_renders_as_in_transformers(tokenizer: Any, template: str, th
 
 def test_a_checkpoint_and_a_gguf_file_have_one_prompt(tokenizer: Any) -> None:
     tokenizer.chat_template = tiny_qwen3.TEMPLATE
-    theirs, ours = Chat("tiny", tokenizer), GgufChat("tiny", Words(tiny_qwen3.TEMPLATE))
+    theirs, ours = Chat("tiny", HubTokenizer(tokenizer)), Chat("tiny", Words(tiny_qwen3.TEMPLATE))
     assert ours.render(MESSAGES, thinking=False) == theirs.render(MESSAGES, thinking=False)
     assert (ours.thinking, ours.template) == (theirs.thinking, theirs.template)
 
 
 def test_a_template_that_refuses_the_messages_says_so() -> None:
-    chat = GgufChat("gruff", Words("{{ raise_exception('System role not supported') }}"))
+    chat = Chat("gruff", Words("{{ raise_exception('System role not supported') }}"))
     with pytest.raises(UserError, match=r"'gruff': .*refuses the messages \(System role not supported\)"):
         chat.render(MESSAGES, thinking=False)
 
 
 def test_a_template_cannot_reach_out_of_its_sandbox() -> None:
-    chat = GgufChat("sly", Words("{{ messages.__class__.__mro__[1].__subclasses__() }}"))
+    chat = Chat("sly", Words("{{ messages.__class__.__mro__[1].__subclasses__() }}"))
     with pytest.raises(UserError, match="refuses the messages"):
         chat.render(MESSAGES, thinking=False)
 
 
 def test_a_template_that_is_no_jinja_is_known_at_once() -> None:
     with pytest.raises(UserError, match=r"'torn': its chat template is no Jinja \(.*endfor"):
-        GgufChat("torn", Words("{% for m in messages %}"))
+        Chat("torn", Words("{% for m in messages %}"))
 
 
 def test_tokens_and_bos_are_the_files(tmp_path: Path) -> None:
     every = "{% for m in messages %}{{ m.content }}{% endfor %}"
-    chat = GgufChat("words", Words("{{ bos_token }}" + every, {"bos_token": "<s>"}, bos=1))
+    chat = Chat("words", Words("{{ bos_token }}" + every, {"bos_token": "<s>"}, bos=1))
     assert (chat.bos, chat.encode("ab"), chat.decode([97, 98])) == (1, [97, 98], "ab")
     assert chat.spellings("Ba") == {"B": [66], "a": [97]}
     assert chat.render(MESSAGES[1:], thinking=False) == f"<s>{MESSAGES[1]['content']}"

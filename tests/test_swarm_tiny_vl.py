@@ -51,7 +51,7 @@ def intents(engine: str, questions: list[Request]) -> Floats:
 def test_its_picture_tokens_see(shipped: Dataset) -> None:
     """What each token of a picture is read as, on report layouts; its decisions make no use of it yet."""
     backend: Any = open_backend(cards.resolve(MODEL, "transformers"), device="cpu")
-    model, tokenizer = backend.engine.model, backend.chat.tokenizer
+    model, tokenizer = backend.engine.model, backend.chat.tokenizer.hub
     filled = model.config.image_token_id
     digits = model.get_input_embeddings().weight[tokenizer.convert_tokens_to_ids(list("0123456789"))]
     read, shown = [], []

@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from harness.backends import checkup
 from harness.backends.base import Completion, Request
 from harness.backends.cards import Card, Latency, load, resolve
+from harness.backends.chat import HubTokenizer
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import missing, open_backend
 from harness.backends.weights import find_checkpoint
@@ -111,7 +112,8 @@ def test_tokens_in_are_the_rendered_prompts(backend: LanguageModel) -> None:
     [answer] = backend.complete([ask(4)])
     prompt = backend.chat.render(ask(4).messages, thinking=False)
     assert answer.prompt_tokens == len(backend.chat.encode(prompt))
-    assert backend.chat.tokenizer.decode(backend.chat.encode(prompt)) == prompt
+    assert isinstance(backend.chat.tokenizer, HubTokenizer)
+    assert backend.chat.tokenizer.hub.decode(backend.chat.encode(prompt)) == prompt
 
 
 def test_think_tags_stay_in_the_text_and_special_tokens_do_not(backend: LanguageModel) -> None:
@@ -186,7 +188,8 @@ def test_a_context_is_full_at_its_last_token_and_the_cards_bound_comes_first(tin
 def test_a_request_that_breaks_the_engine_takes_nobody_with_it(tiny: Path) -> None:
     """A token past the last embedding row fails the batch; asked again alone, only its owner fails."""
     opened = open_tiny(tiny)
-    opened.chat.tokenizer.add_tokens(["<boom>"])
+    assert isinstance(opened.chat.tokenizer, HubTokenizer)
+    opened.chat.tokenizer.hub.add_tokens(["<boom>"])
     before, broken, after = opened.complete([ask(0), ask(1, text="<boom>"), ask(2)])
     assert (broken.text, broken.finish_reason, broken.seconds) == ("", "error", None)
     assert "IndexError" in str(broken.error)

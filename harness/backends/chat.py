@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 from harness.backends.card import Thinking
 from harness.backends.chat_template import FIRST_USER, ChatTemplate, Refused, unsaid, with_system
@@ -18,41 +18,91 @@ _ANSWER = "Keep 7 m/s."
 _TURN = ({"role": "user", "content": "?"}, {"role": "assistant", "content": _ANSWER})
 
 
+class Tokenizer(Protocol):
+    """A model's tokenizer, which comes with a chat template.
+
+    Attributes:
+        template: the template's Jinja text.
+        specials: texts of special tokens by their name in a chat template, such as `bos_token`.
+        bos: id of the token that begins a sequence; None if there is none.
+        vocabulary: number of tokens.
+    """
+
+    @property
+    def template(self) -> str: ...
+    @property
+    def specials(self) -> Mapping[str, str]: ...
+    @property
+    def bos(self) -> int | None: ...
+    @property
+    def vocabulary(self) -> int: ...
+
+    def encode(self, text: str) -> list[int]:
+        """Return the token ids of a rendered prompt, in which the template has already written any BOS."""
+        ...
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """Return the text of an answer without special tokens. Qwen3's `<think>` is not one, and stays."""
+        ...
+
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        """Return the text of each single token, with special tokens; incomplete bytes become U+FFFD."""
+        ...
+
+    def candidates(self, letters: str) -> Sequence[int]:
+        """Return the ids of all tokens whose text may be one of the letters, and perhaps of others."""
+        ...
+
+
+class HubTokenizer:
+    """A `Tokenizer` of transformers (`hub`)."""
+
+    def __init__(self, hub: Any) -> None:
+        self.hub = hub
+        self.template = str(hub.get_chat_template())
+        self.specials: Mapping[str, str] = hub.special_tokens_map
+        self.bos: int | None = hub.bos_token_id
+        self.vocabulary = len(hub)
+
+    def encode(self, text: str) -> list[int]:
+        ids: list[int] = self.hub(text, add_special_tokens=False)["input_ids"]
+        return ids
+
+    def decode(self, ids: Sequence[int]) -> str:
+        return self._text(ids, skip_special_tokens=True)
+
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        return [self._text([i], skip_special_tokens=False) for i in ids]
+
+    def candidates(self, letters: str) -> Sequence[int]:
+        return [
+            token for text, token in self.hub.get_vocab().items()
+            if len(text) <= _LONGEST and (text.startswith("<0x") or any(x in text for x in letters))
+        ]  # fmt: skip
+
+    def _text(self, ids: Sequence[int], skip_special_tokens: bool) -> str:
+        options = {"skip_special_tokens": skip_special_tokens, "clean_up_tokenization_spaces": False}
+        text: str = self.hub.decode(ids, **options)
+        return text
+
+
 class Chat:
-    """A tokenizer with its chat template.
+    """A tokenizer with its chat template; `encode`, `decode` and `pieces` are the tokenizer's.
 
     Attributes:
         name: name of the model.
-        template: the template's Jinja text.
+        tokenizer: its tokenizer.
         image_token: token that the template writes for a picture; None if the model takes none.
         system: where the system text stands: `first-user`, or None for a message of its own.
     """
 
-    image_token: str | None = None
-    system: str | None = None
-
     def __init__(
-        self, name: str, tokenizer: Any, image_token: str | None = None, system: str | None = None
+        self, name: str, tokenizer: Tokenizer, image_token: str | None = None, system: str | None = None
     ) -> None:
-        self.tokenizer = tokenizer
-        self._begin(name, str(tokenizer.get_chat_template()), image_token, system)
-
-    def _begin(self, name: str, template: str, image_token: str | None, system: str | None) -> None:
-        self.name, self.template = name, template
-        self.image_token, self.system = image_token, system
-        self._compiled = ChatTemplate(name, template)
-
-    @property
-    def specials(self) -> Mapping[str, Any]:
-        """Texts of special tokens by their name in a chat template, such as `bos_token`."""
-        specials: Mapping[str, Any] = self.tokenizer.special_tokens_map
-        return specials
-
-    @property
-    def bos(self) -> int | None:
-        """Id of the token that begins a sequence; None if there is none."""
-        token: int | None = self.tokenizer.bos_token_id
-        return token
+        self.name, self.tokenizer, self.image_token, self.system = name, tokenizer, image_token, system
+        self.template, self.bos, self.vocabulary = tokenizer.template, tokenizer.bos, tokenizer.vocabulary
+        self.encode, self.decode, self.pieces = tokenizer.encode, tokenizer.decode, tokenizer.pieces
+        self._compiled = ChatTemplate(name, self.template)
 
     @property
     def _switch(self) -> bool:
@@ -71,8 +121,8 @@ class Chat:
         """Id of the token that the template writes after an answer; None if it writes no such token."""
         with suppress(UserError):
             text = self._apply(self._shown(_TURN), thinking=False, add_generation_prompt=False)
-            _, said, rest = text.rpartition(_ANSWER)
-            tokens = self.encode(rest.lstrip()) if said else []
+            _, answer, rest = text.rpartition(_ANSWER)
+            tokens = self.encode(rest.lstrip()) if answer else []
             # A mark that is a token of its own stands for no text, or is at least written like one.
             if tokens and (not self.decode(tokens[:1]) or _MARK.fullmatch(self.pieces(tokens[:1])[0])):
                 return tokens[0]
@@ -86,8 +136,7 @@ class Chat:
     def render(self, messages: Sequence[Mapping[str, str]], *, thinking: bool) -> str:
         """Render messages to the prompt that the model reads, with `image_token` for a picture.
 
-        Raises:
-            UserError: the template refuses the messages, or leaves out a text of them.
+        Raises UserError if the template refuses the messages, or leaves out a text of them.
         """
         shown = self._shown(with_system(messages, self.system))
         try:
@@ -124,53 +173,22 @@ class Chat:
 
     def _apply(self, messages: list[dict[str, Any]], *, thinking: bool, **values: Any) -> str:
         switch = {"enable_thinking": thinking} if self._switch else {}
-        return self._compiled.render(messages, **self.specials, **switch, **values)
-
-    def encode(self, prompt: str) -> list[int]:
-        """Return the token ids of a rendered prompt, in which the template has already written any BOS."""
-        ids: list[int] = self.tokenizer(prompt, add_special_tokens=False)["input_ids"]
-        return ids
-
-    def decode(self, ids: Sequence[int]) -> str:
-        """Return the text of an answer without special tokens. Qwen3's `<think>` is not one, and stays."""
-        text: str = self.tokenizer.decode(ids, skip_special_tokens=True, clean_up_tokenization_spaces=False)
-        return text
-
-    @property
-    def vocabulary(self) -> int:
-        """Number of tokens."""
-        return len(self.tokenizer)
-
-    def pieces(self, ids: Sequence[int]) -> list[str]:
-        """Return the text of each single token, with special tokens; incomplete bytes become U+FFFD."""
-        return [
-            self.tokenizer.decode([i], skip_special_tokens=False, clean_up_tokenization_spaces=False)
-            for i in ids
-        ]
+        return self._compiled.render(messages, **self.tokenizer.specials, **switch, **values)
 
     def spellings(self, letters: str) -> dict[str, list[int]]:
         """Return the ids of all tokens that are each letter: alone, with blanks around it, or as a byte."""
-        found: dict[str, list[int]] = {letter: [] for letter in letters}
-        candidates = self._candidates(letters)
+        tokens: dict[str, list[int]] = {letter: [] for letter in letters}
+        candidates = self.tokenizer.candidates(letters)
         for token, piece in zip(candidates, self.pieces(candidates), strict=True):
-            if (letter := spelt(piece)) in found:
-                found[letter].append(token)
-        return found
-
-    def _candidates(self, letters: str) -> Sequence[int]:
-        """Return the ids of the tokens whose texts may be one of the letters."""
-        return [
-            token for text, token in self.tokenizer.get_vocab().items()
-            if len(text) <= _LONGEST and (text.startswith("<0x") or any(x in text for x in letters))
-        ]  # fmt: skip
+            if (letter := spelt(piece)) in tokens:
+                tokens[letter].append(token)
+        return tokens
 
 
 def in_parts(messages: Sequence[Mapping[str, str]], picture: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Convert messages to contents that are lists of parts, as models with vision take them.
 
-    Args:
-        messages: chat messages with text; one with the key `image` gets the picture before its text.
-        picture: the part that stands for the picture.
+    A message with the key `image` gets `picture`, the part that stands for it, before its text.
     """
     return [
         {"role": m["role"], "content": [picture] * ("image" in m) + [{"type": "text", "text": m["content"]}]}

@@ -25,22 +25,10 @@ class Refused(UserError):
 
 
 class ChatTemplate:
-    """A compiled chat template, rendered as transformers does.
-
-    Attributes:
-        text: its Jinja text.
-    """
+    """A compiled chat template (`text` in Jinja), rendered as transformers does."""
 
     def __init__(self, name: str, text: str) -> None:
-        """Compile a template.
-
-        Args:
-            name: name of the model, for messages.
-            text: the template.
-
-        Raises:
-            UserError: it is no Jinja, or too long.
-        """
+        """Compile the template of a model. Raises UserError if it is no Jinja, or too long."""
         self.text = text
         self._name = name
         try:
@@ -54,9 +42,7 @@ class ChatTemplate:
     def render(self, messages: Messages, **values: Any) -> str:
         """Render messages, with the values of further names.
 
-        Raises:
-            Refused: the template refuses the messages; the sentence has no advice yet.
-            UserError: it takes more than it may.
+        Raises Refused, without advice yet, if the template refuses them, and UserError if it takes too much.
         """
         given = {"tools": None, "documents": None, "add_generation_prompt": True, **values}
         try:

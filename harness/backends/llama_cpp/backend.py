@@ -18,8 +18,7 @@ def open(
 ) -> "LlamaBackend":
     """Find and load a card's weights.
 
-    Raises:
-        UserError: the file is missing, an option is wrong, or llama.cpp refuses the file.
+    Raises UserError if the file is missing, an option is wrong, or llama.cpp refuses the file.
     """
     if dtype not in (None, "auto"):
         raise UserError(f"dtype {printable(dtype)!r}; a GGUF file has its own: leave it out, or give auto")
@@ -27,47 +26,42 @@ def open(
 
 
 class LlamaBackend(Child):
-    """A GGUF file loaded in a child process.
-
-    Attributes:
-        chat: its tokenizer and chat template.
-        batch_size: most requests that go through the engine together.
-    """
+    """A GGUF file loaded in a child process."""
 
     def __init__(self, card: Card, file: Path, device: str | None, batch_size: int) -> None:
         self.batch_size = batch_size
         super().__init__(
             card.name, "harness.backends.llama_cpp.engine:open_here", card, file, device, batch_size
         )
-        self.chat = _RemoteChat(card.name, self)
+        self.chat = Chat(card.name, _RemoteTokenizer(self), self.call("chat.image_token"), card.system)
 
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
-        """Return the natural log-probabilities of the first `vocabulary` tokens after each prompt.
-
-        Shape (n, vocabulary).
-        """
+        """Return what `LanguageModel.next_log_probs` does."""
         log_p: Floats = self.call("next_log_probs", requests, vocabulary)
         return log_p
 
 
-def _of_child(attribute: str) -> Any:
-    """Return a method that calls the chat's method in the child."""
+class _RemoteTokenizer:
+    """The `Tokenizer` of the model in a child process."""
 
-    def method(chat: "_RemoteChat", *arguments: Any, **options: Any) -> Any:
-        return chat.child.call(f"chat.{attribute}", *arguments, **options)
+    def __init__(self, child: Child) -> None:
+        self._child = child
+        stated = (
+            child.call(f"chat.tokenizer.{name}") for name in ("template", "specials", "bos", "vocabulary")
+        )
+        self.template, self.specials, self.bos, self.vocabulary = stated
 
-    return method
+    def encode(self, text: str) -> list[int]:
+        return list(self._call("encode", text))
 
+    def decode(self, ids: Sequence[int]) -> str:
+        return str(self._call("decode", ids))
 
-class _RemoteChat(Chat):
-    """A chat template and tokenizer in the child process."""
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        return list(self._call("pieces", ids))
 
-    def __init__(self, name: str, child: Child) -> None:
-        self.name = name
-        self.template = child.call("chat.template")
-        self.image_token = child.call("chat.image_token")
-        self.child = child
+    def candidates(self, letters: str) -> Sequence[int]:
+        return range(self.vocabulary)
 
-    bos = property(_of_child("bos"))
-    turn_end = property(_of_child("turn_end"))
-    render, encode, decode, pieces = map(_of_child, ("render", "encode", "decode", "pieces"))
+    def _call(self, attribute: str, *arguments: Any) -> Any:
+        return self._child.call(f"chat.tokenizer.{attribute}", *arguments)

@@ -39,16 +39,9 @@ class Child:
     """
 
     def __init__(self, name: str, opener: str, *arguments: Any, **options: Any) -> None:
-        """Open the backend.
+        """Open a model's backend by `module:function`, called in the child with pickled arguments.
 
-        Args:
-            name: name of the model, for messages.
-            opener: `module:function`, called in the child with `arguments` and `options`, which are pickled.
-            arguments: positional arguments of the opener.
-            options: keyword arguments of the opener.
-
-        Raises:
-            UserError: the opener raised it, or its process died `LOADS` times.
+        Raises UserError if the opener raised it, or its process died `LOADS` times.
         """
         self._name = name
         self._opener = opener, arguments, options
@@ -73,8 +66,7 @@ class Child:
     def call(self, attribute: str, *arguments: Any, **options: Any) -> Any:
         """Return an attribute of the backend by its dotted name; call it if it is a method.
 
-        Raises:
-            UserError: the backend raised it, or died of the call.
+        Raises UserError if the backend raised it, or died of the call.
         """
         for _ in range(2):
             try:

@@ -22,18 +22,14 @@ _FIELDS = c.llama_batch._fields_
 
 
 class LlamaContext:
-    """Sequences by number, 0 to n-1, each a list of tokens whose keys and values are computed.
+    """Sequences by number, 0 to n-1, each a list of `tokens` whose keys and values are computed.
 
     Negative tokens are a picture's. A sequence may be cut before or after a picture, but not inside.
 
     All sequences have equal room. (llama.cpp can also share one memory, but then each sequence would attend
     to all the others' tokens, if only to mask them.) The memory is allocated when it is first needed. When a
     sequence has filled its room, the memory is replaced by one of twice the size and filled again from the
-    tokens.
-
-    Attributes:
-        tokens: tokens of each existing sequence.
-        cache_type: number format of keys and values: `F32` for F32 weights, or else `F16`.
+    tokens. Keys and values are `F32` for F32 weights, or else `F16`.
     """
 
     def __init__(self, model: LlamaModel, sequences: int, projector: Projector | None = None) -> None:
@@ -76,13 +72,9 @@ class LlamaContext:
             self._make(room)
 
     def extend(self, chunks: Mapping[int, Sequence[int]]) -> Logits:
-        """Append a chunk, which must not be empty, to each of some sequences.
+        """Append a chunk, none empty, to each of some sequences; return the logits after it, (n, vocabulary).
 
-        Returns:
-            Logits after the last token of each, (len(chunks), vocabulary).
-
-        Raises:
-            RuntimeError: llama.cpp fails; all sequences are lost then.
+        Raises RuntimeError if llama.cpp fails; all sequences are lost then.
         """
         try:
             logits = self._decode(chunks)
@@ -184,11 +176,7 @@ class LlamaContext:
     ) -> bool:
         """Read a run of each of some sequences, all texts or all pictures; return whether there was room.
 
-        Args:
-            runs: runs by sequence.
-            starts: position of the first token of each run.
-            logits: array that receives the logits after a run.
-            rows: its row for each run; None if the logits are not needed.
+        `starts` has the position of each run's first token; `rows` its row of `logits`, None if not needed.
         """
         inputs = np.concatenate([run.inputs for run in runs.values()])
         places = [run.at(start) for run, start in zip(runs.values(), starts, strict=True)]

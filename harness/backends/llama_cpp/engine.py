@@ -13,7 +13,6 @@ from harness.backends.card import Card
 from harness.backends.chat import Chat
 from harness.backends.engine import check_logits, common_length
 from harness.backends.language_model import LanguageModel
-from harness.backends.llama_cpp.chat import GgufChat
 from harness.backends.llama_cpp.context import LlamaContext, Logits
 from harness.backends.llama_cpp.model import LlamaModel, build, most_sequences
 from harness.backends.llama_cpp.projector import Projector
@@ -31,8 +30,7 @@ _PICTURES = ("<|image_pad|>", "<image>")  # tokens that chat templates write for
 def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
     """Load a GGUF file in this process, which llama.cpp may abort.
 
-    Raises:
-        UserError: llama.cpp refuses the file, its projector, the device or the batch size.
+    Raises UserError if llama.cpp refuses the file, its projector, the device or the batch size.
     """
     os.environ.setdefault("GGML_NO_BACKTRACE", "1")  # a backtrace would start a debugger if there is one
     most = most_sequences() - BEGINNINGS
@@ -64,15 +62,7 @@ class _Group(NamedTuple):
 
 
 class LlamaEngine:
-    """A loaded GGUF file with memory for `batch_size` sequences and some beginnings of prompts.
-
-    Without a projector, it takes no pictures.
-
-    Attributes:
-        chat: its tokenizer and chat template.
-        context_tokens: most tokens of one sequence.
-        stops: token ids that end an answer, sorted.
-    """
+    """A loaded GGUF file with memory for `batch_size` sequences and some beginnings of prompts."""
 
     def __init__(
         self, card: Card, file: Path, model: LlamaModel, batch_size: int, projector: Projector | None = None
@@ -80,7 +70,7 @@ class LlamaEngine:
         shown = [text for text in _PICTURES if projector and text in model.template]
         if projector and not shown:
             raise UserError(f"model {card.name!r}: its chat template has none of {_PICTURES} for a picture")
-        self.chat: Chat = GgufChat(card.name, model, shown[0] if shown else None, card.system)
+        self.chat = Chat(card.name, model, shown[0] if shown else None, card.system)
         self.context_tokens = card.context_tokens or model.trained_tokens
         self.stops: Sequence[int] = sorted({*model.stops, *self.chat.ends})
         self._card, self._file, self._model = card, file, model
@@ -91,15 +81,12 @@ class LlamaEngine:
         self._beginnings = list(range(batch_size, batch_size + BEGINNINGS))
 
     def look(self, image: Image) -> list[int]:
-        """Return the tokens that stand for a picture in a prompt."""
         if self._projector is None:
             raise ValueError(f"model {self._card.name!r} takes no pictures")
         return self._projector.tokens(image)
 
     def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> "LlamaSession":
-        """Read some prompts, none of them empty; what several begin with is computed once.
-
-        All logits are float32, `exact` or not.
+        """Read some prompts; all logits are float32, `exact` or not.
 
         A beginning is kept for later calls, unless half of it is part of one that is kept already.
         """

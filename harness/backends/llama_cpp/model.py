@@ -1,8 +1,4 @@
-"""Load a GGUF file with llama.cpp: its weights, its vocabulary and its metadata.
-
-All of this runs in the child process (`harness.backends.llama_cpp.child`), because llama.cpp may abort its
-process.
-"""
+"""Load a GGUF file with llama.cpp, in a child process since llama.cpp may abort its process."""
 
 import ctypes
 from collections.abc import Sequence
@@ -34,7 +30,7 @@ def last_error() -> str:
 
 
 class LlamaModel:
-    """A loaded model.
+    """A loaded model, and the `harness.backends.chat.Tokenizer` in its file.
 
     Attributes:
         pointer: llama.cpp's model.
@@ -42,11 +38,7 @@ class LlamaModel:
         trained_tokens: length of the context that it was trained for.
         dtype: number format of the weights, as llama.cpp names it.
         stops: token ids that end an answer, sorted.
-        template: chat template.
-        specials: texts of special tokens by their name in a chat template, such as `bos_token`.
-        bos: id of the BOS token; None if there is none.
-        whole_state: whether a sequence's state cannot be cut (recurrent layers), so no beginning can be
-            shared.
+        whole_state: whether a sequence's state cannot be cut (recurrent layers), so no beginning is shared.
         device: `cpu` or `gpu`.
     """
 
@@ -90,7 +82,6 @@ class LlamaModel:
         self.device = "gpu" if c.llama_supports_gpu_offload() and device != "cpu" else "cpu"
 
     def encode(self, text: str) -> list[int]:
-        """Return the token ids of a text. Special tokens written in it are recognised; none is added."""
         data = text.encode(errors="replace")
         ids = np.empty(len(data) + 1, dtype=np.int32)  # a token has at least one byte
         pointer = ids.ctypes.data_as(ctypes.POINTER(c.llama_token))
@@ -101,12 +92,13 @@ class LlamaModel:
         return tokens
 
     def decode(self, ids: Sequence[int]) -> str:
-        """Return the text of token ids without control tokens. Invalid bytes become U+FFFD."""
         return b"".join(self._piece(token) for token in ids).decode(errors="replace")
 
     def pieces(self, ids: Sequence[int]) -> list[str]:
-        """Return the text of each single token, with control tokens."""
         return [self._piece(token, control=True).decode(errors="replace") for token in ids]
+
+    def candidates(self, letters: str) -> Sequence[int]:
+        return range(self.vocabulary)
 
     def _piece(self, token: int, control: bool = False) -> bytes:
         size = 64

@@ -64,9 +64,8 @@ class Projector:
     def __init__(self, name: str, file: Path, model: LlamaModel, vision: Vision) -> None:
         """Load a projector.
 
-        Raises:
-            UserError: llama-cpp-python has no mtmd, the file is not a projector of this model, or a picture
-                does not have as many tokens as the card says.
+        Raises UserError if llama-cpp-python has no mtmd, the file is not a projector of this model, or a
+        picture does not have as many tokens as the card says.
         """
         shown = f"model {name!r} with projector {printable(file)}"
         try:
@@ -116,11 +115,7 @@ class Projector:
         return [t for part in layout for t in (islice(remaining, part) if isinstance(part, int) else part)]
 
     def run(self, token: int) -> Run:
-        """Return the part of a picture that begins with a token.
-
-        Raises:
-            LookupError: no part does, or its picture no longer exists.
-        """
+        """Return the part of a picture that begins with a token. Raises LookupError if it is gone."""
         key, place = picture_of(token)
         if key not in self._encoded:
             if (image := self._images.get(key)) is None:

@@ -9,7 +9,7 @@ from typing import Any, get_args
 from warnings import catch_warnings, simplefilter
 
 from harness.backends.card import Card, Dtype
-from harness.backends.chat import Chat
+from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.engine import Session
 from harness.backends.language_model import LanguageModel
 from harness.backends.weights import fetching, find_checkpoint, find_gguf, held_to_digest, hub_commit, is_gguf
@@ -27,8 +27,7 @@ def open(
 ) -> LanguageModel:
     """Find and load a card's weights.
 
-    Raises:
-        UserError: the device, the weights or the chat template is missing, or files do not load.
+    Raises UserError if the device, the weights or the chat template is missing, or files do not load.
     """
     dtype = dtype or card.dtype
     if dtype not in get_args(Dtype):
@@ -44,8 +43,7 @@ def open(
 def checkpoint(card: Card) -> Path:
     """Return the directory of a card's checkpoint, held to the card's digest; a GGUF file is unpacked.
 
-    Raises:
-        UserError: the weights are not found, are not what the card says, or cannot be unpacked.
+    Raises UserError if the weights are not found, are not what the card says, or cannot be unpacked.
     """
     if not is_gguf(card):
         where = find_checkpoint(card)
@@ -63,8 +61,7 @@ def checkpoint(card: Card) -> Path:
 def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]:
     """Load the tokenizer and the model of a checkpoint.
 
-    Raises:
-        UserError: files do not load, weights do not fill the model, or there is no chat template.
+    Raises UserError if files do not load, weights do not fill the model, or there is no chat template.
     """
     import transformers
 
@@ -161,15 +158,7 @@ def gpus() -> list[str]:
 
 
 class TransformersEngine:
-    """A loaded model with its tokenizer.
-
-    Attributes:
-        chat: its tokenizer and chat template.
-        context_tokens: the card's limit, or else the checkpoint's own.
-        stops: token ids that end an answer, sorted.
-        eyes: its image processor; None if it takes no pictures.
-        model: the transformers model.
-    """
+    """A transformers model with its tokenizer and, if it takes pictures, its image processor (`eyes`)."""
 
     def __init__(self, card: Card, where: Path, tokenizer: Any, model: Any) -> None:
         from harness.backends.transformers.eyes import Eyes
@@ -178,7 +167,8 @@ class TransformersEngine:
         self.card = card
         self.where = where
         self.eyes = Eyes(card.name, where, card.vision, tokenizer, model) if card.vision else None
-        self.chat = Chat(card.name, tokenizer, self.eyes.image_token if self.eyes else None, card.system)
+        image_token = self.eyes.image_token if self.eyes else None
+        self.chat = Chat(card.name, HubTokenizer(tokenizer), image_token, card.system)
         self.model = model
         self.context_tokens: int = (
             card.context_tokens or self.model.config.get_text_config().max_position_embeddings
@@ -194,13 +184,11 @@ class TransformersEngine:
         self._reader = Reader(self.model, self.eyes)
 
     def look(self, image: Image) -> list[int]:
-        """Return the tokens that stand for a picture in a prompt."""
         if self.eyes is None:
             raise ValueError(f"{self.card.name} takes no pictures")
         return self.eyes.look(image)
 
     def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> Session:
-        """Read some prompts; a beginning shared with each other or with earlier prompts is computed once."""
         return self._reader.begin(prompts, exact)
 
     def identity(self) -> dict[str, Any]:
