@@ -26,7 +26,7 @@ from harness import cli
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.cards import Card, Latency, Thinking
 from harness.backends.openai import backend as openai_backend
-from harness.backends.openai import farm as openai_farm
+from harness.backends.openai import pool as openai_pool
 from harness.backends.openai.shapes import body, read
 from harness.backends.servers import KINDS, Kind, Server
 from harness.core import resources
@@ -44,7 +44,7 @@ GOOD = '{"action_distribution":{"SLOWER":0.10,"IDLE":0.80,"FASTER":0.10}}'
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Retries come soon, and no key of whoever runs the tests is sent anywhere."""
-    monkeypatch.setattr(openai_farm, "FIRST_WAIT_S", 0.01)
+    monkeypatch.setattr(openai_pool, "FIRST_WAIT_S", 0.01)
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
 
@@ -206,7 +206,7 @@ def test_what_breaks_down_for_a_moment_is_asked_again_and_the_time_is_charged() 
 
 
 def test_a_wait_that_would_never_end_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(openai_farm, "LONGEST_WAIT_S", 0.02)
+    monkeypatch.setattr(openai_pool, "LONGEST_WAIT_S", 0.02)
     done = ask_one(lambda asked: asked.reply({"error": "busy"}, 429, retry_after="86400"))
     assert (done.retries, done.error) == (2, "HTTP 429: busy")
 

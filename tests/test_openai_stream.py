@@ -14,8 +14,8 @@ from misbehaving import Asked, Play, completion, event, pieces, read_out, servin
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.cards import Card, Latency
 from harness.backends.openai import backend as openai_backend
-from harness.backends.openai import farm as openai_farm
 from harness.backends.openai import http as openai_http
+from harness.backends.openai import pool as openai_pool
 from harness.backends.openai.shapes import read
 from harness.backends.openai.stream import Stream
 from harness.backends.servers import Server
@@ -26,7 +26,7 @@ CUT_OFF = "the stream ends before the answer does"
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(openai_farm, "FIRST_WAIT_S", 0.01)
+    monkeypatch.setattr(openai_pool, "FIRST_WAIT_S", 0.01)
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
 

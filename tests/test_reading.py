@@ -244,8 +244,8 @@ def direct_reads(source: Path) -> list[str]:
 
 
 def is_path(value: ast.expr) -> bool:
-    """Whether `open` of this is a path's: farms, backends and logs have one, too."""
-    return "farm" not in ast.unparse(value) and ast.unparse(value) not in (
+    """Whether `open` of this is a path's: pools, backends and logs have one, too."""
+    return "pool" not in ast.unparse(value) and ast.unparse(value) not in (
         "module",
         "registration",
         "webbrowser",

@@ -11,7 +11,7 @@ from misbehaving import LISTED, Asked, completion, pieces, serving
 from harness.backends.base import Completion, Request
 from harness.backends.cards import Card, Latency
 from harness.backends.openai import backend as openai_backend
-from harness.backends.openai import farm as openai_farm
+from harness.backends.openai import pool as openai_pool
 from harness.backends.openai.faults import Fault, fault_in
 from harness.backends.servers import Server
 from harness.core.errors import UserError
@@ -21,7 +21,7 @@ WORDS = "the provider is overloaded"
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(openai_farm, "FIRST_WAIT_S", 0.01)
+    monkeypatch.setattr(openai_pool, "FIRST_WAIT_S", 0.01)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
 
 

@@ -25,7 +25,7 @@ from served import served
 from harness.backends.base import Request, Served
 from harness.backends.cards import Card, Latency
 from harness.backends.openai import backend as openai_backend
-from harness.backends.openai import farm as openai_farm
+from harness.backends.openai import pool as openai_pool
 from harness.backends.openai.http import Client
 from harness.backends.servers import Kind
 from harness.backends.servers import Server as Where
@@ -45,7 +45,7 @@ ACTIONS = ("SLOWER", "IDLE", "FASTER")
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(openai_farm, "FIRST_WAIT_S", 0.02)
+    monkeypatch.setattr(openai_pool, "FIRST_WAIT_S", 0.02)
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
 
@@ -179,8 +179,8 @@ def test_a_server_that_is_gone_moves_no_decision_but_its_own(
 ) -> None:
     def ranked(urls: list[str]) -> list[str]:
         where = Where(tuple(urls))
-        farm = openai_farm.Farm(Client(where), where, "mine", "m", 4)
-        return [place.url for place in farm._rank(decision)]
+        pool = openai_pool.ServerPool(Client(where), where, "mine", "m", 4)
+        return [server.url for server in pool._rank(decision)]
 
     urls = [f"http://127.0.0.1:{port}/v1" for port in ports]
     gone = data.draw(st.sampled_from(urls))
@@ -276,8 +276,8 @@ def test_a_server_that_is_not_there_yet_is_waited_for(capfd: pytest.CaptureFixtu
 
 
 def test_a_server_is_looked_for_as_long_as_the_run_lasts() -> None:
-    pauses_s = [openai_farm.pause_s(times) for times in (0, 1, 2, 10, 5000)]
-    assert pauses_s == [0.02, 0.04, 0.08, 20.48, openai_farm.LONGEST_WAIT_S]
+    pauses_s = [openai_pool.pause_s(times) for times in (0, 1, 2, 10, 5000)]
+    assert pauses_s == [0.02, 0.04, 0.08, 20.48, openai_pool.LONGEST_WAIT_S]
 
 
 def test_a_bug_is_a_crash_and_no_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 
 from harness.backends.base import Completion, Request, Served, per_token_s
 from harness.backends.card import Card
-from harness.backends.openai.farm import Farm
 from harness.backends.openai.http import Client, Reply
-from harness.backends.openai.read import Reading
-from harness.backends.openai.shapes import Said, body, digest_url, read
+from harness.backends.openai.pool import ServerPool
+from harness.backends.openai.prompt_check import PromptCheck
+from harness.backends.openai.shapes import body, digest_url, failed, model_of, read
 from harness.backends.openai.stream import ASKED, BROKE_OFF
 from harness.backends.orders import averaged
 from harness.backends.servers import Fields, Server
@@ -32,8 +32,7 @@ _CLOSED_S = 5.0  # longest wait for connections to close
 def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
     """Connect to a card's servers.
 
-    Raises:
-        UserError: no server answers, one refuses the key, the key is malformed, or models differ.
+    Raises UserError if no server answers, one refuses the key, the key is malformed, or models differ.
     """
     if card.server is None:
         raise ValueError(f"card {card.name} has no server")
@@ -57,14 +56,14 @@ class OpenAIBackend:
         self.window = batch_size * len(server.urls)
         self._streams = True  # until a server refuses to stream
         self._served = deque[Served](maxlen=_MOST_SERVED)
-        self._told = False  # that a server names another model
+        self._named_other = False  # whether a server was said to name another model
         self._cuts = False  # whether a server was said to cut prompts
         client = Client(server)
-        self._farm = Farm(client, server, card.name, card.weights or "", batch_size)
-        self._reading = Reading(client, card, server)
+        self._pool = ServerPool(client, server, card.name, card.weights or "", batch_size)
+        self._prompts = PromptCheck(client, card, server)
         self._loop = _Loop(client)
         weakref.finalize(self, self._loop.end)
-        self._loop.run(self._farm.open())
+        self._loop.run(self._pool.open())
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """Return one completion per request, in the same order.
@@ -72,10 +71,8 @@ class OpenAIBackend:
         If a server has one request alone, `seconds` is the time from sending it to the last byte, with failed
         attempts and the waits between them; an answer that never came has its time, too. The first request
         opens a connection, which later ones reuse. Only `timed` requests are streamed: in a stream some
-        servers count no tokens, or separate thoughts differently.
-
-        Raises:
-            UserError: no server is left, or one has come back with another model.
+        servers count no tokens, or separate thoughts differently. Raises UserError if no server is left, or
+        one has come back with another model.
         """
         return self._loop.run(self._all(requests))
 
@@ -88,23 +85,17 @@ class OpenAIBackend:
 
         If any of several servers may answer, their URLs are not part of it.
         """
-        model = self._farm.model
+        model = self._pool.model
         version = {} if model.version is None else {"version": model.version}
         where = {} if self._server.any_may_answer else {"base_url": self._server.base_url}
-        return {
-            "engine": "openai",
-            "server": self._server.kind,
-            **where,
-            "model": self._card.weights,
-            "listed": model.listed,
-            **version,
-            **({"states": dict(model.states)} if model.states else {}),
-        }
+        states = {"states": dict(model.states)} if model.states else {}
+        named = {"model": self._card.weights, "listed": model.listed}
+        return {"engine": "openai", "server": self._server.kind, **where, **named, **version, **states}
 
     @property
     def doubt(self) -> str | None:
-        """Why a cached answer may be one of other weights, in one line; None if the servers tell of these."""
-        if self._farm.model.tells_weights:
+        """Why a cached answer may be one of other weights; None if the servers tell of these."""
+        if self._pool.model.tells_weights:
             return None
         return (
             f"model {printable(self._card.name)!r}: some answers come from the completion cache, and its "
@@ -112,7 +103,6 @@ class OpenAIBackend:
         )
 
     def served(self) -> list[Served]:
-        """Return which server gave each answer since the last call."""
         taken: list[Served] = []
         with suppress(IndexError):  # the loop's thread may add some, and another may take some
             while True:
@@ -120,7 +110,7 @@ class OpenAIBackend:
         return taken
 
     async def _all(self, requests: Sequence[Request]) -> list[Completion]:
-        await self._reading.check(requests)
+        await self._prompts.check(requests)
         together = min(self._batch_size, len(requests))
         # One at a time: if a server refuses to stream, the next request must know.
         if together == 1 and any(request.timed for request in requests):
@@ -130,14 +120,12 @@ class OpenAIBackend:
     async def _answer(self, request: Request, together: int) -> Completion:
         if not request.orders:
             return await self._answer_once(request, together)
-        orders = [request.alike(messages=messages, orders=()) for messages in request.orders]
-        each = [request.alike(orders=()), *orders]
-        # Asked alone, they are asked one after the other: their times add up.
-        if together == 1:
-            return _over_orders(request, [await self._answer_once(order, together) for order in each])
-        return _over_orders(
-            request, await asyncio.gather(*(self._answer_once(order, together) for order in each))
-        )
+        orders = [request.alike(messages=each, orders=()) for each in (request.messages, *request.orders)]
+        if together == 1:  # asked alone, they are asked one after the other: their times add up
+            completions = [await self._answer_once(order, together) for order in orders]
+        else:
+            completions = await asyncio.gather(*(self._answer_once(order, together) for order in orders))
+        return _over_orders(request, completions)
 
     async def _answer_once(self, request: Request, together: int) -> Completion:
         reply = await self._reply(request, together == 1 and request.timed)
@@ -146,7 +134,7 @@ class OpenAIBackend:
             together = self._batch_size
         seconds = end_s - reply.begun_s if together == 1 else None
         if reply.fault:
-            answer = Said(error=self._hinted(reply))
+            answer = failed(request, self._hinted(reply))
         else:
             answer = read(reply.payload, request, self._server.kind)
         self._note(request, reply, answer)
@@ -156,36 +144,30 @@ class OpenAIBackend:
         first_s = None
         if seconds is not None and first_at_s is not None and not answer.error:
             first_s = first_at_s - reply.begun_s
-        return Completion(
-            request_id=request.id,
-            text=answer.text,
-            prompt_tokens=answer.prompt_tokens,
-            completion_tokens=answer.completion_tokens,
-            finish_reason=answer.finish_reason,
+        return replace(
+            answer,
             seconds=seconds,
             batch_size=together,
-            error=answer.error,
-            label_mass=answer.label_mass,
             retries=reply.retries,
             first_token_s=first_s,
             token_s=None if seconds is None else per_token_s(seconds, first_s, tokens),
         )
 
-    def _note(self, request: Request, reply: Reply, answer: Said) -> None:
+    def _note(self, request: Request, reply: Reply, answer: Completion) -> None:
         """Keep which server gave an answer; say once if it names another model than it was asked for."""
-        model, asked = answer.model, self._card.weights
-        if model not in (None, asked, f"{asked}:latest", (self._farm.model.listed or {}).get("id")):
-            model = printable(model)
-            if not self._told:
-                self._told, url = True, printable(reply.url)
-                self._farm.say(
+        model, asked = model_of(reply.payload), self._card.weights
+        if model not in (None, asked, f"{asked}:latest", (self._pool.model.listed or {}).get("id")):
+            model, url = printable(model), printable(reply.url)
+            if not self._named_other:
+                self._named_other = True
+                self._pool.say(
                     f"server {url} was asked for {printable(asked)}, and says that {model} answers"
                 )
         if not answer.error:
             self._served.append(Served(request.id, reply.url, model))
-        if not self._cuts and (fault := self._reading.fault(request, answer.prompt_tokens)):
+        if not self._cuts and (fault := self._prompts.fault(request, answer.prompt_tokens)):
             self._cuts = True
-            self._farm.say(f"server {printable(reply.url)} {fault}")
+            self._pool.say(f"server {printable(reply.url)} {fault}")
 
     def _hinted(self, reply: Reply) -> str:
         """Return a reply's fault; if it names a field that a card can change, say so."""
@@ -202,13 +184,13 @@ class OpenAIBackend:
         json_body = partial(body, self._card, self._server, request)
         decision = request.id.partition("/")[0]
         if not streamed or not self._streams or request.answer == "readout":
-            return await self._farm.post(decision, json_body)
-        reply = await self._farm.post(decision, lambda: {**json_body(), **ASKED})
+            return await self._pool.post(decision, json_body)
+        reply = await self._pool.post(decision, lambda: {**json_body(), **ASKED})
         fault = (reply.fault or "").lower()
         if reply.status in (None, 200) or fault.startswith(BROKE_OFF) or "stream" not in fault:
             return reply
         self._streams = False
-        plain = await self._farm.post(decision, json_body)
+        plain = await self._pool.post(decision, json_body)
         return replace(plain, retries=reply.retries + 1 + plain.retries, begun_s=reply.begun_s)
 
 
@@ -216,18 +198,18 @@ def _over_orders(request: Request, completions: Sequence[Completion]) -> Complet
     """Return the completion of a read-out over several orders; if one failed, that one."""
     first = completions[0]
     retries = sum(completion.retries for completion in completions)
-    if failed := next((completion for completion in completions if completion.error), None):
-        return replace(failed, request_id=request.id, retries=retries)
+    if broken := next((completion for completion in completions if completion.error), None):
+        return replace(broken, request_id=request.id, retries=retries)
 
     def total(values: Iterable[Any]) -> Any:
         known = list(values)
         return None if None in known else sum(known)
 
-    of_actions = [json.loads(completion.text)["action_distribution"] for completion in completions]
+    shares = [json.loads(completion.text)["action_distribution"] for completion in completions]
     # The shares come back as the actions' of the first order: each text names its letters by them.
     letters_p = [
-        [(completion.label_mass or 1.0) * of[action] for action in request.actions]
-        for completion, of in zip(completions, of_actions, strict=True)
+        [(completion.label_mass or 1.0) * share[action] for action in request.actions]
+        for completion, share in zip(completions, shares, strict=True)
     ]
     seconds = total(completion.seconds for completion in completions)
     return replace(

@@ -39,11 +39,8 @@ def constraint(kind: Kind, request: Request) -> Mapping[str, Any]:
 def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
     """Return where an answer breaks the constraint that was sent, in words; None if it keeps to it.
 
-    Args:
-        kind: the kind of server that was asked.
-        request: what was asked.
-        text: the answer, without a thought that the server took out.
-        ended: whether the model ended it; one that was cut off need only be the beginning of what fits.
+    `text` is without a thought that the server took out. If the model has not `ended` it, it need only be the
+    beginning of what fits.
     """
     reader = _Reader(text, compact=kind in _BY_PATTERN)
     try:
@@ -104,11 +101,8 @@ class _Reader:
     """Reads a text along a schema: closed objects, lists, bounded texts and numbers, choices.
 
     Neither `re` nor a validator of JSON can say whether a text that was cut off may still become one that
-    fits. Each method raises EOFError if the text ends first, and ValueError if it cannot fit, with `at` the
-    place.
-
-    Attributes:
-        at: number of characters read.
+    fits. Each method raises EOFError if the text ends first, and ValueError if it cannot fit after `at`
+    characters.
     """
 
     def __init__(self, text: str, compact: bool) -> None:

@@ -13,12 +13,7 @@ _REASON = ("metadata", "raw")  # where a router puts the words of the server beh
 
 
 class Fault(NamedTuple):
-    """An error that a server states.
-
-    Attributes:
-        words: the server's own words, of any length.
-        code: the HTTP status that the error would have had; None if it states none.
-    """
+    """An error in the server's words, of any length, and the HTTP status that it would have had, if known."""
 
     words: str
     code: int | None = None
@@ -44,12 +39,10 @@ def words_of(payload: Any) -> str:
 
 
 def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
-    """Return the error in a JSON value that came with HTTP 200; None if there is none.
+    """Return the error in a JSON value that came with HTTP 200, or in an event of a stream; None without one.
 
-    Args:
-        payload: the value, or one event of a stream.
-        of_chat: whether it should be a chat completion. Then a bare text, or words without any choice, are an
-            error as well.
+    Where a chat completion is due (`of_chat`), a bare text, or words without any choice, are an error as
+    well.
     """
     if of_chat and isinstance(payload, str) and payload.strip():
         return Fault(payload)

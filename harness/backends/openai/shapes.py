@@ -6,10 +6,9 @@ Whatever a server promises, `harness.parsing.parse` decides whether an answer is
 import math
 from base64 import b64encode
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from typing import Any
 
-from harness.backends.base import FinishReason, Request
+from harness.backends.base import Completion, FinishReason, Request
 from harness.backends.card import Card
 from harness.backends.chat import in_parts
 from harness.backends.chat_template import with_system
@@ -36,23 +35,6 @@ _ALL: Mapping[Kind, Mapping[str, int]] = {
 }
 
 
-@dataclass(frozen=True)
-class Said:
-    """A server's answer in the fields of a completion; if there is an `error`, these mean nothing.
-
-    Attributes:
-        model: the model that the server says has answered; None if it says none.
-    """
-
-    text: str = ""
-    finish_reason: FinishReason = "error"
-    prompt_tokens: int | None = None
-    completion_tokens: int | None = None
-    label_mass: float | None = None
-    error: str | None = None
-    model: str | None = None
-
-
 def data_url(image: Image) -> str:
     """Encode a picture as the URL that a server is sent."""
     return f"data:image/png;base64,{b64encode(image.png()).decode()}"
@@ -68,8 +50,7 @@ def body(
 ) -> dict[str, Any]:
     """Build the JSON request of one chat completion, not streamed; `url` gives the URL of its picture.
 
-    Raises:
-        UserError: it has a temperature, which the card leaves out.
+    Raises UserError if it has a temperature, which the card leaves out.
     """
     picture = request.image and {"type": "image_url", "image_url": {"url": url(request.image)}}
     json_body: dict[str, Any] = {
@@ -104,10 +85,11 @@ def body(
     return server.fields.applied(json_body)
 
 
-def read(payload: Any, request: Request, kind: Kind = "generic") -> Said:
-    """Read a chat completion. A malformed one becomes an error, in one sentence.
+def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
+    """Read a chat completion, without its time.
 
-    So does one that breaks the constraint that this kind of server was sent.
+    A malformed one, or one that breaks the constraint that this kind of server was sent, is an error in one
+    sentence.
     """
     try:
         choice = payload["choices"][0]
@@ -115,28 +97,29 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Said:
         content, thought = message.get("content"), _thought(message)
         finish, usage = choice.get("finish_reason"), payload.get("usage") or {}
         tokens = _count(usage.get("prompt_tokens")), _count(usage.get("completion_tokens"))
-        model = payload.get("model")
     except (LookupError, TypeError, AttributeError):
-        return Said(error="the answer is no chat completion")
-    model = model if isinstance(model, str) else None
+        return failed(request, "the answer is no chat completion")
     if request.answer == "readout":
-        return replace(_read_out(choice, request, *tokens), model=model)
+        return _read_out(choice, request, *tokens)
     if not isinstance(content, str) and not (content is None and thought):
         if "content" not in message:
-            return Said(error="the answer is no chat completion", model=model)
+            return failed(request, "the answer is no chat completion")
         named = "null" if content is None else type(content).__name__
-        return Said(error=f"the answer's content is no text but {named}", model=model)
+        return failed(request, f"the answer's content is no text but {named}")
     # An answer that a server's content filter cut off counts as cut off.
     finish_reason: FinishReason = "length" if finish in ("length", "content_filter") else "stop"
     content = content or ""
     if request.answer == "constrained" and (
         fault := broken(kind, request, content, ended=finish_reason == "stop")
     ):
-        error = f"the server did not keep to the constraint that was sent: {fault}; {_REMEDY}"
-        return Said(error=error, model=model)
-    return Said(
-        _whole(thought, content, finish_reason, request.thinking), finish_reason, *tokens, model=model
-    )
+        return failed(request, f"the server did not keep to the constraint that was sent: {fault}; {_REMEDY}")
+    text = _with_thought(thought, content, finish_reason, request.thinking)
+    return Completion(request.id, text, *tokens, finish_reason, None, 1)
+
+
+def failed(request: Request, error: str) -> Completion:
+    """Return the completion of a request that has no answer."""
+    return Completion(request.id, "", None, None, "error", None, 1, error)
 
 
 def _thought(message: Mapping[str, Any]) -> str | None:
@@ -145,7 +128,7 @@ def _thought(message: Mapping[str, Any]) -> str | None:
     return next(filter(None, texts), texts[0] if texts else None)
 
 
-def _whole(thought: str | None, content: str, finish_reason: FinishReason, asked: bool) -> str:
+def _with_thought(thought: str | None, content: str, finish_reason: FinishReason, asked: bool) -> str:
     """Restore the text as the model wrote it, if the server took out the thought: the parser looks for it.
 
     An answer that was cut off with nothing after the thought was cut off inside it, so it stays open.
@@ -159,7 +142,7 @@ def _whole(thought: str | None, content: str, finish_reason: FinishReason, asked
 
 def _read_out(
     choice: Mapping[str, Any], request: Request, prompt_tokens: int | None, completion_tokens: int | None
-) -> Said:
+) -> Completion:
     """Read the letters' probabilities from the list of the likeliest tokens.
 
     A letter counts in each of its spellings, with a blank before it or without. One that is not listed is at
@@ -167,27 +150,28 @@ def _read_out(
     probability; each gets the most that it can have. `label_mass` counts the listed letters only.
     """
     try:
-        listed = [
-            (str(t["token"]), float(t["logprob"])) for t in choice["logprobs"]["content"][0]["top_logprobs"]
-        ]
-        p = [math.exp(logprob) for _, logprob in listed]
+        likeliest = choice["logprobs"]["content"][0]["top_logprobs"]
+        listed = [(spelt(str(t["token"])), math.exp(float(t["logprob"]))) for t in likeliest]
     except (LookupError, TypeError, ValueError, OverflowError):
-        return Said(error="the server gives no log-probabilities")
-    names = letters(request.actions)
-    tokens = [spelt(token) for token, _ in listed]
-    listed_p = {
-        letter: math.fsum(x for x, token in zip(p, tokens, strict=True) if token == letter)
-        for letter in names
-    }
-    mass = math.fsum(listed_p.values())
-    if not 0 < math.fsum(p) <= 1.001:
-        return Said(error="the server's log-probabilities are none")
+        return failed(request, "the server gives no log-probabilities")
+    names, total = letters(request.actions), math.fsum(p for _, p in listed)
+    letter_p = {name: math.fsum(p for token, p in listed if token == name) for name in names}
+    mass = math.fsum(letter_p.values())
+    if not 0 < total <= 1.001:
+        return failed(request, "the server's log-probabilities are none")
     if not mass:
-        return Said(error=f"none of the letters {names} is among the {len(p)} likeliest tokens")
-    missing = [letter for letter in names if letter not in tokens]
-    rest = max(0.0, 1.0 - math.fsum(p))
-    shares = [min(min(p), rest / len(missing)) if x in missing else listed_p[x] for x in names]
-    return Said(stated(request.actions, shares), "stop", prompt_tokens, completion_tokens, min(1.0, mass))
+        return failed(request, f"none of the letters {names} is among the {len(listed)} likeliest tokens")
+    missing = set(names) - {token for token, _ in listed}
+    most_p = min(min(p for _, p in listed), max(0.0, 1.0 - total) / max(1, len(missing)))
+    text = stated(request.actions, [most_p if name in missing else letter_p[name] for name in names])
+    tokens = prompt_tokens, completion_tokens
+    return Completion(request.id, text, *tokens, "stop", None, 1, label_mass=min(1.0, mass))
+
+
+def model_of(payload: Any) -> str | None:
+    """Return the model that a server says has answered; None if it says none."""
+    model = payload.get("model") if isinstance(payload, dict) else None
+    return model if isinstance(model, str) else None
 
 
 def _count(value: Any) -> int | None:

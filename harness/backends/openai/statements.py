@@ -58,13 +58,9 @@ class Model(NamedTuple):
 
 
 async def stated(kind: Kind, weights: str, models: Any, ask: Ask) -> Model:
-    """Return what a server states of a model.
+    """Return what a server states of a model, by its answer to `/v1/models` and what else it is asked.
 
-    Args:
-        kind: kind of server.
-        weights: name of the model. A server with one model accepts any name.
-        models: the server's answer to `/v1/models`.
-        ask: asks the server for more.
+    A server with one model accepts any name for it.
     """
     if (entry := _entry(models, "data", weights)) is None:
         return Model()

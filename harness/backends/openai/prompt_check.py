@@ -16,7 +16,7 @@ from harness.core.errors import UserError, printable
 LONGER = 1.5  # times as many characters have more tokens
 
 
-class Reading:
+class PromptCheck:
     """Asks a model's servers, before the first answer of each role, what the model reads.
 
     llama-server renders messages (`/apply-template`), and vLLM counts them (`/tokenize`), without an answer.
@@ -28,13 +28,13 @@ class Reading:
         self._client, self._card, self._server = client, card, server
         self._asked: set[str] = set()  # roles
         self._shortest = self._longest = (0, 0)  # characters and tokens of prompts that were answered
-        self._one = asyncio.Lock()
+        self._alone = asyncio.Lock()
 
     async def check(self, requests: Sequence[Request]) -> None:
         """Ask about the first request of each role. Raises UserError if a text is left out."""
         if self._server.kind not in ("llama-server", "vllm"):
             return
-        async with self._one:
+        async with self._alone:
             for request in requests:
                 if request.role not in self._asked and request.image is None:
                     for base in self._server.urls:
@@ -51,22 +51,23 @@ class Reading:
         here = sum(len(message["content"]) for message in request.messages), tokens
         self._shortest = min(self._shortest if self._shortest[0] else here, here)
         self._longest = max(self._longest, here)
-        (few, counted), (many, of_many) = self._shortest, self._longest
-        if many < LONGER * few or of_many > counted:
+        (few, few_tokens), (many, many_tokens) = self._shortest, self._longest
+        if many < LONGER * few or many_tokens > few_tokens:
             return None
         return (
-            f"counts {counted} tokens in a prompt of {few} characters and {of_many} in one of {many}; it may "
-            "cut prompts, or count only what it did not have in its cache: look at its context length and log"
+            f"counts {few_tokens} tokens in a prompt of {few} characters and {many_tokens} in one of {many}; "
+            "it may cut prompts, or count only what it did not have in its cache: look at its context "
+            "length and log"
         )
 
     async def _ask(self, base: str, asked: dict[str, Any]) -> None:
         messages: Messages = asked["messages"]
         if self._server.kind == "llama-server":
-            prompt = await self._told(base, "/apply-template", "prompt", asked)
+            prompt = await self._field(base, "/apply-template", "prompt", asked)
             lacking = unsaid(messages, prompt) if isinstance(prompt, str) else None
         else:
             counts = [
-                await self._told(base, "/tokenize", "count", {**asked, "messages": some})
+                await self._field(base, "/tokenize", "count", {**asked, "messages": some})
                 for some in (messages, messages[1:])
             ]
             grows = not all(type(n) is int for n in counts) or counts[0] > counts[1]
@@ -79,7 +80,7 @@ class Reading:
                 f"asked; start the server with the template that the model was trained with{way}"
             )
 
-    async def _told(self, base: str, path: str, field: str, asked: dict[str, Any]) -> Any:
+    async def _field(self, base: str, path: str, field: str, asked: dict[str, Any]) -> Any:
         """Return a field of what a server says of messages; None if it does not say."""
         keys = ("model", "messages", "chat_template_kwargs")
         content = json.dumps({key: asked[key] for key in keys if key in asked}).encode()
