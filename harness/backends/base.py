@@ -40,21 +40,21 @@ class Request:
         max_tokens: most tokens the answer may have.
         form: what the prompt asks for (`Prompt.form`).
         answer: how the model answers. `json`: it writes freely. `constrained`: it fills in numbers and
-            choices of a fixed text. `readout`: the messages ask for one letter (see
-            `harness.prompts.readout`), and the letters' probabilities are the answer.
+            choices of a fixed text. `readout`: the messages ask for one letter (`harness.prompts.readout`),
+            and the letters' probabilities are the answer.
         extension: further members of its answer (`Shape.extension`).
-        sums: what becomes of a sum of probabilities that is off 1 in `json`: the answer failed, or it is
-            divided out.
+        sums: whether probabilities of `json` that sum to other than 1 fail the answer, or are divided by
+            their
+            sum.
         thinking: whether the model is asked to think first (if its template can switch that).
         reasons_first: whether the prompt asks for reasons before the answer.
-        temperature: 0 takes the likeliest token each time; above 0, tokens are drawn from softmax(logits /
-            temperature).
+        temperature: 0 takes the likeliest token; above, tokens are drawn from softmax(logits / temperature).
         sample: number of the answer among several to one question, which seeds its draws; 0 if there is one.
         timed: whether the answer's time is measured; a server then streams it, which shows the first token.
         agent: which of the run's agents is asked: 0 is the ego's.
         image: the picture before the text of the last user message; None if there is none.
-        view: the viewer's own scene graph. Only backends without a language model read it (`proxy`, the
-            drivers); it holds nothing that the prompt's author could not see.
+        view: the viewer's own scene graph, for backends without a language model; it holds nothing that the
+            prompt's author could not see.
         truth: scene graph with everything in view; None unless the card is `privileged`.
         scenario: scenario of the view; only backends that read the view read it.
     """
@@ -90,7 +90,7 @@ class Request:
 
     @property
     def divides(self) -> bool:
-        """Whether the sum of the answer's probabilities is divided out, however far it is off 1."""
+        """Whether the answer's probabilities are divided by their sum, however far it is off 1."""
         return self.answer == "constrained" or self.sums == "divide"
 
     def alike(self, **changes: Any) -> "Request":
@@ -115,7 +115,6 @@ class Completion:
     """One answer to a request.
 
     Attributes:
-        request_id: the request's id.
         text: the model's text, unchanged; empty on an error.
         prompt_tokens: tokens of the prompt; None if the engine has no tokenizer. Of several orders, what they
             begin with counts once in process, and as often as a server counts it.
@@ -126,17 +125,16 @@ class Completion:
         batch_size: number of requests that went through the engine together.
         error: the engine's message if finish_reason is `error`.
         label_mass: total probability of the letters in a `readout`; None otherwise.
+        retries: failed attempts before this one; their time is in `seconds`.
+        cached: whether it comes from the cache, in which case it has no seconds.
+        slow_s: declared seconds of this answer beyond its card's latency (the slow tail of a proxy).
+        first_token_s: time to first token (TTFT), prefill included; None if it is not known.
+        token_s: time per output token (TPOT, see `per_token_s`); None if there is only one token.
         letter_share: how much of a read-out over several orders follows the letter, 0 to 1
             (`harness.backends.orders`); None otherwise, like the next.
         follows_letter: whether one letter is the likeliest in every order.
         flipped: of a replayed read-out, whether its likeliest action changed in the reversed list; None where
             that is not known.
-        retries: failed attempts before this one; their time is in `seconds`.
-        cached: whether it comes from the cache, in which case it has no seconds.
-        slow_s: declared seconds of this answer beyond its card's latency (the slow tail of a proxy).
-        first_token_s: time to first token (TTFT), prefill included; None if `seconds` is None or it is not
-            known.
-        token_s: time per output token (TPOT, see `per_token_s`); None if there is only one token.
     """
 
     request_id: str
@@ -203,8 +201,7 @@ class Rendering(Backend, Protocol):
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         """Return each request's prompt as the model reads it, or as sent to a server that renders it itself.
 
-        Raises:
-            UserError: the chat template refuses the messages.
+        Raises UserError if the chat template refuses the messages.
         """
         ...
 
@@ -212,19 +209,13 @@ class Rendering(Backend, Protocol):
 def window(backend: Backend) -> int:
     """Return the most requests that a backend works on at once, if threads may call `complete` concurrently.
 
-    0 for a backend that takes one call at a time; it has no attribute `window`.
+    0 for a backend that takes one call at a time, which has no attribute `window`.
     """
     return getattr(backend, "window", 0)
 
 
 class Served(NamedTuple):
-    """Which server gave an answer.
-
-    Attributes:
-        id: the request's id.
-        server: base URL of the server.
-        model: the model that the server says has answered; None if it says none.
-    """
+    """Which server gave the answer of a request, and the model that it names; None if it names none."""
 
     id: str
     server: str

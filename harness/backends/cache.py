@@ -67,7 +67,7 @@ def key(identity: Mapping[str, Any], prompt: str, request: Request, batch_size: 
 class CompletionFile:
     """The SQLite file. It is opened for every call, so a file that was deleted is simply empty again.
 
-    Both methods raise sqlite3.Error or OSError if it cannot be read or written.
+    Its methods raise sqlite3.Error or OSError if it cannot be read or written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -123,11 +123,7 @@ def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
 
 
 class Cached:
-    """A backend with a cache of its answers, except errors. A cached answer has no seconds.
-
-    Attributes:
-        backend: answers the requests that are not cached.
-    """
+    """A backend with a cache of its answers, except errors. A cached answer has no seconds."""
 
     def __init__(self, backend: Rendering, file: Path) -> None:
         self.backend = backend

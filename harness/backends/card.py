@@ -23,8 +23,7 @@ class Latency:
     """Declared time of one answer.
 
     Attributes:
-        source: `card` means `inference_s`; `paper`, for a card that declares no time, means the paper's
-            145 ms.
+        source: `card` means `inference_s`; `paper`, for a card that declares no time, the paper's 145 ms.
         inference_s: declared seconds of one answer; None for the paper's.
         basis: where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date".
     """
@@ -45,9 +44,7 @@ class Card:
     Attributes:
         name: file stem of the card, `<stem>:<engine>`, name of the directory or GGUF file, hub id, or
             `replay:<run>`.
-        engine: name of the engine that answers.
         description: one line for people.
-        latency: declared time of one answer.
         weights: directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for
             `replay`; the server's name of the model for `openai`; None without a model.
         file: name of the GGUF file in `weights`; None if `weights` is the file itself, or no file is needed.
@@ -62,8 +59,8 @@ class Card:
         licence: SPDX id of the weights' licence, or its name if it has no id.
         max_new_tokens: most tokens of an answer, if the model needs another limit than its prompt's.
         thinking_tokens: most tokens of a thought, in addition to the answer's, if asked to think.
-        server: the server of an `openai` model; None for other engines.
-        failures: how often the proxy fails on purpose; None if it never does.
+        server: the server of an `openai` model.
+        failures: how often the proxy fails on purpose.
         vision: how the model takes pictures; None if it only reads text.
         projector: name of the GGUF file beside `file` that turns pictures into tokens.
         letters: `raw` for a model that was trained to answer by the letters in one order; None, or `cyclic`,
@@ -99,8 +96,7 @@ class Card:
     def at(self, urls: tuple[str, ...]) -> "Card":
         """Return the card of a served model with other servers; the card itself if `urls` is empty.
 
-        Raises:
-            ValueError: one is not a base URL, or is named twice.
+        Raises ValueError if one is not a base URL, or is named twice.
         """
         return replace(self, server=replace(self.server, base_url=urls)) if self.server and urls else self
 

@@ -37,11 +37,7 @@ def names() -> list[str]:
 
 
 def load(name: str) -> Card:
-    """Load a card by `<name>` or `<name>:<engine>`.
-
-    Raises:
-        UserError: there is no such card, it does not list the engine, or its file has a mistake.
-    """
+    """Load a card by `<name>` or `<name>:<engine>`. Raises UserError if there is none or it has a mistake."""
     stem, _, engine = name.partition(":")
     if stem not in names():
         raise unknown("model", name, names())
@@ -59,12 +55,8 @@ def load_all() -> list[Card]:
 def resolve(text: str, engine: str | None = None) -> Card:
     """Return the card of a name, `replay:RUN_DIR`, a path or a hub id, tried in this order.
 
-    Args:
-        text: what the user wrote.
-        engine: engine to run it on, if there is a choice; None for the default one.
-
-    Raises:
-        UserError: there is no such model or engine, or the model does not run on the engine.
+    It runs on `engine`, if there is a choice. Raises UserError if there is no such model or engine, or the
+    model does not run on the engine.
     """
     if engine is not None:
         registration(engine)
@@ -97,10 +89,7 @@ def own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card:
         stated: the card that the run states. Only its name is looked up; the rest is compared.
         given: cards that the user gave, which come before the card files.
         where: name of the run, in messages.
-        hint: what the user can do if there is no such card.
-
-    Raises:
-        UserError: the user has no card of that name, or it asks otherwise than the run did.
+        hint: what the user can do if there is no such card, which is a UserError, as is a card that differs.
     """
     name = printable(stated.name)
     card = next((card for card in given if card.name == stated.name), None)

@@ -14,12 +14,9 @@ Pictured = tuple[Request, Request, Request]  # one question with a camera pictur
 
 @dataclass(frozen=True)
 class Looks:
-    """A model's answers to an image prompt with different pictures.
+    """A model's answers by answer mode to an image prompt, with what the cameras see and a blank picture.
 
-    Attributes:
-        answers: one answer in each answer mode to what the cameras see.
-        blank: the same with a blank picture instead.
-        text: an answer to the text alone, in the last answer mode that worked; None if none did.
+    `text` is an answer to the text alone, in the last answer mode that worked; None if none did.
     """
 
     answers: dict[AnswerMode, Completion]
@@ -63,7 +60,6 @@ class Checkup:
             token, and for a server's.
         thinking: what the model's own template can do, whatever its card says; None for a server's.
         answers: one answer in each answer mode, asked alone after a warm-up; the seconds are of batch size 1.
-        identity: identity of the backend, as in a run's manifest.
         looks: answers to pictures; None if the card says that the model takes none.
     """
 
@@ -83,11 +79,7 @@ def check(
 ) -> Checkup:  # fmt: skip
     """Check a model with some questions, one in each answer mode.
 
-    Args:
-        backend: the model's backend.
-        asked: the questions.
-        shown: questions of an image prompt; empty for a model without vision.
-        progress: called with 1 as soon as a question is answered.
+    For a model with vision, `shown` has questions of an image prompt. `progress` is called with 1 after each.
     """
 
     def answer(request: Request, warm: bool = False) -> Completion:

@@ -21,12 +21,9 @@ SAMPLED_S = 0.02  # time between two samples of a power
 
 @dataclass(frozen=True)
 class Counter:
-    """One energy or power meter.
+    """One energy or power meter, such as `nvml 0`, `rapl package-0` or `jetson VDD_IN`.
 
-    Attributes:
-        name: such as `nvml 0`, `rapl package-0` or `jetson VDD_IN`.
-        joules: reads the energy counted so far, from any start; None for a meter of power.
-        watts: reads the present power; None for a meter of energy.
+    It reads either the joules counted so far, from any start, or the present watts.
     """
 
     name: str

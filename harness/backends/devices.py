@@ -26,11 +26,7 @@ def names() -> list[str]:
 
 
 def load(name: str) -> Device:
-    """Load a profile by name.
-
-    Raises:
-        UserError: there is none, or its file has a mistake.
-    """
+    """Load a profile by name. Raises UserError if there is none, or its file has a mistake."""
     if name not in names():
         raise unknown("device profile", name, names())
     path = resources.find("devices", f"{name}.toml")
@@ -58,12 +54,8 @@ def _with_sources(value: Any, sources: dict[str, str]) -> Any:
 def row_of(device: Device, model: str) -> DeviceRow:
     """Return the row of a model: its own, or the nearest one scaled if the profile allows scaling.
 
-    Args:
-        device: the profile.
-        model: name of a row, of a card, or a size such as `3b`, in billions of weights.
-
-    Raises:
-        UserError: the profile has no row for it.
+    A model is the name of a row, of a card, or a size such as `3b`, in billions of weights. Raises UserError
+    if the profile has no row for it.
     """
     by_name = {row.model: row for row in device.rows}
     if model in by_name:

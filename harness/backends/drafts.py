@@ -1,8 +1,7 @@
 """Guesses of how an answer goes on, from the answers written beside it.
 
-With a guess, a model reads several tokens at a time in place of one. A guess changes no answer: the model
-checks it, and drops what it would not have written itself (speculative decoding, Leviathan et al., 2023).
-Guesses are a batch's own, so no answer depends on an earlier batch.
+A model checks a guess of several tokens at a time, and drops what it would not have written itself
+(speculative decoding, Leviathan et al., 2023), so no answer changes. Guesses are a batch's own.
 """
 
 from collections.abc import Hashable, Sequence

@@ -36,24 +36,16 @@ class Session(Protocol):
     def follow(self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]) -> list[int]:
         """Append a chunk to each sequence, and as much of its guess as is its own likeliest next tokens.
 
-        A chunk is not empty, a guess may be.
-
-        Returns:
-            How many tokens of each guess were appended; an engine that checks none appends none.
+        A chunk is not empty, a guess may be. Returns how many tokens of each guess were appended; an engine
+        that checks none appends none.
         """
         ...
 
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
-        """Return the log-probabilities of some tokens after each of several chunks of each sequence.
+        """Return the log-probabilities of some tokens after each of some chunks of each sequence.
 
-        The sequences end with that: they can only be closed.
-
-        Args:
-            chunks: of each sequence equally many ways to go on, none empty.
-            tokens: as in `log_probs`.
-
-        Returns:
-            Shape (n, ways, len(tokens)).
+        Each sequence has equally many chunks, none empty, and can only be closed then. Shape (n, ways,
+        len(tokens)).
         """
         ...
 
@@ -80,13 +72,10 @@ class Engine(Protocol):
     stops: Sequence[int]
 
     def look(self, image: Image) -> list[int]:
-        """Return the tokens that stand for a picture in a prompt.
+        """Return the tokens that stand for a picture in a prompt. Raises ValueError if the model takes none.
 
         Tokens that the vision encoder fills are negative, equal for equal pixels and different for another
         picture; markers around them are tokens of the vocabulary.
-
-        Raises:
-            ValueError: the model takes no pictures.
         """
         ...
 

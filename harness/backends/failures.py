@@ -26,8 +26,7 @@ class Failures:
         nan: one probability is NaN. Failed, `non_finite`.
         unknown_action: no action's name is one of the scenario's. Failed, `unknown_action`.
         unclosed_think: the answer is in a thought that never ends. Failed, `truncated_reasoning`.
-        slow_tail: the answer takes `slow_s` longer than the card's latency.
-        slow_s: seconds; above 0 if there is a slow tail.
+        slow_tail: the answer takes `slow_s` seconds longer than the card's latency.
     """
 
     fence: Share = 0.0

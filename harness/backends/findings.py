@@ -17,11 +17,10 @@ MOST = 0.5  # letter share from which the letter explains more than all else
 
 
 class Moved(Struct, frozen=True):
-    """How pairs of questions that differ in one fact were answered.
+    """How the `n` pairs of questions that differ in one fact were answered.
 
     Attributes:
         fact: the kind of fact.
-        n: number of pairs.
         moved: in how many the expected action became clearly likelier with the fact.
         mean: mean change of its probability.
     """

@@ -34,11 +34,7 @@ class ModelFacts:
 
 
 def facts(file: Path) -> ModelFacts:
-    """Read what a file states of its model; nothing if it is no GGUF, which loading it reports.
-
-    Raises:
-        OSError: it cannot be opened.
-    """
+    """Read what a file states of its model; nothing if it is no GGUF. Raises OSError if it does not open."""
     try:
         values = metadata(file)
     except ValueError:
@@ -55,15 +51,9 @@ def facts(file: Path) -> ModelFacts:
 
 
 def metadata(file: Path, arrays: bool = False) -> Mapping[str, Any]:
-    """Read the keys and values of a file.
+    """Read the keys and values of a GGUF file; arrays are skipped unless they are asked for.
 
-    Args:
-        file: the GGUF file.
-        arrays: also return arrays, which are otherwise skipped.
-
-    Raises:
-        OSError: it cannot be opened.
-        ValueError: it is no GGUF file, or its keys and values are longer than `LONGEST`.
+    Raises OSError if it cannot be opened, and ValueError if it is no GGUF or they are longer than `LONGEST`.
     """
     with opened(file, "weights") as data:
         head = data.read(LONGEST)

@@ -23,14 +23,10 @@ _SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
 
 
 def local_card(text: str, engine: str | None) -> Card | None:
-    """Return the card of what a user wrote for a model; None if it is none of these.
+    """Return the card of `replay:RUN_DIR`, a path or a hub id; None of another text.
 
-    Args:
-        text: `replay:RUN_DIR`, a path or a hub id.
-        engine: engine to run it on, if there is a choice; None for the default one.
-
-    Raises:
-        UserError: there is no such file or run, or it does not say how to open it.
+    It runs on `engine`, if there is a choice. Raises UserError if there is no such file or run, or it does
+    not say how to open it.
     """
     kind, _, rest = text.partition(":")
     if kind == "replay":

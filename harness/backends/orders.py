@@ -37,10 +37,8 @@ class Averaged:
 def averaged(actions: Sequence[str], letters_p: Sequence[Sequence[float]]) -> Averaged:
     """Average a read-out.
 
-    Args:
-        actions: the actions, in the order of the first reading.
-        letters_p: the letters' probabilities in each cyclic order of the actions
-            (`harness.prompts.readout.cyclic`), a row an order.
+    `letters_p` has the letters' probabilities in each cyclic order of the actions
+    (`harness.prompts.readout.cyclic`), a row an order; the first is that of `actions`.
     """
     p: Floats = np.array(letters_p, dtype=float)
     mass = p.sum(axis=1)

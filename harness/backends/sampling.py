@@ -39,8 +39,8 @@ class Choice:
         """Choose the next token of each sequence of a session.
 
         Args:
-            session: session with the sequences of `places`, in order.
-            places: places of their requests.
+            session: session with the sequences of `places`, the places of their requests, in order.
+            places: see `session`.
             among: allowed tokens of each sequence; None allows all.
         """
         chosen = session.argmax(among)
@@ -57,13 +57,9 @@ class Choice:
 
 
 def drawn(log_p: Floats, among: Sequence[int] | None, temperature: float, u: float) -> int:
-    """Return the token of a uniform draw from softmax(log_p / temperature) over the allowed tokens.
+    """Return the token of a draw from softmax(log_p / temperature) over the tokens of `among` (None: all).
 
-    Args:
-        log_p: log-probabilities of the vocabulary.
-        among: allowed tokens; None allows all.
-        temperature: above 0.
-        u: the draw, in [0, 1).
+    `u` is the uniform draw, in [0, 1). The temperature is above 0.
     """
     tokens = np.arange(len(log_p)) if among is None else np.unique(among)
     with np.errstate(over="ignore"):  # a token far below the likeliest gets probability 0

@@ -126,10 +126,8 @@ class Server:
     def key(self) -> str | None:
         """Return the server's key; None if its variable is not set.
 
-        A card may come from others, so it may not have any variable sent to its server.
-
-        Raises:
-            UserError: the variable holds no key of models, by its name, and the user does not list it.
+        A card may come from others, so it may not have any variable sent to its server. Raises UserError if
+        the variable holds no key of models, by its name, and the user does not list it.
         """
         if not self.key_env or not (key := os.environ.get(self.key_env, "").strip()):
             return None

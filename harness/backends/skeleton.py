@@ -117,12 +117,7 @@ def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
 
 
 class Ask(NamedTuple):
-    """A decision that the model has to make in a skeleton.
-
-    Attributes:
-        forced: tokens to append first, among them that of the last decision.
-        among: tokens to choose from, sorted.
-    """
+    """A decision of the model: `forced` tokens to append first, then the sorted tokens to choose from."""
 
     forced: list[int]
     among: Sequence[int]
@@ -146,8 +141,7 @@ class Leg(NamedTuple):
 class Skeleton:
     """The answers of a shape in a tokenizer's tokens; each follows a line break, as in every template.
 
-    Attributes:
-        most_tokens: length of the longest.
+    The longest has `most_tokens`.
     """
 
     def __init__(self, chat: Chat, shape: Shape) -> None:

@@ -34,10 +34,7 @@ _WHOLE_FIRST = ("llama-bpe",)  # a piece that is a token is not merged out of it
 def tokenizer(source: Path) -> Any:
     """Load a `tokenizers.Tokenizer` from a GGUF file, a tokenizer.json, or a folder with one.
 
-    A file may have been saved with a longest length or with padding; both are switched off.
-
-    Raises:
-        UserError: there is no tokenizer, or it is of another kind.
+    It neither cuts texts off nor pads them, whatever the file says. Raises UserError if there is none.
     """
     from tokenizers import Tokenizer
 

@@ -29,8 +29,7 @@ _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 def find_checkpoint(card: Card) -> Path:
     """Find the directory of a card's checkpoint: as given, beside the cards, or in the hub's cache.
 
-    Raises:
-        UserError: it is not found, or it lacks its config, weights or tokenizer.
+    Raises UserError if it is not found, or lacks its config, weights or tokenizer.
     """
     local = find("models", card.weights or "")
     where = local if local.is_dir() else _snapshot(card)
@@ -67,8 +66,7 @@ def _check_files(card: Card, checkpoint: Path) -> None:
 def find_gguf(card: Card) -> Path:
     """Find the GGUF file of a card: as given, beside the cards, out of a package, or in the hub's cache.
 
-    Raises:
-        UserError: the file is not found, or its projector is not beside it.
+    Raises UserError if the file is not found, or its projector is not beside it.
     """
     if wanted := packages.packaged(card):
         if not wanted.place.is_file():
@@ -122,10 +120,7 @@ def located(card: Card) -> Path:
 def contradictions(card: Card) -> Iterator[str]:
     """Yield a line for each thing that a card says otherwise than its weights. The card holds.
 
-    A shorter context than that of the weights is a choice, and no contradiction.
-
-    Raises:
-        UserError: the weights are not found.
+    A shorter context than that of the weights is a choice. Raises UserError if the weights are not found.
     """
     where = located(card)
     stated = facts(where) if where.is_file() else ModelFacts(context_tokens=_context_tokens(where))
@@ -152,14 +147,10 @@ def _context_tokens(checkpoint: Path) -> int | None:
 
 
 def pull(card: Card) -> Path:
-    """Download the files that a card's engine needs and that are missing, into a cache.
+    """Download what a card's engine needs and lacks into a cache; return the checkpoint or the GGUF file.
 
-    Returns:
-        The checkpoint's directory, or the GGUF file.
-
-    Raises:
-        UserError: there is nothing to fetch, the hub or the registry is not reached or refuses, or the digest
-            is not the card's.
+    Raises UserError if there is nothing to fetch, the hub or the registry is not reached or refuses, or the
+    digest is not the card's.
     """
     if not capabilities(card.engine).has_weights:
         raise UserError(f"model {printable(card.name)!r} runs on {card.engine}: it has no weights to pull")

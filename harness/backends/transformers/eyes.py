@@ -22,18 +22,10 @@ KEPT = 64  # pictures whose encoding is kept: those of a chunk of requests, for 
 
 
 class Eyes:
-    """A loaded model's image processor and vision encoder.
-
-    Attributes:
-        image_token: token that its chat template writes for a picture.
-    """
+    """A loaded model's image processor and vision encoder; a picture is `image_token` in its template."""
 
     def __init__(self, name: str, where: Path, vision: Vision, tokenizer: Any, model: Any) -> None:
-        """Load the processor.
-
-        Raises:
-            UserError: there is none, or a picture does not have as many tokens as the card says.
-        """
+        """Load the processor. Raises UserError if there is none, or it makes more or fewer tokens."""
         self._processor = Processor(name, where, vision)
         if difference := vision.difference(self._processor.tokens):
             raise UserError(f"model {name!r}: {difference}")

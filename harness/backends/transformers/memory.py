@@ -82,8 +82,7 @@ def _paged(columns: int) -> int:
 def joined(parts: Sequence[tuple[Sequence[int], Cache]]) -> Cache:
     """Return one cache of the rows of several, which are emptied. Rows with fewer columns end in zeros.
 
-    Args:
-        parts: caches of paged layers, each with the places of its rows among all.
+    Each cache has paged layers, and comes with the places of its rows among all.
     """
     n = sum(len(places) for places, _ in parts)
     columns = max(cache.get_seq_length() for _, cache in parts)

@@ -33,9 +33,7 @@ class Prefixes:
     def longest(self, ids: list[int], but: Sequence[int] = ()) -> Prefix:
         """Return the longest known beginning of a sequence; `NOTHING` if it is below `LEAST_TOKENS`.
 
-        Args:
-            ids: the sequence.
-            but: a whole prompt that is ignored although it was read before.
+        `but` is a whole prompt that is ignored although it was read before.
         """
         kept = [prefix for prefix in self._kept if prefix.ids != list(but)]
         shared = [len(common([prefix.ids, ids])) for prefix in kept]

@@ -22,11 +22,7 @@ if TYPE_CHECKING:
 
 
 class Processor:
-    """A checkpoint's image processor.
-
-    Attributes:
-        tokens: number of tokens of a picture of the card's size.
-    """
+    """A checkpoint's image processor, which makes `tokens` of a picture of the card's size."""
 
     def __init__(self, name: str, where: Path, vision: Vision) -> None:
         """Load the processor. Raises UserError if the checkpoint has none."""
@@ -78,8 +74,7 @@ class Processor:
 def tokens(card: Card) -> int:
     """Return the number of tokens that a card's processor makes of a picture of the card's size.
 
-    Raises:
-        UserError: the checkpoint or its processor is missing.
+    Raises UserError if the checkpoint or its processor is missing.
     """
     if card.vision is None:
         raise ValueError(f"card {card.name} takes no pictures")

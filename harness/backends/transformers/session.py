@@ -32,11 +32,7 @@ CPU_TOKENS = 1024  # most tokens that a CPU reads together: what more of them ne
 
 
 class Reader:
-    """A model that reads prompts.
-
-    Attributes:
-        together: whether sequences can be padded, and so be read in one batch.
-    """
+    """A model that reads prompts; `together` if sequences can be padded, and so be read in one batch."""
 
     def __init__(self, model: Any, eyes: Eyes | None = None) -> None:
         self._model, self._eyes = model, eyes
@@ -114,9 +110,7 @@ class Reader:
     def _pieces(self, group: Sequence[int], lengths: Sequence[int]) -> list[list[int]]:
         """Split a group's places into those that are read together, the longest first.
 
-        Args:
-            group: places of prompts.
-            lengths: number of tokens to read of each prompt.
+        `lengths` has the number of tokens to read of each prompt.
         """
         most = CPU_TOKENS if self._model.device.type == "cpu" else sum(lengths)
         pieces: list[list[int]] = []

@@ -28,9 +28,8 @@ _SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
 def unpacked(card: Card, file: Path) -> Path:
     """Return the checkpoint of a GGUF file, which is made if it is not kept.
 
-    Raises:
-        UserError: the file has no tokenizer or chat template, transformers does not know its architecture, or
-            the checkpoint cannot be written.
+    Raises UserError if the file has no tokenizer or chat template, transformers does not know its
+    architecture, or the checkpoint cannot be written.
     """
     from transformers import __version__
 
