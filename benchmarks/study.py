@@ -22,12 +22,13 @@ import pandas as pd
 from harness.coordination.operating_point import POINTS
 from harness.report.drawing.pictures import FORMATS, save
 from harness.runs.folder import read
-from harness.studies import figures
 from harness.studies.axes import Setting
 from harness.studies.calibrated import STEPS, Calibrated
-from harness.studies.folder import lay_out
+from harness.studies.figures.bars import operating_points
+from harness.studies.figures.lines import along
 from harness.studies.paper import panels
 from harness.studies.play import play
+from harness.studies.study import lay_out
 
 SEEDS = range(5)
 HARNESS = [sys.executable, "-m", "harness"]
@@ -72,7 +73,7 @@ def pictures(summaries: "Sequence[pd.DataFrame]") -> dict[str, float]:
     """CPU of making the campaign's two figures, of laying them out, and of each format."""
     core, *sweeps, _ = summaries
     start = process_time()
-    drawn = [figures.composite_a(core), figures.along(sweeps)]
+    drawn = [operating_points(core), along(sweeps)]
     found = {"make_figures_cpu_s": process_time() - start}
     start = process_time()
     for figure in drawn:

@@ -20,8 +20,7 @@ from harness import cli
 from harness.backends.base import Completion, Request
 from harness.backends.card import Card
 from harness.evaluate import lifecycle
-from harness.studies import folder as study_folder
-from harness.studies import repeats
+from harness.studies import repeats, study
 
 RUN, DRIVEN, SEEDS = "run", "driven", ("--seeds", "0:4")
 POINTS = ("--condition", "single-local", "--condition", "6g")
@@ -127,7 +126,7 @@ def main(dataset: Path, folder: Path, names: Sequence[str]) -> None:
 
     for module, name, instead in (
         (lifecycle, "datetime", Then), (repeats, "open_backend", opens),
-        (study_folder, "FORMATS", ("svg",)),  # the pictures of a study take longer than all else
+        (study, "FORMATS", ("svg",)),  # the pictures of a study take longer than all else
     ):  # fmt: skip
         setattr(module, name, instead)
     base, here = folder / "base", folder / "here"

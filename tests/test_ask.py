@@ -20,9 +20,9 @@ from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
 from harness.runs.folder import read
-from harness.studies import stored
+from harness.studies import replayed_run
 from harness.studies.axes import Setting
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
 from harness.studies.trust import run_bench
 
 # Some ask nobody, few, those who are there, by who is there, again where an answer fails, or what helpers
@@ -126,7 +126,7 @@ def test_a_study_of_a_run_that_asked_few_is_that_of_one_that_asked_all(tmp_path:
     shutil.copytree(tmp_path / "used", tmp_path / "alone")
     owed: dict[str, list[int]] = {"all": [], "used": []}
     by_run = [
-        [one for [one] in Stored(tmp_path / ask, more=asked.append).walked(STUDIED, (0, 1))]
+        [one for [one] in ReplayedRun(tmp_path / ask, more=asked.append).walked(STUDIED, (0, 1))]
         for ask, asked in owed.items()
     ]
     for one, other in zip(*by_run, strict=True):
@@ -136,9 +136,9 @@ def test_a_study_of_a_run_that_asked_few_is_that_of_one_that_asked_all(tmp_path:
                 np.testing.assert_array_equal(values, getattr(other, of)[name])
     assert sum(owed["used"]) > sum(owed["all"]) > 0
     with pytest.raises(UserError, match=r"--no-model: .* did not ask; leave it out, .* --ask all$") as told:
-        list(Stored(tmp_path / "alone", asks=False).walked(STUDIED, (0, 1)))
+        list(ReplayedRun(tmp_path / "alone", asks=False).walked(STUDIED, (0, 1)))
     assert "\n" not in str(told.value)
-    assert not (tmp_path / "alone" / stored.MORE).exists()
+    assert not (tmp_path / "alone" / replayed_run.MORE).exists()
 
 
 def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
@@ -146,8 +146,8 @@ def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
 ) -> None:
     out = tmp_path / "run"
     evaluate(spec(frozen(8), "all", ("single-local",)), out, lambda done: None)
-    monkeypatch.setattr(stored, "open_backend", None)  # nothing opens a model
-    source = Stored(out, asks=False)
+    monkeypatch.setattr(replayed_run, "open_backend", None)  # nothing opens a model
+    source = ReplayedRun(out, asks=False)
     bench = run_bench(
         source, "6g", ("linear",), ("liar",), (1 / 3,), (0, 1), tmp_path / "trust",
         lambda done: None, lambda owed: None,
@@ -165,7 +165,7 @@ def test_how_much_is_asked_is_said_once_and_first(ask: str, tmp_path: Path) -> N
     evaluate(spec(frozen(2), ask, ("single-local",), "swarm-tiny"), tmp_path / "run", lambda done: None)
     told: list[str] = []
     list(
-        Stored(tmp_path / "run", more=lambda n: told.append(str(n)), say=told.append).walked(
+        ReplayedRun(tmp_path / "run", more=lambda n: told.append(str(n)), say=told.append).walked(
             STUDIED[:1], (0,)
         )
     )

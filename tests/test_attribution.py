@@ -30,10 +30,10 @@ from harness.report.runs import gather
 from harness.runs import folder
 from harness.runs.attribution import Attribution, LeftOut
 from harness.runs.records import Decision
-from harness.studies import attribution, stored
+from harness.studies import attribution, replayed_run
 from harness.studies.attribution import attribute, draw, headline, rows
 from harness.studies.axes import Setting
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
 from harness.world.perception.graph import scene_graph
 
 Said = tuple[int, str, str]
@@ -79,9 +79,9 @@ class Smooth:
 @pytest.fixture
 def judging(monkeypatch: pytest.MonkeyPatch) -> Judging:
     backend = Judging()
-    for module in (evaluation, stored):
+    for module in (evaluation, replayed_run):
         monkeypatch.setattr(module, "open_backend", lambda *_, **__: backend)
-    monkeypatch.setattr(stored, "default_file", lambda: None)
+    monkeypatch.setattr(replayed_run, "default_file", lambda: None)
     monkeypatch.setitem(RULES._loaded, "smooth", Smooth())
     return backend
 
@@ -123,7 +123,7 @@ def test_each_listed_object_moves_what_a_viewer_says_of_conflicts(
     made: Callable[..., Path], small: Dataset
 ) -> None:
     """Only the one vehicle in conflict turns a helper, from (.8, .15, .05) to (.3, .4, .3): 0.5."""
-    found = attribute(Stored(made()), SIXG.name, 12, 0)
+    found = attribute(ReplayedRun(made()), SIXG.name, 12, 0)
     objects = [each for each in found.left_out if each.role != "fusion"]
     expected = {}
     for scene in {each.scene for each in objects}:
@@ -170,7 +170,7 @@ def test_a_message_left_out_of_a_pool_is_exact_and_asks_nobody(
     made: Callable[..., Path], judging: Judging
 ) -> None:
     path = made(SIXG)
-    found = attribute(Stored(path), SIXG.name, 30, 0)
+    found = attribute(ReplayedRun(path), SIXG.name, 30, 0)
     assert not [name for name in judging.asked if "~without" not in name]
     several = list(of_decisions(path, SIXG.name, found))
     assert len(several) > 30
@@ -185,10 +185,10 @@ def test_a_message_left_out_of_a_pool_is_exact_and_asks_nobody(
 
 def test_helpers_that_were_never_asked_are_asked_first(made: Callable[..., Path], judging: Judging) -> None:
     point = named_point("v2x:max_helpers=1")
-    everybody = attribute(Stored(made(point)), point.name, 12, 0)
+    everybody = attribute(ReplayedRun(made(point)), point.name, 12, 0)
     path = made(point, ask="used")
     told: list[str] = []
-    assert attribute(Stored(path, say=told.append), point.name, 12, 0) == everybody
+    assert attribute(ReplayedRun(path, say=told.append), point.name, 12, 0) == everybody
     missing = [name for name in judging.asked if "~without" not in name]
     assert missing
     assert {answer.id for answer in folder.read(path).answers}.isdisjoint(missing)
@@ -199,7 +199,7 @@ def test_a_rule_with_memory_keeps_it(made: Callable[..., Path]) -> None:
     """It is the mean of now and of what it remembers, so half of what moves now moves it after step 0."""
     plain, smooth = SIXG, named_point("6g:loss=0,consensus=smooth")
     path = made(plain, smooth)
-    found = attribute(Stored(path), smooth.name, 30, 0)
+    found = attribute(ReplayedRun(path), smooth.name, 30, 0)
     steps = set()
     for each, d, own in of_decisions(path, smooth.name, found):
         weights = {m.sender: m.weight or 0.0 for m in d.messages} | {"v1": d.own_weight or 0.0}
@@ -215,7 +215,7 @@ def test_a_fusion_call_is_made_again_without_the_message(made: Callable[..., Pat
     """With v3's message it says SLOWER, else FASTER; with nobody's, the ego's own IDLE."""
     fusion = named_point("6g:loss=0,consensus=ego-prompt")
     path = made(fusion)
-    found = attribute(Stored(path), fusion.name, 20, 0)
+    found = attribute(ReplayedRun(path), fusion.name, 20, 0)
     called = [name for name in judging.asked if "+" in name]
     assert called
     for each, d, _ in of_decisions(path, fusion.name, found):
@@ -224,12 +224,12 @@ def test_a_fusion_call_is_made_again_without_the_message(made: Callable[..., Pat
         assert each.action == ("SLOWER" if with_v3 else "FASTER")
         assert each.instead == ("SLOWER" if "v3" in heard else "FASTER" if heard else "IDLE")
     again = judging.asked.copy()
-    assert attribute(Stored(path), fusion.name, 20, 0) == found
+    assert attribute(ReplayedRun(path), fusion.name, 20, 0) == found
     assert judging.asked == again
 
 
 def test_the_draw_is_no_choice_and_a_larger_one_has_the_smaller(made: Callable[..., Path]) -> None:
-    source = Stored(made(named_point("single-local"), SIXG))
+    source = ReplayedRun(made(named_point("single-local"), SIXG))
     came = {(d.scene, d.seed) for d in decisions(source.run.path, SIXG.name)}
     some, of = draw(source, SIXG.name, 10, 0)
     more, _ = draw(source, SIXG.name, 20, 0)
@@ -252,10 +252,10 @@ def test_a_killed_one_goes_on_and_asks_nothing_twice(made: Callable[..., Path], 
 
     path = made()
     with pytest.raises(Killed):
-        attribute(Stored(path, done=die), SIXG.name, 30, 0)
+        attribute(ReplayedRun(path, done=die), SIXG.name, 30, 0)
     before = list(judging.asked)
     assert len(before) == 64
-    found = attribute(Stored(path), SIXG.name, 30, 0)
+    found = attribute(ReplayedRun(path), SIXG.name, 30, 0)
     assert len(judging.asked) == len(set(judging.asked)) > 100
     assert {f"{e.scene}~without-{e.item}/{e.viewer}" for e in found.left_out if e.role != "fusion"} == set(
         judging.asked
@@ -267,7 +267,7 @@ def test_an_answer_that_fails_is_counted_and_moves_nothing(
 ) -> None:
     path = made()
     monkeypatch.setattr(judging, "p", lambda request: (float("nan"),) * 3)
-    found = attribute(Stored(path), SIXG.name, 5, 0)
+    found = attribute(ReplayedRun(path), SIXG.name, 5, 0)
     objects = [e for e in found.left_out if e.role != "fusion"]
     assert {(e.instead, e.change, e.shift) for e in objects} == {(None, None, None)}
     for row in rows(found):
@@ -280,7 +280,7 @@ def test_the_decisions_view_has_what_was_left_out_there_alone(made: Callable[...
     path = made()
     bare = [detail["runs"][0] for detail in unpacked(Decisions(gather([path])))]
     assert not any("left_out" in each for each in bare)
-    found = attribute(Stored(path), SIXG.name, 6, 0)
+    found = attribute(ReplayedRun(path), SIXG.name, 6, 0)
     attribution.write(found, path)
     shown = Decisions(gather([path]))
     details = dict(zip(shown.ids, (d["runs"][0] for d in unpacked(shown)), strict=True))
@@ -296,7 +296,7 @@ def test_the_decisions_view_has_what_was_left_out_there_alone(made: Callable[...
 def test_a_driver_is_asked_for_the_ego_alone(small: Dataset, tmp_path: Path) -> None:
     point = named_point("single-local")
     done = run(spec_of(small, "local-view", points=(point,), seeds=(0,)), tmp_path / "run")
-    found = attribute(Stored(done.out), point.name, 20, 0)
+    found = attribute(ReplayedRun(done.out), point.name, 20, 0)
     assert {e.role for e in found.left_out} == {"ego"}
     assert "seen conflict vehicle in the ego's prompt" in headline(rows(found))
 
@@ -306,12 +306,12 @@ def test_what_cannot_be_asked_otherwise_is_refused(small: Dataset, tmp_path: Pat
     proxy = run(spec_of(small, points=points, seeds=(0,)), tmp_path / "proxy").out
     replayed = run(spec_of(small, f"replay:{proxy}", points=points, seeds=(0,)), tmp_path / "replay").out
     with pytest.raises(UserError, match="no answers to other questions; give the run that it replays"):
-        attribute(Stored(replayed), "single-local", 5, 0)
+        attribute(ReplayedRun(replayed), "single-local", 5, 0)
     truth = run(spec_of(small, "full-view", points=points, seeds=(0,)), tmp_path / "truth").out
     with pytest.raises(UserError, match="full-view reads the truth and no prompt"):
-        attribute(Stored(truth), "single-local", 5, 0)
+        attribute(ReplayedRun(truth), "single-local", 5, 0)
     with pytest.raises(UserError, match="unknown condition '6g'"):
-        attribute(Stored(proxy), "6g", 5, 0)
+        attribute(ReplayedRun(proxy), "6g", 5, 0)
 
 
 def test_no_object_can_be_left_out_of_a_picture(small: Dataset, tmp_path: Path, judging: Judging) -> None:
@@ -320,9 +320,9 @@ def test_no_object_can_be_left_out_of_a_picture(small: Dataset, tmp_path: Path, 
     ego = Agent(card, prompt("v7"))
     seen = run(replace(spec, ego=ego), tmp_path / "seen").out
     with pytest.raises(UserError, match="smolvlm-256m was shown pictures by prompt v7, and no object can be"):
-        attribute(Stored(seen), "single-local", 2, 0)
+        attribute(ReplayedRun(seen), "single-local", 2, 0)
     text = run(replace(spec, ego=replace(ego, image="none")), tmp_path / "text").out
-    assert attribute(Stored(text), "single-local", 2, 0).left_out
+    assert attribute(ReplayedRun(text), "single-local", 2, 0).left_out
 
 
 def test_typed_it_says_what_moves_most_in_eighty_columns(
@@ -368,8 +368,8 @@ def test_a_broken_file_is_one_line(harness: Callable[..., Said], small: Dataset,
 def test_other_readers_do_not_mind_the_file(made: Callable[..., Path], tmp_path: Path) -> None:
     path = made()
     before = answers_of(path)
-    attribution.write(attribute(Stored(path), SIXG.name, 3, 0), path)
+    attribution.write(attribute(ReplayedRun(path), SIXG.name, 3, 0), path)
     assert answers_of(path) == before
     copied = Path(shutil.copytree(path, tmp_path / "copy"))
-    [[walked]] = Stored(copied).walked([Setting("6g", SIXG, 4)], (0, 1))
+    [[walked]] = ReplayedRun(copied).walked([Setting("6g", SIXG, 4)], (0, 1))
     assert not np.isnan(walked.ends["success_rate"]).any()

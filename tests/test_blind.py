@@ -38,7 +38,7 @@ from harness.report.decisions import Decisions
 from harness.report.runs import gather
 from harness.runs import folder
 from harness.studies.axes import Setting
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
 
 BLIND = named_point("6g:messages=blind")
 CONDITIONS = points(["single-local", "6g:loss=0"], ["blind", "no-messages"])
@@ -176,15 +176,15 @@ def test_a_sweep_has_them_asks_for_them_or_says_that_it_lacks_them(
     assert point.asks_blind
     blind = [Setting(point.name, point, 4)]
     with pytest.raises(UserError, match="lacks answers of helpers that are shown nothing, which messages=bl"):
-        list(Stored(less, asks=False).walked(blind, (0, 1)))
+        list(ReplayedRun(less, asks=False).walked(blind, (0, 1)))
     asked: list[int] = []
-    [[more]] = Stored(less, more=asked.append).walked(blind, (0, 1))
+    [[more]] = ReplayedRun(less, more=asked.append).walked(blind, (0, 1))
     assert sum(asked) > 0
     copied = Path(shutil.copytree(done.out, tmp_path / "run"))
-    [[stored]] = Stored(copied, asks=False).walked(blind, (0, 1))
+    [[stored]] = ReplayedRun(copied, asks=False).walked(blind, (0, 1))
     assert np.array_equal(stored.ends["success_rate"], more.ends["success_rate"])
     asked.clear()
-    list(Stored(less, more=asked.append).walked(blind, (0, 1)))
+    list(ReplayedRun(less, more=asked.append).walked(blind, (0, 1)))
     assert asked == []
 
 

@@ -48,7 +48,7 @@ from harness.prompts.versions import load as prompt
 from harness.radio.channel import Draws
 from harness.runs.records import Latency
 from harness.studies.axes import Setting
-from harness.studies.stored import MORE, Stored
+from harness.studies.replayed_run import MORE, ReplayedRun
 
 FUSION = named_point("6g:consensus=ego-prompt")
 LANGUAGE_MODEL = "swarm-tiny"  # its card: answers come from a script, or from itself
@@ -326,14 +326,14 @@ def test_a_resumed_run_has_the_times_that_it_began_with(
 def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(done: Evaluated, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
     asked: list[int] = []
-    source = Stored(folder, more=asked.append)
+    source = ReplayedRun(folder, more=asked.append)
     [[same]] = source.walked([Setting("6g", FUSION, 4)], source.seeds)
     assert asked == [], "the run's own seeds delivered nothing else"
     assert same.ends["success_rate"].mean() == pytest.approx(figure(done, FUSION.name, "success_rate").value)
     [[fewer]] = source.walked([Setting("6g", FUSION, 2)], source.seeds)
     assert sum(asked) > 0
     again: list[int] = []
-    source = Stored(folder, more=again.append)
+    source = ReplayedRun(folder, more=again.append)
     for vehicles, before in ((4, same), (2, fewer)):
         [[now]] = source.walked([Setting("6g", FUSION, vehicles)], source.seeds)
         assert np.array_equal(now.columns["latency_ms"], before.columns["latency_ms"])
@@ -344,7 +344,7 @@ def test_what_another_process_has_asked_meanwhile_is_not_asked_again(done: Evalu
     """Both looked at the run before either asked."""
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
     asked: dict[str, list[int]] = {"one": [], "other": []}
-    one, other = (Stored(folder, done=asked[name].append) for name in asked)
+    one, other = (ReplayedRun(folder, done=asked[name].append) for name in asked)
     [[first]] = one.walked([Setting("6g", FUSION, 2)], one.seeds)
     kept = (folder / MORE).read_bytes()
     with (folder / MORE).open("ab") as file:
@@ -363,12 +363,12 @@ def test_points_that_are_walked_together_make_the_calls_of_each(done: Evaluated,
     settings = [Setting(point.name, point, 4) for point in points]
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
     asked: list[int] = []
-    together = list(Stored(folder, more=asked.append).walked(settings, (0, 1, 2)))
+    together = list(ReplayedRun(folder, more=asked.append).walked(settings, (0, 1, 2)))
     kept = (folder / MORE).read_text().splitlines()
     assert 0 < len(kept) == sum(asked)
     alone = Path(shutil.copytree(done.out, tmp_path / "alone"))
     for setting, [walked] in zip(settings, together, strict=True):
-        [[expected]] = Stored(alone).walked([setting], (0, 1, 2))
+        [[expected]] = ReplayedRun(alone).walked([setting], (0, 1, 2))
         assert np.array_equal(walked.ends["success_rate"], expected.ends["success_rate"])
         for name, values in expected.columns.items():
             assert np.array_equal(walked.columns[name], values, equal_nan=True), (setting, name)
@@ -378,4 +378,4 @@ def test_a_run_whose_prompt_has_changed_is_not_asked_more(done: Evaluated, tmp_p
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
     configure(folder, prompt={**done.manifest.prompt, "sha256": "0" * 64})
     with pytest.raises(UserError, match="prompt v2 has changed since"):
-        list(Stored(folder).walked([Setting("6g", FUSION, 3)], (0,)))
+        list(ReplayedRun(folder).walked([Setting("6g", FUSION, 3)], (0,)))

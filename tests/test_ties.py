@@ -37,7 +37,7 @@ from harness.evaluate.lifecycle import finished
 from harness.radio.channel import Draws
 from harness.runs.folder import read
 from harness.studies.axes import Setting
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
 
 ALONE, OVER_6G = POINTS["single-local"], POINTS["6g"]
 DEAF = named_point("6g:loss=1")
@@ -168,7 +168,7 @@ def test_a_study_of_a_run_draws_as_the_run_did(tied: Card, small: Dataset, tmp_p
         out = run(
             with_ego(spec_of(small, points=(ALONE, OVER_6G), ties=ties), card=tied), tmp_path / ties
         ).out
-        stored = Stored(out)
+        stored = ReplayedRun(out)
         settings = [Setting(point.name, point, stored.vehicles) for point in (ALONE, OVER_6G)]
         for point, [walked] in zip((ALONE, OVER_6G), stored.walked(settings, stored.seeds), strict=True):
             ends = [e.success for e in stored.run.episodes if e.condition == point.name]
@@ -185,7 +185,7 @@ def test_a_run_without_the_setting_took_the_first(
     assert record.pop("ties") == "first"
     (old / "run.json").write_bytes(msgspec.json.encode(record))
     assert read(old).manifest.ties == "first"
-    assert Stored(old).spec.ties == "first"
+    assert ReplayedRun(old).spec.ties == "first"
     assert finished(spec, old).manifest.ties == "first"
     with pytest.raises(UserError, match="ties"):
         finished(replace(spec, ties="drawn"), old)

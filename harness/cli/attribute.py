@@ -36,12 +36,14 @@ def command(
     shows the result at each decision.
     """
     from harness.studies.attribution import attribute, headline, rows, rule, write
-    from harness.studies.stored import Stored
+    from harness.studies.replayed_run import ReplayedRun
 
     options.in_range("--sample", sample, 1, MOST)
     with bar("asking without", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
-        stored = Stored(run, more=progress.more, done=progress, dataset=dataset, models=own, say=progress.say)
+        stored = ReplayedRun(
+            run, more=progress.more, done=progress, dataset=dataset, models=own, say=progress.say
+        )
         chosen = condition or (USUAL if USUAL in stored.points else stored.run.conditions[-1])
         found = attribute(stored, chosen, sample, sample_seed)
     made, file = rows(found), write(found, run)

@@ -1,15 +1,13 @@
 """`harness study paper` and `harness study closed-loop`: whole studies."""
 
 from pathlib import Path
-from textwrap import fill
 
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import WIDTH
 from harness.cli.progress import bar
 from harness.cli.run import file_name
-from harness.cli.sweep import show_tables
+from harness.cli.show import finish
 from harness.core.errors import UserError, printable
 from harness.core.seeds import FIRST, purpose
 
@@ -32,7 +30,6 @@ def paper(
 
     It plays the paper's study, and writes a page with both numbers, and Figures A and B.
     """
-    from harness.studies.ledger import shown, tally
     from harness.studies.paper import panels, run_paper
 
     options.in_range("--episodes", episodes, 10, MOST_EPISODES)
@@ -40,30 +37,10 @@ def paper(
     draws = options.parse_seeds(seeds)
     if len(set(draws)) < len(draws):
         raise UserError(f"--seeds {printable(seeds)}: give different whole numbers, such as 0:5")
-    silent = as_json or quiet
     settings = panels(episodes, sweep_episodes)
-    with bar("grid points", sum(len(panel.settings) for panel in settings), silent) as progress:
-        ledger, equation_2 = run_paper(settings, draws, out, progress)
-    if as_json:
-        typer.echo(ledger.to_json(orient="records"))
-    if silent:
-        return
-    typer.echo(f"{'row':<4}{'what':<31}{'paper':>13}{'ours [95 % CI]':>21}{'off':>6}")
-    for row in map(shown, ledger[ledger.kind != "cited"].itertuples()):
-        mark = {"misses": " MISS", "unclear": " ?"}.get(row["verdict"], "")
-        mark += " *" if row["kind"] == "fitted" else ""
-        typer.echo(
-            f"{row['id']:<4}{row['what'][:30]:<31}{row['paper']:>13}{row['ours']:>21}{row['off']:>6}{mark}"
-        )
-    counts = tally(ledger)
-    told = (
-        f"{counts['within']} of {counts['total']} numbers within the aim, {counts['misses']} miss it, "
-        f"{counts['unclear']} unclear (?: the interval reaches the aim); {counts['predicted']} predicted, "
-        "the others (*) fitted"
-    )
-    typer.echo(fill(told, WIDTH))
-    typer.echo(fill(equation_2, WIDTH))
-    typer.echo(f"wrote {printable(out / 'index.html')}")
+    with bar("grid points", sum(len(panel.settings) for panel in settings), as_json or quiet) as progress:
+        study = run_paper(settings, draws, progress)
+    finish(study, out, as_json, quiet)
 
 
 def closed_loop(
@@ -115,11 +92,6 @@ def closed_loop(
         latency=latency,
     )
     where = out or Path("reports") / f"closed-loop-{file_name(spec.ego.card.name)}-{prompt}"
-    silent = as_json or quiet
-    with bar("layouts", episodes, silent) as progress:
-        summary = run_closed_loop(spec, where, who, progress, default_file())
-    if as_json:
-        typer.echo(summary.to_json(orient="records"))
-    if not silent:
-        show_tables(summary)
-        typer.echo(f"wrote {printable(where / 'figure-a.svg')} and {printable(where / 'figure-b.svg')}")
+    with bar("layouts", episodes, as_json or quiet) as progress:
+        study = run_closed_loop(spec, where, who, progress, default_file())
+    finish(study, where, as_json, quiet)

@@ -136,7 +136,7 @@ def check(
     beyond = outside(asdict(channel), CHANNELS.profile(profile).limits)
     if out:
         from harness.report.drawing.pictures import save
-        from harness.studies.figures import reception
+        from harness.studies.figures.lines import reception
 
         every = np.linspace(1, DISTANCES_M[-1], 250)
         save(reception(name, by_sight(channel, every), every, messages, of_others), out, out.suffix[1:])  # type: ignore[arg-type]
@@ -259,7 +259,7 @@ def crowd(
     line = density_coupled_loss(np.array(vehicles))
     if out:
         from harness.report.drawing.pictures import save
-        from harness.studies.figures import crowds
+        from harness.studies.figures.lines import crowds
 
         between = {"clear": "in sight", "vehicle": "behind a car", "building": "behind a building"}[sight]
         title = f"one transmission over {distance_m:g} m {between}, vehicles within {radius_m:g} m"

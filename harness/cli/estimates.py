@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Sequence
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -44,7 +45,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """
     from rich.cells import cell_len, chop_cells
 
-    stacks = [chop_cells(head, HEAD) or [""] for head in heads[1:]]
+    stacks = [wrap(head, HEAD) or [""] for head in heads[1:]]
     height = max(map(len, stacks))
     folded = zip(*([""] * (height - len(stack)) + stack for stack in stacks), strict=True)
     names_of_heads = [""] * (height - 1) + [heads[0]]

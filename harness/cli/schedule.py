@@ -36,7 +36,7 @@ def learn(
     """
     from harness.coordination.operating_point import named_point
     from harness.studies.learning import ROUNDS, run_learn
-    from harness.studies.stored import Stored
+    from harness.studies.replayed_run import ReplayedRun
 
     if out.suffix != ".toml":
         raise UserError(f"--out {printable(out)}: end it in .toml")
@@ -48,7 +48,7 @@ def learn(
     command = shlex.join(["harness", *sys.argv[1:]])
     with bar("learning", ROUNDS, quiet=quiet) as progress:
         train, others = (
-            [Stored(run, None, progress.more, progress, models=own, say=progress.say) for run in of]
+            [ReplayedRun(run, None, progress.more, progress, models=own, say=progress.say) for run in of]
             for of in (runs, tune)
         )
         progress.more(sum(each.dataset.scenario.parameters.decisions for each in (*train, *others)))
@@ -91,10 +91,10 @@ def compare(
     answers.
     """
     from harness.coordination.schedules import SCHEDULES
-    from harness.studies.folder import refuse_other
     from harness.studies.learning import layouts
+    from harness.studies.replayed_run import ReplayedRun
     from harness.studies.schedules import compare as compared_on
-    from harness.studies.stored import Stored
+    from harness.studies.study import refuse_other
     from harness.studies.sweep import point_of
 
     extras.need("harness study schedule compare", "matplotlib")
@@ -114,7 +114,7 @@ def compare(
     with bar("schedules", quiet=silent, grows=True) as progress:
         own = options.cards(model)
         stored = [
-            Stored(run, latency, progress.more, progress, models=own, say=progress.say)
+            ReplayedRun(run, latency, progress.more, progress, models=own, say=progress.say)
             for run in (*runs, *tune)
         ]
         for other in stored[len(runs) :]:
@@ -127,7 +127,7 @@ def compare(
         })  # fmt: skip
         steps = sum(each.dataset.scenario.parameters.decisions for each in stored)
         progress.more(steps + len(runs) * len(names))
-        apart: list[Stored | None] = [*stored[len(runs) :]] if tune else [None] * len(runs)
+        apart: list[ReplayedRun | None] = [*stored[len(runs) :]] if tune else [None] * len(runs)
         found = [
             compared_on(run, other, point_of([run], condition), names, draws, budget, progress)
             for run, other in zip(stored, apart, strict=False)

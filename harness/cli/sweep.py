@@ -1,19 +1,15 @@
 """`harness study sweep`: finished runs at other operating points."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 
 from harness.cli import options
 from harness.cli.progress import bar
-from harness.core.errors import UserError, printable, unknown
-
-if TYPE_CHECKING:
-    import pandas as pd
+from harness.cli.show import finish
+from harness.core.errors import UserError, unknown
 
 PROXY_EPISODES = 300  # a seed, as in the paper's sweeps
-LABEL = 14  # characters of a grid point's name that leave its row on one line
 
 
 def command(
@@ -21,13 +17,16 @@ def command(
     over: list[str] | None = typer.Option(
         None,
         help="Setting to vary: tau (nats), loss (0 to 1), size (vehicles), latency (ms), window (ms), "
-        "consensus, or any other setting of an operating point by its name. Repeatable. Default: the "
-        "paper's panels.",
+        "consensus, attack, or any other setting of an operating point by its name. Repeatable: every "
+        "combination of their values is played. Default: the paper's panels.",
     ),
     grid: list[str] | None = typer.Option(
         None,
         help="Values to try: 0,10,20 or from:to:step. Give one --grid for each --over, in the same order. "
         "Default: the axis's usual values.",
+    ),
+    apart: bool = typer.Option(
+        False, "--apart", help="Vary one setting at a time, each in a panel of its own, and combine none."
     ),
     condition: list[str] = typer.Option(
         ["6g"],
@@ -57,11 +56,11 @@ def command(
 
     The model is asked only where the run has no answer.
     """
-    from harness.studies.axes import axis_of
+    from harness.studies.axes import CROSS, axis_of
     from harness.studies.axes import grid as values_of
     from harness.studies.calibrated import Calibrated
     from harness.studies.play import Source
-    from harness.studies.stored import Stored
+    from harness.studies.replayed_run import ReplayedRun
     from harness.studies.sweep import run_sweep, settings, usual
 
     axes = [axis_of(name) for name in dict.fromkeys(over or ())]
@@ -74,42 +73,24 @@ def command(
     if latency not in ("run", "paper"):
         raise unknown("--latency", latency, ("run", "paper"))
     grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]
-    conditions, silent = list(dict.fromkeys(condition)), as_json or quiet
-    with bar("grid points", quiet=silent, grows=True) as progress:
+    conditions = list(dict.fromkeys(condition))
+    with bar("grid points", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
-        stored = [
-            Stored(run, latency, progress.more, progress, not no_model, dataset, own, progress.say)
+        replayed = [
+            ReplayedRun(run, latency, progress.more, progress, not no_model, dataset, own, progress.say)
             for run in runs
         ]
+        parts = [slice(n, n + 1) for n in range(len(axes))] if apart else [slice(None)]
         panels = {
-            axis.name: settings(stored, axis, values, conditions)
-            for axis, values in zip(axes, grids, strict=True)
-        } or usual(stored, conditions)
-        draws = options.parse_seeds(seeds) if seeds else stored[0].seeds
-        where = out or runs[0] / f"sweep-{'-'.join(panels)}"
-        sources: list[Source] = [*stored, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
+            CROSS.join(axis.name for axis in axes[part]): settings(
+                replayed, axes[part], grids[part], conditions
+            )
+            for part in parts
+            if axes
+        } or usual(replayed, conditions)
+        draws = options.parse_seeds(seeds) if seeds else replayed[0].seeds
+        where = out or runs[0] / f"sweep-{'-'.join(panels).replace(CROSS, '-')}"
+        sources: list[Source] = [*replayed, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
         progress.more(len(sources) * sum(map(len, panels.values())))
-        summary = run_sweep(sources, panels, draws, where, progress)
-    if as_json:
-        typer.echo(summary.to_json(orient="records"))
-    if not silent:
-        show_tables(summary)
-        for source in stored:
-            if source.lost:
-                typer.echo(source.lost)
-            if source.left_out:
-                typer.echo(source.leaves_out)
-        typer.echo(f"wrote {printable(where / 'index.html')}")
-
-
-def show_tables(summary: "pd.DataFrame") -> None:
-    """Print a study's success, trigger rate, messages, latency and deadline misses, a line a grid point."""
-    from harness.studies.sweep import tables
-
-    for title, rows in tables(summary).items():
-        heads = f"{'success % [95 % CI]':>22}" + "".join(f"{head:>11}" for head in rows[0].others)
-        typer.echo(f"{printable(title)}\n{rows[0].axis:<{LABEL}}{heads}")
-        for row in rows:
-            at = printable(row.at)
-            label = f"{at:<{LABEL}}" if len(row.at) < LABEL else f"{at}\n{'':<{LABEL}}"
-            typer.echo(f"{label}{row.success:>22}" + "".join(f"{text:>11}" for text in row.others.values()))
+        study = run_sweep(sources, panels, draws, where, progress)
+    finish(study, where, as_json, quiet)

@@ -1,23 +1,19 @@
 """`harness study trust`: what consensus rules make of helpers that lie or fail."""
 
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING
 
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import WIDTH, echo_json, table
 from harness.cli.progress import bar
 from harness.cli.run import Swarm, file_name
+from harness.cli.show import finish
 from harness.core import resources, work
-from harness.core.errors import UserError, printable
-from harness.core.figures import shown
+from harness.core.errors import UserError
 
 if TYPE_CHECKING:
     from harness.evaluate.spec import Spec
-
-HEADS = ("rule", "price in peace", "mean of attacks %", "worst attack", "there %")
 
 
 def command(
@@ -73,13 +69,12 @@ def command(
     from harness.coordination.attacks import ATTACKS
     from harness.coordination.rules import RULES
     from harness.evaluate.run import read_or_evaluate
-    from harness.studies.stored import Stored
-    from harness.studies.trust import CAPPED, USUAL, names_of, run_bench, shares_of
-    from harness.studies.trust_page import as_json as plain
-    from harness.studies.trust_page import in_a_sentence, price, write_bench
+    from harness.studies.axes import USUAL_ATTACKS
+    from harness.studies.replayed_run import ReplayedRun
+    from harness.studies.trust import CAPPED, names_of, run_bench, shares_of, trust_study
 
-    chosen = names_of("--attacks", attacks, USUAL, tuple(ATTACKS))
-    ways, parts = names_of("--rules", rules, (*RULES, CAPPED), tuple(RULES)), shares_of(share)
+    attack_names = names_of("--attacks", attacks, USUAL_ATTACKS, tuple(ATTACKS))
+    rule_names, shares = names_of("--rules", rules, (*RULES, CAPPED), tuple(RULES)), shares_of(share)
     if (run is None and model is None) or (run and prompt):
         raise UserError("give either RUN, the folder of a finished run, or --model, with its --prompt")
     with bar("rules under attack", quiet=as_json or quiet, grows=True) as progress:
@@ -91,41 +86,16 @@ def command(
             cache = default_file()
             run = read_or_evaluate(spec, out / "run", progress, cache, progress.more, open_backend).path
         own = options.cards([model] if model else None)
-        stored = Stored(
+        replayed = ReplayedRun(
             run, more=progress.more, done=progress, asks=not no_model, models=own, say=progress.say
         )
-        draws = options.parse_seeds(seeds) if seeds else stored.seeds
+        draws = options.parse_seeds(seeds) if seeds else replayed.seeds
         where = out or run / "trust"
         with work.going_on(where):
-            bench = run_bench(stored, condition, ways, chosen, parts, draws, where, progress, progress.more)
-    page = write_bench(bench, where)
-    if as_json:
-        echo_json(plain(bench))
-    if as_json or quiet:
-        return
-    typer.echo(f"{printable(bench.name)} · {printable(bench.source)} · {printable(bench.condition)}")
-    if stored.lost:
-        typer.echo(fill(stored.lost, WIDTH))
-    if stored.left_out:
-        typer.echo(fill(stored.leaves_out, WIDTH))
-    for sentence in in_a_sentence(bench):
-        typer.echo(fill(printable(sentence, 1000), WIDTH))
-    for part in bench.shares:
-        typer.echo(f"\n{100 * part:.0f} % of the helpers attack")
-        rows = []
-        for rule in bench.rules:
-            worst = bench.worst(rule, part)
-            rows.append((
-                rule, price(bench, rule), shown(bench.mean(rule, part)), worst,
-                shown(bench.success(rule, worst, part)),
-            ))  # fmt: skip
-        table(HEADS, rows)
-    n = bench.price(bench.rules[0]).n
-    typer.echo(
-        f"n = {n} episodes × {len(draws)} channel seeds; 95 % intervals over episodes; price:\n"
-        "difference in success from linear while nobody attacks, in points, paired"
-    )
-    typer.echo(f"wrote {printable(page)}")
+            bench = run_bench(
+                replayed, condition, rule_names, attack_names, shares, draws, where, progress, progress.more
+            )
+    finish(trust_study(bench), where, as_json, quiet)
 
 
 def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> "Spec":

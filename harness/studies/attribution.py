@@ -31,7 +31,7 @@ from harness.evaluate.fusion import codes_of
 from harness.evaluate.walk import Decided, Memory, shown, walk
 from harness.prompts.versions import shown as listing
 from harness.runs.attribution import FILE, Attribution, LeftOut
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
 from harness.studies.twins.scoring import distance
 from harness.world.perception.graph import scene_graph
 
@@ -63,7 +63,7 @@ class Row:
     failed: Estimate
 
 
-def attribute(stored: Stored, condition: str, sample: int, seed: int) -> Attribution:
+def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> Attribution:
     """Leave out every listed object and every message heard at some decision points of a run, in turn.
 
     Args:
@@ -100,7 +100,7 @@ def attribute(stored: Stored, condition: str, sample: int, seed: int) -> Attribu
     )
 
 
-def draw(stored: Stored, condition: str, sample: int, seed: int) -> tuple[dict[str, int], int]:
+def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[dict[str, int], int]:
     """Decision points, each with the channel seed of one of its decisions, and of how many they are drawn.
 
     Each that the condition came to is as likely as any other, and so is each seed. A larger sample has the
@@ -120,7 +120,7 @@ def draw(stored: Stored, condition: str, sample: int, seed: int) -> tuple[dict[s
     return {scene: min(came[scene], key=lambda s: chance(scene, s)) for scene in chosen}, len(came)
 
 
-def objects(stored: Stored, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
+def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
     """Every listed object left out of every prompt about these decision points in turn."""
     asked = [each for scene in scenes for each in _questions(stored, scene)]
     whole = requests(stored.spec, scenes)
@@ -134,7 +134,7 @@ def objects(stored: Stored, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
             )  # fmt: skip
 
 
-def _questions(stored: Stored, scene: Scene) -> Iterator[tuple[Scene, str, str, Request]]:
+def _questions(stored: ReplayedRun, scene: Scene) -> Iterator[tuple[Scene, str, str, Request]]:
     """The decision point, who is asked, what is left out, and the question."""
     spec, graphs = stored.spec, scene.record["graphs"]
     listed: dict[str, list[str]] = {}
@@ -159,7 +159,7 @@ def _kind(scene: Scene, viewer: str, item: str) -> str:
     return SEEN if item in {node["id"] for node in graphs[scene.viewers[0]]["nodes"]} else HIDDEN
 
 
-def messages(stored: Stored, point: OperatingPoint, drawn: Mapping[str, int]) -> Iterator[LeftOut]:
+def messages(stored: ReplayedRun, point: OperatingPoint, drawn: Mapping[str, int]) -> Iterator[LeftOut]:
     """Every message that was in time left out in turn; `drawn` has a channel seed of each decision point."""
     memory, world = Memory(), FrozenWorld(stored.dataset, [point], stored.seeds)
     for [part] in walk(world, [point], stored, stored.spec.ties):
@@ -168,7 +168,7 @@ def messages(stored: Stored, point: OperatingPoint, drawn: Mapping[str, int]) ->
 
 
 def _messages(
-    stored: Stored, part: Decided[Scene], memory: Memory, drawn: Mapping[str, int]
+    stored: ReplayedRun, part: Decided[Scene], memory: Memory, drawn: Mapping[str, int]
 ) -> Iterator[LeftOut]:
     point, due, moments, state = part.point, part.due, part.moments, memory.recall(part.due)
     chosen = [drawn.get(moments[at].id) == seed for at, seed in zip(due.at.tolist(), due.seed, strict=True)]

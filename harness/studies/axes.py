@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 
+from harness.coordination.attacks import ATTACKS
 from harness.coordination.operating_point import POINTS, SETTINGS, SHORT, OperatingPoint, setting_of
 from harness.coordination.rules import POOLS, names
 from harness.coordination.schedules import SCHEDULES
@@ -15,6 +17,13 @@ from harness.radio.profiles import CHANNELS
 
 MOST_POINTS = 1000
 CORE = "core"  # the panel that compares operating points
+CROSS = " × "  # between axes that are crossed
+NONE = "none"  # of attacks
+# The usual attacks: each alone, and a false place and several voices with a lie.
+USUAL_ATTACKS = (
+    "liar", "liar+spoof", "liar:says=permuted", "brake", "brake+spoof", "random", "stuck", "stale", "replay",
+    "silent", "overconfident", "sybil", "liar+sybil", "flood", "spoof", "jump", "liar+jump",
+)  # fmt: skip
 
 Value = float | str
 
@@ -40,14 +49,14 @@ class Axis:
     worded: bool = False
 
     def at(self, point: OperatingPoint, value: Value) -> OperatingPoint:
-        """The operating point with this setting. Raises UserError where it is not allowed."""
+        """Return the operating point with this setting. Raises UserError where it is not allowed."""
         if self.field is None:
             return point
         if self.field not in SETTINGS:
             return point.of_radio({self.field: value if isinstance(value, str) else f"{value:.10g}"})
         setting: object
         if isinstance(value, str):
-            setting = setting_of(self.field, value)
+            setting = "" if self.field == "attack" and value == NONE else setting_of(self.field, value)
         else:
             setting = scaled = value * self.scale
             if isinstance(getattr(point, self.field), int) and scaled == int(scaled):
@@ -66,12 +75,13 @@ AXES = {
         Axis("latency", "nominal latency of the channel, ms", *SHORT["latency"], "0,5,10,25,50,100"),
         Axis("window", "decision window, ms", *SHORT["window"], "150:400:25"),
         Axis("consensus", "consensus", "consensus", 1.0, ",".join(POOLS), worded=True),
+        Axis("attack", "attack", "attack", 1.0, ",".join((NONE, *USUAL_ATTACKS)), worded=True),
     )
 }
 
 
 def axis_of(name: str) -> Axis:
-    """An axis by its name, or by that of any setting in its own unit. Raises UserError if there is none."""
+    """Return an axis by its name, or by that of any setting in its own unit. Raises UserError."""
     if name in AXES:
         return AXES[name]
     usual = {name: getattr(POINTS["6g"], name)} if name in SETTINGS else _usual()
@@ -81,7 +91,7 @@ def axis_of(name: str) -> Axis:
 
 
 def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
-    """Values of an axis: a list `0,10,20`, ranges `from:to[:step]` with both ends, or both mixed.
+    """Return values of an axis: a list `0,10,20`, ranges `from:to[:step]` with both ends, or both mixed.
 
     Raises:
         UserError: it is none, or too long.
@@ -92,10 +102,10 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
         raise UserError(f"--over {axis.name}: no grid is usual; give its values with --grid")
     parts = [part.strip() for part in (text or axis.usual).split(",")]
     if axis.worded:
-        for part in parts:
-            known = {"consensus": names(), "schedule": SCHEDULES}.get(str(axis.field), (part,))
-            if part not in known:
-                raise unknown("--grid", part, known)
+        known = {"consensus": names(), "schedule": SCHEDULES, "attack": (NONE, *ATTACKS)}.get(axis.name)
+        for name in (part for text in parts for part in text.split("+")):
+            if known and (first := name.partition(":")[0]) not in known:
+                raise unknown("--grid", first, known)
         return tuple(dict.fromkeys(parts))
     values = [value for part in parts for value in _values(axis, part)]
     if len(values) > MOST_POINTS:
@@ -106,7 +116,7 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
 
 
 def _usual() -> dict[str, object]:
-    """What every setting of an operating point or of a channel usually is."""
+    """Return what every setting of an operating point or of a channel usually is."""
     radios = CHANNELS.usable().values()
     of_radios = {name: getattr(channel, name) for channel in radios for name in settable(channel)}
     return of_radios | {name: getattr(POINTS["6g"], name) for name in SETTINGS}
@@ -135,18 +145,37 @@ class Setting:
         point: the operating point.
         vehicles: how many, the ego included.
         variable: what varies in the panel; empty where conditions are compared.
-        value: its value there.
+        value: its value there; where axes are crossed, one of each.
     """
 
     condition: str
     point: OperatingPoint
     vehicles: int
     variable: str = ""
-    value: Value | None = None
+    value: Value | tuple[Value, ...] | None = None
+
+    @property
+    def place(self) -> dict[str, Value | None]:
+        """The columns that name it in a table; one more for each of several axes."""
+        place = {"condition": self.condition, "variable": self.variable}
+        if not isinstance(self.value, tuple):
+            return {**place, "value": self.value}
+        texts = [value if isinstance(value, str) else f"{value:g}" for value in self.value]
+        axes = dict(zip(self.variable.split(CROSS), self.value, strict=True))
+        return {**place, "value": CROSS.join(texts), **axes}
+
+
+def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tuple[Value, ...]]:
+    """Return every combination of the values of several axes. Raises UserError if there are too many."""
+    values = list(product(*grids))
+    if len(values) > MOST_POINTS:
+        names = " ".join(f"--over {axis.name}" for axis in axes)
+        raise UserError(f"{names}: {len(values)} combinations; give {MOST_POINTS} or fewer, with --grid")
+    return values
 
 
 def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
-    """The grid points, complete, for a manifest."""
+    """Return the grid points, complete, for a manifest."""
     return {
         name: [{"value": s.value, "vehicles": s.vehicles, **asdict(s.point)} for s in settings]
         for name, settings in panels.items()

@@ -28,7 +28,7 @@ from harness.core.arrays import Bools, Floats, Ints, any_of
 from harness.evaluate.walk import Decided, Due, Fuses
 from harness.radio.channel import Draws, Unit
 from harness.studies.axes import Setting
-from harness.studies.play import Walked, walk_through
+from harness.studies.play import WalkResult, walk_through
 
 VERSION = "3"
 ACTIONS = 3
@@ -222,13 +222,13 @@ class Calibrated:
             "episodes_per_seed": self.episodes,
         }
 
-    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Iterable[Walked]]:
+    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Iterable[WalkResult]]:
         """Episodes of every seed, `CHUNK` at a time, which bounds memory."""
         most = max((setting.vehicles for setting in settings), default=1) - 1
         for setting in settings:
             yield self._walked(setting, most, seeds)
 
-    def _walked(self, setting: Setting, most: int, seeds: Sequence[int]) -> Iterator[Walked]:
+    def _walked(self, setting: Setting, most: int, seeds: Sequence[int]) -> Iterator[WalkResult]:
         for first in range(0, self.episodes, CHUNK):
             numbers = first + np.arange(min(CHUNK, self.episodes - first))
             steps = self._of_seeds(tuple(seeds), most, first)
@@ -242,7 +242,7 @@ class Calibrated:
                 "unsafe_rate": 1.0 - success,
                 "late_rate": np.zeros_like(success),
             }
-            yield Walked(numbers, ends, columns, places)
+            yield WalkResult(numbers, ends, columns, places)
 
     def _drawn(self, seeds: tuple[int, ...], helpers: int, first: int) -> Sequence[_Drawn]:
         """The rows of each step."""

@@ -24,7 +24,7 @@ from harness.evaluate.device import helpers_j
 from harness.evaluate.outlook import outlook
 from harness.evaluate.walk import channel_draws, tie_draws
 from harness.radio.channel import Draws, Physical
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
 from harness.world.sight_lines import site
 
 MOST_SETS = 64
@@ -153,7 +153,7 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
 
 
 def choices(
-    stored: Stored, point: OperatingPoint, seeds: Sequence[int], progress: Callable[[int], None]
+    stored: ReplayedRun, point: OperatingPoint, seeds: Sequence[int], progress: Callable[[int], None]
 ) -> Choices:
     """All choices of an operating point. What the run has no answer to its model is asked.
 
@@ -187,7 +187,7 @@ def choices(
     return Choices(forest, sets, tuple(levels))
 
 
-def _level(stored: Stored, point: OperatingPoint, seeds: Ints, at: Ints, sets: Bools) -> Level:
+def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, sets: Bools) -> Level:
     dataset, forest = stored.dataset, stored.dataset.forest
     scenario, shape = dataset.scenario, (len(seeds), len(at))
     scenes = dataset.scenes([forest.ids[n] for n in at.tolist()])

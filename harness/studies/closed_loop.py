@@ -18,10 +18,12 @@ from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.radio.constant import density_coupled_loss
 from harness.runs.records import Score
-from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Setting, described, grid
-from harness.studies.folder import write, write_manifest
+from harness.studies.figures.bars import operating_points
+from harness.studies.figures.lines import along
 from harness.studies.play import ENDS, PER_DECISION
+from harness.studies.study import Study
+from harness.studies.sweep import in_a_sentence, tables
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +34,7 @@ RUN = "run"  # the live run's folder
 
 
 def panels() -> dict[str, list[Setting]]:
-    """The paper's panels as conditions that are called by what they change; size has density-coupled loss."""
+    """Return the paper's panels as conditions named by what they change; size has density-coupled loss."""
     losses = density_coupled_loss(np.arange(1, VEHICLES + 1))
     changes = (
         *(("size", n, n, f"max_helpers={n - 1},loss={loss:g}") for n, loss in enumerate(losses, 1)),
@@ -48,11 +50,8 @@ def panels() -> dict[str, list[Setting]]:
 
 def run_closed_loop(
     spec: Spec, out: Path, workers: Workers, progress: Callable[[int], None], cache: Path | None
-) -> "pd.DataFrame":
-    """Drive all grid points, and draw Figures A and B. A study that was stopped in `out` continues.
-
-    Writes `run/` (a live run's folder), `conditions` as CSV and JSON Lines, `closed-loop.json`, and the
-    figures as SVG, PDF and PNG.
+) -> Study:
+    """Drive all grid points. A study that was stopped in `out` continues; `run/` there has the live run.
 
     Args:
         spec: the model and how it is asked; its conditions are those of `panels`.
@@ -60,9 +59,6 @@ def run_closed_loop(
         workers: who drives.
         progress: called with the number of layouts just driven under all conditions and seeds.
         cache: file of completions kept between runs.
-
-    Returns:
-        The summary: a row a grid point and metric.
     """
     if (out / RUN / "run.json").is_file():
         done = finished(spec, out / RUN)
@@ -72,15 +68,23 @@ def run_closed_loop(
     grids = panels()
     summary = _summary(done, grids)
     core, *sweeps = (summary[summary.panel == name] for name in grids)
-    drawn = {"figure-a": figures.composite_a(core), "figure-b": figures.along(sweeps)}
-    write(out, drawn, {"conditions": summary})
-    manifest = {"run": RUN, "panels": described(grids), "versions": done.manifest.versions}
-    write_manifest(out, "closed-loop", manifest)
-    return summary
+    shown = tables(summary)
+    m = done.manifest
+    return Study(
+        "closed-loop", f"The paper's panels, driven: {m.variant}",
+        [f"{table.title}: {in_a_sentence(table)}." for table in shown],
+        [
+            f"Every grid point was driven in closed loop on the layouts of {spec.source.name} with "
+            f"channel seeds {', '.join(map(str, m.seeds))}; 95 % intervals are over episodes. "
+            "conditions.csv has all figures with their n, and run/ the driven episodes."
+        ],
+        shown, {"conditions": summary}, {"run": RUN, "panels": described(grids), "versions": m.versions},
+        summary, {"figure-a": operating_points(core), "figure-b": along(sweeps)},
+    )  # fmt: skip
 
 
 def _summary(done: Evaluated, grids: Mapping[str, Sequence[Setting]]) -> "pd.DataFrame":
-    """The live run's figures as a study has them."""
+    """Return the live run's figures as a study has them."""
     import pandas as pd
 
     source = f"{done.manifest.variant}, driven"

@@ -1,7 +1,7 @@
-"""Frozen against closed: how far the success that frozen scenes tell is that of driving.
+"""`harness study fidelity`: how far success on frozen scenes is success in closed loop.
 
-Runs on frozen scenes and live runs of the same model, prompt and answer mode are compared episode by
-episode: the same layout, condition and seed of the channel's luck.
+Runs of the same model, prompt and answer mode are compared episode by episode: the same layout, condition and
+channel seed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,23 +13,21 @@ import numpy as np
 from msgspec.structs import asdict
 
 from harness.core.errors import UserError
-from harness.core.files import bytes_of, write_whole
 from harness.core.statistics import rate_difference
-from harness.report.library import picture
-from harness.report.page import environment
+from harness.core.versions import versions
 from harness.runs.folder import read
 from harness.runs.metrics import World, over_episodes
 from harness.runs.records import Variant
-from harness.studies import folder
-from harness.studies.figures import scatter
+from harness.studies.figures.points import scatter
+from harness.studies.study import Study, Table, percent
 
 if TYPE_CHECKING:
     import pandas as pd
 
 WHO = Variant.__struct_fields__
 KEY = (*WHO, "condition", "seed", "layout_seed")
+COMPARED = ("frozen", "closed", "difference", "agreement")
 ENDS = ("", "_low", "_high")  # of the columns of an estimate
-TEMPLATES = Path(__file__).parent / "templates"
 LEAST_RANKED = 5  # four in the same order are chance in 1 of 12, five in 1 of 60, both ways round
 SHOWN = 20  # ways to disagree that the page lists
 
@@ -56,7 +54,7 @@ class Fidelity:
 
 
 def fidelity(runs: Sequence[Path]) -> Fidelity:
-    """Hold runs on frozen scenes against live runs.
+    """Compare runs on frozen scenes with live runs.
 
     Raises:
         UserError: a folder is no run, or no frozen run has anything in common with a live one.
@@ -123,7 +121,7 @@ def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
 
 
 def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
-    """How episodes ended that did so otherwise: a row a model, condition and two endings, with a count."""
+    """Return how episodes ended that ended otherwise: a row a model, condition and two ends, with a count."""
     ends = both.assign(
         frozen_end=both.failure_frozen.where(~both.success_frozen, "success"),
         closed_end=both.failure_closed.where(~both.success_closed, "success"),
@@ -134,23 +132,53 @@ def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
     return counts.sort_values("count", ascending=False, kind="stable")
 
 
-def write(result: Fidelity, out: Path) -> Path:
-    """Write `fidelity` and `episodes` as CSV and JSON Lines, the picture and the page, which is returned."""
-    rows = [shown(row) for row in result.table.to_dict("records")]
-    figure = scatter(result.table, [row["who"] for row in rows])
-    folder.write(out, {"fidelity": figure}, {"fidelity": result.table, "episodes": result.episodes})
-    page = environment(TEMPLATES).get_template("fidelity.html.j2").render(
-        figure=picture(bytes_of(out / "fidelity.svg", "picture")),
-        rows=rows,
-        headline=" ".join(headline(result)),
-        ways=disagreements(result.episodes).head(SHOWN).to_dict("records"),
+def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> Study:
+    """Declare the study of a comparison."""
+    rows: list[dict[Any, Any]] = result.table.to_dict("records")
+    other = disagreements(result.episodes).head(SHOWN).to_dict("records")
+    heads = (
+        "model · prompt · answers, condition",
+        "frozen %",
+        "closed loop %",
+        "difference, points",
+        "same %",
+        "n",
+    )
+    ends_heads = (
+        "model · prompt · answers, condition",
+        "end on frozen scenes",
+        "end in closed loop",
+        "episodes × seeds",
+    )
+    return Study(
+        "fidelity", "Frozen and closed loop compared", headline(result),
+        [
+            "On frozen scenes, success is looked up: the outcome of each action was found in advance, by "
+            "driving on with a planner that sees everything. The same models, under the same conditions "
+            "and seeds, also drove the same layouts in closed loop. There an action takes effect as late "
+            "as its decision took, and each action changes what comes next.",
+            "Paired by episode, condition and channel seed; n is the number of episodes, each averaged "
+            "over its seeds; 95 % intervals are over episodes. A point below the figure's dashed line "
+            "succeeds less often in closed loop.",
+        ],
+        [
+            Table("Side by side", heads, [
+                (_place(row), *(percent(row, *(name + end for end in ENDS)) for name in COMPARED),
+                 str(row["n"])) for row in rows
+            ], terminal=(0, 1, 2, 3, 4)),
+            Table("Where they disagree", ends_heads, [
+                (_place(row), *(str(row[name]) for name in ("frozen_end", "closed_end", "count")))
+                for row in other
+            ]),
+        ],
+        {"fidelity": result.table, "episodes": result.episodes},
+        {"sources": [{"name": str(run)} for run in runs], "versions": versions()}, result.table,
+        {"fidelity": scatter(result.table, [_who(row) for row in rows])},
     )  # fmt: skip
-    write_whole(out / "index.html", page)
-    return out / "index.html"
 
 
 def headline(result: Fidelity) -> list[str]:
-    """The outcome in sentences: the rank correlation, or why there is none, and the largest difference."""
+    """Say the rank correlation, or why there is none, and the largest difference."""
     rows: list[dict[Any, Any]] = result.table.to_dict("records")
     worst = max(rows, key=lambda row: abs(row["difference"]))
     points, low, high = (100 * worst[f"difference{end}"] for end in ENDS)
@@ -169,15 +197,9 @@ def headline(result: Fidelity) -> list[str]:
     return sentences
 
 
-def shown(row: dict[Any, Any]) -> dict[str, str]:
-    """A row of the table as text; percent and points."""
+def _who(row: dict[Any, Any]) -> str:
+    return " · ".join(str(row[name]) for name in WHO)
 
-    def cell(name: str, sign: str = "") -> str:
-        value, low, high = (100 * row[f"{name}{end}"] for end in ENDS)
-        return f"{value:{sign}.1f} [{low:{sign}.1f}, {high:{sign}.1f}]"
 
-    return {
-        "who": " · ".join(str(row[name]) for name in WHO), "condition": str(row["condition"]),
-        "frozen": cell("frozen"), "closed": cell("closed"), "difference": cell("difference", "+"),
-        "agreement": cell("agreement"), "n": str(row["n"]),
-    }  # fmt: skip
+def _place(row: dict[Any, Any]) -> str:
+    return f"{_who(row)}, {row['condition']}"

@@ -19,8 +19,8 @@ from harness.report.drawing.pictures import styled
 from harness.report.library import picture
 from harness.report.page import environment
 from harness.runs.metrics import LATENCY, SUCCESS
-from harness.studies.folder import write, write_manifest
 from harness.studies.grid import FIELDS, Cell, Effect, Grid, Halves, level
+from harness.studies.study import write, write_manifest
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -22,7 +22,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.seeds import Purpose, purposes, stated
 from harness.studies.choices import Choices, Choose, choices
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
 
 UNITS = 12
 ROUNDS = 6
@@ -34,7 +34,7 @@ LEAST = 1e-3  # standard deviation of an input that varies
 THRESHOLDS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
 
 
-def layouts(stored: Stored, wanted: Purpose) -> str:
+def layouts(stored: ReplayedRun, wanted: Purpose) -> str:
     """A run with its layout seeds in words. Raises UserError unless all are for this purpose."""
     seeds = stored.dataset.forest.seeds
     first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
@@ -88,7 +88,7 @@ def fit(x: Floats, y: Floats) -> Network:
     return Network(parts[0], parts[1], parts[2], parts[3], parts[4], float(parts[5]))
 
 
-def learn(train: Sequence[Stored], point: OperatingPoint, progress: Callable[[int], None]) -> Network:
+def learn(train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]) -> Network:
     """The network learnt from runs on train layouts, under an operating point.
 
     Its `max_helpers` are asked while it is learnt; the first round decides by its own schedule.
@@ -113,7 +113,7 @@ def by_network(made: Choices, point: OperatingPoint, network: Network, threshold
 
 
 def tuned(
-    network: Network, tune: Sequence[Stored], point: OperatingPoint, progress: Callable[[int], None]
+    network: Network, tune: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]
 ) -> float:
     """The threshold with the most success on tune layouts, the mean over runs; of equals the highest."""
     success = np.zeros(len(THRESHOLDS))
@@ -133,7 +133,7 @@ def text(stated: Stated) -> str:
 
 
 def run_learn(
-    train: Sequence[Stored], tune: Sequence[Stored], point: OperatingPoint, out: Path, command: str,
+    train: Sequence[ReplayedRun], tune: Sequence[ReplayedRun], point: OperatingPoint, out: Path, command: str,
     progress: Callable[[int], None],
 ) -> Stated:  # fmt: skip
     """Learn a schedule, choose its threshold, and write its file.

@@ -1,13 +1,14 @@
 """Every number of the paper beside ours: how far off, whether fitted, and what had to be assumed."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.core.figures import PLAIN
 from harness.core.files import text_of
 from harness.studies.calibrated import FITTED_ON
+from harness.studies.study import Table, strong
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -132,20 +133,47 @@ def tally(ledger: "pd.DataFrame") -> dict[str, int]:
     }
 
 
-def shown(row: Any) -> dict[str, Any]:
-    """One row of the ledger as text."""
-    value = f" {row.value:g}" if isinstance(row.value, float) else ""
-    theirs = f"{row.paper_low:g}" + (f" to {row.paper_high:g}" if row.paper_high != row.paper_low else "")
-    cited = row.kind == "cited"
-    unit = UNITS.get(row.unit, f", {row.unit}")
-    return {
-        "id": row.id,
-        "what": " ".join(filter(None, (row.condition, f"{row.variable}{value}", f"{row.metric}{unit}"))),
-        "paper": theirs,
-        "ours": "" if cited else PLAIN.interval(row.ours, row.ci_low, row.ci_high),
-        "off": "" if cited else f"{row.difference:+z.1f}",
-        "allowed": "" if cited else f"{row.allowed:.1f}",
-        "kind": row.kind,
-        "verdict": row.verdict,
-        "assumed": row.assumed,
-    }
+def headline(ledger: "pd.DataFrame") -> list[str]:
+    """Say how many numbers of the paper are met, and which are not."""
+    counts = tally(ledger)
+    sentences = [
+        f"{counts['within']} of {counts['total']} numbers within the aim, {counts['misses']} miss it, "
+        f"{counts['unclear']} unclear (the interval reaches the aim); {counts['predicted']} of the "
+        f"{counts['total']} are predictions: no parameter of the proxy was chosen on them, as on the "
+        "others (*)."
+    ]
+    for verdict, title in (("misses", "Missed"), ("unclear", "Unclear")):
+        rows = ledger[ledger.verdict == verdict].to_dict("records")
+        if named := "; ".join(f"{row['id']}, {_what(row)}: {row['difference']:+z.1f}" for row in rows):
+            sentences.append(f"{title}: {named}.")
+    return sentences
+
+
+def tables(ledger: "pd.DataFrame") -> list[Table]:
+    """Return the numbers that the proxy plays, and those that are only cited."""
+    played, cited = list[Sequence[str]](), list[Sequence[str]]()
+    for row in ledger.to_dict("records"):
+        low, high = row["paper_low"], row["paper_high"]
+        paper = f"{low:g}" + (f" to {high:g}" if high != low else "")
+        if row["kind"] == "cited":
+            cited.append((f"{row['id']} {_what(row)}", paper, row["assumed"]))
+            continue
+        off = f"{row['difference']:+z.1f}"
+        missed = row["verdict"] in ("misses", "unclear")
+        played.append((
+            f"{row['id']}{'*' * (row['kind'] == 'fitted')} {_what(row)}", paper,
+            PLAIN.interval(row["ours"], row["ci_low"], row["ci_high"]),
+            strong(f"{off} {row['verdict']}") if missed else off, f"{row['allowed']:.1f}", row["kind"],
+            row["assumed"],
+        ))  # fmt: skip
+    heads = ("row", "paper", "ours [95 % CI]", "off by", "aim", "kind", "assumed")
+    return [
+        Table("Ledger", heads, played, terminal=range(4)),
+        Table("Cited, and not played", ("row", "paper", "note"), cited),
+    ]
+
+
+def _what(row: Mapping[Any, Any]) -> str:
+    value = f" {row['value']:g}" if isinstance(row["value"], float) else ""
+    unit = UNITS.get(row["unit"], f", {row['unit']}")
+    return " ".join(filter(None, (row["condition"], f"{row['variable']}{value}", f"{row['metric']}{unit}")))

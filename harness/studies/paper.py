@@ -2,29 +2,23 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from harness.coordination.operating_point import POINTS
-from harness.core.figures import PERCENT
-from harness.core.files import bytes_of, write_whole
 from harness.core.versions import versions
-from harness.report.library import picture
-from harness.report.page import environment
-from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Setting, axis_of, described, grid
 from harness.studies.calibrated import Calibrated
-from harness.studies.folder import write, write_manifest
-from harness.studies.ledger import ledger, marks, shown, tally
+from harness.studies.figures.bars import operating_points
+from harness.studies.figures.lines import along
+from harness.studies.ledger import headline, ledger, marks, tables
 from harness.studies.play import joined, play
+from harness.studies.study import Study, Table, percent
 
 if TYPE_CHECKING:
     import pandas as pd
 
-OFF = ("misses", "unclear")
 WEIGHTS = "min_distance_m"  # the setting that flattens the weights of Equation 2
 EQUAL_M = 1000.0  # beyond every distance, so that all weights are equal
-TEMPLATES = Path(__file__).parent / "templates"
 VEHICLES = 4  # the ego and the cooperative neighbourhood of three
 
 
@@ -66,61 +60,52 @@ def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
     ]
 
 
-class Study(NamedTuple):
-    """What the study says beside its folder.
-
-    Attributes:
-        ledger: the paper's numbers beside ours.
-        equation_2: what the weights by distance do in it, in words.
-    """
-
-    ledger: "pd.DataFrame"
-    equation_2: str
-
-
-def run_paper(
-    panels: Sequence[Panel], seeds: Sequence[int], out: Path, progress: Callable[[int], None]
-) -> Study:
-    """Play the paper's panels with the calibrated proxy.
-
-    Writes `conditions`, `episodes` and `ledger` as CSV and JSON Lines, `study.json`, the Figures A and B as
-    SVG, PDF and PNG, and `index.html`.
-    """
+def run_paper(panels: Sequence[Panel], seeds: Sequence[int], progress: Callable[[int], None]) -> Study:
+    """Play the paper's panels with the calibrated proxy, and hold them against the paper's numbers."""
     sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels}
-    played = [play(sources[p.episodes], p.name, p.settings, seeds, progress) for p in panels]
-    whole, (core, *sweeps, weights) = joined(played), (p.summary for p in played)
-    study = Study(ledger(whole.summary), equation_2(weights))
-    theirs = marks(study.ledger)
-    manifest = {
-        "study": "paper",
-        "seeds": list(seeds),
-        "episodes_per_seed": {p.name: p.episodes for p in panels},
-        "source": next(iter(sources.values())).manifest(),
-        "panels": described({p.name: p.settings for p in panels}),
-        "versions": versions(),
-    }
-    drawn = {"figure-a": figures.composite_a(core, theirs), "figure-b": figures.along(sweeps, theirs)}
-    write(out, drawn, {"conditions": whole.summary, "episodes": whole.episodes, "ledger": study.ledger})
-    write_manifest(out, "study", manifest)
-    rows = [shown(row) for row in study.ledger.itertuples()]
-    page = environment(TEMPLATES).get_template("paper.html.j2").render(
-        manifest=manifest,
-        rows=rows,
-        equation_2=study.equation_2,
-        off={v: [f"{r['id']}, {r['what']}: {r['off']}" for r in rows if r["verdict"] == v] for v in OFF},
-        pictures={stem: picture(bytes_of(out / f"{stem}.svg", "picture")) for stem in drawn},
-        **tally(study.ledger),
+    results = [play(sources[p.episodes], p.name, p.settings, seeds, progress) for p in panels]
+    whole, (core, *sweeps, weights) = joined(results), (result.summary for result in results)
+    numbers = ledger(whole.summary)
+    theirs, proxy = marks(numbers), next(iter(sources.values())).manifest()
+    episodes = {p.name: p.episodes for p in panels}
+    return Study(
+        "study", "The paper's study, from one causal simulator", headline(numbers),
+        [
+            f"Intents of a calibrated proxy (version {proxy['proxy_model_version']}) go through the same "
+            "trigger, channel, consensus and scoring as a language model's. It was "
+            f"{proxy['calibration_label']}. No condition has a success probability of its own to draw "
+            "from, and no parameter depends on a panel or a grid point. So the study shows that one "
+            "mechanism explains the numbers. It is no evidence that a language model would give them.",
+            f"95 % intervals are over {len(seeds)} seed means of {episodes[CORE]} episodes each, "
+            f"{episodes['size']} at a grid point of figure B, whose points share their random draws. Draws "
+            "are stratified, so an interval shows how far other seeds of this proxy would move a mean; "
+            "plain draws, like the paper's, scatter more.",
+            equation_2(weights),
+            "Crosses and bars in the figures are the paper's values and ranges, and shaded is the band "
+            "that it calls best. The cloud's latency is the paper's figure: nothing here simulates a "
+            "cloud.",
+        ],
+        [*tables(numbers), Table(
+            "What was fitted", ("parameter", "value", "rows of the paper"),
+            [
+                (name, str(proxy["parameters"].get(name, "")), ", ".join(rows))
+                for name, rows in proxy["fitted_on"].items()
+            ], "Every parameter that was chosen on rows of the paper.",
+        )],
+        {"conditions": whole.summary, "episodes": whole.episodes, "ledger": numbers},
+        {
+            "study": "paper", "seeds": list(seeds), "episodes_per_seed": episodes, "source": proxy,
+            "panels": described({p.name: p.settings for p in panels}), "versions": versions(),
+        },
+        numbers, {"figure-a": operating_points(core, theirs), "figure-b": along(sweeps, theirs)},
     )  # fmt: skip
-    write_whole(out / "index.html", page)
-    return study
 
 
 def equation_2(weights: "pd.DataFrame") -> str:
-    """What the weights by distance do in the calibrated proxy, from the summary of their panel."""
+    """Say what the weights by distance do in the calibrated proxy, from the summary of their panel."""
     success = weights[weights.metric == "success_rate"].set_index("value")
     with_it, without = (
-        PERCENT.interval(*success.loc[metres, ["mean", "ci_low", "ci_high"]].to_numpy(dtype=float))
-        for metres in (1.0, EQUAL_M)
+        percent(success.loc[metres], "mean", "ci_low", "ci_high") for metres in (1.0, EQUAL_M)
     )
     return (
         f"Equation 2 in the calibrated proxy: 6g succeeds in {with_it} % with weights by distance, and in "

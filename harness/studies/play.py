@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NAMES = ("source", "panel", "condition", "variable")
-PLACE = (*NAMES, "value")
 EPISODE_METRICS = (
     "success_rate", "trigger_rate", "latency_proxy_ms", "messages_per_episode", "effective_loss",
 )  # fmt: skip
@@ -40,7 +39,7 @@ COLUMNS = ("latency_ms", "deadline_missed", "triggered", "messages", "effective_
 
 
 @dataclass(frozen=True)
-class Walked:
+class WalkResult:
     """What a walk at one operating point came to, for some seeds and episodes of each.
 
     Attributes:
@@ -71,7 +70,7 @@ class Source(Protocol):
         """What a reader needs to know of where the intents come from."""
         ...
 
-    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Iterable[Walked]]:
+    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Iterable[WalkResult]]:
         """Walks at each grid point in turn, in parts of some episodes; every point has the same draws.
 
         A grid point's vehicles are the nearest ones. Its parts are taken before the next point.
@@ -102,12 +101,12 @@ def walk_through(
 
 
 @dataclass(frozen=True)
-class Played:
-    """What came of a panel.
+class PanelResult:
+    """What a source came to at the grid points of a panel.
 
     Attributes:
-        summary: a row a grid point and metric: `PLACE`, `metric`, `mean`, `ci_low`, `ci_high`, `n`,
-            `interval`.
+        summary: a row a grid point, metric and interval: `source`, `panel`, the columns of `Setting.place`,
+            `metric`, `mean`, `ci_low`, `ci_high`, `n`, `interval`.
         episodes: a row a grid point, seed and episode.
     """
 
@@ -118,29 +117,31 @@ class Played:
 def play(
     source: Source, panel: str, settings: Sequence[Setting], seeds: Sequence[int],
     progress: Callable[[int], None],
-) -> Played:  # fmt: skip
+) -> PanelResult:  # fmt: skip
     """Play every grid point with every seed.
 
     Args:
         source: whose intents.
         panel: what tables call this set of grid points.
         settings: the grid points.
-        seeds: of the luck; each is paired with itself across the points.
+        seeds: of the channel; each is paired with itself across the points.
         progress: called with 1 whenever a grid point is done.
     """
     import pandas as pd
 
     rows: list[dict[str, Any]] = []
     episodes: list[dict[str, Floats]] = []
-    for setting, walked in zip(settings, source.walked(settings, seeds), strict=True):
-        place = (source.name, panel, setting.condition, setting.variable, setting.value)
-        parts = [_part(w, len(seeds)) for w in walked]
+    for setting, walks in zip(settings, source.walked(settings, seeds), strict=True):
+        parts = [_part(walk, len(seeds)) for walk in walks]
         metrics = {name: np.hstack([part.metrics[name] for part in parts]) for name in parts[0].metrics}
         of_seeds = zip(*(part.latency_ms for part in parts), strict=True)
         latency_ms = np.array([percentiles(np.concatenate(of_seed)) for of_seed in of_seeds])
+        # Where axes are crossed, the columns of each come last.
+        place = {"source": source.name, "panel": panel, **setting.place}
+        first = {name: place.pop(name) for name in (*NAMES, "value")}
         rows += [
-            {**dict(zip(PLACE, place, strict=True)), "metric": metric, "mean": e.value, "ci_low": e.low,
-             "ci_high": e.high, "n": e.n, "interval": interval}
+            {**first, "metric": metric, "mean": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n,
+             "interval": interval, **place}
             for metric, e, interval in _estimates(source, metrics, latency_ms)
         ]  # fmt: skip
         numbers = np.concatenate([part.episodes for part in parts])
@@ -148,18 +149,18 @@ def play(
             "seed": np.repeat(seeds, len(numbers)), "episode": np.tile(numbers, len(seeds)),
         })  # fmt: skip
         progress(1)
-    return Played(pd.DataFrame(rows), _episode_table(source.name, panel, settings, episodes))
+    return PanelResult(pd.DataFrame(rows), _episode_table(source.name, panel, settings, episodes))
 
 
 class _Part(NamedTuple):
-    """What stays of some episodes: their numbers (E,), metrics (S, E), and each seed's latencies (n,)."""
+    """Some episodes: their numbers (E,), metrics (S, E), and each seed's latencies (n,)."""
 
     episodes: Ints
     metrics: Mapping[str, Floats]
     latency_ms: Sequence[Floats]
 
 
-def _part(walked: Walked, seeds: int) -> _Part:
+def _part(walked: WalkResult, seeds: int) -> _Part:
     n, left_out = len(walked.episodes), np.isnan(walked.ends["success_rate"])
 
     def metric(name: str) -> Floats:
@@ -203,28 +204,20 @@ def over_own_episodes(name: str, values: Floats) -> Estimate:
 def _episode_table(
     source: str, panel: str, settings: Sequence[Setting], values: Sequence[Mapping[str, Floats]]
 ) -> "pd.DataFrame":
-    """The table of a panel's episodes, from `EPISODE_METRICS`, `seed` and `episode` of each grid point, (n,).
-
-    Names are kept once.
-    """
+    """Return a panel's episodes, from `EPISODE_METRICS`, `seed` and `episode` of each grid point, (n,)."""
     import pandas as pd
 
     column = {name: np.concatenate([of[name] for of in values]) for name in values[0]}
     point = np.repeat(np.arange(len(settings)), [len(of["seed"]) for of in values])
-
-    def named(names: list[Any]) -> "pd.Categorical[Any]":
-        return pd.Categorical(names).take(point)
-
-    swept = [np.nan if s.value is None else s.value for s in settings]
-    kind = object if any(isinstance(v, str) for v in swept) else float
     whole = ~np.isnan(column["success_rate"])  # those that were not left out
     column, point = {name: values[whole] for name, values in column.items()}, point[whole]
+    places = [{"source": source, "panel": panel, **setting.place} for setting in settings]
+    worded = any(isinstance(place["value"], str) for place in places)
+    values_of = np.array([place.pop("value") for place in places], dtype=object if worded else float)[point]
+    named = {name: pd.Categorical([place[name] for place in places]).take(point) for name in places[0]}
     return pd.DataFrame({
-        "source": named([source] * len(settings)),
-        "panel": named([panel] * len(settings)),
-        "condition": named([s.condition for s in settings]),
-        "variable": named([s.variable for s in settings]),
-        "value": np.array(swept, dtype=kind)[point],
+        **{name: named.pop(name) for name in NAMES},
+        "value": values_of,
         "seed": column["seed"],
         "episode": column["episode"].astype(int),
         "success": column["success_rate"].astype(bool),
@@ -232,18 +225,13 @@ def _episode_table(
         "latency_ms": column["latency_proxy_ms"].round(3),
         "messages": column["messages_per_episode"].astype(int),
         "effective_loss": column["effective_loss"].round(6),
+        **named,
     })  # fmt: skip
 
 
-def joined(parts: Sequence[Played]) -> Played:
-    """What came of several panels or sources, one below the other; the names in episodes are kept once."""
+def joined(parts: Sequence[PanelResult]) -> PanelResult:
+    """Return the results of several panels or sources, one below the other."""
     import pandas as pd
-    from pandas.api.types import union_categoricals
 
-    tables = [part.episodes for part in parts]
-    names = {name: union_categoricals([table[name] for table in tables]) for name in NAMES}
-    rest = pd.concat([table.drop(columns=list(NAMES)) for table in tables], ignore_index=True)
-    return Played(
-        pd.concat([part.summary for part in parts], ignore_index=True),
-        pd.concat([pd.DataFrame(names), rest], axis=1),
-    )
+    tables = [[part.summary for part in parts], [part.episodes for part in parts]]
+    return PanelResult(*(pd.concat(each, ignore_index=True) for each in tables))

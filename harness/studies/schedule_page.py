@@ -15,8 +15,8 @@ from harness.report.drawing.colours import COLOURS, INK, MARKERS, PALE
 from harness.report.drawing.pictures import styled
 from harness.report.library import picture
 from harness.report.page import environment
-from harness.studies.folder import write, write_manifest
 from harness.studies.schedules import NEVER, Chosen, Compared, Play
+from harness.studies.study import write, write_manifest
 
 if TYPE_CHECKING:
     import pandas as pd

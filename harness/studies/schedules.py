@@ -21,7 +21,7 @@ from harness.core.multiplicity import holm
 from harness.core.statistics import Estimate, of_resamples, resampled
 from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
 from harness.studies.choices import COSTS, Choices, choices
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
 
 RESAMPLES = 2000
 SHARES = np.arange(0.0, 1.0, 0.1)  # of decision points that ask nobody, at the thresholds that are tried
@@ -270,8 +270,8 @@ class Compared:
 
 
 def compare(
-    stored: Stored, tune: Stored | None, point: OperatingPoint, names: Sequence[str], seeds: Sequence[int],
-    budget: float, progress: Callable[[int], None],
+    stored: ReplayedRun, tune: ReplayedRun | None, point: OperatingPoint, names: Sequence[str],
+    seeds: Sequence[int], budget: float, progress: Callable[[int], None],
 ) -> Compared:  # fmt: skip
     """Play every schedule on a run, and on one on tune layouts.
 

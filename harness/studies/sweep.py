@@ -1,68 +1,80 @@
-"""`harness study sweep`: stored answers at every point of a grid."""
+"""`harness study sweep`: a run's answers, scored again at every point of a grid."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from matplotlib.figure import Figure
+
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
-from harness.core.figures import PERCENT
-from harness.core.files import bytes_of, write_whole
 from harness.core.versions import versions
-from harness.report.library import picture
-from harness.report.page import environment
-from harness.studies import figures
-from harness.studies.axes import AXES, CORE, Axis, Setting, Value, described, grid
-from harness.studies.folder import refuse_other, write, write_manifest
+from harness.runs.metrics import SUCCESS
+from harness.studies.axes import AXES, CORE, CROSS, Axis, Setting, Value, crossed, described, grid
+from harness.studies.figures.bars import operating_points
+from harness.studies.figures.heat_map import heat_map
+from harness.studies.figures.lines import along
 from harness.studies.play import Source, joined, play
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
+from harness.studies.study import Study, Table, percent, refuse_other
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TEMPLATES = Path(__file__).parent / "templates"
-COLUMNS = (
-    ("trigger %", "trigger_rate", 100),
-    ("msgs", "messages_per_episode", 1),
-    ("latency ms", "latency_proxy_ms", 1),
-    ("late %", "deadline_miss_rate", 100),
+ESTIMATE = ("mean", "ci_low", "ci_high")
+HEADS = {
+    "trigger %": ("trigger_rate", 100), "msgs": ("messages_per_episode", 1),
+    "latency ms": ("latency_proxy_ms", 1), "late %": ("deadline_miss_rate", 100),
+}  # fmt: skip
+PAIRED = (
+    "Stored answers, scored again at other operating points. All points share their random draws, so a "
+    "difference shows the setting and not the draws. 95 % intervals are over episodes, those of the "
+    "calibrated proxy over seeds; conditions.csv has all figures with their n."
 )
 
 
 def settings(
-    sources: Sequence[Stored], axis: Axis, values: Sequence[Value], conditions: Sequence[str]
+    sources: Sequence[Source],
+    axes: Sequence[Axis],
+    grids: Sequence[Sequence[Value]],
+    conditions: Sequence[str],
 ) -> tuple[Setting, ...]:
-    """The grid points of one axis, for each condition.
+    """Return the grid points of one axis, or of several that are crossed, for each condition.
 
     Raises:
-        UserError: no such condition, one without a channel or in which the axis changes nothing, or more
-            vehicles than there are.
+        UserError: no such condition, one without a channel or in which an axis changes nothing, more
+            vehicles than there are, or too many points.
     """
-    vehicles = min(source.vehicles for source in sources)
-    if axis.field is None and max(map(float, values)) > vehicles:
-        raise UserError(
-            f"--grid: {max(map(float, values)):g} vehicles; the run's scenes have {vehicles} at most"
-        )
-    found = []
-    for name in conditions:
-        points = [axis.at(point_of(sources, name), value) for value in values]
-        idle = [point.idle(axis.field) for point in points]
-        if idle and all(idle):
+    runs = [source for source in sources if isinstance(source, ReplayedRun)]
+    vehicles = min(run.vehicles for run in runs)
+    name, found = CROSS.join(axis.name for axis in axes), list[Setting]()
+    for axis, values in zip(axes, grids, strict=True):
+        if axis.field is None and max(map(float, values)) > vehicles:
             raise UserError(
-                f"--over {axis.name}: it changes nothing in {printable(name)}: {idle[0]}; vary another "
-                "setting or another --condition"
+                f"--grid: {max(map(float, values)):g} vehicles; the run's scenes have {vehicles} at most"
             )
-        found += [
-            Setting(name, point, vehicles if axis.field else int(value), axis.name, value)
-            for point, value in zip(points, values, strict=True)
-        ]
+    for condition in conditions:
+        start = point_of(runs, condition)
+        idle: list[dict[str, str | None]] = []
+        for values in crossed(axes, grids):
+            point, size = start, vehicles
+            for axis, value in zip(axes, values, strict=True):
+                point, size = axis.at(point, value), size if axis.field else int(value)
+            idle.append({axis.name: point.idle(axis.field) for axis in axes})
+            found.append(Setting(condition, point, size, name, values if len(axes) > 1 else values[0]))
+        for axis in axes:
+            if all(point[axis.name] for point in idle):
+                raise UserError(
+                    f"--over {axis.name}: it changes nothing in {printable(condition)}: "
+                    f"{idle[0][axis.name]}; vary another setting or another --condition"
+                )
     return tuple(found)
 
 
-def point_of(sources: Sequence[Stored], name: str) -> OperatingPoint:
-    """The runs' operating point of that name, or one of the paper's, or a change of one of those."""
-    theirs = {source.points[name] for source in sources if name in source.points}
+def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
+    """Return the runs' operating point of that name, or one of the paper's, or a change of one of those."""
+    theirs = {run.points[name] for run in runs if name in run.points}
     if len(theirs) > 1:
         raise UserError(f"--condition {printable(name)} is not the same in all runs; sweep them one by one")
     point = theirs.pop() if theirs else named_point(name)
@@ -71,111 +83,127 @@ def point_of(sources: Sequence[Stored], name: str) -> OperatingPoint:
     return point
 
 
-def usual(sources: Sequence[Stored], conditions: Sequence[str]) -> dict[str, tuple[Setting, ...]]:
-    """The paper's panels for runs: their own conditions, swarm size under density-coupled loss, loss, tau."""
-    vehicles = min(source.vehicles for source in sources)
-    own = {name: point for source in sources for name, point in source.points.items()}
-    sizes = settings(sources, AXES["size"], grid(AXES["size"], f"1:{vehicles}"), conditions)
-    return {
-        "core": tuple(Setting(name, point, vehicles) for name, point in own.items()),
-        "size": tuple(replace(s, point=replace(s.point, density_coupled=True, loss=None)) for s in sizes),
-        **{name: settings(sources, AXES[name], grid(AXES[name]), conditions) for name in ("loss", "tau")},
+def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, tuple[Setting, ...]]:
+    """Return the paper's panels: the runs' conditions, size under density-coupled loss, loss and tau."""
+    vehicles = min(run.vehicles for run in runs)
+    own = {name: point for run in runs for name, point in run.points.items()}
+    grids = {
+        "size": grid(AXES["size"], f"1:{vehicles}"),
+        "loss": grid(AXES["loss"]),
+        "tau": grid(AXES["tau"]),
     }
+    panels = {name: settings(runs, [AXES[name]], [values], conditions) for name, values in grids.items()}
+    crowded = (replace(s, point=replace(s.point, density_coupled=True, loss=None)) for s in panels["size"])
+    core = tuple(Setting(name, point, vehicles) for name, point in own.items())
+    return {CORE: core, **panels, "size": tuple(crowded)}
 
 
 def run_sweep(
     sources: Sequence[Source], panels: Mapping[str, Sequence[Setting]], seeds: Sequence[int], out: Path,
     progress: Callable[[int], None],
-) -> "pd.DataFrame":  # fmt: skip
+) -> Study:  # fmt: skip
     """Play every source at every grid point; points and sources are paired by common random numbers.
-
-    Writes `index.html`, `conditions` and `episodes` as CSV and JSON Lines, `sweep.json`, and the panels as
-    SVG, PDF and PNG: `sweep` along the axes, and a source's operating points, where they are among the
-    panels.
-
-    Returns:
-        The summary: a row a source, grid point and metric.
 
     Raises:
         UserError: the folder holds another sweep.
     """
-    stated = {
-        "sources": [source.manifest() for source in sources],
-        "seeds": list(seeds),
-        "panels": described(panels),
-    }
+    stated = {"sources": [s.manifest() for s in sources], "seeds": list(seeds), "panels": described(panels)}
     refuse_other(out, "sweep", stated)
-    played = {
+    runs = [source for source in sources if isinstance(source, ReplayedRun)]
+
+    def able(source: Source, point: OperatingPoint) -> bool:
+        # The proxy has no model that could answer a fusion call, or blindly.
+        return source in runs or not (point.asks_again or point.asks_blind)
+
+    results = {
         panel: [
-            play(source, panel, able, seeds, progress)
+            play(source, panel, those, seeds, progress)
             for source in sources
-            # The proxy has no model that could answer a fusion call, or blindly.
-            if (able := [s for s in points if isinstance(source, Stored) or not _asks(s.point)])
+            if (those := [setting for setting in points if able(source, setting.point)])
         ]
         for panel, points in panels.items()
     }
-    for source in sources:
-        if isinstance(source, Stored):
-            source.settle()
-    whole = joined([part for parts in played.values() for part in parts])
-    along = [whole.summary[whole.summary.panel == panel] for panel in panels if panel != CORE]
-    drawn = {"sweep": figures.along(along)}
-    for n, part in enumerate(played.get(CORE, ()), 1):
-        drawn[f"operating-points-{n}"] = figures.composite_a(part.summary)
-    write(out, drawn, {"conditions": whole.summary, "episodes": whole.episodes})
-    asked = [source.manifest() for source in sources]  # anew: it says what was left out
-    write_manifest(out, "sweep", {**stated, "sources": asked, "versions": versions()})
-    found = tables(whole.summary)
-    page = environment(TEMPLATES).get_template("sweep.html.j2").render(
-        pictures={name: picture(bytes_of(out / f"{name}.svg", "picture")) for name in drawn},
-        tables=found, sentences=[f"{name}: {in_a_sentence(rows)}." for name, rows in found.items()],
-        seeds=seeds, axes=len(along),
-        title=f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",
+    for run in runs:
+        run.settle()
+    whole = joined([part for parts in results.values() for part in parts])
+    summary = whole.summary
+    lines = [summary[summary.panel == panel] for panel in panels if panel != CORE and CROSS not in panel]
+    figures = {"sweep": along(lines)} if lines else {}
+    figures |= {
+        f"operating-points-{n}": operating_points(part.summary)
+        for n, part in enumerate(results.get(CORE, ()), 1)
+    }
+    maps = [
+        (part.summary, condition)
+        for panel, parts in results.items() if CROSS in panel
+        for part in parts for condition in dict.fromkeys(part.summary.condition)
+    ]  # fmt: skip
+    figures |= {
+        "sweep" if n == 0 else f"sweep-{n + 1}": _map(part[part.condition == condition])
+        for n, (part, condition) in enumerate(maps)
+    }
+    shown = tables(summary)
+    return Study(
+        "sweep", f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",
+        [f"{table.title}: {in_a_sentence(table)}." for table in shown],
+        [f"{PAIRED} Channel seeds: {', '.join(map(str, seeds))}."], shown,
+        {"conditions": summary, "episodes": whole.episodes},
+        # Anew, since sources state what was left out.
+        {**stated, "sources": [s.manifest() for s in sources], "versions": versions()},
+        summary, figures,
+        [text for run in runs for text in (run.lost, run.left_out and run.leaves_out) if text],
     )  # fmt: skip
-    write_whole(out / "index.html", page)
-    return whole.summary
 
 
-@dataclass(frozen=True)
-class Row:
-    """One grid point as text: where `at` on which `axis`, success with its interval, others by name."""
+def _map(part: "pd.DataFrame") -> Figure:
+    """Draw success of crossed axes: the first down, the second across, a panel for each of the others."""
+    down, across, *others = part.variable.iloc[0].split(CROSS)
+    rows = part[(part.metric == SUCCESS) & (part.interval == _interval(part))]
+    groups = rows.groupby(others, sort=False) if others else [((), rows)]
+    panels = {}
+    for values, group in groups:
+        names = [f"{name} {value}" for name, value in zip(others, values, strict=True)]
+        wide = group.pivot(index=down, columns=across, values="mean")
+        wide = wide.reindex(index=group[down].unique(), columns=group[across].unique())
+        panels[", ".join([str(group.condition.iloc[0]), *names])] = 100 * wide.to_numpy(dtype=float)
+    return heat_map(panels, [*map(_text, wide.index)], [*map(_text, wide.columns)], down, across)
 
-    axis: str
-    at: str
-    success: str
-    others: dict[str, str]
 
-
-def _asks(point: OperatingPoint) -> bool:
-    return point.asks_again or point.asks_blind
-
-
-def tables(summary: "pd.DataFrame") -> dict[str, list[Row]]:
-    """A study's main figures, a table a source and curve, by its title."""
-    found: dict[str, list[Row]] = {}
-    places: dict[tuple[Any, ...], list[dict[Any, Any]]] = {}
-    for row in summary.to_dict("records"):
-        value = None if row["panel"] == CORE else row["value"]
-        places.setdefault((row["source"], row["panel"], row["condition"], value), []).append(row)
-    for (source, panel, condition, value), rows in places.items():
-        title = str(source) if panel == CORE else f"{source} · {condition} over {panel}"
+def tables(summary: "pd.DataFrame") -> list[Table]:
+    """Return a study's main figures, a table a source and curve."""
+    heads, rows = dict[str, str](), dict[str, list[Sequence[str]]]()
+    places = ["source", "panel", "condition", "value"]
+    known = summary.assign(value=summary.value.where(summary.panel != CORE, None))
+    for (source, panel, condition, value), group in known.groupby(places, sort=False, dropna=False):
         # Over episodes, but where a seed has episodes of its own.
-        of = {row["metric"]: row for row in sorted(rows, key=_over_episodes)}
-        success = of["success_rate"]
-        ends = (success[name] for name in ("mean", "ci_low", "ci_high"))
-        others = {name: f"{scale * of[metric]['mean']:.1f}" for name, metric, scale in COLUMNS}
-        at = str(condition if panel == CORE else value if isinstance(value, str) else f"{value:g}")
-        axis = "condition" if panel == CORE else str(panel)
-        found.setdefault(title, []).append(Row(axis, at, PERCENT.interval(*ends), others))
-    return found
+        metrics = group.sort_values("interval", ascending=False, kind="stable").set_index("metric")
+        metrics = metrics[~metrics.index.duplicated(keep="last")]
+        others = (f"{scale * metrics['mean'][name]:.1f}" for name, scale in HEADS.values())
+        core = panel == CORE
+        title = str(source) if core else f"{source} · {condition} over {panel}"
+        heads[title] = "condition" if core else str(panel)
+        cells = (str(condition) if core else _text(value), percent(metrics.loc[SUCCESS], *ESTIMATE), *others)
+        rows.setdefault(title, []).append(cells)
+    return [
+        Table(title, (head, "success %, 95 % CI", *HEADS), rows[title], terminal=range(2 + len(HEADS)))
+        for title, head in heads.items()
+    ]
 
 
-def in_a_sentence(rows: Sequence[Row]) -> str:
-    """What came out along an axis: success at both ends, and where it is best if that lies between."""
-    shown = {row.at: f"{row.success} % of episodes succeed at {row.axis} {row.at}" for row in rows}
-    best = max(rows, key=lambda row: float(row.success.split()[0]))
-    return "; ".join(dict.fromkeys([shown[rows[0].at], shown[best.at], shown[rows[-1].at]]))
+def in_a_sentence(table: Table) -> str:
+    """Say success at the ends of an axis and where it is best; of crossed axes where it is worst and best."""
+
+    def success(row: Sequence[str]) -> float:
+        return float(row[1].split()[0])
+
+    best, axis = max(table.rows, key=success), table.heads[0]
+    around = [min(table.rows, key=success), best] if CROSS in axis else [table.rows[0], best, table.rows[-1]]
+    return "; ".join(dict.fromkeys(f"{row[1]} % of episodes succeed at {axis} {row[0]}" for row in around))
 
 
-def _over_episodes(row: dict[Any, Any]) -> bool:
-    return bool(row["interval"] == "episodes")
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _interval(part: "pd.DataFrame") -> str:
+    return "episodes" if (part.interval == "episodes").any() else "seed means"

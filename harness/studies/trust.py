@@ -1,12 +1,10 @@
 """`harness study trust`: every consensus rule under every attack, and its cost while nobody attacks.
 
-A stored run's answers are walked again under each rule, attack and share of attackers; no model is asked
-what the run has. All cells have the same episodes, channel draws and attackers, so contrasts are paired by
-episode.
+A run's stored answers are played again under each rule, attack and share of attackers. All cells have the
+same episodes, channel draws and attackers, so differences are paired by episode.
 """
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -20,22 +18,19 @@ from harness.coordination.rules import EGO_PROMPT
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import bytes_of, digest
+from harness.core.figures import as_mapping, shown
+from harness.core.files import digest
 from harness.core.kept import code_sha256
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import (
-    Estimate,
-    negative_log_likelihood,
-    of_resamples,
-    resampled,
-)
+from harness.core.statistics import Estimate, negative_log_likelihood, of_resamples, resampled
 from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.walk import Decided, walk
 from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
-from harness.studies.folder import refuse_other
-from harness.studies.stored import Stored
+from harness.studies.figures.heat_map import heat_map
+from harness.studies.replayed_run import ReplayedRun
+from harness.studies.study import Cells, Study, Table, ends, refuse_other, strong
 from harness.studies.sweep import point_of
 
 RESAMPLES = 2000
@@ -43,11 +38,7 @@ TRUSTED = 0.5  # of trust; below it a helper is taken for an attacker
 PEACE, EXCLUDED = "", "absent"
 BASE = "linear"
 CAPPED = "linear:weight_cap=0.3"
-# What `--attacks all` is: each alone, and a false place and several voices with a lie.
-USUAL = (
-    "liar", "liar+spoof", "liar:says=permuted", "brake", "brake+spoof", "random", "stuck", "stale", "replay",
-    "silent", "overconfident", "sybil", "liar+sybil", "flood", "spoof", "jump", "liar+jump",
-)  # fmt: skip
+LOSES, COSTS = 2.0, 1.0  # points: what a robust rule may lose under an attack, and cost in peace
 
 
 @dataclass(frozen=True)
@@ -150,27 +141,27 @@ def shares_of(text: str) -> tuple[float, ...]:
     return tuple(dict.fromkeys(share for share in found if share))
 
 
-def play(stored: Stored, point: OperatingPoint, seeds: Sequence[int], of: tuple[str, str, float]) -> Cell:
-    """Walk one cell: a rule, an attack and a share."""
+def play(run: ReplayedRun, point: OperatingPoint, seeds: Sequence[int], of: tuple[str, str, float]) -> Cell:
+    """Play one cell: a rule, an attack and a share."""
     at = under(point, *of)
-    world = FrozenWorld(stored.dataset, [at], seeds)
-    parts = [part for [part] in walk(world, [at], stored.asked_in(world, [at]), stored.spec.ties)]
+    world = FrozenWorld(run.dataset, [at], seeds)
+    parts = [part for [part] in walk(world, [at], run.asked_in(world, [at]), run.spec.ties)]
     ends = world.ends(at)
     place = {number: n for n, number in enumerate(world.numbers.tolist())}
     row = {seed: n for n, seed in enumerate(seeds)}
     cells = [
         np.array([row[s] * len(place) + place[e] for e, s in part.due.episodes], dtype=int) for part in parts
     ]
-    nats = np.concatenate([_nats(stored, part) for part in parts])
+    nats = np.concatenate([_nats(run, part) for part in parts])
     flagged, first = _flagged(parts, len(place), place)
     means = mean_by_place(nats, np.concatenate(cells), len(seeds) * len(place)).reshape(len(seeds), -1)
     means[np.isnan(ends["success_rate"])] = np.nan  # left out
     return Cell(*of, ends["success_rate"], ends["unsafe_rate"], means, flagged, first)
 
 
-def _nats(stored: Stored, part: Decided[Scene]) -> Floats:
+def _nats(run: ReplayedRun, part: Decided[Scene]) -> Floats:
     """-ln of what each decision's policy gives to safe actions, (n,); NaN where none is safe."""
-    forest = stored.dataset.forest
+    forest = run.dataset.forest
     at = np.array([forest.place[scene.id] for scene in part.moments])[part.due.at]
     return negative_log_likelihood(part.result.fused, forest.safe[at])
 
@@ -204,15 +195,19 @@ class Bench:
         name: of the run.
         source: its dataset.
         condition: the operating point that is attacked.
+        seeds: of the channel.
         cells: by rule, attack and share.
         alone: success of an ego that never asks, (S, E).
+        caveats: what the run lacks.
     """
 
     name: str
     source: str
     condition: str
+    seeds: tuple[int, ...]
     cells: Mapping[tuple[str, str, float], Cell]
     alone: Floats
+    caveats: tuple[str, ...] = ()
 
     @cached_property
     def rules(self) -> tuple[str, ...]:
@@ -271,13 +266,13 @@ class Bench:
 
 
 def run_bench(
-    stored: Stored, condition: str, rules: Sequence[str], attacks: Sequence[str], shares: Sequence[float],
+    run: ReplayedRun, condition: str, rules: Sequence[str], attacks: Sequence[str], shares: Sequence[float],
     seeds: Sequence[int], out: Path, progress: Callable[[int], None], more: Callable[[int], None],
 ) -> Bench:  # fmt: skip
     """Play every cell that the folder has not.
 
     Args:
-        stored: the run.
+        run: the run.
         condition: an operating point with a channel.
         rules: of consensus; the linear pool is added.
         attacks: without shares.
@@ -291,7 +286,7 @@ def run_bench(
         UserError: the point has no channel, or asks nobody, or its rule is a fusion call; or the folder has
             the study of another run or condition.
     """
-    point = point_of([stored], condition)
+    point = point_of([run], condition)
     if why := point.idle("attack"):
         raise UserError(f"--condition {printable(condition)}: no attack changes anything: {why}")
     if point.attack or EGO_PROMPT in rules:
@@ -300,71 +295,193 @@ def run_bench(
             f"call is attacked by `harness eval --condition {condition}:consensus={EGO_PROMPT} --attack "
             "injection`"
         )
-    of = {"sources": [{"name": stored.name}], "dataset": stored.run.source, "condition": condition}
-    refuse_other(out, "trust", of)
+    refuse_other(
+        out, "trust", {"sources": [{"name": run.name}], "dataset": run.run.source, "condition": condition}
+    )
     every = [
         *((rule, PEACE, 0.0) for rule in dict.fromkeys([BASE, *rules])),
         *((BASE, EXCLUDED, share) for share in shares),
         *product(dict.fromkeys([BASE, *rules]), attacks, shares),
     ]
-    kept = _Kept(out / "cells.jsonl", stored, point, seeds)
+    depends_on = [
+        run.manifest(), str(run.run.manifest.identity), asdict(point), list(seeds), versions(),
+        code_sha256("**/*.py"),
+    ]  # fmt: skip
+    kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[tuple[str, str, float], Cell]()
     more(len(every))
-    cells = {}
-    for place in every:
-        if (cell := kept.get(place)) is None:
-            cell = play(stored, point, seeds, place)
-            stored.settle()
-            kept.add(cell)
-        cells[place] = cell
+    for rule, attack, share in every:
+        key = rule, attack, share
+        if values := kept.get(*key):
+            first, flagged = values.pop("first"), values.pop("flagged")
+            success, unsafe, nats = (np.array(values[k], dtype=float) for k in ("success", "unsafe", "nats"))
+            judged = None if flagged is None else np.array(flagged, dtype=float)
+            cell = Cell(rule, attack, share, success, unsafe, nats, judged, tuple(first))
+        else:
+            cell = play(run, point, seeds, key)
+            run.settle()
+            kept.add(key, **{k: v for k, v in vars(cell).items() if k not in ("rule", "attack", "share")})
+        cells[key] = cell
         progress(1)
-    never = FrozenWorld(stored.dataset, [alone := OperatingPoint("never asks", None)], seeds)
-    for _ in walk(never, [alone], stored.asked_in(never, [alone]), stored.spec.ties):
+    never = FrozenWorld(run.dataset, [alone := OperatingPoint("never asks", None)], seeds)
+    for _ in walk(never, [alone], run.asked_in(never, [alone]), run.spec.ties):
         pass
-    stored.settle()
-    return Bench(stored.name, stored.run.source, condition, cells, never.ends(alone)["success_rate"])
+    run.settle()
+    caveats = tuple(text for text in (run.lost, run.left_out and run.leaves_out) if text)
+    success = never.ends(alone)["success_rate"]
+    return Bench(run.name, run.run.source, condition, tuple(seeds), cells, success, caveats)
 
 
-class _Kept:
-    """Finished cells in a file, a line each; those of other answers, settings or code do not count."""
+def trust_study(bench: Bench) -> Study:
+    """Declare the study of a bench: a heat map, tables of rules and of success a share, and of detection."""
+    import pandas as pd
 
-    def __init__(self, path: Path, stored: Stored, point: OperatingPoint, seeds: Sequence[int]) -> None:
-        self._path = path
-        self._of = digest([
-            stored.manifest(), str(stored.run.manifest.identity), asdict(point), list(seeds),
-            versions(), code_sha256("**/*.py"),
-        ])  # fmt: skip
-        self._cells: dict[tuple[str, str, float], Cell] = {}
-        data = bytes_of(path, "rows") if path.is_file() else b""
-        for line in data.splitlines():
-            self._read(line)
-        self._torn = not data.endswith(b"\n") and bool(data)
+    panels = {
+        f"{100 * share:.0f} % of the helpers attack": 100
+        * np.array(
+            [
+                [bench.success(rule, attack, share * bool(attack)).value for rule in bench.rules]
+                for attack in (PEACE, *bench.attacks)
+            ]
+        )
+        for share in bench.shares
+    }
+    rows = [row for cell in bench.cells.values() for row in _rows(bench, cell)]
+    cells = [
+        {"rule": c.rule, "attack": c.attack or None, "share": c.share,
+         "success": as_mapping(over_episodes(SUCCESS, c.success)),
+         "detection": {k: as_mapping(e) for k, e in found.items()} if (found := c.detection()) else None}
+        for c in bench.cells.values()
+    ]  # fmt: skip
+    n = bench.price(BASE).n
+    return Study(
+        "trust", f"Consensus rules under attack: {bench.name} on {bench.source}", headline(bench),
+        [
+            f"n = {n} episodes × {len(bench.seeds)} channel seeds under {bench.condition}. All cells have "
+            "the same episodes, channel draws and attackers, so differences are paired by episode; 95 % "
+            "intervals are over episodes. Price in peace: the difference in success from linear while "
+            "nobody attacks, in points. All figures are in figures.csv."
+        ],
+        [table for share in bench.shares for table in _tables(bench, share)] + [*_detections(bench)],
+        {"figures": pd.DataFrame(rows)},
+        {
+            "sources": [{"name": bench.name}], "dataset": bench.source, "condition": bench.condition,
+            "rules": list(bench.rules), "attacks": list(bench.attacks), "shares": list(bench.shares),
+            "versions": versions(),
+        },
+        {"run": bench.name, "dataset": bench.source, "condition": bench.condition, "cells": cells},
+        {"heat-map": heat_map(panels, ["nobody attacks", *bench.attacks], bench.rules)}, bench.caveats,
+    )  # fmt: skip
 
-    def _read(self, line: bytes) -> None:
-        try:
-            plain = json.loads(line)
-            if plain.pop("of") != self._of:
-                return
-            success, unsafe, nats = (np.array(plain[k], dtype=float) for k in ("success", "unsafe", "nats"))
-            flagged = None if plain["flagged"] is None else np.array(plain["flagged"], dtype=float)
-            of = str(plain["rule"]), str(plain["attack"]), float(plain["share"])
-            self._cells[of] = Cell(*of, success, unsafe, nats, flagged, tuple(plain["first"]))
-        except (ValueError, KeyError, TypeError):
-            return  # a torn line is played again
 
-    def get(self, of: tuple[str, str, float]) -> Cell | None:
-        return self._cells.get(of)
+def headline(bench: Bench) -> list[str]:
+    """Say what asking is worth in peace, what the worst attack takes from linear, and who withstands it."""
+    share, peace = bench.shares[0], bench.success(BASE)
+    alone, worst = over_episodes(SUCCESS, bench.alone), bench.worst(BASE, share)
+    best = max(bench.rules, key=lambda rule: bench.mean(rule, share).value)
+    sentences = [
+        f"While nobody attacks, {shown(peace)} % of episodes succeed under the linear pool, and "
+        f"{shown(alone)} % with an ego that never asks.",
+        f"If {100 * share:.0f} % of the helpers attack, {worst} harms the linear pool most: "
+        f"{shown(bench.success(BASE, worst, share))} % succeed.",
+        f"On average over all {len(bench.attacks)} attacks, {best} succeeds most often, in "
+        f"{shown(bench.mean(best, share))} % (linear: {shown(bench.mean(BASE, share))}); its price in "
+        f"peace, in points: {price(bench, best)}.",
+    ]
+    if "liar+spoof" in bench.attacks:
+        robust = [
+            rule for rule in bench.rules
+            if 100 * bench.price(rule).value >= -COSTS
+            and 100 * bench.loss(rule, "liar+spoof", share).value >= -LOSES
+        ]  # fmt: skip
+        sentences.append(
+            f"Rules that lose {LOSES:g} points or less to a liar at a spoofed place, and cost {COSTS:g} "
+            f"point or less in peace: {', '.join(robust) or 'none'}."
+        )
+    return sentences
 
-    def add(self, cell: Cell) -> None:
-        plain = {key: _plain(value) for key, value in vars(cell).items()}
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("ab") as file:
-            file.write(b"\n" * self._torn + json.dumps({"of": self._of, **plain}).encode() + b"\n")
-        self._torn = False
+
+def price(bench: Bench, rule: str) -> str:
+    """Return what a rule costs in peace, in points; a dash for the one that others are held against."""
+    return "–" if rule == BASE else shown(bench.price(rule))
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return [
-            [None if np.isnan(x) else float(x) for x in row] for row in value
-        ]  # exact: cells are read back
-    return list(value) if isinstance(value, tuple) else value
+def _tables(bench: Bench, share: float) -> Iterator[Table]:
+    title = f"{100 * share:.0f} % of the helpers attack"
+    worst = {rule: bench.worst(rule, share) for rule in bench.rules}
+    rows: list[Sequence[str]] = [
+        (
+            rule,
+            price(bench, rule),
+            shown(bench.mean(rule, share)),
+            attack,
+            shown(bench.success(rule, attack, share)),
+        )
+        for rule, attack in worst.items()
+    ]
+    heads = ("rule", "price in peace", "mean of attacks %", "worst attack", "there %")
+    yield Table(title, heads, rows, terminal=range(len(heads)))
+    rows = [("nobody attacks", *(shown(bench.success(rule)) for rule in bench.rules))]
+    rows += [
+        (attack, *(
+            strong(shown(bench.success(rule, attack, share)), bench.clear(rule, attack, share))
+            for rule in bench.rules
+        ))
+        for attack in bench.attacks
+    ]  # fmt: skip
+    yield Table(
+        f"{title}: success, %", ("attack", *bench.rules), rows,
+        "Bold: the rule differs from the linear pool under the same attack, with p at most 0.05 after Holm's "
+        "correction over the grid. For comparison, a linear pool that knows the attackers and does not hear "
+        f"them succeeds in {shown(bench.success(BASE, EXCLUDED, share))} %.",
+    )  # fmt: skip
+
+
+def _detections(bench: Bench) -> Iterator[Table]:
+    """How rules that judge helpers find attackers, and whom they take for one in peace."""
+    names = ("precision", "recall", "f1", "false_alarms")
+    for rule in bench.rules:
+        rows = [
+            (
+                c.attack or "nobody attacks", f"{c.share:.2f}", *(shown(found[name]) for name in names),
+                "–" if np.isnan(c.time_to_detection) else f"{c.time_to_detection:.0f}",
+                f"{sum(map(bool, c.first))} of {len(c.first)}",
+            )
+            for c in bench.cells.values() if c.rule == rule and (found := c.detection())
+        ]  # fmt: skip
+        if rows:
+            yield Table(
+                f"How well {rule} finds attackers",
+                ("attack", "share", "precision %", "recall %", "F1 %", "false alarms %",
+                 "messages until an attacker is found, median", "attackers found"), rows,
+                "Counted over messages that were heard. An attack that leaves a message unchanged cannot be "
+                "found in it. The rule's parameters were chosen on tune layouts.",
+            )  # fmt: skip
+
+
+def _rows(bench: Bench, cell: Cell) -> list[dict[str, Any]]:
+    place = {"rule": cell.rule, "attack": cell.attack or "none", "share": cell.share}
+    estimates = {
+        "success_rate": over_episodes(SUCCESS, cell.success),
+        "unsafe_rate": over_episodes("unsafe_rate", cell.unsafe),
+        "nats": over_episodes("nats", cell.nats),
+        **{f"detection_{name}": e for name, e in (cell.detection() or {}).items()},
+    }
+    if cell.attack == PEACE:
+        estimates["price_in_peace"] = bench.price(cell.rule)
+    elif cell.attack != EXCLUDED:
+        estimates["loss_to_attack"] = bench.loss(cell.rule, cell.attack, cell.share)
+    p = bench.holm.get((cell.rule, cell.attack, cell.share))
+    rows = [
+        {
+            **place,
+            "metric": name,
+            **ends(e),
+            "n": e.n,
+            "p_holm_against_linear": p if name == SUCCESS else None,
+        }
+        for name, e in estimates.items()
+    ]
+    if cell.flagged is not None:
+        n = sum(map(bool, cell.first))
+        rows.append({**place, "metric": "messages_to_detection", "value": cell.time_to_detection, "n": n})
+    return rows

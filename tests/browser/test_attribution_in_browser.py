@@ -14,13 +14,13 @@ from harness.report.page import write_report
 from harness.report.runs import gather
 from harness.runs import folder
 from harness.studies.attribution import attribute, write
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
 
 
 @pytest.fixture(scope="module")
 def made(small, tmp_path_factory):
     path = run(spec_of(small, points=points(["6g"], ["blind"])), tmp_path_factory.mktemp("moved") / "run").out
-    write(attribute(Stored(path), "6g", 12, 0), path)
+    write(attribute(ReplayedRun(path), "6g", 12, 0), path)
     return write_report(gather([path]), path / "report.html")
 
 

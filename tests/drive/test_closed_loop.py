@@ -41,7 +41,7 @@ def test_the_study_is_a_live_run_and_figures_of_it(harness: Callable[..., Said])
     assert max(map(len, out.splitlines())) <= 80
     folder = Path("study")
     figures = {f"figure-{f}.{kind}" for f in "ab" for kind in ("svg", "pdf", "png")}
-    tables = {"conditions.csv", "conditions.jsonl", "closed-loop.json", "run"}
+    tables = {"conditions.csv", "conditions.jsonl", "closed-loop.json", "index.html", "run"}
     assert {p.name for p in folder.iterdir()} == figures | tables
     table = pd.read_csv(folder / "conditions.csv")
     driven = pd.read_csv(folder / "run" / "episodes.csv")

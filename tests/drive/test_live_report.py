@@ -22,7 +22,7 @@ from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import read
 from harness.runs.records import ClosedLoop
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
 from harness.world import scenarios
 
 V2 = prompts.load("v2")
@@ -279,4 +279,4 @@ def test_decisions_without_a_step_are_one_line_that_names_the_file(driven, tmp_p
 
 def test_what_needs_frozen_scenes_refuses_a_live_run(driven):
     with pytest.raises(UserError, match=r"was driven, .* give a folder made by `harness eval`"):
-        Stored(driven)
+        ReplayedRun(driven)

@@ -70,7 +70,8 @@ CLOSED = {
 }  # fmt: skip
 STUDIES = {
     "sweep-axes": [
-        "study", "sweep", "{frozen-proxy}", "--seeds", "0:2", *conditions("6g", "v2x:on_demand=true"),
+        "study", "sweep", "{frozen-proxy}", "--apart", "--seeds", "0:2",
+        *conditions("6g", "v2x:on_demand=true"),
         "--over", "tau", "--grid", "0.5,0.7,0.9", "--over", "loss", "--grid", "0,0.2",
         "--over", "size", "--grid", "1:3", "--over", "window", "--grid", "150,250",
         "--over", "latency", "--grid", "0,100",

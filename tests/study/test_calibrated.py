@@ -27,12 +27,12 @@ from harness.studies.calibrated import (
     stratified,
 )
 from harness.studies.fit import fit
-from harness.studies.play import Walked
+from harness.studies.play import WalkResult
 
 SURE = OperatingPoint("6g", "6g", loss=0.0)  # nothing is lost
 
 
-def walked(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0) -> Walked:
+def walked(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0) -> WalkResult:
     [[made]] = source.walked([Setting("", point, vehicles)], [seed])
     return made
 
@@ -41,11 +41,11 @@ def success(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: 
     return ends(walked(source, point, vehicles, seed))
 
 
-def ends(made: Walked) -> Bools:
+def ends(made: WalkResult) -> Bools:
     return made.ends["success_rate"][0] == 1.0
 
 
-def by_episode(made: Walked, name: str) -> Floats:
+def by_episode(made: WalkResult, name: str) -> Floats:
     """A column of the decisions, (E, S)."""
     in_order = np.argsort(made.places, kind="stable")  # decisions of an episode come in their order
     return made.columns[name][in_order].reshape(len(made.episodes), STEPS)

@@ -7,11 +7,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness.studies import figures
 from harness.studies.calibrated import Calibrated
+from harness.studies.figures.bars import operating_points
+from harness.studies.figures.lines import along
 from harness.studies.ledger import ledger, marks, paper_numbers, tally, verdict
 from harness.studies.paper import panels, run_paper
 from harness.studies.play import joined, over_own_episodes, play
+from harness.studies.study import write_study
 
 EPISODES = 1500  # a seed
 SEEDS = range(5)
@@ -20,7 +22,7 @@ SEEDS = range(5)
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "paper"
-    run_paper(panels(core=EPISODES, sweep=EPISODES), SEEDS, out, lambda done: None)
+    write_study(run_paper(panels(core=EPISODES, sweep=EPISODES), SEEDS, lambda done: None), out)
     return out
 
 
@@ -79,15 +81,12 @@ def test_five_seeds_that_round_alike_are_not_taken_for_exact() -> None:
     assert verdict(30.0, np.nan, np.nan, 89.0, 91.0) == "unclear"
 
 
-def test_seeds_are_the_studys_own(tmp_path: Path) -> None:
-    one, again, other = (
-        run_paper(panels(10, 10), seeds, tmp_path / name, lambda done: None)
-        for name, seeds in (("a", (7,)), ("b", (7,)), ("c", (3,)))
-    )
-    assert one.ledger.equals(again.ledger)
-    assert not one.ledger.equals(other.ledger)
-    assert "100.0 [–, –] %" in other.equation_2
-    assert json.loads((tmp_path / "c" / "study.json").read_text())["seeds"] == [3]
+def test_seeds_are_the_studys_own() -> None:
+    one, again, other = (run_paper(panels(10, 10), seeds, lambda done: None) for seeds in ((7,), (7,), (3,)))
+    assert one.data["ledger"].equals(again.data["ledger"])
+    assert not one.data["ledger"].equals(other.data["ledger"])
+    assert "100.0 [–, –] %" in " ".join(other.about)
+    assert other.manifest["seeds"] == [3]
 
 
 def test_what_equation_2_does_is_measured(study: Path) -> None:
@@ -109,8 +108,8 @@ def test_the_papers_values_are_drawn_in_every_panel(study: Path) -> None:
     core, *sweeps = (summary[summary.panel == name] for name in ("core", "size", "loss", "tau"))
     theirs = marks(numbers)
     for bare, crossed in (
-        (figures.composite_a(core), figures.composite_a(core, theirs)),
-        (figures.along(sweeps), figures.along(sweeps, theirs)),
+        (operating_points(core), operating_points(core, theirs)),
+        (along(sweeps), along(sweeps, theirs)),
     ):
         for before, after in zip(bare.axes, crossed.axes, strict=True):
             assert len(after.lines) > len(before.lines), after.get_ylabel()

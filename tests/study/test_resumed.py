@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from killed_study import COMMANDS
 
-from harness.studies.stored import MORE
+from harness.studies.replayed_run import MORE
 
 SCRIPT = Path(__file__).parents[1] / "killed_study.py"
 

@@ -30,8 +30,8 @@ from harness.runs.metrics import METRICS, of_decisions
 from harness.studies import axes
 from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.learning import fit, layouts
+from harness.studies.replayed_run import ReplayedRun
 from harness.studies.schedules import Compared, Play, Setting, _area, compare
-from harness.studies.stored import Stored
 from harness.world import scenarios
 
 SEED = 100  # of the first layout of `small`
@@ -44,16 +44,16 @@ POINTS_PLAYED = (
 
 
 @pytest.fixture(scope="module")
-def stored(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Stored:
-    return Stored(run(spec_of(small), tmp_path_factory.mktemp("schedules") / "run").out)
+def stored(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> ReplayedRun:
+    return ReplayedRun(run(spec_of(small), tmp_path_factory.mktemp("schedules") / "run").out)
 
 
-def made(stored: Stored, text: str) -> Choices:
+def made(stored: ReplayedRun, text: str) -> Choices:
     return choices(stored, named_point(text), stored.seeds, lambda n: None)
 
 
 @pytest.mark.parametrize("text", POINTS_PLAYED)
-def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: Stored, text: str):
+def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: ReplayedRun, text: str):
     """The oracle is at least as good in every episode, and needs as few messages for a success."""
     point = named_point(text)
     every = made(stored, text)
@@ -75,7 +75,7 @@ def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: Stored, text:
     assert (fewest[..., 0] <= costs[..., 0])[success == 1].all()
 
 
-def test_of_nobody_to_ask_the_oracle_is_the_ego_alone(stored: Stored):
+def test_of_nobody_to_ask_the_oracle_is_the_ego_alone(stored: ReplayedRun):
     every = made(stored, "6g:max_helpers=0")
     [[alone]] = stored.walked([axes.Setting("", POINTS["single-local"], stored.vehicles)], stored.seeds)
     success, costs = every.oracle()
@@ -91,7 +91,7 @@ def test_of_nobody_to_ask_the_oracle_is_the_ego_alone(stored: Stored):
         ("6g:attack=liar", "the oracle knows no attack; leave it out"),
     ],
 )
-def test_what_the_oracle_cannot_bound_is_refused(stored: Stored, text: str, says: str):
+def test_what_the_oracle_cannot_bound_is_refused(stored: ReplayedRun, text: str, says: str):
     with pytest.raises(UserError, match=says):
         made(stored, text)
 
@@ -230,7 +230,7 @@ def test_an_area_has_the_best_rank_and_not_the_best_luck():
 
 
 def test_schedules_are_compared_from_the_command_line(
-    stored: Stored, harness: Callable[..., Any], tmp_path: Path
+    stored: ReplayedRun, harness: Callable[..., Any], tmp_path: Path
 ):
     out = tmp_path / "out"
     chosen = ("--schedule", "entropy", "--schedule", "coverage", "--schedule", "learnt", "--out", out)
@@ -253,7 +253,7 @@ def test_schedules_are_compared_from_the_command_line(
     assert all(row["success"] <= rows[-1]["success"] for row in rows)
 
 
-def test_the_same_twice(stored: Stored):
+def test_the_same_twice(stored: ReplayedRun):
     once, twice = (
         compare(stored, None, SIXG, ["random", "learnt"], (0, 1), 0.5, lambda n: None) for _ in range(2)
     )
@@ -274,7 +274,7 @@ def test_the_same_twice(stored: Stored):
         ),
     ],
 )
-def test_bad_input_is_one_line(stored: Stored, harness: Callable[..., Any], args: Any, says: str):
+def test_bad_input_is_one_line(stored: ReplayedRun, harness: Callable[..., Any], args: Any, says: str):
     given = [stored.run.path if a == "RUN" else a for a in args]
     code, _, err = harness("study", "schedule", "compare", stored.run.path, *given)
     assert code == 2
@@ -286,16 +286,16 @@ def test_bad_input_is_one_line(stored: Stored, harness: Callable[..., Any], args
 
 
 @pytest.fixture(scope="module")
-def train(tmp_path_factory: pytest.TempPathFactory) -> Stored:
+def train(tmp_path_factory: pytest.TempPathFactory) -> ReplayedRun:
     """A run on train layouts."""
     folder = tmp_path_factory.mktemp("train")
     build(scenarios.get("occluded-intersection"), folder / "data", 2, 150_000, 1, lambda done: None, False)
-    return Stored(run(spec_of(load(folder / "data")), folder / "run").out)
+    return ReplayedRun(run(spec_of(load(folder / "data")), folder / "run").out)
 
 
 @pytest.mark.slow
 def test_a_schedule_is_learnt_and_then_one_of_its_name(
-    stored: Stored, train: Stored, harness: Callable[..., Any], tmp_path: Path
+    stored: ReplayedRun, train: ReplayedRun, harness: Callable[..., Any], tmp_path: Path
 ):
     (tmp_path / MARKER).touch()
     typed = (
@@ -363,7 +363,7 @@ def test_a_run_pins_the_file_of_its_schedule(small: Dataset, tmp_path: Path, mon
     with pytest.raises(UserError, match="was begun with another schedules"):
         run(spec_of(small, points=points), out)
     with pytest.raises(UserError, match="schedule mine has changed since; restore it or run again"):
-        Stored(out)
+        ReplayedRun(out)
 
 
 def test_the_schedule_that_ships_says_what_it_was_learnt_and_tuned_on():
@@ -381,13 +381,13 @@ def test_joules_of_choices_are_those_of_the_runs_decisions(small: Dataset, tmp_p
     )  # fmt: skip
     done = run(spec, tmp_path / "run")
     [energy] = [score for score in done.scores if score.metric == "energy_j" and score.interval == "episodes"]
-    stored = Stored(done.out)
+    stored = ReplayedRun(done.out)
     every = made(stored, "6g")
     _, costs = every.played(every.scheduled(SIXG))
     joules, decisions = (costs[..., COSTS.index(name)] for name in ("energy_j", "decisions"))
     assert joules.sum() / decisions.sum() == pytest.approx(energy.value, abs=1e-4)
     assert np.isnan(
-        made(Stored(run(spec_of(small), tmp_path / "other").out), "6g").levels[0].costs[..., 4]
+        made(ReplayedRun(run(spec_of(small), tmp_path / "other").out), "6g").levels[0].costs[..., 4]
     ).all()
 
 
@@ -402,7 +402,7 @@ def test_a_model_is_opened_once_whatever_it_is_asked(
         opened.append(card.name)
         return open_backend(card, **options)
 
-    monkeypatch.setattr("harness.studies.stored.open_backend", counting)
+    monkeypatch.setattr("harness.studies.replayed_run.open_backend", counting)
     monkeypatch.setattr(asking, "CHUNK", 2)
-    made(Stored(out), "6g")
+    made(ReplayedRun(out), "6g")
     assert opened == ["proxy"]

@@ -1,60 +1,55 @@
-"""A study's tables as text, beside what pandas writes of them without formulas."""
+"""A study's folder: its tables as pandas writes them without formulas, and its page."""
 
-from collections.abc import Callable, Iterator
-from typing import Any
+import json
+from pathlib import Path
 
 import pandas as pd
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from markupsafe import Markup
 
-from harness.core.files import neutral
-from harness.studies import tables
-from harness.studies.tables import as_csv, as_json_lines
+from harness.studies.study import Cells, Study, Table, p_cell, strong, write_study, write_table
 
-TEXTS = st.text(alphabet="=-1aé,\"'\n\r\t/\\{}:😀\u2028 ", max_size=4)
-COLUMNS: dict[str, st.SearchStrategy[Any]] = {
-    "float": st.floats(width=64) | st.sampled_from([0.0, -0.0, 0.1 + 0.2, 1e16, 1e-5, float("nan")]),
-    "int": st.integers(-(2**62), 2**62),
-    "bool": st.booleans(),
-    "text": TEXTS,
-    "text or none": TEXTS | st.none(),
-    "mixed": TEXTS | st.floats() | st.integers(0, 3) | st.booleans() | st.none(),
-}
+HOSTILE = "=cmd()</script>\u202e"
 
 
-def whole(parts: Iterator[memoryview]) -> str:
-    return b"".join(map(bytes, parts)).decode()
+def test_texts_are_no_formulas_in_csv_and_whole_in_json(tmp_path: Path) -> None:
+    table = pd.DataFrame({
+        "text": ["=1+1", "a,\"b\"", None], "number": [-1.5, 0.1 + 0.2, float("nan")], "n": [1, 2, 3],
+        "mixed": pd.Series(["-x", -2.0, True], dtype=object), "named": pd.Categorical(["@a", "b", "@a"]),
+    })  # fmt: skip
+    write_table(table, tmp_path / "table")
+    assert (tmp_path / "table.csv").read_text() == (
+        "text,number,n,mixed,named\n'=1+1,-1.5,1,'-x,'@a\n"
+        '"a,""b""",0.30000000000000004,2,-2.0,b\n,,3,True,\'@a\n'
+    )
+    rows = [json.loads(line) for line in (tmp_path / "table.jsonl").read_text().splitlines()]
+    assert rows[0] == {"text": "=1+1", "number": -1.5, "n": 1, "mixed": "-x", "named": "@a"}
+    assert rows[2]["number"] is None
 
 
-@st.composite
-def frames(draw: Callable[[Any], Any]) -> pd.DataFrame:
-    rows = draw(st.lists(st.tuples(*COLUMNS.values(), TEXTS), min_size=1, max_size=8))
-    *columns, named = (list(column) for column in zip(*rows, strict=True))
-    table = pd.DataFrame(dict(zip(COLUMNS, columns[:-1], strict=False)))
-    table["mixed"] = pd.Series(columns[-1], dtype=object)
-    return table.assign(**{'named, "so"': pd.Categorical(named)})
+def test_a_table_without_rows_has_its_names(tmp_path: Path) -> None:
+    write_table(pd.DataFrame({"a": [], "b": []}), tmp_path / "table")
+    assert (tmp_path / "table.csv").read_text() == "a,b\n"
 
 
-@given(frames())
-def test_the_text_is_what_pandas_writes(table: pd.DataFrame) -> None:
-    texts = ("text", "text or none", "mixed", 'named, "so"')
-    safe = table.assign(**{name: pd.Series(list(map(neutral, table[name])), dtype=object) for name in texts})
-    assert whole(as_csv(table)) == safe.to_csv(index=False, lineterminator="\n")
-    assert whole(as_json_lines(table)) == table.to_json(orient="records", lines=True)
+def test_a_page_shows_text_as_text_and_a_terminal_no_markup(tmp_path: Path) -> None:
+    table = Table(HOSTILE, ("name", "value", "p"), [(HOSTILE, strong("1.0"), p_cell(0.0))], terminal=(0, 1))
+    study = Study("sweep", HOSTILE, [HOSTILE], [HOSTILE], [table], {}, {"a": 1}, {}, caveats=[HOSTILE])
+    page = write_study(study, tmp_path).read_text()
+    assert "<strong>1.0</strong>" in page
+    assert "&lt; 0.001" in page
+    assert "=cmd()&lt;/script&gt;⟨U+202E⟩" in page
+    assert "</script>" not in page
+    assert table.in_terminal == (["name", "value"], [[HOSTILE, "1.0"]])
+    assert not isinstance(table.in_terminal[1][0][1], Markup)
+    assert json.loads((tmp_path / "sweep.json").read_text()) == {"format": "swarmdrive-sweep/1", "a": 1}
 
 
-@given(table=frames(), rows=st.integers(1, 4))
-def test_parts_are_the_whole(table: pd.DataFrame, rows: int) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tables, "ROWS", rows)
-        parts = [*map(bytes, as_csv(table))], [*map(bytes, as_json_lines(table))]
-    assert [len(part) for part in parts] == [1 + -(-len(table) // rows), -(-len(table) // rows)]
-    assert b"".join(parts[0]).decode() == whole(as_csv(table))
-    assert b"".join(parts[1]).decode() == whole(as_json_lines(table))
-
-
-def test_a_table_without_rows_has_its_names() -> None:
-    table = pd.DataFrame({"a": [], "b": []})
-    assert whole(as_csv(table)) == "a,b\n"
-    assert whole(as_json_lines(table)) == ""
+def test_cells_of_something_else_and_torn_ones_do_not_count(tmp_path: Path) -> None:
+    path = tmp_path / "cells.jsonl"
+    for n in (1, 2):
+        Cells(path, "this").add(("a", n), value=n)
+    path.write_bytes(path.read_bytes()[:-5])
+    Cells(path, "that").add(("a", 2), value=3)
+    kept = Cells(path, "this")
+    assert (kept.get("a", 1), kept.get("a", 2)) == ({"value": 1}, None)
+    assert Cells(path, "that").get("a", 2) == {"value": 3}

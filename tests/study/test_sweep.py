@@ -14,9 +14,10 @@ from harness.coordination.operating_point import POINTS, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import Evaluated
-from harness.studies import stored
+from harness.studies import replayed_run
 from harness.studies.axes import AXES, Setting, axis_of, grid
-from harness.studies.stored import Stored
+from harness.studies.replayed_run import ReplayedRun
+from harness.studies.study import write_study
 from harness.studies.sweep import run_sweep, settings
 
 
@@ -26,14 +27,16 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
 
 
 @pytest.fixture(scope="module")
-def source(done: Evaluated) -> Stored:
-    return Stored(done.out)
+def source(done: Evaluated) -> ReplayedRun:
+    return ReplayedRun(done.out)
 
 
-def swept(source: Stored, out: Path, name: str, text: str | None = None) -> pd.DataFrame:
+def swept(source: ReplayedRun, out: Path, name: str, text: str | None = None) -> pd.DataFrame:
     axis = AXES[name]
-    points = settings([source], axis, grid(axis, text), ["6g"])
-    return run_sweep([source], {name: points}, source.seeds, out, lambda n: None)
+    points = settings([source], [axis], [grid(axis, text)], ["6g"])
+    study = run_sweep([source], {name: points}, source.seeds, out, lambda n: None)
+    write_study(study, out)
+    return study.data["conditions"]
 
 
 def value(summary: pd.DataFrame, at: Any, metric: str) -> float:
@@ -42,7 +45,7 @@ def value(summary: pd.DataFrame, at: Any, metric: str) -> float:
 
 
 def test_at_the_runs_own_point_a_sweep_says_what_the_run_said(
-    done: Evaluated, source: Stored, tmp_path: Path
+    done: Evaluated, source: ReplayedRun, tmp_path: Path
 ) -> None:
     summary = swept(source, tmp_path, "tau", "0.7")
     for metric in ("success_rate", "trigger_rate", "latency_proxy_ms", "messages_per_episode"):
@@ -50,7 +53,7 @@ def test_at_the_runs_own_point_a_sweep_says_what_the_run_said(
 
 
 def test_without_others_or_trigger_a_vehicle_is_alone(
-    done: Evaluated, source: Stored, tmp_path: Path
+    done: Evaluated, source: ReplayedRun, tmp_path: Path
 ) -> None:
     alone = figure(done, "single-local", "success_rate").value
     assert value(swept(source, tmp_path / "a", "size", "1"), 1, "success_rate") == pytest.approx(alone)
@@ -58,14 +61,35 @@ def test_without_others_or_trigger_a_vehicle_is_alone(
     assert value(swept(source, tmp_path / "c", "loss", "1"), 1, "success_rate") == pytest.approx(alone)
 
 
-def test_every_axis_gives_its_panels(source: Stored, tmp_path: Path) -> None:
-    panels = {name: settings([source], axis, grid(axis), ["6g"]) for name, axis in AXES.items()}
-    summary = run_sweep([source], panels, source.seeds, tmp_path, lambda n: None)
-    assert set(summary.panel) == set(AXES)
+def test_every_axis_gives_its_panels(source: ReplayedRun, tmp_path: Path) -> None:
+    panels = {name: settings([source], [axis], [grid(axis)], ["6g"]) for name, axis in AXES.items()}
+    study = run_sweep([source], panels, source.seeds, tmp_path, lambda n: None)
+    write_study(study, tmp_path)
+    assert set(study.data["conditions"].panel) == set(AXES)
     names = {f"{table}.{kind}" for table in ("conditions", "episodes") for kind in ("csv", "jsonl")}
     names |= {"index.html", *(f"sweep.{kind}" for kind in ("json", "svg", "pdf", "png"))}
     assert {p.name for p in tmp_path.iterdir()} == names
     assert json.loads((tmp_path / "sweep.json").read_text())["panels"]["consensus"][0]["value"] == "linear"
+
+
+def test_axes_that_are_crossed_give_every_combination_what_it_has_alone(
+    source: ReplayedRun, tmp_path: Path
+) -> None:
+    axes, grids = [axis_of("attack"), AXES["consensus"]], [("none", "liar+spoof"), ("linear", "median")]
+    points = {"attack × consensus": settings([source], axes, grids, ["6g"])}
+    study = run_sweep([source], points, source.seeds, tmp_path, lambda n: None)
+    page = write_study(study, tmp_path).read_text()
+    assert "% of episodes succeed at attack × consensus liar+spoof × linear" in page
+    assert (tmp_path / "sweep.svg").is_file()
+    rows = study.data["conditions"]
+    assert list(rows.value.unique()) == [f"{a} × {rule}" for a in grids[0] for rule in grids[1]]
+    attacked = rows[(rows.attack == "liar+spoof") & (rows.consensus == "median")]
+    alone = settings([source], axes[1:], grids[1:], ["6g:attack=liar+spoof"])
+    apart = run_sweep([source], {"consensus": alone}, source.seeds, tmp_path / "apart", lambda n: None)
+    expected = apart.data["conditions"]
+    expected = expected[expected.value == "median"]
+    assert attacked["mean"].tolist() == expected["mean"].tolist()
+    assert attacked.metric.tolist() == expected.metric.tolist()
 
 
 TOGETHER = (
@@ -85,11 +109,11 @@ def test_points_that_are_walked_together_are_each_as_alone(
     few = run(spec_of(small, points=(POINTS["single-local"],), ask=ask), tmp_path / "few").out
     names = [name for name in TOGETHER if asks or "blind" not in name]
     points = [Setting(name, named_point(name), vehicles) for vehicles in (4, 2) for name in names]
-    source = Stored(few, asks=asks)
+    source = ReplayedRun(few, asks=asks)
     together = list(source.walked(points, (0, 1, 5)))
     assert bool(source.left_out) != asks
     for setting, [walked] in zip(points, together, strict=True):
-        alone = Stored(Path(shutil.copytree(few, tmp_path / "copy", dirs_exist_ok=True)), asks=asks)
+        alone = ReplayedRun(Path(shutil.copytree(few, tmp_path / "copy", dirs_exist_ok=True)), asks=asks)
         [[expected]] = alone.walked([setting], (0, 1, 5))
         assert alone.left_out <= source.left_out
         for name, values in expected.ends.items():
@@ -100,19 +124,20 @@ def test_points_that_are_walked_together_are_each_as_alone(
 
 
 def test_many_points_are_walked_in_parts(
-    source: Stored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    source: ReplayedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = swept(source, tmp_path / "whole", "tau")
-    monkeypatch.setattr(stored, "WALKS", 5 * 8)  # of four episodes with two seeds
+    monkeypatch.setattr(replayed_run, "WALKS", 5 * 8)  # of four episodes with two seeds
     assert swept(source, tmp_path / "parts", "tau").equals(whole)
 
 
-def test_runs_are_paired(source: Stored, small: Dataset, tmp_path: Path) -> None:
+def test_runs_are_paired(source: ReplayedRun, small: Dataset, tmp_path: Path) -> None:
     """The same answers under another prompt's name see the same luck."""
-    other = Stored(run(spec_of(small, prompt="v1"), tmp_path / "v1").out)
+    other = ReplayedRun(run(spec_of(small, prompt="v1"), tmp_path / "v1").out)
     axis = AXES["loss"]
-    points = settings([source, other], axis, (0.0, 0.5), ["6g"])
-    made = run_sweep([source, other], {"loss": points}, (0, 1), tmp_path / "out", lambda n: None)
+    points = settings([source, other], [axis], [(0.0, 0.5)], ["6g"])
+    study = run_sweep([source, other], {"loss": points}, (0, 1), tmp_path / "out", lambda n: None)
+    made = study.data["conditions"]
     assert len(set(made.source)) == 2
     assert not made[made.metric == "success_rate"]["mean"].isna().any()
 
@@ -126,10 +151,10 @@ def test_runs_are_paired(source: Stored, small: Dataset, tmp_path: Path) -> None
     ],
 )
 def test_what_cannot_be_is_one_line(
-    source: Stored, axis: str, values: tuple[float, ...], condition: str, said: str
+    source: ReplayedRun, axis: str, values: tuple[float, ...], condition: str, said: str
 ) -> None:
     with pytest.raises(UserError, match=said):
-        settings([source], AXES[axis], values, [condition])
+        settings([source], [AXES[axis]], [values], [condition])
 
 
 @pytest.mark.parametrize(
@@ -146,12 +171,12 @@ def test_what_cannot_be_is_one_line(
     ],
 )
 def test_a_setting_that_is_refused_as_idle_changes_nothing(
-    condition: str, name: str, values: tuple[Any, ...], source: Stored
+    condition: str, name: str, values: tuple[Any, ...], source: ReplayedRun
 ) -> None:
     axis, point = axis_of(name), named_point(condition)
     assert point.idle(axis.field)
     with pytest.raises(UserError, match=f"--over {name}: it changes nothing in {condition}: "):
-        settings([source], axis, values, [condition])
+        settings([source], [axis], [values], [condition])
     both = [Setting(condition, axis.at(point, value), source.vehicles, name, value) for value in values]
     [one], [two] = source.walked(both, source.seeds)
     assert np.isfinite(one.ends["success_rate"]).all()
@@ -160,13 +185,13 @@ def test_a_setting_that_is_refused_as_idle_changes_nothing(
             np.testing.assert_array_equal(values_of_one, of_two[metric])
 
 
-def test_a_setting_that_one_value_frees_is_drawn(source: Stored) -> None:
+def test_a_setting_that_one_value_frees_is_drawn(source: ReplayedRun) -> None:
     axis = axis_of("schedule")
-    assert len(settings([source], axis, ("never", "entropy"), ["6g:schedule=never"])) == 2
+    assert len(settings([source], [axis], [("never", "entropy")], ["6g:schedule=never"])) == 2
 
 
 def test_another_sweep_is_not_overwritten_and_the_same_one_is_made_again(
-    source: Stored, tmp_path: Path
+    source: ReplayedRun, tmp_path: Path
 ) -> None:
     swept(source, tmp_path, "tau", "0.7")
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -177,7 +202,7 @@ def test_another_sweep_is_not_overwritten_and_the_same_one_is_made_again(
         ("0.8", "6g", source.seeds, "panels"), ("0.7", "v2x", source.seeds, "panels"),
         ("0.7", "6g", (7,), "seeds"),
     ):  # fmt: skip
-        points = {"tau": settings([source], axis, grid(axis, text), [condition])}
+        points = {"tau": settings([source], [axis], [grid(axis, text)], [condition])}
         with pytest.raises(UserError, match=f"holds another sweep, with other {other}; name another folder"):
             run_sweep([source], points, seeds, tmp_path, lambda n: None)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -18,9 +18,18 @@ from harness.evaluate.lifecycle import Evaluated
 from harness.runs.folder import read
 from harness.runs.listing import runs
 from harness.studies import trust
-from harness.studies.stored import Stored
-from harness.studies.trust import EXCLUDED, PEACE, Bench, names_of, run_bench, shares_of
-from harness.studies.trust_page import in_a_sentence, write_bench
+from harness.studies.replayed_run import ReplayedRun
+from harness.studies.study import write_study
+from harness.studies.trust import (
+    EXCLUDED,
+    PEACE,
+    Bench,
+    headline,
+    names_of,
+    run_bench,
+    shares_of,
+    trust_study,
+)
 
 ATTACKED = named_point("6g:attack=liar:share=1/3+spoof:share=1/3")
 RULES, ATTACKS, THIRD = ("linear", "trust", "linear:weight_cap=0.3"), ("liar+spoof", "stale"), 1 / 3
@@ -33,7 +42,7 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
 
 
 def played(done: Evaluated, out: Path, told: Any = lambda n: None) -> Bench:
-    stored = Stored(done.out)
+    stored = ReplayedRun(done.out)
     return run_bench(stored, "6g", RULES, ATTACKS, (THIRD,), stored.seeds, out, told, lambda n: None)
 
 
@@ -104,9 +113,9 @@ def test_finished_cells_are_kept_and_a_torn_one_is_played_again(
 
 
 def test_its_folder_has_a_page_figures_and_a_picture(bench: Bench, tmp_path: Path) -> None:
-    page = write_bench(bench, tmp_path).read_text()
+    page = write_study(trust_study(bench), tmp_path).read_text()
     assert "liar+spoof" in page
-    assert in_a_sentence(bench)[0].startswith("While nobody attacks")
+    assert headline(bench)[0].startswith("While nobody attacks")
     names = {path.name for path in tmp_path.iterdir()}
     assert {"index.html", "trust.json", "figures.csv", "figures.jsonl", "heat-map.svg"} <= names
     rows = [json.loads(line) for line in (tmp_path / "figures.jsonl").read_text().splitlines()]
@@ -197,7 +206,7 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
 
 
 def test_fusion_calls_are_attacked_elsewhere(done: Evaluated, tmp_path: Path) -> None:
-    stored = Stored(done.out)
+    stored = ReplayedRun(done.out)
     for condition, rules in (("6g", ("ego-prompt",)), ("6g:attack=liar", ("linear",))):
         with pytest.raises(UserError, match="harness eval"):
             run_bench(stored, condition, rules, (), (THIRD,), (0,), tmp_path, lambda n: None, lambda n: None)

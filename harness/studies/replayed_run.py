@@ -43,7 +43,7 @@ from harness.runs.records import Answer
 from harness.runs.sources import PROMPTS, prompt_of
 from harness.runs.unanswered import tally
 from harness.studies.axes import Setting
-from harness.studies.play import Walked, walk_through
+from harness.studies.play import WalkResult, walk_through
 
 WALKS = 1 << 17  # most that are walked together, unless one grid point has more: some 120 MB
 _GIVE_IT = "to ask it, give --model with its folder, .gguf file or hub id, or write a card models/NAME.toml"
@@ -51,7 +51,7 @@ OWN = ("ego", "helper")  # roles that have one answer a vehicle
 MORE = "more-answers.jsonl"  # answers at decision points that the run did not come to, and its fusion calls
 
 
-class Stored:
+class ReplayedRun:
     """An evaluated run, with its own inference times or the `paper`'s.
 
     Attributes:
@@ -168,7 +168,7 @@ class Stored:
             "decision_points_without_answer": sorted(self.left_out),
         }  # fmt: skip
 
-    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Sequence[Walked]]:
+    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Sequence[WalkResult]]:
         """All episodes, with the ego and so many of the nearest vehicles.
 
         Raises:
@@ -184,7 +184,7 @@ class Stored:
 
     def _walked(
         self, points: Sequence[OperatingPoint], vehicles: int, seeds: Sequence[int]
-    ) -> Iterator[Sequence[Walked]]:
+    ) -> Iterator[Sequence[WalkResult]]:
         """The same at points that are walked together."""
         different = list(dict.fromkeys(points))
         world = FrozenWorld(self.dataset, different, seeds)
@@ -192,7 +192,7 @@ class Stored:
         walks = walk_through(world, different, ask, seeds, world.numbers, self.spec.ties)
         walked = dict(zip(different, walks, strict=True))
         for point in points:
-            yield [Walked(world.numbers, world.ends(point), *walked[point])]
+            yield [WalkResult(world.numbers, world.ends(point), *walked[point])]
 
     def asked_in(
         self, world: FrozenWorld, points: Sequence[OperatingPoint], helpers: int | None = None
@@ -389,7 +389,7 @@ class Stored:
 class _Nearest:
     """A run's intents, of which only the nearest helpers' count."""
 
-    def __init__(self, stored: Stored, helpers: int, leave_out: Callable[[Bools], None]) -> None:
+    def __init__(self, stored: ReplayedRun, helpers: int, leave_out: Callable[[Bools], None]) -> None:
         self._stored, self._helpers, self._leave_out = stored, helpers, leave_out
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:

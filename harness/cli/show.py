@@ -1,0 +1,50 @@
+"""A finished study in a terminal."""
+
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+import typer
+
+from harness.cli.estimates import WIDTH, echo_json, table
+from harness.core.errors import printable
+
+if TYPE_CHECKING:
+    from harness.studies.study import Study
+
+LONGEST = 2000  # characters of a sentence
+CELL = 80
+
+
+def finish(study: "Study", out: Path, as_json: bool = False, quiet: bool = False) -> None:
+    """Write a study, and print it as JSON or as text, unless `quiet`."""
+    from harness.studies.study import write_study
+
+    page = write_study(study, out)
+    if as_json:
+        echo_answer(study)
+    elif not quiet:
+        show(study)
+        typer.echo(f"wrote {printable(page)}")
+
+
+def echo_answer(study: "Study") -> None:
+    """Print what a study found as JSON: a data frame as records."""
+    if hasattr(study.answer, "to_json"):
+        typer.echo(study.answer.to_json(orient="records"))
+    else:
+        echo_json(study.answer)
+
+
+def show(study: "Study") -> None:
+    """Print a study: its outcome, caveats, the tables that a terminal has room for, and how it was made."""
+    for text in (study.title, *study.headline, *study.caveats):
+        typer.echo(fill(printable(text, LONGEST), WIDTH))
+    for each in study.tables:
+        if each.terminal:
+            heads, rows = each.in_terminal
+            typer.echo(f"\n{fill(printable(each.title, LONGEST), WIDTH)}")
+            table(heads, [[printable(cell, CELL) for cell in row] for row in rows])
+    typer.echo()
+    for text in study.about:
+        typer.echo(fill(printable(text, LONGEST), WIDTH))

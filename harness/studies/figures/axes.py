@@ -1,0 +1,52 @@
+"""What figures of studies share: plain axes, letters, intervals, and the paper's values."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.report.drawing.colours import INK, PALE
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def paper_values(marks: "pd.DataFrame | None", panel: str, metric: str, **place: str) -> "pd.DataFrame":
+    """Return what the paper says of a metric in a panel; nothing if its values are not to be drawn."""
+    import pandas as pd
+
+    if marks is None:
+        return pd.DataFrame(columns=["value", "low", "high"])
+    wanted = (marks.panel == panel) & (marks.metric == metric)
+    for column, value in place.items():
+        wanted &= marks[column] == value
+    return marks[wanted]
+
+
+def cross(axes: Any, theirs: "pd.DataFrame", x: Any) -> None:
+    """Draw the paper's values at `x`: a cross, or the range that it gives."""
+    low, high = (theirs[end].to_numpy(dtype=float) for end in ("low", "high"))
+    x, single = np.broadcast_to(x, low.shape), low == high
+    if single.any():
+        look: dict[str, Any] = {"color": INK, "markersize": 4.5, "zorder": 5, "clip_on": False}
+        axes.plot(x[single], low[single], "x", label="the paper", **look)
+    if not single.all():
+        middle, half = (low + high)[~single] / 2, (high - low)[~single] / 2
+        axes.errorbar(x[~single], middle, half, fmt="none", ecolor=INK, capsize=2, linewidth=1, zorder=5)
+
+
+def interval_of(rows: "pd.DataFrame") -> str:
+    """Return `episodes` where every seed plays the same ones, `seed means` where a seed has its own."""
+    return "episodes" if (rows.interval == "episodes").any() else "seed means"
+
+
+def plain(axes: Any, lines: str) -> None:
+    """Draw pale lines behind the data, along `x`, `y` or both axes, and no frame."""
+    axes.grid(axis=lines, color=PALE, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def lettered(drawn: Any) -> None:
+    """Name panels (a), (b) and so on."""
+    for axes, letter in zip(drawn, "abcdefg", strict=False):
+        axes.set_title(f"({letter})", loc="left", fontsize=8)

@@ -1,0 +1,89 @@
+"""Bars of operating points, and the paper's values beside them."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patches import Patch
+
+from harness.report.drawing.colours import GREY, INK, conditions
+from harness.report.drawing.pictures import styled
+from harness.studies.axes import CORE
+from harness.studies.figures.axes import cross, interval_of, lettered, paper_values, plain
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CLOUD_MS = 510.0  # the paper's cloud comparator, which it cites and nobody can run
+SHORT = 13  # characters of a name that fit under a bar
+
+
+@styled
+def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) -> Figure:
+    """Draw latency, success and communication of the operating points, with 95 % intervals.
+
+    Args:
+        core: the rows of a study's summary that are theirs.
+        paper: the paper's values beside (`harness.studies.ledger.marks`).
+    """
+    figure = Figure(figsize=(7.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    latency, success, talk = drawn = figure.subplots(1, 3)
+    names = list(dict.fromkeys(core.condition))
+    talking = [name for name in names if _value(core, name, "messages_per_episode")[0] > 0]
+    in_legend = len(names) > 3 or max(map(len, names)) > SHORT
+    colours = conditions(names)
+    for axes, metric, scale, label, bars, margin in (
+        (latency, "latency_proxy_ms", 1.0, "latency of a decision, ms", names, 0.14),
+        (success, "success_rate", 100.0, "success, %", names, 0.14),
+        (talk, "messages_per_episode", 1.0, "messages per episode (bars)", talking, 0.25),
+    ):
+        ticks = ["cloud"] if axes is latency else []
+        for x, name in enumerate(bars, len(ticks)):
+            mean, down, up = _value(core, name, metric, scale)
+            axes.bar(x, mean, width=0.65, color=colours[name], edgecolor=INK, linewidth=0.5)
+            axes.errorbar(x, mean, yerr=[[down], [up]], color=INK, capsize=2.5, linewidth=1.0)
+            theirs = paper_values(paper, CORE, metric, condition=name)
+            cross(axes, theirs, x)
+            axes.annotate(
+                f"{mean:.1f}", (x, np.nanmax([mean, mean + up, *theirs.high])),
+                xytext=(0, 2 if theirs.empty else 4), textcoords="offset points", ha="center", fontsize=6,
+            )  # fmt: skip
+        if axes is latency:
+            axes.bar(0, CLOUD_MS, width=0.65, color="white", edgecolor=GREY, hatch="////", linewidth=0.8)
+            axes.text(0, CLOUD_MS + 8, f"{CLOUD_MS:.0f}", ha="center", va="bottom", fontsize=7)
+            axes.text(
+                0, CLOUD_MS / 2, "cited, not runnable", ha="center", va="center", rotation=90, fontsize=6.5,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
+            )  # fmt: skip
+        ticks += [name.replace("-", "-\n") for name in bars]
+        axes.set_xticks(range(len(ticks)), [] if in_legend else ticks, fontsize=7)
+        axes.set_ylabel(label)
+        axes.margins(y=margin)
+        plain(axes, "y")
+    success.set_ylim(0, 108)
+    key: list[Any] = []
+    if in_legend:
+        key += [Patch(facecolor=colour, edgecolor=INK, label=name) for name, colour in colours.items()]
+    key += success.get_legend_handles_labels()[0][:1]  # the paper's values
+    if key:
+        figure.legend(handles=key, loc="outside lower center", ncols=3, frameon=False, fontsize=7)
+    rate = talk.twinx()
+    for n, name in enumerate(talking):
+        mean, down, up = _value(core, name, "trigger_rate", 100.0)
+        rate.errorbar(n + 0.2, mean, yerr=[[down], [up]], marker="D", color=INK, capsize=2, markersize=4)
+        cross(rate, paper_values(paper, CORE, "trigger_rate", condition=name), n + 0.33)
+    rate.set(ylim=(0, 112), ylabel="trigger rate, % (diamonds)")
+    rate.spines[["top"]].set_visible(False)
+    lettered(drawn)
+    return figure
+
+
+def _value(
+    rows: "pd.DataFrame", condition: str, metric: str, scale: float = 1.0
+) -> tuple[float, float, float]:
+    """Mean, and how far the interval reaches below and above it."""
+    of = rows[(rows.condition == condition) & (rows.metric == metric)]
+    [estimate] = of[of.interval == interval_of(of)][["mean", "ci_low", "ci_high"]].to_numpy(dtype=float)
+    mean, low, high = scale * estimate
+    return mean, mean - low, high - mean

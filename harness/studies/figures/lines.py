@@ -1,0 +1,158 @@
+"""Lines: success along an axis, and what radios receive along distance or among vehicles."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from harness.core.arrays import Floats
+from harness.report.drawing.colours import COLOURS, GREY, INK, MARKERS
+from harness.report.drawing.pictures import styled
+from harness.studies.axes import axis_of
+from harness.studies.figures.axes import cross, interval_of, lettered, paper_values, plain
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from harness.studies.reception import Compared, Drawn
+
+PAPER_LOSS = ((2, 0.6), (4, 6.6), (8, 18.6))  # vehicles, % lost: the paper's panel of swarm sizes
+BEST_BAND = (0.65, 0.70)  # of tau, the paper's
+BESIDE = {"size": ("effective_loss", "packet loss"), "tau": ("trigger_rate", "trigger rate")}  # of success
+
+
+@styled
+def along(panels: "Sequence[pd.DataFrame]", paper: "pd.DataFrame | None" = None) -> Figure:
+    """Draw success along one axis a panel, several sources in one, with loss or trigger rate beside it.
+
+    Args:
+        panels: parts of a study's summary.
+        paper: the paper's values (`harness.studies.ledger.marks`); its best band of tau is drawn with them.
+    """
+    figure = Figure(figsize=(2.5 * len(panels) + 0.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    drawn = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, panel in zip(drawn, panels, strict=True):
+        _along(axes, panel, paper)
+    lettered(drawn)
+    key: dict[str, Any] = {}
+    for axes in figure.axes:
+        key |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        list(key.values()), list(key), loc="outside lower center", ncols=3, frameon=False, fontsize=7
+    )
+    return figure
+
+
+def _along(axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None") -> None:
+    variable = str(panel.variable.iloc[0])
+    curves = [(axes, "success_rate", "success")]
+    if variable in BESIDE:
+        metric, label = BESIDE[variable]
+        beside = axes.twinx()
+        beside.set_ylabel(f"{label}, %")
+        beside.spines[["top"]].set_visible(False)
+        curves.append((beside, metric, label))
+    ticks = list(dict.fromkeys(panel.value)) if axis_of(variable).worded else []
+    for n, (source, condition) in enumerate(dict.fromkeys(zip(panel.source, panel.condition, strict=True))):
+        rows = panel[(panel.source == source) & (panel.condition == condition)]
+        name = condition if len(set(panel.source)) == 1 else f"{source}, {condition}"
+        for where, metric, label in curves:
+            at = rows[(rows.metric == metric) & (rows.interval == interval_of(rows))]
+            mean, low, high = (100 * at[k].to_numpy(dtype=float) for k in ("mean", "ci_low", "ci_high"))
+            look: dict[str, Any] = {
+                "color": COLOURS[n % len(COLOURS)] if where is axes else GREY,
+                "marker": MARKERS[n % len(MARKERS)], "label": f"{label}, {name}",
+            }  # fmt: skip
+            if ticks:
+                x = [ticks.index(value) + 0.12 * n for value in at.value]
+                spread = [mean - low, high - mean]
+                where.errorbar(x, mean, yerr=spread, capsize=2, linestyle="none", markersize=4, **look)
+                continue
+            x = at.value.tolist()
+            where.plot(x, mean, "-" if where is axes else ":", markersize=3, linewidth=1.2, **look)
+            where.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0)
+    if ticks:
+        axes.set_xticks(range(len(ticks)), ticks, rotation=30, ha="right", fontsize=7)
+    for where, metric, _ in curves:
+        theirs = paper_values(paper, str(panel.panel.iloc[0]), metric)
+        cross(where, theirs, theirs.value.to_numpy(dtype=float))
+    for where, metric, _ in curves[1:]:
+        where.set_ylim(0, 125 if metric == "trigger_rate" else None)
+        if metric == "trigger_rate":
+            where.set_yticks(range(0, 101, 20))
+    if variable == "tau" and paper is not None:
+        axes.axvspan(*BEST_BAND, color="#ECECEC", zorder=0, label="best band of the paper")
+    axes.set(xlabel=axis_of(variable).label, ylabel="success, %")
+    plain(axes, "y")
+
+
+@styled
+def reception(
+    name: str, curves: Mapping[str, Floats], distances_m: Floats, messages: "Sequence[Drawn]",
+    against: "Sequence[Compared]",
+) -> Figure:  # fmt: skip
+    """A radio's reception against distance, and beside it, if there are any, against others' curves.
+
+    Args:
+        name: of the condition.
+        curves: label of what stands between, and reception at `distances_m`.
+        distances_m: `(n,)`.
+        messages: what was drawn in sight.
+        against: others' curves.
+    """
+    figure = Figure(figsize=(7.2 if against else 3.8, 3.0), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    axes = figure.add_subplot(1, 2 if against else 1, 1)
+    for (label, curve), colour, dashes in zip(curves.items(), COLOURS, ("-", "--", ":"), strict=False):
+        axes.plot(distances_m, 100 * curve, dashes, color=colour, linewidth=1.4, label=label)
+    crossing = [each.crossing for each in messages]
+    value, low, high = 100 * np.array([(each.value, each.low, each.high) for each in crossing]).T
+    axes.errorbar(
+        [each.distance_m for each in messages], value, yerr=[value - low, high - value], fmt="o", color=INK,
+        markersize=2.5, capsize=2, linewidth=0.8, label=f"messages, n = {crossing[0].n} each",
+    )  # fmt: skip
+    axes.set(xlabel="distance, m", ylabel="received, %", ylim=(-2, 102), xlim=(0, None))
+    axes.set_title(name, fontsize=8)
+    axes.legend(fontsize=6, frameon=False)
+    if against:
+        axes = figure.add_subplot(1, 2, 2)
+        axes.axline((0, 0), (100, 100), color=GREY, linewidth=0.8)
+        for each in against:
+            axes.plot(100 * each.curve.reception, 100 * each.reception, ".", color=COLOURS[0], markersize=2.5)
+        mean = 100 * np.mean([each.mean_difference for each in against])
+        axes.set(
+            xlabel="others' curves, %", ylabel="model, %", xlim=(-2, 102), ylim=(-2, 102), aspect="equal"
+        )
+        curves_ = f"{len(against)} curve{'s' * (len(against) != 1)}"
+        axes.set_title(f"{curves_}, {mean:.1f} points apart on average", fontsize=8)
+    return figure
+
+
+@styled
+def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], line: Floats, title: str) -> Figure:
+    """Draw the loss of one transmission against vehicles in the radius: radios beside the paper's line.
+
+    Args:
+        vehicles: `(n,)`, sender and receiver included.
+        losses: name of a radio to its losses, `(n,)`.
+        line: the paper's, `(n,)`.
+        title: what the losses are of.
+    """
+    figure = Figure(figsize=(4.6, 3.2), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    axes = figure.add_subplot()
+    axes.plot(vehicles, 100 * line, color=INK, linewidth=1.2, label="the paper's line")
+    axes.plot(*zip(*PAPER_LOSS, strict=True), "x", color=INK, label="the paper's three points")
+    for (name, loss), colour, marker in zip(losses.items(), COLOURS, MARKERS, strict=False):
+        axes.plot(vehicles, 100 * loss, marker=marker, markersize=3, linewidth=1.0, color=colour, label=name)
+    axes.set(
+        xscale="log",
+        xlabel="vehicles in the radius, the ego included",
+        ylabel="packet loss, %",
+        ylim=(-2, 102),
+    )
+    axes.set_xticks(vehicles, [str(n) for n in vehicles])
+    axes.minorticks_off()
+    axes.set_title(title, fontsize=8)
+    axes.legend(fontsize=6, frameon=False)
+    return figure

@@ -1,0 +1,89 @@
+"""Points with intervals, and fronts: what one quantity costs in another."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from harness.report.drawing.colours import GREY, INK, MARKERS, conditions
+from harness.report.drawing.pictures import styled
+from harness.studies.figures.axes import plain
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Places `x` and `y` that steps join, ascending in both; `look` is Matplotlib's."""
+
+    label: str
+    x: Sequence[float]
+    y: Sequence[float]
+    look: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""  # beside the last place
+
+
+@styled
+def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]]) -> Figure:
+    """Draw success in percent against a cost; a panel has a title, the cost with its unit, and its steps."""
+    width = max(3.6 * len(panels), 4.4)
+    figure = Figure(figsize=(width, 3.6), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    for axes, (title, cost, lines) in zip(
+        figure.subplots(1, len(panels), squeeze=False, sharey=True)[0], panels, strict=True
+    ):
+        for line in lines:
+            axes.plot(line.x, line.y, drawstyle="steps-post", linewidth=1, label=line.label, **line.look)
+            if line.name:
+                axes.annotate(
+                    line.name, (line.x[-1], line.y[-1]), xytext=(0, 5), textcoords="offset points",
+                    ha="center", fontsize=6.5, color=INK,
+                )  # fmt: skip
+        axes.set(xlabel=cost, ylabel="success, %" if axes is figure.axes[0] else "")
+        axes.set_title(title, fontsize=8)
+        axes.margins(x=0.1, y=0.1)
+        plain(axes, "both")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    key = dict(zip(labels, handles, strict=True))
+    figure.legend(
+        list(key.values()), list(key), loc="outside lower center", ncols=4, frameon=False, fontsize=7
+    )
+    return figure
+
+
+@styled
+def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
+    """Draw closed-loop over frozen success, a point a model and condition, with 95 % intervals.
+
+    Args:
+        table: of `harness.studies.fidelity`.
+        models: who drove, of each row.
+    """
+    figure = Figure(figsize=(5.6, 3.4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 100], [0, 100], color=GREY, linewidth=0.8, linestyle="--", label="the same")
+    markers = {model: MARKERS[n % len(MARKERS)] for n, model in enumerate(dict.fromkeys(models))}
+    colours = conditions(table.condition)
+    for model, (_, row) in zip(models, table.iterrows(), strict=True):
+        (x, *x_ends), (y, *y_ends) = (
+            100 * np.array([row[f"{world}{end}"] for end in ("", "_low", "_high")])
+            for world in ("frozen", "closed")
+        )
+        axes.errorbar(
+            x, y, np.abs(np.array([y_ends]).T - y), np.abs(np.array([x_ends]).T - x),
+            color=colours[row["condition"]], marker=markers[model], markersize=4.5, linewidth=0.7,
+        )  # fmt: skip
+    for model, marker in markers.items():
+        axes.plot([], [], color=GREY, marker=marker, linestyle="none", label=model)
+    for condition, colour in colours.items():
+        axes.plot([], [], color=colour, linewidth=3, label=condition)
+    axes.set(
+        xlabel="success on frozen scenes, %", ylabel="success in closed loop, %", xlim=(0, 102), ylim=(0, 102)
+    )
+    axes.set_aspect("equal")
+    plain(axes, "both")
+    figure.legend(loc="outside right upper", frameon=False, fontsize=7)
+    return figure

@@ -1,0 +1,236 @@
+"""A study: what was computed, in tables, figures and sentences, and one writer of its folder and page."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from harness.core.errors import UserError, printable
+from harness.core.figures import PERCENT
+from harness.core.files import bytes_of, neutral, replacing, text_of, write_whole
+from harness.core.multiplicity import LEVEL
+from harness.core.statistics import Estimate
+from harness.report.drawing.pictures import FORMATS, save
+from harness.report.library import picture
+from harness.report.page import environment
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TEMPLATES = Path(__file__).parent / "templates"
+WIDEST_REM, REM_PER_INCH = 66, 10.5
+SOURCE = ("name", "latency")  # of a source, what makes a study another one
+
+
+@dataclass(frozen=True)
+class Table:
+    """Text in columns, for a page and a terminal.
+
+    Attributes:
+        title: what stands above it.
+        heads: of the columns; the first column names the rows.
+        rows: the cells of each; `Markup` is shown as it is on the page, and as text in a terminal.
+        note: what stands below it on the page.
+        terminal: the columns that a terminal has room for; none where only the page shows the table.
+        most: how many rows a terminal shows; None for all.
+    """
+
+    title: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+    terminal: Sequence[int] = ()
+    most: int | None = None
+
+    @property
+    def in_terminal(self) -> tuple[list[str], list[list[str]]]:
+        """Heads and rows of the columns that a terminal has room for, as plain text."""
+        rows = [[self.heads[n] for n in self.terminal]]
+        rows += [[_plain(row[n]) for n in self.terminal] for row in self.rows[: self.most]]
+        return rows[0], rows[1:]
+
+
+@dataclass(frozen=True)
+class Study:
+    """A finished study.
+
+    Attributes:
+        kind: names its manifest, `<kind>.json`.
+        title: what was played.
+        headline: the outcome in sentences, with n and intervals.
+        about: how it was made: n, what the intervals are over, and what the outcome is conditional on.
+        tables: for the page and the terminal.
+        data: the tables that are written as CSV and JSON Lines, by file name.
+        manifest: what it was made of.
+        answer: what `--json` prints, a data frame or plain values.
+        figures: by file name.
+        caveats: what a reader must know first.
+        more: what else the page shows, below the tables.
+    """
+
+    kind: str
+    title: str
+    headline: Sequence[str]
+    about: Sequence[str]
+    tables: Sequence[Table]
+    data: "Mapping[str, pd.DataFrame]"
+    manifest: Mapping[str, Any]
+    answer: Any
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+    caveats: Sequence[str] = ()
+    more: Markup = field(default_factory=Markup)
+
+
+def strong(text: str, when: bool = True) -> str:
+    """Return text that stands out on a page, where it should."""
+    return Markup("<strong>{}</strong>").format(text) if when else text
+
+
+def p_cell(p: float | None) -> str:
+    """Return a p-value as a cell, bold where it is at most `LEVEL`; a dash where there is none."""
+    if p is None:
+        return "–"
+    return strong("< 0.001" if p < 0.001 else f"{p:.3f}", p <= LEVEL)
+
+
+def ends(
+    estimate: Estimate, name: str = "value", low: str = "ci_low", high: str = "ci_high"
+) -> dict[str, Any]:
+    """Return an estimate and its 95 % interval as three columns of a row."""
+    return {name: estimate.value, low: estimate.low, high: estimate.high}
+
+
+def percent(row: Any, value: str, low: str, high: str) -> str:
+    """Return columns of a row, a share with its interval, as `89.0 [81.4, 93.7]` percent."""
+    return PERCENT.interval(row[value], row[low], row[high])
+
+
+def write_study(study: Study, out: Path) -> Path:
+    """Write tables, figures, the page, and last the manifest, each file whole; return the page."""
+    write(out, study.figures, study.data)
+    pictures = {
+        stem: (
+            picture(bytes_of(out / f"{stem}.svg", "picture")),
+            round(min(WIDEST_REM, REM_PER_INCH * figure.get_size_inches()[0])),
+        )
+        for stem, figure in study.figures.items()
+    }
+    page = environment(TEMPLATES).get_template("study.html.j2").render(study=study, pictures=pictures)
+    write_whole(out / "index.html", page)
+    write_manifest(out, study.kind, study.manifest)
+    return out / "index.html"
+
+
+def write(out: Path, figures: Mapping[str, Figure], data: "Mapping[str, pd.DataFrame]") -> None:
+    """Write figures as SVG, PDF and PNG, and tables."""
+    out.mkdir(parents=True, exist_ok=True)
+    for stem, figure in figures.items():
+        lay_out(figure)
+        for kind in FORMATS:
+            save(figure, out / f"{stem}.{kind}", kind, dpi=300)
+    for stem, table in data.items():
+        write_table(table, out / stem)
+
+
+def write_manifest(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
+    """Write what a study was made of as `<kind>.json`."""
+    text = json.dumps({"format": f"swarmdrive-{kind}/1", **manifest}, allow_nan=False)
+    write_whole(out / f"{kind}.json", msgspec.json.format(text, indent=1) + "\n")
+
+
+def write_table(table: "pd.DataFrame", path: Path) -> None:
+    """Write a table as CSV, whose texts no spreadsheet takes for formulas, and as JSON Lines."""
+    texts = table.select_dtypes(exclude=["number", "bool"])
+    safe = table.assign(**{str(name): column.astype(object).map(neutral) for name, column in texts.items()})
+    with replacing(path.with_name(f"{path.name}.csv")) as part:
+        safe.to_csv(part, index=False, lineterminator="\n", compression=None)
+    with replacing(path.with_name(f"{path.name}.jsonl")) as part:
+        table.to_json(part, orient="records", lines=True, compression=None)
+
+
+def lay_out(figure: Figure) -> None:
+    """Lay a figure out once, and not again for every format: it is half of the work."""
+    if layout := figure.get_layout_engine():
+        layout.execute(figure)
+        figure.set_layout_engine("none")
+
+
+def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
+    """Raise UserError if a folder has a finished study of this kind that was made otherwise.
+
+    Args:
+        out: the folder.
+        kind: of the study.
+        manifest: what its `<kind>.json` has to state; of sources, only what they are and their latency.
+    """
+    try:
+        stated = json.loads(text_of(out / f"{kind}.json"))
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, RecursionError):
+        stated = {}  # it is no study of this kind
+    theirs = stated if isinstance(stated, dict) else {}
+    now = json.loads(json.dumps(manifest))
+    if other := [key for key, value in now.items() if _lasting(key, theirs.get(key)) != _lasting(key, value)]:
+        raise UserError(
+            f"{printable(out)} holds another {kind}, with other {', '.join(other)}; name another folder with "
+            "--out, or delete it"
+        )
+
+
+class Cells:
+    """Finished parts of a study in a file, a line each, so that the same command continues a killed one.
+
+    Lines that depend on something else, or are torn, do not count.
+    """
+
+    def __init__(self, path: Path, depends_on: str) -> None:
+        """Read the file at `path`; `depends_on` is the digest of all that decides a part."""
+        self._path, self._of = path, depends_on
+        data = bytes_of(path, "rows") if path.is_file() else b""
+        self._torn = bool(data) and not data.endswith(b"\n")
+        self._cells = dict(self._read(data))
+
+    def _read(self, data: bytes) -> Iterator[tuple[tuple[Any, ...], dict[str, Any]]]:
+        for line in data.splitlines():
+            try:
+                cell = json.loads(line)
+                if cell["of"] == self._of:
+                    yield tuple(cell["key"]), dict(cell["values"])
+            except (ValueError, KeyError, TypeError):
+                continue
+
+    def get(self, *key: Any) -> dict[str, Any] | None:
+        """Return what was kept of a part, with None for NaN; None if it is yet to be computed."""
+        return self._cells.get(key)
+
+    def add(self, key: Sequence[Any], **values: Any) -> None:
+        """Keep a part: arrays and plain values, to the last bit."""
+        line = json.dumps({"of": self._of, "key": key, "values": {k: _exact(v) for k, v in values.items()}})
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.open("ab") as file:
+            file.write(b"\n" * self._torn + line.encode() + b"\n")
+        self._torn = False
+
+
+def _exact(value: Any) -> Any:
+    if not isinstance(value, np.ndarray):
+        return value
+    return [[None if np.isnan(x) else float(x) for x in row] for row in value]
+
+
+def _lasting(key: str, value: Any) -> Any:
+    """Return a value of a manifest without what changes where a source moves or answers more."""
+    if key != "sources" or not isinstance(value, list):
+        return value
+    return [{k: of.get(k) for k in SOURCE} if isinstance(of, dict) else of for of in value]
+
+
+def _plain(cell: str) -> str:
+    return cell.striptags() if isinstance(cell, Markup) else cell
