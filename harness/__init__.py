@@ -1,29 +1,26 @@
-"""SwarmDrive Harness: evaluates prompts, parsing and coordination in cooperative driving."""
+"""SwarmDrive Harness: evaluates prompts, parsing and coordination in cooperative driving.
 
-from typing import TYPE_CHECKING
+From Python as from the command line: docs/python.md.
+"""
+
+from typing import TYPE_CHECKING, Any
 
 from harness.core.errors import UserError
 
 if TYPE_CHECKING:
-    from os import PathLike
+    from harness.api import compare, load, ls
 
-    from harness.runs.tables import Tables
-
-__all__ = ["UserError", "load"]
+__all__ = ["UserError", "compare", "load", "ls"]
 __version__ = "0.2.0"
 
 
-def load(run: "str | PathLike[str]") -> "Tables":
-    """A run as pandas tables: `summary`, `episodes`, `decisions`, `answers`, and its `config`.
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
 
-    Args:
-        run: folder made by `harness eval` or `harness drive`.
 
-    Raises:
-        UserError: it is no finished run, or a file of it is broken.
-    """
-    from pathlib import Path
+def __getattr__(name: str) -> Any:
+    if name in __all__:  # loaded at first use, since pandas and the report take time
+        from harness import api
 
-    from harness.runs.tables import load as read
-
-    return read(Path(run))
+        return getattr(api, name)
+    raise AttributeError(f"module 'harness' has no attribute {name!r}; it has {', '.join(__all__)}")

@@ -7,9 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from harness.world.parameters import Parameters
-from harness.world.road import Ground, Path, Road, crossings
-from harness.world.scenario import Layout, Scenario, Spawn
+from harness.extend import Ground, Layout, Parameters, Path, Road, Scenario, Spawn, crossings
 
 REACH_M, HALF_M = 100.0, 2.0
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
@@ -22,6 +22,7 @@ TEXT = (
     "fault",
 )  # fmt: skip
 MESSAGE = ("risk", "evidence", "recommended_maneuver", "confidence")  # a helper's answer without its intent
+T = TypeVar("T", bound="Tables")
 PLACE = ["scene", "episode", "step", "danger"]
 
 
@@ -34,11 +35,12 @@ class Tables:
     Attributes:
         path: the run's folder.
         config: the content of run.json.
+        source: the run's records.
     """
 
     path: Path
     config: Mapping[str, Any] = field(repr=False)
-    _run: Run = field(repr=False)
+    source: Run = field(repr=False)
 
     @cached_property
     def summary(self) -> "pd.DataFrame":
@@ -53,7 +55,7 @@ class Tables:
     @cached_property
     def decisions(self) -> "pd.DataFrame":
         """One row for each decision point, condition and seed: decisions.parquet."""
-        return self._run.decisions.frame()
+        return self.source.decisions.frame()
 
     @cached_property
     def answers(self) -> "pd.DataFrame":
@@ -61,7 +63,7 @@ class Tables:
         import numpy as np
         import pandas as pd
 
-        answers, actions = list(self._run.answers), self.config["actions"]
+        answers, actions = list(self.source.answers), self.config["actions"]
         columns = {
             name: [answer.cell(name) for answer in answers]
             for name in (*Answer.__struct_fields__, *TURNS)
@@ -95,11 +97,11 @@ class Tables:
         )
 
 
-def load(run: Path) -> Tables:
+def tables_of(run: Path, kind: type[T]) -> T:
     """Load a run from its folder.
 
     Raises:
         UserError: the folder holds no finished run, or one of another version.
     """
     source = read(run)
-    return Tables(run, msgspec.json.decode(msgspec.json.encode(source.manifest)), source)
+    return kind(run, msgspec.json.decode(msgspec.json.encode(source.manifest)), source)

@@ -7,18 +7,29 @@ from typing import Any
 
 import numpy as np
 
-from harness.backends.base import Completion, Request
-from harness.backends.card import Card
-from harness.backends.registry import Capabilities, Registration
-from harness.coordination.attacks import Attack, Turn
-from harness.coordination.consensus import Fused, Messages, linear_pool
-from harness.coordination.intents import Intents
-from harness.coordination.scheduling import Formula, Known
-from harness.core.arrays import Floats
-from harness.core.figures import PERCENT
-from harness.radio.channel import Broadcast, Delivery, Draws, Links
-from harness.radio.constant import link_up
-from harness.runs.metrics import Metric
+from harness.extend import (
+    PERCENT,
+    Attack,
+    Broadcast,
+    Capabilities,
+    Card,
+    Completion,
+    Delivery,
+    Draws,
+    Floats,
+    Formula,
+    Fused,
+    Intents,
+    Known,
+    Links,
+    Messages,
+    Metric,
+    Registration,
+    Request,
+    Turn,
+    linear_pool,
+    link_up,
+)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,211 @@
+"""Evaluate, load and compare runs from Python; results show themselves in a notebook (docs/python.md)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from io import BytesIO
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from markupsafe import Markup, escape
+
+from harness.core.errors import UserError, printable, unknown
+from harness.runs.records import FrozenScenes, Score
+from harness.runs.tables import Tables, tables_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from harness.dataset.load import Scene
+
+HEADLINE = {
+    "success": "success_rate",
+    "unsafe": "unsafe_rate",
+    "latency": "latency_proxy_ms",
+    "asked": "trigger_rate",
+    "messages": "messages_per_episode",
+}
+"""Metrics of a run's own table, by their heads."""
+
+
+class Run(Tables):
+    """A finished run. A notebook shows its headline and a row for each condition."""
+
+    def decision(self, scene: str, viewer: str | None = None) -> "DecisionPoint":
+        """Return a decision point of the run.
+
+        Args:
+            scene: its id, as in the column `scene` of `decisions`.
+            viewer: whose view the picture shows; None for the ego's.
+
+        Raises:
+            UserError: the run has no such decision point, its dataset is not found, or nobody of that name
+                answers there.
+        """
+        if scene not in self.source.decisions.scenes:
+            raise unknown("decision point", scene, list(self.source.decisions.scenes))
+        if isinstance(self.source.manifest.world, FrozenScenes):
+            from harness.runs.folder import check_scenes, dataset_of
+
+            dataset = dataset_of(self.source)
+            check_scenes(self.source, dataset, [scene])
+            seen = dataset.scene(scene)
+        else:
+            from harness.evaluate.replay import scene_of
+
+            seen = scene_of(self.source, scene)
+            if seen.id != scene:
+                raise UserError(f"decision point {printable(scene)} comes out otherwise in this simulator")
+        if viewer is not None and viewer not in seen.viewers:
+            raise unknown(f"viewer of scene {printable(scene, 40)}", viewer, seen.viewers)
+        return DecisionPoint(self, seen, viewer)
+
+    def _repr_html_(self) -> str:
+        from harness.report import caveats, words
+
+        def cell(score: Score) -> str:
+            shown = words.shown(score)
+            return shown["value"] + (f" [{shown['interval']}]" if shown["interval"] else "")
+
+        import pandas as pd
+
+        rows = [
+            {"condition": condition}
+            | {
+                head: cell(score)
+                for head, metric in HEADLINE.items()
+                if (score := self.source.score(condition, metric))
+            }
+            for condition in self.source.conditions
+        ]
+        sentences = [words.headline(self.source), *caveats.unread(self.source.scores)]
+        n = f"n = {len(self.source.grid.episodes)} episodes × {len(self.source.grid.seeds)} channel seeds"
+        return _page(sentences, _frame(pd.DataFrame(rows)), f"{n}; 95 % intervals over episodes; {self.path}")
+
+
+@dataclass(frozen=True)
+class DecisionPoint:
+    """A decision point of a run. A notebook shows its picture, the answers and the decisions.
+
+    Attributes:
+        run: the run.
+        scene: who is where, and what each vehicle sees.
+        viewer: whose view the picture shows; None for the ego's.
+    """
+
+    run: Run
+    scene: "Scene"
+    viewer: str | None = None
+
+    @property
+    def answers(self) -> "pd.DataFrame":
+        """The answers that were given here, rows of `Run.answers`."""
+        return self.run.answers[self.run.answers.scene == self.scene.id]
+
+    @property
+    def decisions(self) -> "pd.DataFrame":
+        """The decisions that were made here, rows of `Run.decisions`."""
+        return self.run.decisions[self.run.decisions.scene == self.scene.id]
+
+    @cached_property
+    def svg(self) -> str:
+        """The scene from above."""
+        from harness.report.drawing.scene import draw
+
+        draw(self.scene, picture := BytesIO(), "svg", self.viewer)
+        return picture.getvalue().decode()
+
+    def _repr_html_(self) -> str:
+        from harness.report.library import picture
+
+        image = Markup('<img alt="the scene from above" src="{}">').format(picture(self.svg.encode()))
+        answers = self.answers[["viewer", "role", "verdict", "raw", *self._columns("intent_")]]
+        columns = ["condition", "action", "triggered", *self._columns("fused_")]
+        groups = self.decisions.groupby(columns, observed=True, dropna=False, sort=False).seed
+        decisions = groups.agg(seeds=lambda seeds: ", ".join(map(str, seeds))).reset_index()
+        return _page([], image, _frame(answers), _frame(decisions))
+
+    def _columns(self, prefix: str) -> list[str]:
+        return [f"{prefix}{action}" for action in self.run.source.actions]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Run B against run A. A notebook shows what became of success, and the differences.
+
+    Attributes:
+        report: what `harness compare --json` prints.
+        findings: what became of success in each condition, in a sentence.
+    """
+
+    report: Mapping[str, Any]
+    findings: tuple[str, ...]
+
+    @cached_property
+    def differences(self) -> "pd.DataFrame":
+        """One row for each condition and metric: both means, B - A and its 95 % interval."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            [
+                {"condition": each["condition"], "metric": metric, **numbers}
+                for each in self.report["conditions"]
+                for metric, numbers in each["metrics"].items()
+            ]
+        )
+
+    def _repr_html_(self) -> str:
+        names = [f"{letter}: {self.report[letter.lower()]['run']}" for letter in "AB"]
+        return _page([*names, *self.findings, *self.report["caveats"]], _frame(self.differences))
+
+
+def load(run: str | PathLike[str]) -> Run:
+    """Load a finished run.
+
+    Args:
+        run: folder made by `harness eval` or `harness drive`.
+
+    Raises:
+        UserError: it is no finished run, or a file of it is broken.
+    """
+    return tables_of(Path(run), Run)
+
+
+def ls(folder: str | PathLike[str] = "reports") -> "pd.DataFrame":
+    """List the runs and studies in a folder, newest first: a row each, as `harness run ls` prints them.
+
+    Raises:
+        UserError: there is no such folder.
+    """
+    import pandas as pd
+
+    from harness.runs.listing import Listed, runs
+
+    return pd.DataFrame(runs(Path(folder)), columns=list(Listed.__dataclass_fields__))
+
+
+def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Comparison:
+    """Compare run B with run A on the episodes, conditions and seeds that both have.
+
+    Raises:
+        UserError: one is no finished run, or they have nothing to be paired by.
+    """
+    from harness.report.compare.difference import compare as compared
+    from harness.report.compare.pair import pair
+    from harness.report.compare.text import mapping
+    from harness.report.compare.words import findings
+
+    difference = compared(pair(*(side.path if isinstance(side, Run) else Path(side) for side in (a, b))))
+    return Comparison(
+        mapping(difference, (), most=10), tuple(sentence for sentence, _ in findings(difference))
+    )
+
+
+def _page(sentences: list[str], *parts: Markup | str) -> str:
+    paragraphs = [Markup("<p>{}</p>").format(sentence) for sentence in sentences]
+    return Markup("").join([*paragraphs, *map(escape, parts)])
+
+
+def _frame(frame: "pd.DataFrame") -> Markup:
+    return Markup(frame.to_html(index=False, na_rep="–", float_format="{:.4g}".format))  # it escapes texts

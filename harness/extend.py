@@ -1,0 +1,67 @@
+"""Re-export what plug-ins build on. A name that goes warns for a release first: CONTRIBUTING.md."""
+
+from harness.backends.base import Backend, Completion, Request
+from harness.backends.card import Card
+from harness.backends.registry import Capabilities, Registration
+from harness.coordination.attacks import Attack, Turn
+from harness.coordination.consensus import Fused, Messages, Pool, Rule, linear_pool
+from harness.coordination.intents import Intents
+from harness.coordination.scheduling import Formula, Known
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import UserError
+from harness.core.figures import PERCENT, Unit
+from harness.radio.channel import Broadcast, Channel, Delivery, Draws, Links, Physical
+from harness.radio.constant import link_up
+from harness.runs.metrics import Metric
+from harness.world.parameters import Parameters
+from harness.world.road import Ground, Lane, Path, PathKey, Road, crossings, ground, straights, to_the_left
+from harness.world.scenario import Draws as LayoutDraws
+from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.state import Building
+
+__all__ = [
+    "PERCENT",
+    "Attack",
+    "Backend",
+    "Bools",
+    "Broadcast",
+    "Building",
+    "Capabilities",
+    "Card",
+    "Channel",
+    "Completion",
+    "Delivery",
+    "Draws",
+    "Floats",
+    "Formula",
+    "Fused",
+    "Ground",
+    "Intents",
+    "Ints",
+    "Known",
+    "Lane",
+    "Layout",
+    "LayoutDraws",
+    "Links",
+    "Messages",
+    "Metric",
+    "Parameters",
+    "Path",
+    "PathKey",
+    "Physical",
+    "Pool",
+    "Registration",
+    "Request",
+    "Road",
+    "Rule",
+    "Scenario",
+    "Spawn",
+    "Turn",
+    "Unit", "UserError",
+    "crossings",
+    "ground",
+    "linear_pool",
+    "link_up",
+    "straights",
+    "to_the_left",
+]  # fmt: skip

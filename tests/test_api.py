@@ -1,0 +1,103 @@
+"""The harness from Python: few names, which say what the command line says and show themselves."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from evaluating import live_spec_of, run, spec_of
+
+import harness
+from harness import extend
+from harness.coordination.operating_point import POINTS
+from harness.dataset.load import Dataset
+
+
+@pytest.fixture(scope="module")
+def folder(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two frozen runs, of the proxy and of a driver, and a closed-loop one."""
+    folder, points = tmp_path_factory.mktemp("api"), (POINTS["single-local"], POINTS["6g"])
+    for model in ("proxy", "local-view"):
+        run(spec_of(small, model, points=points), folder / model)
+    run(live_spec_of(points=points), folder / "driven")
+    return folder
+
+
+def test_there_are_few_names_and_importing_loads_nothing_else() -> None:
+    assert dir(harness) == ["UserError", "__version__", "compare", "load", "ls"]
+    code = "import sys, harness; assert not {'numpy', 'pandas', 'msgspec'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with pytest.raises(AttributeError, match="no attribute 'evaluation'; it has UserError, compare"):
+        _ = harness.evaluation
+
+
+def test_a_run_shows_its_headline_and_a_row_for_each_condition(folder: Path) -> None:
+    page = harness.load(folder / "proxy")._repr_html_()
+    assert page.startswith("<p>Under 6g, ")
+    parts = ["<td>single-local</td>", "<td>6g</td>", "<th>success</th>", "<th>latency</th>"]
+    assert [page.count(part) for part in parts] == [1] * 4
+    assert "episodes × " in page
+
+
+@pytest.mark.parametrize("name", ["proxy", "driven"])
+def test_a_decision_point_shows_its_picture_answers_and_decisions(folder: Path, name: str) -> None:
+    made = harness.load(folder / name)
+    scene = made.decisions.scene.iloc[-1]
+    point = made.decision(scene)
+    assert scene in point.svg
+    assert set(point.answers.scene) == set(point.decisions.scene) == {scene}
+    page = point._repr_html_()
+    assert "data:image/svg+xml" in page
+    assert page.count("action_distribution") == len(point.answers)
+    assert point.viewer is None
+    other = made.decision(scene, point.scene.viewers[1])
+    assert other.svg != point.svg
+    with pytest.raises(harness.UserError, match="unknown viewer"):
+        made.decision(scene, "v99")
+    with pytest.raises(harness.UserError, match="unknown decision point"):
+        made.decision("99999-0-nowhere")
+
+
+def test_what_a_model_wrote_is_text_in_a_notebook(small: Dataset, tmp_path: Path) -> None:
+    from run_on_disk import made_up
+
+    def hostile(row: dict[str, object]) -> None:
+        row["raw"] = "<script>alert(1)</script>"
+
+    made = harness.load(made_up(tmp_path / "<b>run", answer=hostile))
+    assert "<script>" not in made.answers.to_html()
+    assert "<b>run" not in made._repr_html_()
+
+
+def test_a_folder_of_runs_is_a_table(folder: Path) -> None:
+    table = harness.ls(folder)
+    assert set(table.name) == {"proxy", "local-view", "driven"}
+    assert set(table.state) == {"finished"}
+    with pytest.raises(harness.UserError, match="is no folder"):
+        harness.ls(folder / "nowhere")
+
+
+def test_a_comparison_is_the_command_lines(folder: Path) -> None:
+    difference = harness.compare(harness.load(folder / "local-view"), folder / "proxy")
+    table = difference.differences.set_index(["condition", "metric"])
+    row: Any = table.loc[("6g", "success_rate")]
+    assert row.b - row.a == pytest.approx(row.difference)
+    assert row.low <= row.difference <= row.high
+    assert [sentence.partition(":")[0] for sentence in difference.findings] == ["single-local", "6g"]
+    page = difference._repr_html_()
+    assert all(sentence.replace("'", "&#39;") in page for sentence in difference.findings)
+    with pytest.raises(harness.UserError, match="give two of a kind"):
+        harness.compare(folder / "proxy", folder / "driven")
+
+
+def test_what_plug_ins_build_on_is_pinned() -> None:
+    names = """
+    Attack Backend Bools Broadcast Building Capabilities Card Channel Completion Delivery Draws Floats
+    Formula Fused Ground Intents Ints Known Lane Layout LayoutDraws Links Messages Metric PERCENT
+    Parameters Path PathKey Physical Pool Registration Request Road Rule Scenario Spawn Turn Unit UserError
+    crossings ground linear_pool link_up straights to_the_left
+    """
+    # A name that goes stays here for a release, with a warning: CONTRIBUTING.md.
+    assert sorted(extend.__all__, key=str.lower) == sorted(names.split(), key=str.lower)
+    assert all(getattr(extend, name) for name in extend.__all__)
