@@ -17,6 +17,7 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.run import evaluate
+from harness.evaluate.settings import words
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
 from harness.runs.folder import read
@@ -112,9 +113,9 @@ def test_a_stopped_run_asks_the_same_in_the_same_batches(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("ask", ["all", "used"])
 def test_the_command_that_repeats_a_run_asks_alike(ask: str) -> None:
-    words = " ".join(spec(frozen(2), ask).words())
-    assert ("--ask all" in words) == (ask == "all")
-    assert "--ask used" not in words  # the default
+    typed = " ".join(words(spec(frozen(2), ask).stated()))
+    assert ("--ask all" in typed) == (ask == "all")
+    assert "--ask used" not in typed  # the default
 
 
 STUDIED = [Setting(name, named_point(name), 4) for name in ("v2x", "v2x:tau_nats=0.2", "6g:attack=stale")]

@@ -25,13 +25,13 @@ from reading import unpacked
 from run_on_disk import answers_of
 
 from harness.backends.base import Completion, Request
-from harness.cli.options import points
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate.asking import requests
 from harness.evaluate.lifecycle import Evaluated
+from harness.evaluate.resolve import points
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.report.decisions import Decisions

@@ -14,12 +14,13 @@ from evaluating import run, spec_of, with_ego
 from tokenizers import Tokenizer, models
 
 from harness import __version__, cli
-from harness.cli.options import parse_seeds, points
 from harness.cli.run import default_out
 from harness.core import work
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
+from harness.evaluate.resolve import points
 from harness.evaluate.run import evaluate
+from harness.evaluate.settings import parse_seeds
 from harness.prompts import versions
 
 HEAVY = (
@@ -99,7 +100,8 @@ def one_line(said: Said) -> str:
         (["eval", "--device", "cuda"], "--device cuda: proxy has no weights here (engines transformers"),
         (["eval", "--dtype", "int3"], "--dtype int3: proxy has no weights here (engines transformers"),
         (["eval", "--modle", "proxy"], "No such option: --modle"),
-        (["eval", "extra"], "unexpected extra argument"),
+        (["eval", "extra"], "settings extra: there is no such file; give a run.toml or the folder of a run"),
+        (["eval", "run.toml", "extra"], "unexpected extra argument"),
         (["evaluate"], "No such command 'evaluate'"),
         (["--verbose"], "No such option: --verbose"),
         (["prompt", "shwo"], "No such command 'shwo'"),

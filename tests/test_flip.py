@@ -14,7 +14,6 @@ from harness.backends import cards
 from harness.backends.base import Completion, Letters, Request
 from harness.backends.orders import averaged
 from harness.backends.registry import open_backend
-from harness.cli.run import Swarm
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
@@ -22,6 +21,8 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.asking import Asker, answer_of, requests
 from harness.evaluate.latency import PAPER
 from harness.evaluate.lifecycle import finished_with
+from harness.evaluate.resolve import agents
+from harness.evaluate.settings import HelperSettings, Settings
 from harness.evaluate.spec import Spec
 from harness.prompts import readout, versions
 from harness.report.caveats import of_run
@@ -174,10 +175,15 @@ def test_what_is_no_read_out_of_a_language_model_is_refused(harness: Callable[..
 
 def test_helpers_are_flipped_where_they_read_out() -> None:
     for mode, flips in (("json", False), ("readout", True)):
-        swarm = Swarm("swarm-tiny", None, "v4", answer="readout", helper_answer=mode, flip=True)  # type: ignore[arg-type]
-        agents = swarm.agents(SCENARIO)
-        assert (agents["ego"].flip, agents["helpers"][0].flip) == (True, flips)
-        assert agents["helpers"][0].settings().get("flip", False) == flips
+        ego, helpers = agents(
+            Settings(
+                model="swarm-tiny", prompt="v4", answer="readout", flip=True,
+                helpers=HelperSettings(answer=mode),
+            ),
+            SCENARIO,
+        )  # fmt: skip
+        assert (ego.flip, helpers[0].flip) == (True, flips)
+        assert helpers[0].settings().get("flip", False) == flips
 
 
 @pytest.mark.parametrize("command", [("eval", "--limit", "1"), ("drive", "--episodes", "1")])

@@ -39,6 +39,7 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.asking import read_kept
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.run import evaluate
+from harness.evaluate.settings import words
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.runs.records import Answer, FrozenScenes
@@ -483,4 +484,4 @@ def test_a_model_folder_named_like_a_card_is_not_taken_for_the_card(small: Datas
     (tmp_path / "proxy").mkdir()
     (tmp_path / "proxy" / "config.json").write_text("{}")
     spec = spec_of(small, str(tmp_path / "proxy"))
-    assert f"--model {tmp_path / 'proxy'} " in shlex.join(spec.words())
+    assert f"--model {tmp_path / 'proxy'} " in shlex.join(words(spec.stated()))

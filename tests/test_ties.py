@@ -34,6 +34,7 @@ from harness.coordination.operating_point import POINTS, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import finished
+from harness.evaluate.settings import words
 from harness.radio.channel import Draws
 from harness.runs.folder import read
 from harness.studies.axes import Setting
@@ -198,7 +199,7 @@ def test_a_run_without_the_setting_took_the_first(
 
 @pytest.mark.parametrize("ties", ["drawn", "first"])
 def test_the_command_that_repeats_a_run_falls_alike(ties: str, small: Dataset) -> None:
-    assert ("--ties first" in " ".join(spec_of(small, ties=ties).words())) == (ties == "first")
+    assert ("--ties first" in " ".join(words(spec_of(small, ties=ties).stated()))) == (ties == "first")
 
 
 def test_another_word_is_refused_in_one_line(

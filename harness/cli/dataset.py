@@ -48,7 +48,7 @@ def build(
 
     If the build is stopped, the same command continues it.
     """
-    name = options.scenario_name(name, env, env_config)
+    name = options.typed_scenario(options.scenario_name(name, env, env_config))
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     if lag is not None:
         period_s = scenario.parameters.decision_period_s

@@ -9,12 +9,13 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
-from harness.cli.run import Column, Swarm, as_mapping, default_out, show
+from harness.cli.run import Column, as_mapping, default_out, show
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
 from harness.core.files import text_of
 from harness.core.resources import folder
 from harness.core.seeds import purpose, stated
+from harness.evaluate.settings import OUTPUT, DriveSettings, Settings, changed
 
 if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
@@ -32,81 +33,46 @@ COLUMNS = (
 )
 
 
+@options.takes(DriveSettings)
 def command(
-    model: options.Model = "proxy",
-    engine: options.Engine = None,
-    prompt: options.ScenarioPrompt = None,
-    condition: options.Conditions = None,
-    attack: options.Attacks = None,
-    scenario: str | None = typer.Option(
-        None,
-        help="Scenario to drive; NAME:beacon_loss=0.3 changes its beacons. Default: occluded-intersection.",
-    ),
+    settings: Settings,
     env: options.Env = None,
     env_config: options.EnvConfig = None,
-    episodes: int | None = typer.Option(
-        None, help="Number of layouts to drive. Default: as many as the scenario's shipped dataset has."
-    ),
-    first_seed: int | None = typer.Option(
-        None, help="Layout seed of the first episode. Default: that of the scenario's shipped dataset."
-    ),
-    sample: int | None = typer.Option(None, help="Draw this many of these episodes at random."),
-    sample_seed: int = typer.Option(
-        0, help="Seed of this draw; with the same seed, eval draws the same episodes of as many."
-    ),
-    seeds: options.Seeds = "0:5",
-    thinking: options.Thinking = False,
-    answer: options.Answer = "json",
-    image: options.Image = "own",
-    letters: options.Letters = None,
-    flip: options.Flip = False,
-    sums: options.Sums = "refuse",
-    helper_model: options.HelperModel = None,
-    helper_prompt: options.HelperPrompt = None,
-    helper_answer: options.HelperAnswer = None,
-    helper_thinking: options.HelperThinking = None,
-    ask: options.Ask = "used",
-    ties: options.Ties = None,
-    batch_size: options.BatchSize = 8,
-    server: options.Servers = None,
     workers: options.ModelWorkers = "2",
-    device: options.Device = None,
-    dtype: options.Dtype = None,
-    latency: options.Latency = None,
-    device_profile: options.DeviceProfile = None,
-    device_model: options.DeviceModel = None,
     out: Path | None = typer.Option(
         None, help="Folder to write the run to. Default: reports/<model>-<prompt>-drive."
     ),
     shard: options.Shard = None,
     save_video: int = typer.Option(
-        0, help="Number of failed episodes of the last condition to draw as videos."
+        0,
+        help="Number of failed episodes of the last condition to draw as videos.",
+        rich_help_panel=OUTPUT,
     ),
     no_cache: options.NoCache = False,
-    tag: options.Tags = None,
     as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    quiet: options.QuietOutput = False,
 ) -> None:
     """Drive episodes in closed loop, in highway-env.
 
     If the run is stopped, the same command continues it.
     """
-    from harness.backends import devices
     from harness.backends.cache import default_file
-    from harness.coordination.operating_point import POINTS
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
+    from harness.evaluate import resolve
     from harness.evaluate.live_world import LiveSource
     from harness.evaluate.run import evaluate, evaluate_shard
-    from harness.evaluate.spec import Spec
     from harness.world.environments.examination import examine
     from harness.world.scenarios import DEFAULT
 
-    if condition and ALL in condition and len(condition) > 1:
-        raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
-    name = options.scenario_name(scenario if scenario or env else DEFAULT, env, env_config)
+    world: Any = settings.world
+    if ALL in settings.condition:
+        if len(settings.condition) > 1:
+            raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
+        settings = changed(settings, {"condition": ()})
+    name = options.scenario_name(world.scenario if world.scenario or env else DEFAULT, env, env_config)
     shipped = _shipped(name.partition(":")[0], DEFAULT)
-    episodes = shipped["episodes"] if episodes is None else episodes
-    first_seed = shipped["seed"] if first_seed is None else first_seed
+    episodes = shipped["episodes"] if world.episodes is None else world.episodes
+    first_seed = shipped["seed"] if world.first_seed is None else world.first_seed
     options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     options.in_range("--first-seed", first_seed, 0, LAST_SEED)
     purpose(first_seed, episodes)
@@ -117,31 +83,12 @@ def command(
         )
     if save_video:
         extras.need("--save-video", "matplotlib")
-    names = POINTS if condition in (None, [], [ALL]) else condition
-    source = LiveSource(first_seed, episodes, name, sample, sample_seed)
+    source = LiveSource(first_seed, episodes, name, world.sample, world.sample_seed)
     if source.scenario.is_environment:
         examine(source.scenario, first_seed)
     driven = len(source.numbers)
     options.in_range("--save-video", save_video, 0, driven)
-    swarm = Swarm(
-        model, engine, prompt, answer, thinking, image,
-        helper_model, helper_prompt, helper_answer, helper_thinking, letters, sums, ties, flip,
-    )  # fmt: skip
-    spec = Spec(
-        **swarm.agents(source.scenario),
-        source=source,
-        points=options.points(tuple(names), attacks=attack),
-        seeds=options.parse_seeds(seeds),
-        batch_size=batch_size,
-        servers=tuple(server or ()),
-        device=device,
-        dtype=dtype,
-        latency=latency,
-        device_profile=devices.load(device_profile) if device_profile else None,
-        device_model=device_model,
-        tags=tuple(dict.fromkeys(tag or ())),
-        ask=ask,
-    )
+    spec = resolve.spec(settings, source)
     silent = as_json or quiet
     if part and out:
         with bar(f"driving {printable(spec.ego.card.name, 30)}", quiet=silent) as progress:

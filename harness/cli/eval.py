@@ -12,10 +12,11 @@ import typer
 from harness.cli import options, repeats, suite
 from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
-from harness.cli.run import Column, Swarm, as_mapping, default_out, show
-from harness.core import resources, work
+from harness.cli.run import Column, as_mapping, default_out, show
+from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.seeds import stated
+from harness.evaluate.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
 
 if TYPE_CHECKING:
     from harness.core.parallel import Workers
@@ -33,121 +34,55 @@ COLUMNS = (
 )
 
 
+@options.takes(FrozenSettings)
 def command(
-    model: str = typer.Option(
-        "proxy",
-        help="Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file, a "
-        "hub id, or replay:RUN, which scores the stored answers of a run again.",
-    ),
-    engine: options.Engine = None,
-    prompt: options.ScenarioPrompt = None,
-    dataset: str = typer.Option(
-        resources.DATASET,
-        help="Name of a shipped dataset, a dataset's folder, or suite:NAME for several datasets at once.",
-    ),
-    condition: options.Conditions = None,
-    control: options.Controls = None,
-    attack: options.Attacks = None,
-    seeds: options.Seeds = "0:5",
-    limit: int | None = typer.Option(None, help="Use only this many episodes, from the first. Default: all."),
-    only: str | None = typer.Option(None, help="Use only these episodes: 3,10:20 means 3 and 10 to 19."),
-    danger: str | None = typer.Option(
-        None,
-        help="Use only episodes whose danger comes from this sector, such as left; none means episodes "
-        "without a danger.",
-    ),
-    sample: int | None = typer.Option(
-        None, help="Draw this many episodes at random from those that --only and --danger leave."
-    ),
-    sample_seed: int = typer.Option(0, help="Seed of this draw."),
-    thinking: options.Thinking = False,
-    answer: options.Answer = "json",
-    image: options.Image = "own",
-    letters: options.Letters = None,
-    flip: options.Flip = False,
-    sums: options.Sums = "refuse",
-    helper_model: options.HelperModel = None,
-    helper_prompt: options.HelperPrompt = None,
-    helper_answer: options.HelperAnswer = None,
-    helper_thinking: options.HelperThinking = None,
-    temperature: options.Temperature = 0.0,
-    sampling_seed: options.SamplingSeed = 0,
+    settings: Settings,
     repeat: int | None = typer.Option(
         None,
         "--repeats",
         help="Evaluate this many times, 2 to 100, each with the next sampling seed; needs a --temperature "
         "above 0.",
+        rich_help_panel=ANSWERS,
     ),
-    ask: options.Ask = "used",
-    ties: options.Ties = None,
-    batch_size: options.BatchSize = 8,
     workers: options.RuleWorkers = None,
-    server: options.Servers = None,
-    device: options.Device = None,
-    dtype: options.Dtype = None,
-    latency: options.Latency = None,
-    device_profile: options.DeviceProfile = None,
-    device_model: options.DeviceModel = None,
     out: Path | None = typer.Option(
         None, help="Folder to write the run to. Default: reports/<model>-<prompt>-<dataset>."
     ),
     no_cache: options.NoCache = False,
     dry_run: bool = typer.Option(
-        False, "--dry-run", help="Only render the prompts and count requests and tokens; write nothing."
+        False,
+        "--dry-run",
+        help="Only render the prompts and count requests and tokens; write nothing.",
+        rich_help_panel=OUTPUT,
     ),
     tokenizer: Path | None = typer.Option(
         None,
         help="With --dry-run: tokenizer to count with: a tokenizer.json, its folder, or a GGUF file. "
         "Default: the model's.",
+        rich_help_panel=OUTPUT,
     ),
-    tag: options.Tags = None,
     as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    quiet: options.QuietOutput = False,
 ) -> None:
     """Evaluate a model with a prompt on frozen scenes.
 
     If the run is stopped, the same command continues it.
     """
-    from harness.backends import devices
     from harness.backends.cache import default_file
-    from harness.coordination.operating_point import POINTS
     from harness.dataset import load, suites
     from harness.dataset.select import Selection
+    from harness.evaluate import resolve
     from harness.evaluate.frozen_world import FrozenSource
-    from harness.evaluate.spec import Spec
 
-    named = suites.named(dataset)
-    selection = Selection(limit, only, danger, sample, sample_seed)
+    world: Any = settings.world
+    named = suites.named(world.dataset)
+    selection = Selection(world.limit, world.only, world.danger, world.sample, world.sample_seed)
     frozen = [
-        selection.of(load.load(load.find(name), None if selection.given else limit))
-        for name in (named.datasets if named else (dataset,))
+        selection.of(load.load(load.find(name), None if selection.given else world.limit))
+        for name in (named.datasets if named else (world.dataset,))
     ]
-    options.say_all(limit, frozen)
-    swarm = Swarm(
-        model, engine, prompt, answer, thinking, image,
-        helper_model, helper_prompt, helper_answer, helper_thinking, letters, sums, ties, flip,
-    )  # fmt: skip
-    channel_seeds = options.parse_seeds(seeds)
-    specs = [
-        Spec(
-            **swarm.agents(each.scenario),
-            source=FrozenSource(each, selection),
-            points=options.points(condition or tuple(POINTS), control, attack),
-            seeds=channel_seeds,
-            batch_size=batch_size,
-            servers=tuple(server or ()),
-            device=device,
-            dtype=dtype,
-            temperature=temperature,
-            sampling_seed=sampling_seed,
-            latency=latency,
-            device_profile=devices.load(device_profile) if device_profile else None,
-            device_model=device_model,
-            tags=tuple(dict.fromkeys(tag or ())),
-            ask=ask,
-        )
-        for each in frozen
-    ]
+    options.say_all(world.limit, frozen)
+    specs = [resolve.spec(settings, FrozenSource(each, selection)) for each in frozen]
     if named:
         suite.check(named, specs)
     if repeat is not None:
@@ -189,7 +124,7 @@ def command(
     references = in_trees(frozen[0])
     beside = {name: references[name] for name in BESIDE if name in references}
     notes = (
-        f"n = {len(frozen[0].episodes)} episodes × {len(channel_seeds)} channel seeds; "
+        f"n = {len(frozen[0].episodes)} episodes × {len(specs[0].seeds)} channel seeds; "
         f"{'of ' if selection.given else ''}{stated(frozen[0].manifest.seed, seeds_of)};",
         "95 % intervals over episodes; msgs: per episode; gain: over single-local, paired",
         *map(meaning, beside),

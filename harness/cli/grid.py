@@ -9,7 +9,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import console, table
 from harness.cli.progress import bar
-from harness.cli.run import file_name, first_folder, helper_options
+from harness.cli.run import file_name, first_folder
 from harness.core import extras, resources
 from harness.core.errors import UserError, printable
 
@@ -58,6 +58,7 @@ def command(
     from harness.coordination.operating_point import POINTS
     from harness.dataset import load
     from harness.dataset.select import Selection
+    from harness.evaluate import resolve
     from harness.evaluate.agent import Agent
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
@@ -77,7 +78,7 @@ def command(
         ]
 
     egos = agents({"--model": model, "--prompt": prompt, "--answer": answer})
-    with helper_options({"--answer": helper_answer}):
+    with resolve.helper_options({"--answer": helper_answer}):
         helpers = agents({
             "--helper-model": helper_model or model, "--helper-prompt": helper_prompt or prompt,
             "--helper-answer": helper_answer or answer,
@@ -89,7 +90,7 @@ def command(
     spec = Spec(
         ego=egos[0],
         source=FrozenSource(frozen, Selection(limit)),
-        points=options.points(condition or tuple(POINTS), control, attack),
+        points=resolve.points(condition or tuple(POINTS), control or (), attack or ()),
         seeds=options.parse_seeds(seeds),
         batch_size=batch_size,
         device=device,

@@ -1,28 +1,30 @@
-"""Options that several commands have, each declared once."""
+"""Options that several commands have, and the options of an evaluation, which its settings state."""
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option, echo
 
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import UserError, printable
 from harness.core.files import text_of
+from harness.evaluate import settings as stated
+from harness.evaluate.settings import HELP, parse_seeds
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from harness.backends.base import AnswerMode
     from harness.backends.base import Letters as LettersMode
-    from harness.backends.base import Sums as SumsMode
     from harness.backends.cards import Card
-    from harness.coordination.operating_point import OperatingPoint
     from harness.core import parallel, shards
     from harness.dataset.load import Dataset as Frozen  # Dataset is an option here
-    from harness.evaluate.agent import ImageMode
 else:  # typer takes any text; what is evaluated says which are allowed
-    AnswerMode = ImageMode = LettersMode = SumsMode = str
+    AnswerMode = LettersMode = str
 
-MOST_SEEDS = 1000
+__all__ = ["parse_seeds"]
+
 _RAY = "or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT."
 
 Runs = Annotated[list[Path], Argument(help="One or more folders of finished runs.", metavar="RUN...")]
@@ -47,22 +49,17 @@ Env = Annotated[
     str | None,
     Option(
         help="A highway-env environment to use instead of a scenario: merge-v0, or my_package:MyEnv-v0 for "
-        "one of your own."
+        "one of your own.",
+        rich_help_panel=stated.EPISODES,
     ),
 ]
-EnvConfig = Annotated[Path | None, Option(help="With --env: JSON file with changes to its configuration.")]
-Engine = Annotated[
-    str | None,
-    Option(
-        help="Engine to run the model on, such as llama-cpp, if its card names several. Default: its main "
-        "one."
-    ),
+EnvConfig = Annotated[
+    Path | None,
+    Option(help="With --env: JSON file with changes to its configuration.", rich_help_panel=stated.EPISODES),
 ]
+Engine = Annotated[str | None, Option(help=HELP["engine"])]
 Prompt = Annotated[str, Option(help="Prompt version; `harness prompt list` shows them.")]
-ScenarioPrompt = Annotated[
-    str | None,
-    Option(help="Prompt version; `harness prompt list` shows them. Default: the scenario's usual one."),
-]
+ScenarioPrompt = Annotated[str | None, Option(help=HELP["prompt"])]
 RunsDataset = Annotated[
     Path | None,
     Option(
@@ -71,113 +68,25 @@ RunsDataset = Annotated[
     ),
 ]
 Dataset = Annotated[str, Option(help="Name of a shipped dataset, or a dataset's folder.")]
-Conditions = Annotated[
-    list[str] | None,
-    Option(
-        help="Condition to score: an operating point such as single-local, v2x or 6g, or one with changed "
-        "settings: 6g:consensus=ego-prompt. Repeatable. Default: all operating points."
-    ),
-]
-Controls = Annotated[
-    list[str] | None,
-    Option(
-        "--control",
-        help="Beside each condition with a channel, also score a control. shuffled-messages: the ego hears "
-        "the helpers of another layout. no-messages: every message is lost. blind: the helpers see nothing. "
-        "Repeatable.",
-    ),
-]
-Attacks = Annotated[
-    list[str] | None,
-    Option(
-        "--attack",
-        help="Beside each condition with a channel, also score it under attack: liar:share=1/3 makes a "
-        "third of the helpers lie; liar+spoof combines two attacks. `harness study trust --help` lists them. "
-        "Repeatable.",
-    ),
-]
-Seeds = Annotated[
-    str,
-    Option(help="Channel seeds: 0:5 means 0 to 4; 3,7,9 is a list. Every episode is scored with each seed."),
-]
+Conditions = Annotated[list[str] | None, Option(help=HELP["condition"])]
+Controls = Annotated[list[str] | None, Option("--control", help=HELP["control"])]
+Attacks = Annotated[list[str] | None, Option("--attack", help=HELP["attack"])]
+Seeds = Annotated[str, Option(help=HELP["seeds"])]
 FirstSeed = Annotated[int, Option(help="Layout seed of the first episode; the others follow.")]
-Thinking = Annotated[bool, Option("--thinking", help="Ask the model to think before it answers.")]
-Answer = Annotated[
-    AnswerMode,
-    Option(
-        help="How the model answers. json: free text with a JSON object. constrained: decoding allows only "
-        "what fits the schema. readout: the intent is read from the probabilities of one letter per action."
-    ),
-]
-Letters = Annotated[
-    LettersMode | None,
-    Option(
-        help="How a readout's letters are read. raw: once. cyclic: averaged over as many orders of the list "
-        "as there are actions, so that no letter is preferred. Default: the card's, or cyclic."
-    ),
-]
-Flip = Annotated[
-    bool,
-    Option(
-        "--flip",
-        help="Ask each readout once more with the list of actions reversed, and count how often the "
-        "likeliest action changes. It changes no decision.",
-    ),
-]
-Sums = Annotated[
-    SumsMode,
-    Option(
-        help="What becomes of an answer in json whose only fault is that its numbers do not sum to 1. "
-        "refuse: it failed. divide: they are divided by their sum, and the summary counts it as divided."
-    ),
-]
-Image = Annotated[
-    ImageMode,
-    Option(
-        help="Which picture an image prompt shows: own (the viewer's), blank, another (another scene's), or "
-        "none (text only)."
-    ),
-]
-HelperModel = Annotated[
-    str | None,
-    Option(
-        help="Model of the helpers. Several, such as a,b,c, are assigned to the helpers in turn. "
-        "Default: the ego's model."
-    ),
-]
-HelperPrompt = Annotated[str | None, Option(help="Prompt version of the helpers. Default: the ego's prompt.")]
-HelperAnswer = Annotated[
-    AnswerMode | None,
-    Option(help="How the helpers answer: json, constrained or readout. Default: like the ego."),
-]
-HelperThinking = Annotated[
-    bool | None,
-    Option(
-        "--helper-thinking/--no-helper-thinking",
-        help="Ask the helpers to think before they answer. Default: like the ego.",
-    ),
-]
-BatchSize = Annotated[
-    int,
-    Option(help="Number of prompts in one batch; with a served model, of requests to each server at once."),
-]
-Servers = Annotated[
-    list[str] | None,
-    Option(
-        "--server",
-        help="Base URL of a server of the model, such as http://gpu-1:8000/v1; replaces the card's. Repeat "
-        "it to spread the requests over several servers.",
-    ),
-]
-Workers = Annotated[
-    str,
-    Option(metavar="WHO", help=f"Number of worker processes, {_RAY}"),
-]
+Thinking = Annotated[bool, Option("--thinking", help=HELP["thinking"])]
+Answer = Annotated[AnswerMode, Option(help=HELP["answer"])]
+Letters = Annotated[LettersMode | None, Option(help=HELP["letters"])]
+BatchSize = Annotated[int, Option(help=HELP["batch_size"])]
+Device = Annotated[str | None, Option(help=HELP["device"])]
+Dtype = Annotated[str | None, Option(help=HELP["dtype"])]
+Latency = Annotated[str | None, Option(help=HELP["latency"])]
+Workers = Annotated[str, Option(metavar="WHO", help=f"Number of worker processes, {_RAY}")]
 ModelWorkers = Annotated[
     str,
     Option(
         metavar="WHO",
         help=f"Number of worker processes, each of which loads the model, {_RAY}",
+        rich_help_panel=stated.ENGINE,
     ),
 ]
 RuleWorkers = Annotated[
@@ -186,6 +95,7 @@ RuleWorkers = Annotated[
         metavar="WHO",
         help=f"Number of worker processes, {_RAY} For rules such as proxy only; used on more than 256 "
         "layouts, and for the report of more than 1536 scenes. Default: 2.",
+        rich_help_panel=stated.ENGINE,
     ),
 ]
 PageWorkers = Annotated[
@@ -198,87 +108,77 @@ Shard = Annotated[
         metavar="I/N",
         help="Do only part I of N, such as 3/16; `harness run merge` joins the parts. auto/N takes I from "
         "the task number of a Slurm or Kubernetes job.",
-    ),
-]
-Device = Annotated[
-    str | None,
-    Option(
-        help="Where the model runs: cpu, cuda or cuda:N; with llama-cpp cpu or gpu. Default: a GPU if there "
-        "is one."
-    ),
-]
-Dtype = Annotated[
-    str | None, Option(help="Number format of the weights: float32, bfloat16 or auto. Default: the card's.")
-]
-Latency = Annotated[
-    str | None,
-    Option(
-        help="Inference time of one answer: paper (145 ms), card (what the card states), measured (batch 1 "
-        "on this machine, which must be idle), or seconds: ego=0.2,helper=0.1,fusion=0.3. Default: card, or "
-        "paper if the card states none."
-    ),
-]
-DeviceProfile = Annotated[
-    str | None,
-    Option(
-        help="Computer in every vehicle, such as agx-orin (`harness model device list`). It times each "
-        "answer by its tokens; use it instead of --latency."
-    ),
-]
-DeviceModel = Annotated[
-    str | None,
-    Option(
-        help="With --device-profile: model whose row of the profile times all answers. Default: the model "
-        "that gave the answer."
-    ),
-]
-Temperature = Annotated[float, Option(help="Sampling temperature, 0 to 2; 0 is greedy decoding.")]
-SamplingSeed = Annotated[int, Option(help="Seed of the sampling; needs a --temperature above 0.")]
-Ask = Annotated[
-    str,
-    Option(
-        help="Which helpers answer. used: those whose answer some condition uses. all: every helper in every "
-        "scene, which gives the same decisions and lets other conditions be scored later without the model."
-    ),
-]
-Ties = Annotated[
-    str | None,
-    Option(
-        help="Which of equally likely actions the ego takes. drawn: one by chance, with the same draws for "
-        "every condition, prompt and model. first: the most careful. Default: drawn, or as in the run that "
-        "is replayed."
+        rich_help_panel=stated.EPISODES,
     ),
 ]
 NoCache = Annotated[
-    bool, Option("--no-cache", help="Ask the model again, even for answers that an earlier run stored.")
+    bool,
+    Option(
+        "--no-cache",
+        help="Ask the model again, even for answers that an earlier run stored.",
+        rich_help_panel=stated.ENGINE,
+    ),
 ]
-Tags = Annotated[list[str] | None, Option(help="Label to find the run by later. Repeatable.")]
 Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
-Quiet = Annotated[bool, Option("--quiet", help="Print only errors, and the JSON of --json.")]
+_QUIET = "Print only errors, and the JSON of --json."
+Quiet = Annotated[bool, Option("--quiet", help=_QUIET)]
+QuietOutput = Annotated[bool, Option("--quiet", help=_QUIET, rich_help_panel=stated.OUTPUT)]
 
 
-CONTROLS = {"shuffled-messages": "messages=shuffled", "no-messages": "loss=1", "blind": "messages=blind"}
+def takes(world: type[stated.FrozenSettings] | type[stated.DriveSettings]) -> Callable[[Any], Any]:
+    """Give a command the options of an evaluation; the command's first parameter gets their `Settings`.
+
+    A first argument names a file of settings, or a run's folder; options that are typed beside it win.
+    """
+
+    def decorate(command: Any) -> Any:
+        def typed(file: Path | None = None, **values: Any) -> Any:
+            given = {name: values.pop(name) for name in names}
+            given = {name: value for name, value in given.items() if value is not None}
+            if "scenario" in given:
+                typed_scenario(given["scenario"])
+            if file:
+                return command(stated.read(file, world, given), **values)
+            return command(stated.changed(stated.Settings(world=world()), given), **values)
+
+        made = [_parameter(each) for each in stated.options(world)]
+        names = [each.name for each in made]
+        file = inspect.Parameter(
+            "file",
+            inspect.Parameter.KEYWORD_ONLY,
+            default=Argument(
+                None,
+                metavar="RUN.TOML",
+                help="Settings of a run: its run.toml, or its folder. Options that are typed beside it win.",
+            ),
+            annotation=Path | None,
+        )
+        own = list(inspect.signature(command).parameters.values())[1:]
+        own = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
+        parameters = [file, *made, *own]
+        typed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        typed.__annotations__ = {each.name: each.annotation for each in parameters}
+        typed.__doc__, typed.__name__ = command.__doc__, command.__name__
+        return typed
+
+    return decorate
 
 
-def points(
-    conditions: "Sequence[str]",
-    controls: "Sequence[str] | None" = None,
-    attacks: "Sequence[str] | None" = None,
-) -> "tuple[OperatingPoint, ...]":
-    """Operating points by name, each once, and with a channel their controls, and attacks on them."""
-    from harness.coordination.operating_point import named_point
-
-    given = [named_point(name) for name in dict.fromkeys(conditions)]
-    found, beside = list(given), []
-    for control in dict.fromkeys(controls or ()):
-        if control not in CONTROLS:
-            raise unknown("--control", control, CONTROLS)
-        beside.append(CONTROLS[control])
-    for setting in (*beside, *(f"attack={attack}" for attack in dict.fromkeys(attacks or ()))):
-        for point in given:
-            if point.profile and setting.partition("=")[0] not in point.name:
-                found.append(named_point(point.name + ("," if ":" in point.name else ":") + setting))
-    return tuple(dict.fromkeys(found))
+def _parameter(option: stated.Option) -> inspect.Parameter:
+    """Return a setting as a parameter; it is None where nothing is typed, so that a file's value stays."""
+    flags = (option.flag, *([option.off] if option.kind is bool else ()))
+    usual = "" if option.default in (None, ()) or option.kind is bool else f" Default: {option.default}."
+    return inspect.Parameter(
+        option.name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=Option(
+            None,
+            "/".join(flags),
+            help=option.help + usual,
+            rich_help_panel=option.panel or None,
+        ),
+        annotation=option.kind | None,
+    )
 
 
 def cards(models: "Sequence[str] | None") -> "list[Card]":
@@ -298,26 +198,6 @@ def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
             )
 
 
-def parse_seeds(text: str) -> tuple[int, ...]:
-    """Seeds from `0:5` (0 to 4) or `3,7,9`."""
-    start, colon, stop = text.partition(":")
-    try:
-        # A range is counted before it is made: 0:99999999999 would not fit into memory.
-        most = int(start) + MOST_SEEDS + 1 if colon else 0
-        seeds = tuple(range(int(start), min(int(stop), most)) if colon else map(int, text.split(",")))
-    except ValueError:
-        seeds = ()
-    if not colon and len(seeds) == 1 and seeds != (0,):
-        n, end = (printable(at, 20) for at in (seeds[0], seeds[0] + 1))
-        raise UserError(f"--seeds {n}: give 0:{n} for seeds from 0 on, or {n}:{end} for seed {n} alone")
-    if not 0 < len(seeds) <= MOST_SEEDS:
-        raise UserError(
-            f"--seeds {printable(text)}: give a range such as 0:5, or a list such as 3,7,9, "
-            f"of {MOST_SEEDS} seeds at most"
-        )
-    return seeds
-
-
 def scenario_name(name: str | None, env: str | None, env_config: Path | None) -> str:
     """The scenario that is meant by a name, or by an environment and what its configuration changes."""
     import json
@@ -329,9 +209,9 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     if name is not None:
         if env_config is not None:
             raise UserError("--env-config changes an environment; give --env as well")
-        return typed(name)
+        return name
     assert env is not None
-    typed(f"{environment.PREFIX}{env}")
+    typed_scenario(f"{environment.PREFIX}{env}")
     if env_config is None:
         return f"{environment.PREFIX}{env}"
     try:
@@ -344,7 +224,7 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
         ) from None
 
 
-def typed(scenario: str) -> str:
+def typed_scenario(scenario: str) -> str:
     """Return a scenario's name that the user typed, which may thus import an environment's module."""
     from harness.world.environments import environment
 

@@ -43,7 +43,7 @@ def command(
 
     if finish_reason not in FINISH_REASONS:
         raise errors.unknown("finish reason", finish_reason, FINISH_REASONS)
-    actions = scenarios.get(options.typed(scenario)).actions
+    actions = scenarios.get(options.typed_scenario(scenario)).actions
     shape = Shape(role, actions)
     if prompt is not None:
         version = versions.load(prompt)

@@ -1,7 +1,6 @@
 """What `harness eval` and `harness drive` have in common: a run's folder, its table and its JSON."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -16,12 +15,10 @@ from harness.core.errors import UserError, printable
 from harness.core.formats import WORK
 
 if TYPE_CHECKING:
-    from harness.backends.base import AnswerMode, Letters, Sums
-    from harness.evaluate.agent import Agent, ImageMode
+    from harness.evaluate.agent import Agent
     from harness.evaluate.lifecycle import Evaluated
     from harness.evaluate.spec import Spec
     from harness.runs.records import Manifest, Score
-    from harness.world.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -39,77 +36,6 @@ class Column:
         from harness.runs.metrics import entry, written
 
         return written(score) if self.interval else entry(score.metric).unit.text(score.value)
-
-
-@dataclass(frozen=True)
-class Swarm:
-    """Who is asked and how ties fall, as it was typed: of the helpers, what is None is the ego's."""
-
-    model: str
-    engine: str | None
-    prompt: str | None
-    answer: "AnswerMode" = "json"
-    thinking: bool = False
-    image: "ImageMode" = "own"
-    helper_model: str | None = None
-    helper_prompt: str | None = None
-    helper_answer: "AnswerMode | None" = None
-    helper_thinking: bool | None = None
-    letters: "Letters | None" = None
-    sums: "Sums" = "refuse"
-    ties: str | None = None
-    flip: bool = False
-
-    def agents(self, scenario: "Scenario") -> "dict[str, Any]":
-        """The fields of a `Spec` that say who answers in a scenario, and `ties`."""
-        from harness.backends import cards
-        from harness.evaluate.agent import Agent
-        from harness.prompts import versions
-
-        version = self.prompt or scenario.prompt
-        card = cards.resolve(self.model, self.engine)
-        ego = Agent(
-            card, versions.load(version), self.answer, self.thinking, self.image, self.letters, self.sums,
-            self.flip,
-        )  # fmt: skip
-        models = self.helper_model.split(",") if self.helper_model else []
-        prompt, mode = versions.load(self.helper_prompt or version), self.helper_answer or self.answer
-        thinks = self.thinking if self.helper_thinking is None else self.helper_thinking
-        image = self.image if prompt.image else "own"
-        others = [cards.resolve(name.strip()) for name in models] or [card]
-        with helper_options({"--answer": self.helper_answer, "--thinking": self.helper_thinking}):
-            letters = self.letters if mode == "readout" else None
-            sums = self.sums if mode == "json" else "refuse"
-            flip = self.flip and mode == "readout"
-            how = (prompt, mode, thinks, image, letters, sums, flip)
-            helpers = tuple(Agent(other, *how) for other in others)
-        return {"ego": ego, "helpers": helpers, "ties": _usual_ties(ego) if self.ties is None else self.ties}
-
-
-def _usual_ties(ego: "Agent") -> str:
-    """How ties fall where nothing is typed: as in the run that is replayed, if one is."""
-    from harness.coordination.coordinate import TIES
-    from harness.runs.folder import read
-
-    with suppress(UserError):  # what is no run is refused when it is opened
-        return read(Path(ego.card.weights or "")).manifest.ties if ego.can.own_latency else TIES[0]
-    return TIES[0]
-
-
-@contextmanager
-def helper_options(typed: Mapping[str, object]) -> Iterator[None]:
-    """Name a helper's option in what is wrong with a helper.
-
-    Args:
-        typed: what was given as the helper's own, by the ego's option; None where the ego's holds.
-    """
-    try:
-        yield
-    except UserError as error:
-        said = str(error)
-        if typed.get(said.partition(" ")[0].rstrip(":")) is not None:
-            said = said.replace("--", "--helper-", 1)
-        raise UserError(said if said.startswith("--helper-") else f"helpers: {said}") from None
 
 
 def file_name(model: str) -> str:

@@ -41,7 +41,7 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
     from harness.cli.docstrings import echo_fields
     from harness.world import scenarios
 
-    scenario = scenarios.get(options.typed(name))
+    scenario = scenarios.get(options.typed_scenario(name))
     description, actions = scenario.description, scenario.actions
     if as_json:
         from harness.prompts.answer_schema import ROLES, answer_schema
@@ -114,7 +114,7 @@ def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episod
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios
 
-    scenario = scenarios.get(options.typed(name))
+    scenario = scenarios.get(options.typed_scenario(name))
     options.in_range(counted, episodes, 1, LAST_EPISODE + 1)
     options.in_range("--seed", seed, 0, LAST_SEED)
     purpose(seed, episodes)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin
 
 from typer import Context, Typer, echo
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from harness.cli.commands import COMMANDS, GROUPS, OLD, PANELS, SHORT
@@ -48,8 +48,24 @@ class Branch(Mapping[str, Any]):
 def _command(name: str, place: str) -> Any:
     module, _, function = place.partition(":")
     app = Typer(add_completion=False, rich_markup_mode=None)
-    app.command(name)(getattr(import_module(f"harness.cli.{module}"), function or "command"))
+    app.command(name, cls=Command)(getattr(import_module(f"harness.cli.{module}"), function or "command"))
     return get_command(app)
+
+
+class Command(TyperCommand):
+    """A command whose help lists its options by panel, those without one first."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the arguments, then each panel's options."""
+        panels: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for parameter in self.get_params(ctx):
+            if record := parameter.get_help_record(ctx):
+                usual = "Options" if parameter.param_type_name == "option" else "Arguments"
+                panels.setdefault(getattr(parameter, "rich_help_panel", None) or usual, []).append(record)
+        for panel, rows in panels.items():
+            if rows:
+                with formatter.section(panel):
+                    formatter.write_dl(rows)
 
 
 class Group(TyperGroup):

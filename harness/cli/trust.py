@@ -7,7 +7,7 @@ import typer
 
 from harness.cli import options
 from harness.cli.progress import bar
-from harness.cli.run import Swarm, file_name
+from harness.cli.run import file_name
 from harness.cli.show import finish
 from harness.core import resources, work
 from harness.core.errors import UserError
@@ -101,15 +101,15 @@ def command(
 def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> "Spec":
     """The evaluation whose answers are walked."""
     from harness.dataset import load
+    from harness.evaluate import resolve
     from harness.evaluate.frozen_world import FrozenSource
-    from harness.evaluate.spec import Spec
+    from harness.evaluate.settings import Settings
 
-    frozen = load.load(load.find(resources.DATASET))
-    swarm = Swarm(model, None, prompt)
-    return Spec(
-        **swarm.agents(frozen.scenario),
-        source=FrozenSource(frozen),
-        points=options.points([condition], None, None),
-        seeds=options.parse_seeds(seeds or "0:5"),
+    settings = Settings(
+        model=model,
+        prompt=prompt,
+        condition=(condition,),
+        seeds=seeds or "0:5",
         ask="all",  # attacks use what every helper intends
     )
+    return resolve.spec(settings, FrozenSource(load.load(load.find(resources.DATASET))))

@@ -10,6 +10,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.select import ALL, Selection
+from harness.evaluate.settings import FrozenSettings
 from harness.evaluate.walk import Decided, Due, Placed, channel_draws
 from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
@@ -31,7 +32,6 @@ class FrozenSource:
     dataset: Dataset
     selection: Selection = ALL
     kind: ClassVar[World] = "frozen"
-    command: ClassVar[str] = "eval"
 
     @property
     def name(self) -> str:
@@ -63,10 +63,10 @@ class FrozenSource:
             path=str(self.dataset.path), selection=self.selection.given,
         )  # fmt: skip
 
-    def options(self) -> list[tuple[str, object]]:
-        """Return the options for the dataset's folder and the selection of its episodes."""
-        selection = [(f"--{key.replace('_', '-')}", value) for key, value in self.selection.given.items()]
-        return [("--dataset", argument(self.dataset.path)), ("--limit", self.selection.limit), *selection]
+    def settings(self) -> FrozenSettings:
+        """Return the dataset's folder and the selection of its episodes."""
+        given: dict[str, Any] = self.selection.given
+        return FrozenSettings(dataset=str(argument(self.dataset.path)), limit=self.selection.limit, **given)
 
 
 class _Walks:

@@ -13,6 +13,7 @@ from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
+from harness.evaluate.settings import words
 from harness.evaluate.spec import Spec
 from harness.runs import folder
 from harness.runs.records import Latency, Manifest, Score
@@ -63,7 +64,8 @@ def begin(
     if begun is None:
         return Begun(
             settings=spec.settings(), shard=shard, created=datetime.now(UTC).isoformat(timespec="seconds"),
-            command=spec.words(), identity=identity, tags=spec.tags, latency=latency, versions=versions(),
+            command=words(spec.stated()), identity=identity, tags=spec.tags, latency=latency,
+            versions=versions(),
         )  # fmt: skip
     if not same_model(begun.identity, identity):
         raise UserError(
@@ -85,7 +87,7 @@ def as_finished(spec: Spec, begun: Begun) -> Begun:
     if spec.latency == latencies.MEASURED:  # a repeat must not measure: other times would make other rows
         spec = replace(spec, latency=latencies.as_declared(begun.latency))
     return msgspec.structs.replace(
-        begun, settings=spec.settings(), tags=spec.tags, command=spec.words(), versions=versions()
+        begun, settings=spec.settings(), tags=spec.tags, command=words(spec.stated()), versions=versions()
     )
 
 

@@ -19,6 +19,7 @@ from harness.dataset.load import Scene
 from harness.dataset.select import drawn
 from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
+from harness.evaluate.settings import DriveSettings
 from harness.evaluate.walk import Decided, Due, Placed, channel_draws
 from harness.runs import metrics
 from harness.runs.records import ClosedLoop, Episode
@@ -44,7 +45,6 @@ class LiveSource:
     sample_seed: int = 0
     name: ClassVar[str] = "drive"
     kind: ClassVar[metrics.World] = "closed-loop"
-    command: ClassVar[str] = "drive"
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -80,15 +80,12 @@ class LiveSource:
             else {"of": self.episodes, "sample": self.sample, "sample_seed": self.sample_seed},
         )  # fmt: skip
 
-    def options(self) -> list[tuple[str, object]]:
-        """Return the options for the scenario and its layouts."""
-        return [
-            ("--scenario", self.scenario_name),
-            ("--episodes", self.episodes),
-            ("--first-seed", self.first_seed),
-            ("--sample", self.sample),
-            ("--sample-seed", None if self.sample is None else self.sample_seed),
-        ]
+    def settings(self) -> DriveSettings:
+        """Return the scenario and its layouts."""
+        return DriveSettings(
+            scenario=self.scenario_name, episodes=self.episodes, first_seed=self.first_seed,
+            sample=self.sample, sample_seed=0 if self.sample is None else self.sample_seed,
+        )  # fmt: skip
 
     def trial(self, most: int, ego_alone: bool) -> list[Scene]:
         """Return one decision point of each of up to `most` episodes, at different times."""

@@ -5,6 +5,7 @@ import os
 import shlex
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -40,6 +41,7 @@ from harness.evaluate.lifecycle import (
     refuse_finished,
     unfinished,
 )
+from harness.evaluate.settings import FILE, of_words, text_of
 from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import of_all_seeds, table, walk
@@ -420,6 +422,8 @@ def _gather(
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
         kept_sources.write(out, made_of, place)
+        with suppress(UserError):  # a stranger's shard may state any command
+            write_whole(out / FILE, text_of(of_words(begun.command)))
         servers.write(out, [place, *(other / WORK for other in others)])
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)

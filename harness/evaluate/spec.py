@@ -16,6 +16,7 @@ from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.device import rows_of
 from harness.evaluate.latency import MEASURED, NAMES, declared
+from harness.evaluate.settings import DriveSettings, FrozenSettings, HelperSettings, Settings
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
 from harness.runs.metrics import World
@@ -33,11 +34,6 @@ class Source(Protocol):
     @property
     def kind(self) -> World:
         """The world's kind, as a run's manifest has it."""
-        ...
-
-    @property
-    def command(self) -> str:
-        """The command that walks this world: `eval` or `drive`."""
         ...
 
     @property
@@ -64,8 +60,8 @@ class Source(Protocol):
         """Return the world's record in a run's manifest."""
         ...
 
-    def options(self) -> list[tuple[str, object]]:
-        """Return the options of `command` that select this world; None for an option that is not given."""
+    def settings(self) -> FrozenSettings | DriveSettings:
+        """Return the settings that select this world."""
         ...
 
 
@@ -340,31 +336,29 @@ class Spec:
             "device_model": self.device_model,
         }
 
-    def words(self) -> tuple[str, ...]:
-        """Return the words of a command that runs this evaluation again; without `--out`."""
+    def stated(self) -> Settings:
+        """Return the settings that `resolve.spec` makes this evaluation of."""
+        helpers = HelperSettings()
+        if self.helpers:
+            thinking = any(agent.thinking and agent.card.thinking != "always" for agent in self.helpers)
+            helpers = HelperSettings(
+                model=",".join(argument(agent.card) for agent in self.helpers),
+                prompt=self.helpers[0].prompt.version, answer=self.helpers[0].answer,
+                thinking=None if thinking == self.ego.thinking else thinking,
+            )  # fmt: skip
         first = self.seeds[0]
-        seeds = ",".join(map(str, self.seeds)) if len(self.seeds) > 1 else f"{first}:{first + 1}"
-        options = [
-            ("--model", argument(self.ego.card)), ("--prompt", self.ego.prompt.version),
-            *self._helper_options(), *self.source.options(), ("--seeds", seeds),
-            *(("--condition", point.name) for point in self.points), ("--answer", self.ego.answer),
-            ("--image", None if self.ego.image == "own" else self.ego.image), ("--letters", self._letters),
-            ("--sums", None if self.ego.sums == "refuse" else self.ego.sums),
-            ("--batch-size", self.batch_size), *(("--server", url) for url in self.servers),
-            ("--device", self.device), ("--dtype", self.dtype),
-            ("--temperature", self.temperature or None), ("--sampling-seed", self.sampling_seed or None),
-            ("--latency", self.latency),
-            ("--device-profile", self.device_profile and self.device_profile.name),
-            ("--device-model", self.device_model), ("--ask", None if self.ask == ASKS[0] else self.ask),
-            ("--ties", None if self.ties == TIES[0] else self.ties), *(("--tag", tag) for tag in self.tags),
-        ]  # fmt: skip
-        parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
-        flags = ["--thinking"] if self.ego.thinking else []
-        flags += ["--flip"] if self.ego.flip else []
-        helpers_think = any(agent.thinking and agent.card.thinking != "always" for agent in self.helpers)
-        if self.helpers and helpers_think != self.ego.thinking:
-            flags.append("--helper-thinking" if helpers_think else "--no-helper-thinking")
-        return ("harness", self.source.command, *parts, *flags)
+        return Settings(
+            model=argument(self.ego.card), prompt=self.ego.prompt.version, helpers=helpers,
+            world=self.source.settings(), condition=tuple(point.name for point in self.points),
+            seeds=",".join(map(str, self.seeds)) if len(self.seeds) > 1 else f"{first}:{first + 1}",
+            answer=self.ego.answer, thinking=self.ego.thinking, image=self.ego.image, letters=self._letters,
+            flip=self.ego.flip, sums=self.ego.sums, batch_size=self.batch_size, server=self.servers,
+            device=self.device, dtype=self.dtype, temperature=self.temperature,
+            sampling_seed=self.sampling_seed, latency=self.latency,
+            device_profile=self.device_profile.name if self.device_profile else None,
+            device_model=self.device_model,
+            ask=self.ask, ties=None if self.ties == TIES[0] else self.ties, tag=self.tags,
+        )  # fmt: skip
 
     @property
     def _letters(self) -> str | None:
@@ -372,13 +366,3 @@ class Spec:
         reads = [agent for agent in self.agents if agent.answer == "readout"]
         own = all(agent.letters == replace(agent, letters=None).letters for agent in reads)
         return None if own else reads[0].letters
-
-    def _helper_options(self) -> list[tuple[str, object]]:
-        if not self.helpers:
-            return []
-        first = self.helpers[0]
-        return [
-            ("--helper-model", ",".join(argument(agent.card) for agent in self.helpers)),
-            ("--helper-prompt", first.prompt.version),
-            ("--helper-answer", first.answer),
-        ]

@@ -9,7 +9,7 @@ from axe_playwright_python.sync_playwright import Axe
 from evaluating import run, spec_of
 from opening import NARROW, picture
 
-from harness.cli.options import points
+from harness.evaluate.resolve import points
 from harness.report.page import write_report
 from harness.report.runs import gather
 from harness.runs import folder

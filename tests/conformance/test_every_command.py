@@ -102,6 +102,8 @@ class Strangers:
         Path("evil.json").write_text(json.dumps({"other_vehicles_type": f"{MODULE}.Car"}))
         Path("evil.csv").write_text("distance_m,reception\n1,0.5\n9,0.1\n")
         Path("evil.txt").write_text(f'{{"import": "{MODULE}"}} {{{{ environ }}}} {asked.url}')
+        for name, text in SETTINGS.items():
+            Path(name).write_text(text.format(url=asked.url))
         self._datasets()
         self._runs(asked.url)
 
@@ -158,6 +160,13 @@ class Strangers:
             change(Path(f"reports/{name}/run.json"), world=stated_world)
 
 
+SETTINGS = {
+    "weights.toml": 'model = "models/evil-weights"\n',
+    "replay.toml": 'model = "replay:reports/served"\n',
+    "server.toml": 'model = "mine"\nserver = ["{url}"]\n',
+    "module.toml": '[world]\nkind = "frozen"\ndataset = "datasets/module"\n',
+    "driven.toml": f'[world]\nkind = "closed-loop"\nscenario = "{ENV}"\n',
+}
 RUNS = [f"reports/{name}" for name in ("served", "posing", "weights", "moved", "named", "driven", "traffic")]
 DATASETS = ["module", "datasets/traffic"]
 MODELS = ["evil", "mine", "models/evil-weights", "replay:reports/served", "replay:reports/weights"]
@@ -167,7 +176,7 @@ HOSTILE: dict[str, Sequence[str]] = {
     "dataset": DATASETS, "model": MODELS, "helper_model": ["evil", "mine"], "prompt": ["evil"],
     "helper_prompt": ["evil"], "version": ["evil"], "condition": ["evil"], "env_config": ["evil.json"],
     "against": ["evil.csv"], "tokenizer": ["models/evil-weights"], "base": ["models/evil-weights"],
-    "file": ["evil.txt"], "names": ["evil"],
+    "file": ["evil.txt"], "eval file": list(SETTINGS), "drive file": list(SETTINGS), "names": ["evil"],
     "study grid model": ["proxy,evil", "proxy,models/evil-weights"], "study closed-loop model": ["evil"],
     "run history dataset": [],
     "radio show name": ["evil"], "radio check name": ["evil"], "model check name": ["evil", "mine"],

@@ -1,0 +1,90 @@
+"""Make an evaluation of settings: cards, prompts, operating points and seeds in place of their names."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from harness.backends import cards, devices
+from harness.coordination.coordinate import TIES
+from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.core.errors import UserError, unknown
+from harness.evaluate.agent import Agent
+from harness.evaluate.settings import Settings, parse_seeds
+from harness.evaluate.spec import Source, Spec
+from harness.prompts import versions
+from harness.runs.folder import read
+from harness.world.scenario import Scenario
+
+CONTROLS = {"shuffled-messages": "messages=shuffled", "no-messages": "loss=1", "blind": "messages=blind"}
+
+
+def spec(settings: Settings, source: Source) -> Spec:
+    """Return the evaluation of a world under these settings. Raises UserError for what is not allowed."""
+    ego, helpers = agents(settings, source.scenario)
+    profile = settings.device_profile
+    return Spec(
+        ego=ego, helpers=helpers, source=source, seeds=parse_seeds(settings.seeds),
+        points=points(settings.condition or tuple(POINTS), settings.control, settings.attack),
+        batch_size=settings.batch_size, servers=settings.server, device=settings.device, dtype=settings.dtype,
+        temperature=settings.temperature, sampling_seed=settings.sampling_seed, latency=settings.latency,
+        device_profile=devices.load(profile) if profile else None, device_model=settings.device_model,
+        tags=tuple(dict.fromkeys(settings.tag)), ask=settings.ask,
+        ties=_usual_ties(ego) if settings.ties is None else settings.ties,
+    )  # fmt: skip
+
+
+def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, ...]]:
+    """Return the agents that answer for the ego and for the helpers in a scenario."""
+    own, version = settings.helpers, settings.prompt or scenario.prompt
+    card = cards.resolve(settings.model, settings.engine)
+    # Agent checks the modes.
+    how = (settings.answer, settings.thinking, settings.image, settings.letters, settings.sums, settings.flip)
+    ego = Agent(card, versions.load(version), *how)  # type: ignore[arg-type]
+    prompt, mode = versions.load(own.prompt or version), own.answer or settings.answer
+    others = [cards.resolve(name.strip()) for name in own.model.split(",")] if own.model else [card]
+    with helper_options({"--answer": own.answer, "--thinking": own.thinking}):
+        theirs = (
+            prompt, mode, settings.thinking if own.thinking is None else own.thinking,
+            settings.image if prompt.image else "own", settings.letters if mode == "readout" else None,
+            settings.sums if mode == "json" else "refuse", settings.flip and mode == "readout",
+        )  # fmt: skip
+        return ego, tuple(Agent(other, *theirs) for other in others)  # type: ignore[arg-type]
+
+
+def _usual_ties(ego: Agent) -> str:
+    """Return how ties fall where nothing is stated: as in the run that is replayed, if one is."""
+    with suppress(UserError):  # what is no run is refused when it is opened
+        return read(Path(ego.card.weights or "")).manifest.ties if ego.can.own_latency else TIES[0]
+    return TIES[0]
+
+
+@contextmanager
+def helper_options(typed: Mapping[str, object]) -> Iterator[None]:
+    """Name a helper's option in what is wrong with a helper.
+
+    Args:
+        typed: what was given as the helper's own, by the ego's option; None where the ego's holds.
+    """
+    try:
+        yield
+    except UserError as error:
+        reason = str(error)
+        if typed.get(reason.partition(" ")[0].rstrip(":")) is not None:
+            reason = reason.replace("--", "--helper-", 1)
+        raise UserError(reason if reason.startswith("--helper-") else f"helpers: {reason}") from None
+
+
+def points(
+    conditions: Sequence[str], controls: Sequence[str] = (), attacks: Sequence[str] = ()
+) -> tuple[OperatingPoint, ...]:
+    """Return operating points by name, each once, and of those with a channel the controls and attacks."""
+    named = [named_point(name) for name in dict.fromkeys(conditions)]
+    if wrong := [control for control in controls if control not in CONTROLS]:
+        raise unknown("--control", wrong[0], CONTROLS)
+    beside = dict.fromkeys((*(CONTROLS[control] for control in controls), *(f"attack={a}" for a in attacks)))
+    derived = [
+        named_point(point.name + ("," if ":" in point.name else ":") + setting)
+        for setting in beside for point in named
+        if point.profile and setting.partition("=")[0] not in point.name
+    ]  # fmt: skip
+    return tuple(dict.fromkeys((*named, *derived)))

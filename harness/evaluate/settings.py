@@ -1,0 +1,470 @@
+"""State the settings of an evaluation as a user types them: one record for commands and a run's file.
+
+Each field of `Settings` is an option of `harness eval` or `harness drive`, with its help and its panel there.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+
+from msgspec import Meta, Struct, structs, to_builtins
+
+from harness.core.config import convert, toml
+from harness.core.errors import UserError, printable
+from harness.core.resources import DATASET
+
+FILE = "run.toml"
+COMMANDS = {"frozen": "eval", "closed-loop": "drive"}  # by the world's kind
+MOST_SEEDS = 1000
+
+CONDITIONS, EPISODES, ANSWERS = "Conditions", "Episodes", "How models answer"
+HELPERS, ENGINE, LATENCY, OUTPUT = "Helpers", "Engines and servers", "Latency", "Output"
+
+
+def option(text: str, panel: str = "", only: str = "") -> Meta:
+    """Describe a setting: its help, its panel (by default the first), the world that alone has it."""
+    return Meta(extra={"help": text, "panel": panel, "only": only})
+
+
+class HelperSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Who answers for the helpers, and how, where that is not the ego's model, prompt and mode."""
+
+    model: Annotated[
+        str | None,
+        option(
+            "Model of the helpers. Several, such as a,b,c, are assigned to the helpers in turn. "
+            "Default: the ego's model.",
+            HELPERS,
+        ),
+    ] = None
+    prompt: Annotated[
+        str | None, option("Prompt version of the helpers. Default: the ego's prompt.", HELPERS)
+    ] = None
+    answer: Annotated[
+        str | None,
+        option("How the helpers answer: json, constrained or readout. Default: like the ego.", HELPERS),
+    ] = None
+    thinking: Annotated[
+        bool | None, option("Ask the helpers to think before they answer. Default: like the ego.", HELPERS)
+    ] = None
+
+
+class FrozenSettings(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="frozen"
+):
+    """The frozen episodes that are evaluated."""
+
+    dataset: Annotated[
+        str,
+        option("Name of a shipped dataset, a dataset's folder, or suite:NAME for several datasets at once."),
+    ] = DATASET
+    limit: Annotated[int | None, option("Use only this many episodes, from the first. Default: all.")] = None
+    only: Annotated[
+        str | None, option("Use only these episodes: 3,10:20 means 3 and 10 to 19.", EPISODES)
+    ] = None
+    danger: Annotated[
+        str | None,
+        option(
+            "Use only episodes whose danger comes from this sector, such as left; none means episodes "
+            "without a danger.",
+            EPISODES,
+        ),
+    ] = None
+    sample: Annotated[
+        int | None,
+        option("Draw this many episodes at random from those that --only and --danger leave.", EPISODES),
+    ] = None
+    sample_seed: Annotated[int, option("Seed of this draw.", EPISODES)] = 0
+
+
+class DriveSettings(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="closed-loop"
+):
+    """The episodes that are driven in closed loop."""
+
+    scenario: Annotated[
+        str | None,
+        option(
+            "Scenario to drive; NAME:beacon_loss=0.3 changes its beacons. Default: occluded-intersection."
+        ),
+    ] = None
+    episodes: Annotated[
+        int | None,
+        option("Number of layouts to drive. Default: as many as the scenario's shipped dataset has."),
+    ] = None
+    first_seed: Annotated[
+        int | None,
+        option(
+            "Layout seed of the first episode. Default: that of the scenario's shipped dataset.", EPISODES
+        ),
+    ] = None
+    sample: Annotated[int | None, option("Draw this many of these episodes at random.", EPISODES)] = None
+    sample_seed: Annotated[
+        int,
+        option("Seed of this draw; with the same seed, eval draws the same episodes of as many.", EPISODES),
+    ] = 0
+
+
+class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All that decides an evaluation, as plain values; a run's `run.toml` is this record.
+
+    What is not checked here is checked where it is used: `resolve.spec` makes live objects of it.
+    """
+
+    model: Annotated[
+        str,
+        option(
+            "Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file, a "
+            "hub id, or replay:RUN, which scores the stored answers of a run again."
+        ),
+    ] = "proxy"
+    engine: Annotated[
+        str | None,
+        option(
+            "Engine to run the model on, such as llama-cpp, if its card names several. Default: its main "
+            "one.",
+            ENGINE,
+        ),
+    ] = None
+    prompt: Annotated[
+        str | None,
+        option("Prompt version; `harness prompt list` shows them. Default: the scenario's usual one."),
+    ] = None
+    helpers: HelperSettings = HelperSettings()
+    world: FrozenSettings | DriveSettings = FrozenSettings()
+    seeds: Annotated[
+        str,
+        option("Channel seeds: 0:5 means 0 to 4; 3,7,9 is a list. Every episode is scored with each seed."),
+    ] = "0:5"
+    condition: Annotated[
+        tuple[str, ...],
+        option(
+            "Condition to score: an operating point such as single-local, v2x or 6g, or one with changed "
+            "settings: 6g:consensus=ego-prompt. Repeatable. Default: all operating points."
+        ),
+    ] = ()
+    control: Annotated[
+        tuple[str, ...],
+        option(
+            "Beside each condition with a channel, also score a control. shuffled-messages: the ego hears "
+            "the helpers of another layout. no-messages: every message is lost. blind: the helpers see "
+            "nothing. Repeatable.",
+            CONDITIONS,
+            "frozen",
+        ),
+    ] = ()
+    attack: Annotated[
+        tuple[str, ...],
+        option(
+            "Beside each condition with a channel, also score it under attack: liar:share=1/3 makes a third "
+            "of the helpers lie; liar+spoof combines two attacks. `harness study trust --help` lists them. "
+            "Repeatable.",
+            CONDITIONS,
+        ),
+    ] = ()
+    answer: Annotated[
+        str,
+        option(
+            "How the model answers. json: free text with a JSON object. constrained: decoding allows only "
+            "what fits the schema. readout: the intent is read from the probabilities of one letter per "
+            "action."
+        ),
+    ] = "json"
+    thinking: Annotated[bool, option("Ask the model to think before it answers.")] = False
+    image: Annotated[
+        str,
+        option(
+            "Which picture an image prompt shows: own (the viewer's), blank, another (another scene's), or "
+            "none (text only).",
+            ANSWERS,
+        ),
+    ] = "own"
+    letters: Annotated[
+        str | None,
+        option(
+            "How a readout's letters are read. raw: once. cyclic: averaged over as many orders of the list "
+            "as there are actions, so that no letter is preferred. Default: the card's, or cyclic.",
+            ANSWERS,
+        ),
+    ] = None
+    flip: Annotated[
+        bool,
+        option(
+            "Ask each readout once more with the list of actions reversed, and count how often the "
+            "likeliest action changes. It changes no decision.",
+            ANSWERS,
+        ),
+    ] = False
+    sums: Annotated[
+        str,
+        option(
+            "What becomes of an answer in json whose only fault is that its numbers do not sum to 1. "
+            "refuse: it failed. divide: they are divided by their sum, and the summary counts it as divided.",
+            ANSWERS,
+        ),
+    ] = "refuse"
+    batch_size: Annotated[
+        int,
+        option(
+            "Number of prompts in one batch; with a served model, of requests to each server at once.", ENGINE
+        ),
+    ] = 8
+    server: Annotated[
+        tuple[str, ...],
+        option(
+            "Base URL of a server of the model, such as http://gpu-1:8000/v1; replaces the card's. Repeat it "
+            "to spread the requests over several servers.",
+            ENGINE,
+        ),
+    ] = ()
+    device: Annotated[
+        str | None,
+        option(
+            "Where the model runs: cpu, cuda or cuda:N; with llama-cpp cpu or gpu. Default: a GPU if there "
+            "is one.",
+            ENGINE,
+        ),
+    ] = None
+    dtype: Annotated[
+        str | None,
+        option("Number format of the weights: float32, bfloat16 or auto. Default: the card's.", ENGINE),
+    ] = None
+    temperature: Annotated[
+        float, option("Sampling temperature, 0 to 2; 0 is greedy decoding.", ANSWERS, "frozen")
+    ] = 0.0
+    sampling_seed: Annotated[
+        int, option("Seed of the sampling; needs a --temperature above 0.", ANSWERS, "frozen")
+    ] = 0
+    latency: Annotated[
+        str | None,
+        option(
+            "Inference time of one answer: paper (145 ms), card (what the card states), measured (batch 1 on "
+            "this machine, which must be idle), or seconds: ego=0.2,helper=0.1,fusion=0.3. Default: card, or "
+            "paper if the card states none.",
+            LATENCY,
+        ),
+    ] = None
+    device_profile: Annotated[
+        str | None,
+        option(
+            "Computer in every vehicle, such as agx-orin (`harness model device list`). It times each answer "
+            "by its tokens; use it instead of --latency.",
+            LATENCY,
+        ),
+    ] = None
+    device_model: Annotated[
+        str | None,
+        option(
+            "With --device-profile: model whose row of the profile times all answers. Default: the model "
+            "that gave the answer.",
+            LATENCY,
+        ),
+    ] = None
+    ask: Annotated[
+        str,
+        option(
+            "Which helpers answer. used: those whose answer some condition uses. all: every helper in every "
+            "scene, which gives the same decisions and lets other conditions be scored later without the "
+            "model.",
+            HELPERS,
+        ),
+    ] = "used"
+    ties: Annotated[
+        str | None,
+        option(
+            "Which of equally likely actions the ego takes. drawn: one by chance, with the same draws for "
+            "every condition, prompt and model. first: the most careful. Default: drawn, or as in the run "
+            "that is replayed.",
+            CONDITIONS,
+        ),
+    ] = None
+    tag: Annotated[tuple[str, ...], option("Label to find the run by later. Repeatable.", OUTPUT)] = ()
+
+
+class Option(NamedTuple):
+    """An option of a command, made of a field of the settings."""
+
+    path: tuple[str, ...]  # the names of the table and the key in `run.toml`
+    name: str  # as a parameter: helper_model
+    kind: Any  # str, int, float, bool or list[str]
+    default: Any
+    help: str
+    panel: str
+
+    @property
+    def flag(self) -> str:
+        """Return what is typed."""
+        return "--" + self.name.replace("_", "-")
+
+    @property
+    def off(self) -> str:
+        """Return what is typed to turn it off, if it is a flag."""
+        return "--no-" + self.name.replace("_", "-")
+
+    def of(self, settings: Any) -> Any:
+        """Return the value of settings."""
+        for name in self.path:
+            settings = getattr(settings, name)
+        return settings
+
+
+def options(world: type[Struct]) -> list[Option]:
+    """Return the options of the command that walks a world, in the order of the fields."""
+    return [
+        *_options(Settings, str(world.__struct_config__.tag), {"helpers": HelperSettings, "world": world})
+    ]
+
+
+def _options(
+    kind: type[Struct], only: str, tables: Mapping[str, type[Struct]], table: str = ""
+) -> Iterator[Option]:
+    hints = get_type_hints(kind, include_extras=True)
+    for field in structs.fields(kind):
+        if field.name in tables:
+            yield from _options(tables[field.name], only, {}, field.name)
+            continue
+        plain, meta = get_args(hints[field.name])
+        if meta.extra["only"] in ("", only):
+            name = f"helper_{field.name}" if table == "helpers" else field.name
+            path = (table, field.name) if table else (field.name,)
+            yield Option(path, name, _kind(plain), field.default, meta.extra["help"], meta.extra["panel"])
+
+
+def _kind(plain: Any) -> Any:
+    if isinstance(plain, UnionType):
+        plain = get_args(plain)[0]
+    return list[str] if get_origin(plain) is tuple else plain
+
+
+def kind_of(settings: Settings) -> str:
+    """Return the kind of the world: `frozen` or `closed-loop`."""
+    return str(settings.world.__struct_config__.tag)
+
+
+WORLDS: dict[str, type[FrozenSettings] | type[DriveSettings]] = {
+    "frozen": FrozenSettings, "closed-loop": DriveSettings,
+}  # fmt: skip
+HELP = {each.name: each.help for world in WORLDS.values() for each in options(world)}
+
+
+def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
+    """Return settings with some values changed, each by the name of its option."""
+    tables: dict[str, Any] = to_builtins(settings)
+    for each in options(type(settings.world)):
+        if each.name in given:
+            table = tables if len(each.path) == 1 else tables[each.path[0]]
+            table[each.path[-1]] = given[each.name]
+    return convert(tables, Settings, "settings")
+
+
+def words(settings: Settings) -> tuple[str, ...]:
+    """Return the words of a command with these settings, without `--out`; defaults are left out."""
+    typed: list[str] = []
+    for each in options(type(settings.world)):
+        value = each.of(settings)
+        if value is None or value == each.default:
+            continue
+        if isinstance(value, bool):
+            typed.append(each.flag if value else each.off)
+        else:
+            values = value if isinstance(value, tuple) else (value,)
+            typed += [word for part in values for word in (each.flag, str(part))]
+    return ("harness", COMMANDS[kind_of(settings)], *typed)
+
+
+def of_words(typed: Sequence[str]) -> Settings:
+    """Return the settings of a command. Raises UserError if it is none that `words` writes."""
+    try:
+        kind = next(kind for kind, command in COMMANDS.items() if command == typed[1])
+        flags = {flag: each for each in options(WORLDS[kind]) for flag in (each.flag, each.off)}
+        given: dict[str, Any] = {}
+        rest = iter(typed[2:])
+        for flag in rest:
+            each = flags[flag]
+            if each.kind is bool:
+                given[each.name] = flag == each.flag
+            elif each.kind == list[str]:
+                given[each.name] = [*given.get(each.name, ()), next(rest)]
+            else:
+                given[each.name] = each.kind(next(rest))
+    except (IndexError, KeyError, StopIteration, ValueError):
+        raise UserError(f"{printable(' '.join(typed))} is no command of a run") from None
+    return changed(Settings(world=WORLDS[kind]()), given)
+
+
+def text_of(settings: Settings) -> str:
+    """Return the text of `run.toml`: every setting that has a value, also where it is the default."""
+    command = COMMANDS[kind_of(settings)]
+    lines = [f"# The settings of a run. `harness {command} {FILE}` runs it again; an option beside it wins."]
+    tables: dict[str, list[str]] = {"": [], "helpers": [], "world": [f"kind = {_toml(kind_of(settings))}"]}
+    for each in options(type(settings.world)):
+        if (value := each.of(settings)) not in (None, ()):
+            *table, key = each.path
+            tables["".join(table)].append(f"{key} = {_toml(value)}")
+    for name, rows in tables.items():
+        lines += ([f"\n[{name}]"] if name and rows else []) + rows
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    # JSON writes what TOML reads, except that TOML wants DEL escaped.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
+    """Return the settings of a file, or of a run's folder, with what the user typed beside it.
+
+    A file names no model to open and no server to ask: it may come from a stranger. Cards, prompts, devices
+    and datasets are looked up by name.
+
+    Raises:
+        UserError: the file cannot be read, is of another command, or names what only a user may.
+    """
+    file = file / FILE if file.is_dir() else file
+    where = f"settings {printable(file)}"
+    if not file.exists():
+        raise UserError(
+            f"{where}: there is no such file; give a {FILE} or the folder of a run that has one, which runs "
+            "have since 0.3; for another, type the command in its run.json"
+        )
+    settings = changed(convert(toml(file, where), Settings, where), given)
+    if not isinstance(settings.world, world):
+        raise UserError(f"{where} are of `harness {COMMANDS[kind_of(settings)]}`; type that")
+    for name, models in {"model": settings.model, "helper_model": settings.helpers.model or ""}.items():
+        for model in filter(None, map(str.strip, models.split(","))):
+            if name not in given and not _is_card(model):
+                raise UserError(
+                    f"{where}: {printable(model)} is none of your cards, and a file names no other model to "
+                    f"open; give it by --{name.replace('_', '-')}"
+                )
+    if settings.server and "server" not in given:
+        raise UserError(f"{where}: a file names no server to ask; give --server, or take the line out")
+    return settings
+
+
+def _is_card(model: str) -> bool:
+    from harness.backends.cards import names
+
+    return model.partition(":")[0] in names()
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of `0:5`, which are 0 to 4, or of `3,7,9`."""
+    start, colon, stop = text.partition(":")
+    try:
+        # A range is counted before it is made: 0:99999999999 would not fit into memory.
+        most = int(start) + MOST_SEEDS + 1 if colon else 0
+        seeds = tuple(range(int(start), min(int(stop), most)) if colon else map(int, text.split(",")))
+    except ValueError:
+        seeds = ()
+    if not colon and len(seeds) == 1 and seeds != (0,):
+        n, end = (printable(at, 20) for at in (seeds[0], seeds[0] + 1))
+        raise UserError(f"--seeds {n}: give 0:{n} for seeds from 0 on, or {n}:{end} for seed {n} alone")
+    if not 0 < len(seeds) <= MOST_SEEDS:
+        raise UserError(
+            f"--seeds {printable(text)}: give a range such as 0:5, or a list such as 3,7,9, "
+            f"of {MOST_SEEDS} seeds at most"
+        )
+    return seeds

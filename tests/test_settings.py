@@ -1,0 +1,149 @@
+"""The settings of an evaluation: one record for the command line, a run's file and a run's command."""
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from evaluating import same_decisions, spec_of
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset
+from harness.evaluate import resolve
+from harness.evaluate.settings import (
+    WORLDS,
+    DriveSettings,
+    FrozenSettings,
+    HelperSettings,
+    Settings,
+    of_words,
+    options,
+    read,
+    text_of,
+    words,
+)  # fmt: skip
+from harness.runs.folder import read as read_run
+
+Said = tuple[int, str, str]
+TEXTS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=8)
+VALUES: dict[str, st.SearchStrategy[Any]] = {
+    str(str): TEXTS, str(int): st.integers(0, 99), str(float): st.floats(0, 2), str(bool): st.booleans(),
+    str(list[str]): st.lists(TEXTS, min_size=1, max_size=3).map(tuple),
+}  # fmt: skip
+
+
+@st.composite
+def every_setting(draw: Callable[..., Any]) -> Settings:
+    """Settings with any value that their types allow."""
+    world = draw(st.sampled_from(list(WORLDS.values())))
+    tables: dict[str, dict[str, Any]] = {"": {}, "helpers": {}, "world": {}}
+    for each in options(world):
+        if draw(st.booleans()):
+            *table, key = each.path
+            tables["".join(table)][key] = draw(VALUES[str(each.kind)])
+    return Settings(helpers=HelperSettings(**tables["helpers"]), world=world(**tables["world"]), **tables[""])
+
+
+@given(every_setting())
+def test_settings_are_the_same_as_words_and_as_a_file(settings: Settings) -> None:
+    assert of_words(words(settings)) == settings
+    assert msgspec.convert(tomllib.loads(text_of(settings)), Settings) == settings
+
+
+def test_what_is_no_command_of_a_run_is_refused() -> None:
+    for typed in (
+        (),
+        ("harness", "report"),
+        ("harness", "eval", "--nothing"),
+        ("harness", "eval", "--limit", "x"),
+    ):
+        with pytest.raises(UserError, match="is no command of a run"):
+            of_words(typed)
+
+
+def test_an_evaluation_states_the_settings_that_make_it(small: Dataset) -> None:
+    spec = replace(spec_of(small), tags=("nightly",), latency="paper", seeds=(3, 7))
+    settings = spec.stated()
+    assert (settings.tag, settings.latency, settings.seeds) == (("nightly",), "paper", "3,7")
+    assert resolve.spec(settings, spec.source) == spec
+
+
+def test_a_run_is_repeated_by_its_file(harness: Callable[..., Said], small_path: Path) -> None:
+    asked = (
+        "eval",
+        "--dataset",
+        small_path,
+        "--limit",
+        "2",
+        "--seeds",
+        "3,7",
+        "--condition",
+        "6g:tau=0.5",
+        "--quiet",
+    )
+    assert harness(*asked, "--tag", "first", "--out", "a")[0] == 0
+    stated = tomllib.loads(Path("a/run.toml").read_text())
+    assert (stated["model"], stated["prompt"], stated["seeds"]) == ("proxy", "v2", "3,7")
+    assert stated["world"] == {"kind": "frozen", "dataset": str(small_path), "limit": 2, "sample_seed": 0}
+    for file in ("a/run.toml", "a"):
+        assert harness("eval", file, "--quiet", "--out", f"of-{Path(file).name}") == (0, "", "")
+        assert same_decisions(Path("a"), Path(f"of-{Path(file).name}"))
+    assert harness("eval", "a", "--limit", "1", "--prompt", "v4", "--quiet", "--out", "b")[0] == 0
+    changed: Any = read_run(Path("b")).manifest
+    assert (changed.world.limit, changed.prompt["version"], changed.tags) == (1, "v4", ("first",))
+    assert [point["name"] for point in changed.conditions] == ["6g:tau=0.5"]
+
+
+HOSTILE = {
+    'model = "./theirs"': "./theirs is none of your cards, and a file names no other model to open; give "
+    "it by --model",
+    'model = "replay:theirs"': "replay:theirs is none of your cards",
+    'model = "theirs/on-the-hub"': "theirs/on-the-hub is none of your cards",
+    '[helpers]\nmodel = "proxy, ./theirs"': "give it by --helper-model",
+    'server = ["http://theirs:1/v1"]': "a file names no server to ask; give --server, or take the line out",
+    "model = 3": "model = 3; allowed: str",
+    'prompd = "v2"': "unknown key in settings stated.toml 'prompd'; did you mean 'prompt'?",
+    '[world]\nkind = "closed-loop"': "are of `harness drive`; type that",
+    '[world]\nkind = "dream"': "stated.toml",
+    "model =": "stated.toml is no TOML",
+}
+
+
+@pytest.mark.parametrize(("text", "said"), HOSTILE.items())
+def test_a_file_of_settings_opens_nothing_that_the_user_did_not_name(
+    harness: Callable[..., Said], text: str, said: str
+) -> None:
+    Path("theirs").mkdir()
+    Path("theirs/config.json").write_text("{}")
+    Path("stated.toml").write_text(text)
+    code, out, err = harness("eval", "stated.toml", "--limit", "1")
+    assert (code, out, err.count("\n")) == (2, "", 1), err
+    assert said in err
+    assert not Path("reports").exists()
+
+
+def test_what_is_typed_beside_a_file_wins(tmp_path: Path) -> None:
+    file = tmp_path / "stated.toml"
+    file.write_text(
+        'model = "./theirs"\nthinking = true\nserver = ["http://theirs:1/v1"]\n'
+        '[world]\nkind = "closed-loop"\n'
+    )
+    typed = {"model": "proxy", "thinking": False, "server": ["http://mine:1/v1"], "episodes": 3}
+    settings = read(file, DriveSettings, typed)
+    assert (settings.model, settings.thinking, settings.server) == ("proxy", False, ("http://mine:1/v1",))
+    assert settings.world == DriveSettings(episodes=3)
+    with pytest.raises(UserError, match="are of `harness drive`"):
+        read(file, FrozenSettings, typed)
+
+
+@pytest.mark.parametrize("command", ["eval", "drive"])
+def test_help_shows_ten_options_first(harness: Callable[..., Said], command: str) -> None:
+    blocks = harness(command, "--help")[1].split("\n\n")
+    [first] = [block for block in blocks if block.startswith("Options:")]
+    assert sum(line.startswith("  --") for line in first.splitlines()) == 11  # with --help
+    assert len([block for block in blocks if block.startswith(("Helpers:", "Conditions:", "Latency:"))]) == 3
