@@ -27,6 +27,7 @@ from harness.runs.metrics import Metric
 SURE = Metric("sure_rate", "share of decisions that are sure", Unit("%", 1, 100.0), "higher", "rate", 1.0,
               decisions=lambda d: (d["entropy_nats"] < 0.1).astype(float))
 OTHER = Metric("other", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"])
+FIRST = Metric("first", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"], primary=True)
 NOTHING = Metric("nothing", "", Unit(), "lower")
 """
 
@@ -97,10 +98,32 @@ def test_a_package_adds_a_metric_and_replaces_none(tmp_path: Path) -> None:
     assert {(score.condition, score.value) for score in scores} == {("single-local", 0.5), ("6g", 0.5)}
     made_up(tmp_path / "other", decision=lambda row: row.update(entropy_nats=0.0))
     comparison = compare(pair(tmp_path / "run", tmp_path / "other"))
-    assert "sure_rate %" in terminal(comparison, [], 3)
+    assert "sure_rate %" in terminal(comparison, [], 3, whole=True)
     assert judge(gate("6g:sure_rate > 0.1"), comparison).failed == (("6g", 0.5),)
     with pytest.raises(UserError, match="did you mean 'sure_rate'"):
         gate("6g:sur_rate > 0.1")
+
+
+@pytest.mark.usefixtures("installed")
+def test_another_metric_changes_no_corrected_p(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own is exploratory, and stands uncorrected."""
+
+    def lose(row: Row) -> None:
+        if row["episode"] < 3:
+            row |= {"success": False, "failure": "collision"}
+
+    run_of(tmp_path / "a")
+    made_up(tmp_path / "b", episode=lose, decision=lambda row: row.update(entropy_nats=0.0))
+    runs = tmp_path / "a", tmp_path / "b"
+    more = compare(pair(*runs)).conditions[1].differences
+    own = next(d for d in more if d.metric == "sure_rate")
+    assert own.p_value is not None
+    assert own.p_corrected is None
+    monkeypatch.setattr(type(METRICS), "_entries", lambda self: {})
+    fewer = compare(pair(*runs)).conditions[1].differences
+    assert len(more) == len(fewer) + 1
+    assert [d.p_corrected for d in more if d is not own] == [d.p_corrected for d in fewer]
+    assert any(d.p_corrected is not None for d in fewer)
 
 
 @pytest.mark.parametrize(
@@ -109,6 +132,7 @@ def test_a_package_adds_a_metric_and_replaces_none(tmp_path: Path) -> None:
         ("gone = by_hand:GONE", "'gone' .*does not load"),
         ("odd = by_hand:PACKAGE", "'odd' .*does not load"),
         ("mine = by_hand:OTHER", "'mine' .* is the metric 'other' with 1 functions; give it the name of"),
+        ("first = by_hand:FIRST", "'first' .* with 1 functions, a primary one; .* is not primary"),
         ("nothing = by_hand:NOTHING", "'nothing' .* with 0 functions; give it .* one function"),
     ],
 )

@@ -24,6 +24,9 @@ def command(
     junit: Path | None = typer.Option(
         None, help="Also write the gates to this file, as test cases in JUnit XML for a CI system."
     ),
+    every: bool = typer.Option(
+        False, "--all", help="Print every metric, not only the primary ones and what changed most clearly."
+    ),
     as_markdown: bool = typer.Option(
         False, "--markdown", help="Print Markdown, such as for a comment on a pull request."
     ),
@@ -64,5 +67,5 @@ def command(
     if as_json:
         echo_json(text.mapping(difference, verdicts, show))
     else:
-        typer.echo((text.markdown if as_markdown else text.terminal)(difference, verdicts, show))
+        typer.echo((text.markdown if as_markdown else text.terminal)(difference, verdicts, show, every))
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)

@@ -107,11 +107,12 @@ class Metrics(Plugins[Metric]):
     def _load(self, name: str) -> Metric:
         metric = super()._load(name)
         functions = [each for each in (metric.decisions, metric.episodes) if each]
-        if metric.name != name or not name.isidentifier() or len(functions) != 1:
+        if metric.name != name or not name.isidentifier() or len(functions) != 1 or metric.primary:
             raise UserError(
                 f"plug-in {printable(name)!r} ({self.group}) is the metric {printable(metric.name)!r} with "
-                f"{len(functions)} functions; give it the name of its entry point, of letters, digits and _, "
-                "and one function, of decisions or of episodes"
+                f"{len(functions)} functions{', a primary one' * metric.primary}; give it the name of its "
+                "entry point, of letters, digits and _, and one function, of decisions or of episodes; a "
+                "package's metric is not primary"
             )
         return metric
 

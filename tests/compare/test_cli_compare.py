@@ -165,6 +165,27 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
         assert part in said, part
 
 
+def test_six_metrics_come_first_and_all_print_the_rest(worse: tuple[Path, Path], harness: Harness) -> None:
+    """The primary metrics, then what changed most clearly: entropy, and bits, alike in every episode."""
+
+    def differ(row: Row) -> None:
+        row["entropy_nats"] += 0.5 + row["episode"] % 2 / 100
+        row["request_bits"] += 8
+
+    change(worse[1], decision=differ)
+    metrics = json.loads(harness("compare", *worse, "--json")[1])["conditions"][1]["metrics"]
+    for form in ((), ("--markdown",)):
+        few, every = (harness("compare", *worse, *form, *more)[1] for more in ((), ("--all",)))
+        rows = [[name for name in metrics if re.search(rf"[ ?] {name} ", text)] for text in (few, every)]
+        primary = ["success_rate", "unsafe_rate", "latency_proxy_ms"]
+        assert set(rows[0]) == {*primary, "bits_per_episode", "entropy_nats"}
+        assert set(rows[1]) == set(metrics)
+        assert f"{len(metrics) - 5} more metrics: --all" in few
+        assert re.search(r"\? entropy_nats ", few)
+        assert "more metrics" not in every
+    assert [name for name, d in metrics.items() if d["primary"]] == primary
+
+
 def test_prefill_and_decode_of_each_run_are_said(
     runs: tuple[Path, Path], harness: Harness, tmp_path: Path
 ) -> None:
@@ -186,7 +207,7 @@ def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harne
     condition = told["conditions"][1]
     assert condition["metrics"]["success_rate"] | {"low": 0, "high": 0} == {
         "a": 1.0, "b": 0.75, "difference": -0.25, "low": 0, "high": 0, "n": 4, "n_excluded": 0,
-        "p": pytest.approx(0.317, abs=1e-3), "p_holm": 1.0,
+        "p": pytest.approx(0.317, abs=1e-3), "p_holm": 1.0, "primary": True,
     }  # fmt: skip
     assert condition["lost"] == {
         "count": 2, "episodes": 1,
@@ -213,12 +234,14 @@ def test_no_p_is_printed_as_zero_and_json_keeps_the_number(runs: tuple[Path, Pat
     told = json.loads(harness("compare", *runs, "--json")[1], parse_constant=pytest.fail)
     of = [metric for c in told["conditions"] for metric in c["metrics"].values() if metric["p"] is not None]
     latency = told["conditions"][1]["metrics"]["latency_proxy_ms"]
-    assert 0 < latency["p"] < latency["p_holm"] <= latency["p"] * len(of) < 1e-9
+    assert 0 < latency["p"] < latency["p_holm"] <= latency["p"] * 6 < 1e-9
     printed = [harness("compare", *runs, *form)[1] for form in ((), ("--markdown",), ("--html", "page.html"))]
     for text in (*printed[:2], unescape(Path("page.html").read_text())):
         said = " ".join(text.split())
         assert "< 0.001" in said
-        assert f"Holm's method corrects it for the {len(of)} differences that have an interval" in said
+        tested, primary = len(of), sum(metric["primary"] for metric in of)
+        assert f"corrects that of the primary metrics, {primary} differences" in said
+        assert f"The other {tested - primary} are exploratory" in said
     assert not [line for line in printed[0].splitlines() if line.endswith((" 0.000", "= 0.000"))]
 
 

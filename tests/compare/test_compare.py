@@ -107,14 +107,16 @@ def test_success_that_hangs_on_the_seed_has_an_interval_over_episodes(runs: tupl
     assert c.conditions[1].gained == (Flip(0, (0,), "late", "success"), Flip(3, (0,), "late", "success"))
 
 
-def test_holm_counts_every_difference_in_every_condition(runs: tuple[Path, Path]) -> None:
-    """Four successes of four gained under 6g: the least p, times all that is compared."""
+def test_holm_counts_the_primary_metrics_in_every_condition(runs: tuple[Path, Path]) -> None:
+    """Four successes of four gained under 6g: the least p, times all primary differences."""
     ends(runs[0], "6g", [["late"] * 4] * 2)
     ends(runs[1], "6g", [[""] * 4] * 2)
     c = found(runs)
     every = [d for of in c.conditions for d in of.differences]
-    p_values = [d.p_value for d in every if d.p_value is not None]
-    assert [d.p_corrected for d in every if d.p_value is not None] == holm(p_values)
+    primary = [d for d in every if METRICS[d.metric].primary and d.p_value is not None]
+    p_values = [d.p_value for d in primary if d.p_value is not None]
+    assert [d.p_corrected for d in primary] == holm(p_values)
+    assert {d.metric for d in every if d.p_corrected is not None} == {"success_rate", "unsafe_rate"}
     gained = differences(c, "6g")["success_rate"]
     assert gained.change.low > 0
     assert gained.p_value is not None

@@ -15,7 +15,7 @@ from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.flips import LOST_BY, DecisionFlip, flips
 from harness.report.compare.pair import Pair
 from harness.runs import percentiles
-from harness.runs.metrics import METRICS, SUCCESS, difference, metrics_of, p_value
+from harness.runs.metrics import METRICS, SUCCESS, difference, entry, metrics_of, p_value
 from harness.runs.sources import prompt_of
 
 
@@ -30,7 +30,8 @@ class Difference:
         change: B - A, paired by episode and seed, with a 95 % interval over episodes
             (`harness.runs.metrics.difference`); of a latency percentile, a bootstrap's.
         p_value: of no difference, of this one alone, by its interval; None where there is none.
-        p_corrected: by Holm's method (Holm 1979) for all differences of the comparison.
+        p_corrected: by Holm's method (Holm 1979) for the primary metrics in all conditions; None of any other
+            metric, which is exploratory.
     """
 
     metric: str
@@ -39,6 +40,11 @@ class Difference:
     change: Estimate
     p_value: float | None = None
     p_corrected: float | None = None
+
+    @property
+    def primary(self) -> bool:
+        """Whether the metric is one of those that answer for the comparison."""
+        return entry(self.metric).primary
 
 
 @dataclass(frozen=True)
@@ -162,15 +168,14 @@ def _prompts(pair: Pair) -> PromptChange | str | None:
 
 
 def _corrected(conditions: Sequence[InCondition]) -> tuple[InCondition, ...]:
-    """The same, each difference with its p-value as it counts among all of them."""
-    p_values = [d.p_value for c in conditions for d in c.differences if d.p_value is not None]
-    among = iter(holm(p_values))
-    return tuple(
-        replace(c, differences=tuple(
-            d if d.p_value is None else replace(d, p_corrected=next(among)) for d in c.differences
-        ))
-        for c in conditions
-    )  # fmt: skip
+    """Correct the p-values of the primary metrics, as they count among each other in all conditions."""
+    p_values = [p for c in conditions for d in c.differences if d.primary and (p := d.p_value) is not None]
+    corrected = iter(holm(p_values))
+
+    def with_p(d: Difference) -> Difference:
+        return replace(d, p_corrected=next(corrected)) if d.primary and d.p_value is not None else d
+
+    return tuple(replace(c, differences=tuple(map(with_p, c.differences))) for c in conditions)
 
 
 def _settings(pair: Pair) -> Iterator[tuple[str, str | None, str | None]]:

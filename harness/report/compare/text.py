@@ -14,7 +14,7 @@ from harness.core.junit import Case
 from harness.core.junit import junit as test_suite
 from harness.prompts.difference import PromptChange
 from harness.report.compare import words
-from harness.report.compare.difference import Comparison, InCondition
+from harness.report.compare.difference import Comparison, Difference, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import where
 
@@ -22,16 +22,19 @@ WIDTH = 80
 WHOLE = 10**6  # lists are cut by number, never in the middle of an id
 
 
-def terminal(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
-    """Lines of at most `WIDTH` columns; `most` episodes, requests and so on are listed of each kind."""
+def terminal(comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool = False) -> str:
+    """Write lines of at most `WIDTH` columns; `most` episodes, requests and so on are listed of each kind.
+
+    Unless `whole`, only those metrics are listed that come first.
+    """
     return "\n".join(
         piece
-        for text in _lines(comparison, verdicts, most)
+        for text in _lines(comparison, verdicts, most, whole)
         for piece in wrap(printable(text, WHOLE), WIDTH, subsequent_indent="    ")
     )
 
 
-def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterator[str]:
+def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool) -> Iterator[str]:
     pair = comparison.pair
     yield from (f"{name}: {side}" for name, side in words.sides(pair, whole=True))
     yield from words.caveats(pair)
@@ -46,9 +49,13 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> It
             yield label
             label = ""
         yield f"{label:<26}{'A':>8}{'B':>9}{'B - A':>9} {'[95 % interval]':>18}{'p':>9}"
-        for one in map(words.line, c.differences):
-            named = f"{words.SIGNS[one.verdict]:<2}{one.metric}"
-            yield f"{named:<27}{one.a:>7}{one.b:>9}{one.change:>9} {one.interval:>18}{one.p:>9}"
+        primary, exploratory, more = _groups(c, whole)
+        yield from map(_row, primary)
+        if exploratory:
+            yield "exploratory, p not corrected:"
+            yield from map(_row, exploratory)
+        if more:
+            yield f"{more} more metrics: --all"
         yield words.success(c, pair)
         yield from (f"  {way}: {episodes}" for way, episodes in words.both_ways(c, pair, most))
         yield words.decisions(c, pair)
@@ -62,7 +69,21 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> It
     yield from map(words.judged, verdicts)
 
 
-def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
+def _groups(c: InCondition, whole: bool) -> tuple[list[Difference], list[Difference], int]:
+    """Return the primary metrics, the exploratory ones that are shown, and how many are not."""
+    primary, exploratory = words.first(c)
+    if whole:
+        exploratory = [d for d in c.differences if not d.primary]
+    return primary, exploratory, len(c.differences) - len(primary) - len(exploratory)
+
+
+def _row(d: Difference) -> str:
+    text = words.line(d)
+    named = f"{words.SIGNS[text.verdict]:<2}{text.metric}"
+    return f"{named:<27}{text.a:>7}{text.b:>9}{text.change:>9} {text.interval:>18}{text.p:>9}"
+
+
+def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool = False) -> str:
     """GitHub's Markdown, in which a run's text is code: no link, no picture, no mention."""
     pair = comparison.pair
     failed = sum(bool(verdict.failed) for verdict in verdicts)
@@ -72,7 +93,7 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
     said += [f"- {code(caveat)}" for caveat in words.caveats(pair)]
     said += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(comparison)}", ""]
     for c in comparison.conditions:
-        said += [f"#### {code(c.condition)}", "", *_table(c), "", words.success(c, pair), ""]
+        said += [f"#### {code(c.condition)}", "", *_table(c, whole), "", words.success(c, pair), ""]
         said += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
         said += ["", words.decisions(c, pair), ""]
         said += [f"- {how}: {code(scenes)}" for how, scenes in words.given_away(c, pair, most)]
@@ -86,13 +107,16 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
     return "\n".join([*said, "", "</details>"])
 
 
-def _table(c: InCondition) -> list[str]:
+def _table(c: InCondition, whole: bool) -> list[str]:
+    primary, exploratory, more = _groups(c, whole)
     rows = [
-        f"| {words.SIGNS[one.verdict]} {one.metric} | {one.a} | {one.b} | {one.change} | {one.interval} "
-        f"| {one.p} |"
-        for one in map(words.line, c.differences)
+        f"| {words.SIGNS[text.verdict]} {text.metric} | {text.a} | {text.b} | {text.change} "
+        f"| {text.interval} | {text.p}{'' if d.primary else ' exploratory'} |"
+        for d in (*primary, *exploratory)
+        for text in [words.line(d)]
     ]
-    return ["| metric | A | B | B - A | 95 % interval | p |", "|---|--:|--:|--:|--:|--:|", *rows]
+    head = ["| metric | A | B | B - A | 95 % interval | p |", "|---|--:|--:|--:|--:|--:|"]
+    return [*head, *rows, *(["", f"{more} more metrics: --all"] if more else [])]
 
 
 def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
@@ -152,7 +176,7 @@ def _in_condition(c: InCondition, most: int) -> dict[str, Any]:
         d.metric: {
             "a": d.a, "b": d.b, "difference": d.change.value, "low": _number(d.change.low),
             "high": _number(d.change.high), "n": d.change.n, "n_excluded": d.change.n_excluded,
-            "p": d.p_value, "p_holm": d.p_corrected,
+            "p": d.p_value, "p_holm": d.p_corrected, "primary": d.primary,
         }
         for d in c.differences
     }  # fmt: skip

@@ -16,25 +16,18 @@ from harness.report.compare.pair import Pair, Side, where
 from harness.report.words import p_value, pace
 from harness.runs.metrics import SUCCESS, entry
 
-BETTER, WORSE = "better", "worse"
-SIGNS = {BETTER: "✓", WORSE: "✗", "": ""}
+BETTER, WORSE, HINT = "better", "worse", "hint"
+SIGNS = {BETTER: "✓", WORSE: "✗", HINT: "?", "": ""}
 HUNKS = 3  # changes of a prompt's text that are shown beside the numbers
-# What a page shows first; the others are behind a fold.
-LEADING = (
-    "success_rate",
-    "unsafe_rate",
-    "late_rate",
-    "latency_proxy_ms",
-    "messages_per_episode",
-    "fallback_rate",
-)
+SHOWN = 6  # metrics that are shown first
 
 
 @dataclass(frozen=True)
 class Line:
-    """A difference as text: the metric with its unit, both means, B - A, its interval and Holm's p.
+    """A difference as text: the metric with its unit, both means, B - A, its interval and its p.
 
-    `verdict` is `better` or `worse` where p is at most 0.05 and the metric has a good side.
+    `verdict` is `better` or `worse` where the corrected p of a primary metric is at most 0.05; `hint` where
+    that of an exploratory one is, uncorrected.
     """
 
     verdict: str
@@ -47,24 +40,58 @@ class Line:
 
 
 def line(d: Difference) -> Line:
-    """A difference as text; shares in percent."""
+    """Write a difference, with four figures at most; shares in percent."""
     unit, e = entry(d.metric).unit, d.change
     interval = "–" if math.isnan(e.low) else f"[{', '.join(unit.number(x, '+', 4) for x in (e.low, e.high))}]"
+    p = d.p_corrected if d.primary else d.p_value
     return Line(
         verdict(d), f"{d.metric}{' %' if unit.name == '%' else ''}",
         unit.number(d.a, digits=4), unit.number(d.b, digits=4), unit.number(e.value, "+", 4), interval,
-        "–" if d.p_corrected is None else p_value(d.p_corrected).removeprefix("= "),
+        "–" if p is None else p_value(p).removeprefix("= "),
     )  # fmt: skip
 
 
 def verdict(d: Difference) -> str:
-    """`better` or `worse` where the difference is beyond chance and large enough to be shown; else empty."""
-    metric = entry(d.metric)
-    if d.p_corrected is None or d.p_corrected > LEVEL or metric.better == "neither":
+    """Judge a difference that is beyond chance and large enough to be shown; any other is empty."""
+    better, p = entry(d.metric).better, d.p_corrected if d.primary else d.p_value
+    if p is None or p > LEVEL or not _visible(d):
         return ""
-    if round(d.change.value * metric.unit.factor, metric.unit.decimals) == 0:
+    if not d.primary:
+        return HINT
+    if better == "neither":
         return ""
-    return BETTER if (d.change.value > 0) == (metric.better == "higher") else WORSE
+    return BETTER if (d.change.value > 0) == (better == "higher") else WORSE
+
+
+def _visible(d: Difference) -> bool:
+    unit = entry(d.metric).unit
+    return round(d.change.value * unit.factor, unit.decimals) != 0
+
+
+def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
+    """Choose what is shown first: the primary metrics, and the exploratory ones that changed most clearly.
+
+    Together they are `SHOWN` at most. Those of which one way is better come before all others, and before
+    percentiles, which say again how long a decision takes.
+    """
+
+    def order(d: Difference) -> tuple[bool, float]:
+        metric = entry(d.metric)
+        # What changed alike in every episode has no interval.
+        return metric.better == "neither" or bool(metric.percentile), -1.0 if d.p_value is None else d.p_value
+
+    primary = [d for d in c.differences if d.primary]
+    changed = [
+        d for d in c.differences
+        if not d.primary and _visible(d) and (verdict(d) or d.p_value is None)
+    ]  # fmt: skip
+    return primary, sorted(changed, key=order)[: max(SHOWN - len(primary), 0)]
+
+
+def rest(c: InCondition) -> list[Difference]:
+    """Return the differences that are not among the `first`."""
+    primary, striking = first(c)
+    return [d for d in c.differences if d not in (*primary, *striking)]
 
 
 def findings(comparison: Comparison) -> list[tuple[str, str]]:
@@ -144,15 +171,18 @@ def success(c: InCondition, pair: Pair) -> str:
 
 
 def many(comparison: Comparison) -> str:
-    """How many differences were tested, how p counts that, and how many hold."""
-    p_values = [p for c in comparison.conditions for d in c.differences if (p := d.p_corrected) is not None]
-    held = sum(p <= LEVEL for p in p_values)
+    """Say how many differences were tested, how p counts that, and how many hold."""
+    tested = [d for c in comparison.conditions for d in c.differences if d.p_value is not None]
+    p_values = [d.p_corrected for d in tested if d.p_corrected is not None]
+    hints = sum(not d.primary and (d.p_value or 0.0) <= LEVEL for d in tested)
     return (
         "p comes from the interval: it is 1 minus the confidence level at which the interval would just "
-        f"touch 0. Holm's method corrects it for the {len(p_values)} differences that have an interval: the "
+        f"touch 0. Holm's method corrects that of the primary metrics, {len(p_values)} differences: the "
         f"chance that one or more of them is at most {LEVEL} without a real difference is {100 * LEVEL:.0f} "
-        f"% at most. {held} are at most {LEVEL}. Intervals, tests of success and gates are not corrected. "
-        f"{SIGNS[BETTER]} better, {SIGNS[WORSE]} worse: p is at most {LEVEL}"
+        f"% at most. {sum(p <= LEVEL for p in p_values)} are at most {LEVEL}: {SIGNS[BETTER]} better, "
+        f"{SIGNS[WORSE]} worse. The other {len(tested) - len(p_values)} are exploratory and not corrected: "
+        f"{hints} are at most {LEVEL} ({SIGNS[HINT]}), and {LEVEL * (len(tested) - len(p_values)):.0f} would "
+        "be by chance alone. Intervals, tests of success and gates are not corrected"
     )
 
 
