@@ -32,10 +32,10 @@ from harness.prompts import versions as prompts
 from harness.training import lessons
 from harness.training.answers import answer, message
 from harness.training.distill import Curriculum, distill
-from harness.training.examples import Question, alone, excerpts, kl_nats, with_messages
 from harness.training.lessons import Lessons, draw, label
 from harness.training.model import chat
 from harness.training.muon import Muon, orthogonal
+from harness.training.questions import Question, alone, excerpts, kl_nats, with_messages
 from harness.training.train import STAGES, Plan, Sample, _batches
 from harness.world import scenarios
 from harness.world.reference import drive, finish
@@ -58,14 +58,14 @@ def silent(*_: object) -> None:
 @pytest.fixture(scope="module")
 def once_drawn() -> Callable[..., Any]:
     """What a layout teaches, drawn once for all tests."""
-    return cache(lessons.drawn)
+    return cache(lessons.decision_points)
 
 
 @pytest.fixture(scope="module")
 def few(once_drawn: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
     place = tmp_path_factory.mktemp("lessons")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lessons, "drawn", once_drawn)
+        patch.setattr(lessons, "decision_points", once_drawn)
         return [
             draw(scenario, versions, CURRICULUM.layouts, CURRICULUM.seed, place / scenario.name, 1, silent)
             for scenario, versions in LEARNT.items()
@@ -87,11 +87,11 @@ def test_of_each_level_as_many_are_learnt_from_as_a_whole_tree_has():
         name for name, at in forest.place.items()
         if forest.tree[at] == 9 and any(ends_well(at, action) for action in range(len(CROSSING.actions)))
     }  # fmt: skip
-    points = [point["moment"] for point in lessons.drawn(CROSSING, 200_009, 9)]
+    points = [point["moment"] for point in lessons.decision_points(CROSSING, 200_009, 9)]
     by_step = Counter(int(forest.step[forest.place[name]]) for name in in_tree)
     assert {point["scene"] for point in points} <= in_tree
     assert Counter(point["step"] for point in points) == {
-        step: min(lessons.OF_A_LEVEL, n) for step, n in by_step.items()
+        step: min(lessons.PER_LEVEL, n) for step, n in by_step.items()
     }
 
 
@@ -120,14 +120,14 @@ def asked(few: list[Lessons]) -> list[Question]:
 
 @pytest.fixture
 def drawn_before(once_drawn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lessons, "drawn", once_drawn)
+    monkeypatch.setattr(lessons, "decision_points", once_drawn)
 
 
 @pytest.fixture(scope="module")
 def student(once_drawn: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("distilled") / "student"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lessons, "drawn", once_drawn)
+        patch.setattr(lessons, "decision_points", once_drawn)
         patch.setattr("harness.training.train.LOG_STEPS", 4)
         distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
     return out
@@ -400,11 +400,11 @@ def test_it_learns_from_every_level_of_a_tree(few: list[Lessons]) -> None:
             steps = [s.record["step"] for s in each.scenes if s.record["episode"] == number]
             assert set(steps) == set(range(min(steps), max(steps) + 1))
             assert max(steps) > 1
-            assert all(steps.count(step) <= lessons.OF_A_LEVEL for step in steps)
+            assert all(steps.count(step) <= lessons.PER_LEVEL for step in steps)
 
 
 def test_a_layout_teaches_the_same_wherever_it_is_drawn(few: list[Lessons]) -> None:
-    again = msgspec.json.encode(lessons.drawn(PASSING, CURRICULUM.seed + 1, 1))
+    again = msgspec.json.encode(lessons.decision_points(PASSING, CURRICULUM.seed + 1, 1))
     assert msgspec.json.decode(again) == [
         {"moment": scene.record, "label": few[1].labels[scene.id].tolist()}
         for scene in few[1].scenes if scene.record["episode"] == 1

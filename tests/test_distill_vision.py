@@ -21,7 +21,6 @@ from harness.prompts import versions as prompts
 from harness.training.answers import sights
 from harness.training.cells import cells
 from harness.training.distill import Curriculum, distill
-from harness.training.examples import Question, alone
 from harness.training.lessons import Lessons, draw
 from harness.training.model import (
     END,
@@ -33,6 +32,7 @@ from harness.training.model import (
     take_over,
     train_tokenizer,
 )
+from harness.training.questions import Question, alone
 from harness.training.student import Student
 from harness.training.train import STAGES, Plan
 from harness.world.perception.camera import Sight
@@ -61,7 +61,7 @@ def folder(lessons: Lessons, tmp_path_factory: pytest.TempPathFactory) -> Path:
         point = {"moment": scene.record, "label": lessons.labels[scene.id].tolist()}
         of_layout[scene.record["episode"]].append(point)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.training.lessons.drawn", lambda scenario, seed, n: of_layout[n])
+        patch.setattr("harness.training.lessons.decision_points", lambda scenario, seed, n: of_layout[n])
         distill(Curriculum({SCENARIO: VERSIONS}, LAYOUTS, FIRST["train"]), PLAN, out, silent, silent, "cpu")
     return out
 

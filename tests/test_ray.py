@@ -15,7 +15,7 @@ import pytest
 
 from harness.core.errors import Unfinished, UserError
 from harness.core.parallel import TRIES, Ray, each, spread
-from harness.core.versions import of_node
+from harness.core.versions import node_versions
 
 ray = pytest.importorskip("ray", reason="needs the ray extra")
 
@@ -128,13 +128,13 @@ def test_an_error_of_the_works_own_is_raised_and_never_tried_again(cluster: Any,
 
 
 def test_another_version_is_named_with_its_node(cluster: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    ours = of_node()
+    ours = node_versions()
     for changed, said in (
         ({**ours, "numpy": "1.0"}, rf"numpy {ours['numpy']}, not 1\.0"),
         ({**ours, "source of harness": "0" * 12}, rf"source of harness {ours['source of harness']}, not 0+"),
         ({**ours, "torch-of-mine": "3"}, "torch-of-mine missing, not 3"),
     ):
-        monkeypatch.setattr(ray_tasks, "of_node", lambda changed=changed: changed)
+        monkeypatch.setattr(ray_tasks, "node_versions", lambda changed=changed: changed)
         with pytest.raises(
             UserError, match=rf"^node [\d.]+ \(\w{{8}}\) has {said}; install the same on every"
         ):

@@ -10,7 +10,7 @@ import pytest
 from harness.core.errors import UserError
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Site
 from harness.radio.fading import Trips
-from harness.radio.trace import Trace, of_profile, read
+from harness.radio.trace import Trace, from_profile, read
 
 PLAIN = "distance_m,reception\n300,0.2\n100,0.8\n"
 SIGHTED = (
@@ -26,7 +26,7 @@ def table(tmp_path: Path, text: str = PLAIN) -> Path:
 
 
 def load(path: Path, **settings: object) -> Trace:
-    return of_profile({"file": path.name, **settings}, path.parent, "channel file mine.toml [parameters]")
+    return from_profile({"file": path.name, **settings}, path.parent, "channel file mine.toml [parameters]")
 
 
 def sites(distances_m: list[float], sight: list[int]) -> Site:
@@ -151,7 +151,7 @@ def test_a_trace_without_places_is_refused(tmp_path):
 def test_a_mistake_in_a_profile_is_one_line(tmp_path, parameters, says):
     table(tmp_path)
     with pytest.raises(UserError) as error:
-        of_profile(parameters, tmp_path, "mine.toml [parameters]")
+        from_profile(parameters, tmp_path, "mine.toml [parameters]")
     assert says in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -162,4 +162,4 @@ def test_a_profile_names_no_file_that_lies_elsewhere(file: str, tmp_path: Path) 
     (tmp_path / "secret.csv").write_text("sk-secret,reception\n1,1\n")
     (tmp_path / "channels/link.csv").symlink_to(tmp_path / "secret.csv")
     with pytest.raises(UserError, match="lies elsewhere; put it beside the profile"):
-        of_profile({"file": file, "latency_s": 0.01}, tmp_path / "channels", "profile")
+        from_profile({"file": file, "latency_s": 0.01}, tmp_path / "channels", "profile")

@@ -103,7 +103,7 @@ def _typed() -> None:
         _fail(str(extras.without("this command", *lack)))
     except shell.Stopped as stopped:
         stop = stopped.__cause__
-        said, code = (stop.said, stop.code) if isinstance(stop, Stop) else ("interrupted", 130)
+        said, code = (stop.word, stop.code) if isinstance(stop, Stop) else ("interrupted", 130)
         _fail(_noted(said, stop), code)
     except _UsageError as error:
         message, context = error.format_message(), error.ctx

@@ -157,10 +157,10 @@ def examples(
         raise UserError(f"{printable(file)} is there already; delete it to draw others")
     if reason := prompts.unfit(draft, of):
         raise UserError(f"prompt {version} {reason}; give another --scenario, or another version")
-    from harness.training import shown
+    from harness.training import prompt_examples
 
     with bar("drawing layouts", count) as progress:
-        drawn = shown.examples(draft, of, count, first_seed, progress)
+        drawn = prompt_examples.examples(draft, of, count, first_seed, progress)
     write_whole(file, text_of(drawn))
     typer.echo(f"wrote {printable(file)}: {drawn}")
 

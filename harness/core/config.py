@@ -267,9 +267,10 @@ def _members(hint: Any, value: Any) -> list[Any]:
     members = [member for each in get_args(hint) for member in _members(each, value)]
     tags = [getattr(member, "__struct_config__", None) for member in members]
     named = [
-        member for member, tag in zip(members, tags, strict=True)
+        member
+        for member, tag in zip(members, tags, strict=True)
         if tag and tag.tag is not None and isinstance(value, Mapping) and value.get(tag.tag_field) == tag.tag
-    ]  # fmt: skip
+    ]
     return named or members
 
 

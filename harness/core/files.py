@@ -92,7 +92,7 @@ LARGEST: dict[Kind, int] = {
     "picture": 64 * _MB,  # figures and pages
     "rows": 32 << 30,  # one line or row for each answer or decision, layouts, logs of work
     "weights": 4 << 40,
-}  # fmt: skip
+}
 """The largest file of each kind, bytes."""
 
 

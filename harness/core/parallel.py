@@ -49,7 +49,7 @@ def workers_of(text: str) -> Workers:
 
 
 class Executor(Protocol):
-    """Runs items on workers. Every submitted item comes back once, as its result or as `Lost`."""
+    """Runs items on workers. Every submitted item comes back once, as its result or as `WorkerDied`."""
 
     def room(self) -> bool:
         """Whether another item can be submitted."""
@@ -60,7 +60,7 @@ class Executor(Protocol):
         ...
 
     def take(self) -> "tuple[int, Any]":
-        """Wait for an item; return its place, and its result or `Lost`. Raises what the work raises."""
+        """Wait for an item; return its place, and its result or `WorkerDied`. Raises what the work raises."""
         ...
 
     def close(self) -> None:
@@ -68,7 +68,7 @@ class Executor(Protocol):
         ...
 
 
-class Lost:
+class WorkerDied:
     """Stands for the result of an item whose worker died."""
 
 
@@ -107,7 +107,7 @@ def each(
                 busy += 1
             place, result = executor.take()
             busy -= 1
-            if not isinstance(result, Lost):
+            if not isinstance(result, WorkerDied):
                 n_done += 1
                 on_result(place, result)
                 continue
@@ -177,7 +177,7 @@ class _Processes:
         except BrokenProcessPool:
             place, pool = self._busy.pop(future)
             pool.shutdown()
-            return place, Lost()
+            return place, WorkerDied()
         place, pool = self._busy.pop(future)
         self._idle.append(pool)
         return place, result

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 STOPS = {signal.SIGTERM: "terminated", signal.SIGINT: "interrupted"}
 AGAIN_S = 0.05  # after which a stop that fell where nothing can be raised is raised again
 LEAST_MB = 768  # of address space; with less, libraries end the process in ways that cannot be caught
-# What is said where memory ran out, but by a MemoryError.
+# Texts of the errors, other than MemoryError, of a process whose memory ran out.
 MEMORY = (
     "failed to map segment", "Cannot allocate memory", "can't start new thread", "Failed to launch worker",
 )  # fmt: skip
@@ -24,7 +24,7 @@ class Stop(KeyboardInterrupt):
     """SIGTERM or SIGINT, which end a command wherever it is; the argument is the signal's number."""
 
     @property
-    def said(self) -> str:
+    def word(self) -> str:
         return STOPS[self.args[0]]
 
     @property
@@ -55,7 +55,7 @@ def run(program: Callable[[], object]) -> None:
         stops.over = True
         ended_by_itself = isinstance(error, SystemExit) and not stops.terminated
         if stops.seen and not ended_by_itself:
-            if not isinstance(error, SystemExit) or error.code != stops.seen.code:  # else it is said already
+            if not isinstance(error, SystemExit) or error.code != stops.seen.code:  # it is printed
                 stops.end()
         elif _lacks_memory(error):
             print("harness: memory ran out; give this command more, or less to do", file=sys.stderr)
@@ -80,7 +80,7 @@ class _Stops:
 
     @property
     def terminated(self) -> bool:
-        """Whether SIGTERM came, which no command takes for its usual end."""
+        """Whether SIGTERM came, which is no command's usual end."""
         return self.seen is not None and self.seen.args[0] == signal.SIGTERM
 
     def listen(self) -> None:
@@ -92,7 +92,7 @@ class _Stops:
         sys.unraisablehook = self._unraisable
 
     def let_go(self) -> None:
-        """Leave signals to the system, which ends the process by them, as the interpreter is taken down."""
+        """Leave signals to the system, whose default ends the process while the interpreter shuts down."""
         for number in STOPS:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, signal.SIG_DFL)
@@ -103,7 +103,7 @@ class _Stops:
         with suppress(Exception):
             sys.stdout.flush()
         with suppress(OSError):
-            os.write(2, f"harness: {self.seen.said}\n".encode())
+            os.write(2, f"harness: {self.seen.word}\n".encode())
         os._exit(self.seen.code)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
@@ -148,7 +148,7 @@ def _open_streams() -> None:
 
 
 def _leave_out_wrong_date() -> None:
-    """Take a date that is none out of the environment: NumPy fails at it where SciPy imports all of it."""
+    """Remove a wrong date from the environment: NumPy, when SciPy imports all of it, fails at one."""
     try:
         time.gmtime(int(os.environ.get("SOURCE_DATE_EPOCH", "0")))
     except (ValueError, OverflowError, OSError):
@@ -156,7 +156,7 @@ def _leave_out_wrong_date() -> None:
 
 
 def _lack() -> str | None:
-    """What the process lacks to run at all, in a sentence."""
+    """Say what the process lacks to run at all; None if it lacks nothing."""
     try:
         os.getcwd()
     except OSError as error:

@@ -18,9 +18,9 @@ from ray import exceptions
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from harness.core.errors import Unanswered, UserError, printable
-from harness.core.parallel import Lost
+from harness.core.parallel import WorkerDied
 from harness.core.process import Stop
-from harness.core.versions import differing, of_node
+from harness.core.versions import differing, node_versions
 
 DEAD = (
     exceptions.WorkerCrashedError,
@@ -47,7 +47,7 @@ class Tasks:
         _connect(address)
         self._label, self._repeatable = label, repeatable
         self._run = ray.remote(num_cpus=1, max_retries=0)(_on_node)
-        self._work = ray.put((work, of_node(), os.getcwd()))
+        self._work = ray.put((work, node_versions(), os.getcwd()))
         self._busy: dict[Any, tuple[int, Any]] = {}
         self._again: dict[Any, tuple[int, str, str]] = {}  # repeated items: place, first node, its result
         self._nodes: dict[str, str] = {}  # names by id of the nodes that have answered
@@ -71,7 +71,7 @@ class Tasks:
         place, item = self._busy.pop(ready)
         answer = _result(ready)
         if answer is None:
-            return place, Lost()
+            return place, WorkerDied()
         node, name, result = answer
         if self._repeatable and node not in self._nodes:
             if self._nodes:

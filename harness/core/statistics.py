@@ -208,7 +208,7 @@ def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
     return np.vstack([np.ones((1, n), dtype=np.int64), draws.multinomial(n, np.full(n, 1 / n), times)])
 
 
-def of_resamples(values: Floats, n: int) -> Estimate:
+def resampled_estimate(values: Floats, n: int) -> Estimate:
     """Return a figure of n units with its bootstrap's 95 % interval.
 
     Args:

@@ -27,7 +27,7 @@ def versions(packages: Sequence[str] = PACKAGES) -> Any:
 
 
 @cache
-def of_node() -> dict[str, str]:
+def node_versions() -> dict[str, str]:
     """Return the versions that must agree on all nodes of one job, with a digest of the harness's source."""
     required: dict[str, str] = versions((*PACKAGES, "pyarrow", "shapely", "gymnasium", "msgspec", "pillow"))
     del required["platform"]  # it names the kernel, which may differ
@@ -36,7 +36,7 @@ def of_node() -> dict[str, str]:
 
 def differing(wanted: dict[str, str]) -> str | None:
     """Describe the first version that differs here from those wanted; None if all agree."""
-    here = of_node()
+    here = node_versions()
     for name in {**wanted, **here}:
         if here.get(name) != wanted.get(name):
             return f"{name} {here.get(name, 'missing')}, not {wanted.get(name, 'missing')}"

@@ -57,7 +57,7 @@ class Site:
         units = {unit: its.take(at) for unit, its in self.units.items()}
         return Site(self.xy_m[at], self.sight[at], self.blocker_m[at], self.corner_m[at], self.first_m, units)
 
-    def to(self, links: slice) -> "Site":
+    def select(self, links: slice) -> "Site":
         """Select some of the links, `(..., h)`."""
         xy_m = np.concatenate([self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2)
         sight, blocker_m = self.sight[..., links], self.blocker_m[..., links]

@@ -36,8 +36,8 @@ class Trips:
 
     def uniforms(self, helpers: int) -> Floats:
         """Return the draws of each decision's packets, `(..., 1 + 2H)`: one for the wait, then H pairs."""
-        of_pairs, place = self._of_pairs(_packets, self.steps, helpers)
-        return of_pairs[place, self.step]
+        pairs_draws, place = self._once_a_pair(_packets, self.steps, helpers)
+        return pairs_draws[place, self.step]
 
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
         """Return the shadowing of the link to each helper, `(..., H)`, standard normal.
@@ -48,7 +48,7 @@ class Trips:
                 is 1/e.
         """
         helpers = xy_m.shape[-2] - 1
-        waves, place = self._of_pairs(_waves, helpers)
+        waves, place = self._once_a_pair(_waves, helpers)
         ego = np.broadcast_to(xy_m[..., :1, :], xy_m[..., 1:, :].shape)
         ends = (
             np.concatenate([ego, xy_m[..., 1:, :]], axis=-1).reshape(place.size, helpers, 4, 1)
@@ -64,7 +64,7 @@ class Trips:
             total[block] = np.cos(angle).sum(axis=-1)
         return total.reshape(*xy_m.shape[:-2], helpers) * math.sqrt(2 / WAVES)
 
-    def _of_pairs(self, drawn: Any, *args: int) -> tuple[Floats, Ints]:
+    def _once_a_pair(self, drawn: Any, *args: int) -> tuple[Floats, Ints]:
         """Return the draws for each seed and layout, (P, ...), and each decision's index in them, `(...)`."""
         seeds, seed = np.unique(self.seed, return_inverse=True)
         layouts, layout = np.unique(self.layout_seed, return_inverse=True)

@@ -61,9 +61,11 @@ class NrMode2(Sidelink):
     def __post_init__(self) -> None:
         super().__post_init__()
         numbers = {
-            "mcs": (0, 28), "packet_bytes": (1, 10_000), "subchannel_blocks": (10, 100),
+            "mcs": (0, 28),
+            "packet_bytes": (1, 10_000),
+            "subchannel_blocks": (10, 100),
             "efficiency": (0.1, 1.0),
-        }  # fmt: skip
+        }
         for name, (least, most) in numbers.items():
             if not least <= getattr(self, name) <= most:
                 raise UserError(f"{name} is {getattr(self, name)}: give {least} to {most}")

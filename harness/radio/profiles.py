@@ -29,7 +29,7 @@ MODELS = {
     "lte-v2x-mode4": "harness.radio.lte_mode4:LteMode4",
     "nr-v2x-mode2": "harness.radio.nr_mode2:NrMode2",
     "its-g5": "harness.radio.its_g5:ItsG5",
-    "trace": "harness.radio.trace:of_profile",
+    "trace": "harness.radio.trace:from_profile",
 }
 
 

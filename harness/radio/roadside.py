@@ -38,17 +38,17 @@ class Relay(Wrapped):
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """A lost reply keeps its slot, and that of its copy if there is one."""
         up, delay_s, loss, airtime_s = self.channel.deliver(links, draws)
-        has_request = draws.packet[..., 0] >= loss_of(self.channel, links.where, draws, links.request_bits)
+        has_request = draws.packet[..., 0] >= link_loss(self.channel, links.where, draws, links.request_bits)
         at_unit = links.where.units[self.unit]
         heard = self.channel.deliver(
-            replace(links, asked=links.asked & has_request, site=at_unit.to(HELPERS)),
+            replace(links, asked=links.asked & has_request, site=at_unit.select(HELPERS)),
             draws.of(".roadside").requested,
         ).up
         heard &= links.asked & has_request
         copies = draws.of(".roadside-ego")
         copy = self.channel.request(links.payload_bits, replace(copies, given=copies.packet))
         copied = heard & (
-            copies.packet[..., 1] >= loss_of(self.channel, at_unit.to(EGO), copies, links.payload_bits)
+            copies.packet[..., 1] >= link_loss(self.channel, at_unit.select(EGO), copies, links.payload_bits)
         )
         copy_end_s = delay_s + self.delay_s + copy.heard_s
         return Delivery(
@@ -103,7 +103,7 @@ def by_unit(
     back_draw, request_draw, policy_draw = np.moveaxis(to_ego.first_packets, -1, 0)
 
     def lost(size_bits: float) -> Floats:
-        return loss_of(channel, at_unit.to(EGO), to_ego, size_bits)[..., 0]
+        return link_loss(channel, at_unit.select(EGO), to_ego, size_bits)[..., 0]
 
     wanted = np.any(links.asked, axis=-1)
     to_unit = channel.request(2 * bits, draws)
@@ -111,9 +111,8 @@ def by_unit(
     ask = channel.request(bits, to_helpers)
     heard_s = np.asarray(to_unit.heard_s + delay_s + ask.heard_s)
     asked = links.asked & reached[..., None]
-    replies = channel.deliver(
-        replace(links, asked=asked, ready_s=ready(heard_s[..., None]), site=at_unit.to(HELPERS)), to_helpers
-    )
+    ready_s, site = ready(heard_s[..., None]), at_unit.select(HELPERS)
+    replies = channel.deliver(replace(links, asked=asked, ready_s=ready_s, site=site), to_helpers)
     back = channel.request(bits, replace(to_ego, given=back_draw[..., None]))
     back_s = delay_s + back.heard_s
     latest_s = left_s - back_s
@@ -137,6 +136,6 @@ def by_unit(
     )
 
 
-def loss_of(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
+def link_loss(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
     """Return the probability that one transmission of so many bits is lost on each link, `(..., H)`."""
     return channel.loss(site, draws.shadow(site.xy_m, channel.decorrelation_m), bits)

@@ -107,7 +107,7 @@ class Trace:
         return found
 
 
-def of_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace:
+def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace:
     """Build the channel of a profile that names a `file` beside it. Raises UserError if it is wrong."""
     if not isinstance(parameters.get("file"), str):
         raise UserError(f"{where} has no file; add it, a CSV with distance_m and reception")

@@ -19,7 +19,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import Estimate, of_resamples, resampled
+from harness.core.statistics import Estimate, resampled, resampled_estimate
 from harness.evaluate.agent import Agent
 from harness.evaluate.run import read_or_evaluate
 from harness.evaluate.spec import Spec
@@ -277,7 +277,7 @@ class Grid:
         shares = _shares(np.maximum(squares - times * by_chance[:, None], 0.0))
         if np.isnan(shares[:, 0]).any() or np.isnan(shares[0]).mean() > LEVEL:
             return None
-        return Halves(condition, *(of_resamples(share, n) for share in shares))
+        return Halves(condition, *(resampled_estimate(share, n) for share in shares))
 
 
 def _squares(means: Floats) -> Floats:

@@ -18,7 +18,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.multiplicity import holm
-from harness.core.statistics import Estimate, of_resamples, resampled
+from harness.core.statistics import Estimate, resampled, resampled_estimate
 from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
 from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.replayed_run import ReplayedRun
@@ -223,7 +223,7 @@ class Compared:
         return self._interval(_area(success, np.clip(spent, 0.0, most), ranks, most[:, 0]))
 
     def _interval(self, values: Floats) -> Estimate:
-        return of_resamples(values, self.weights.shape[1])
+        return resampled_estimate(values, self.weights.shape[1])
 
     def _resampled(self, values: Sequence[Floats]) -> Floats:
         """Means of values (S, E) in each resample, (1 + RESAMPLES, P)."""

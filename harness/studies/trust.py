@@ -22,7 +22,7 @@ from harness.core.figures import as_mapping, shown
 from harness.core.files import digest
 from harness.core.kept import code_sha256
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import Estimate, negative_log_likelihood, of_resamples, resampled
+from harness.core.statistics import Estimate, negative_log_likelihood, resampled, resampled_estimate
 from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
@@ -86,7 +86,7 @@ class Cell:
                 "f1": 2 * hits / (2 * hits + wrongs + misses),
                 "false_alarms": wrongs / (wrongs + rights),
             }
-        return {name: of_resamples(of, len(hit)) for name, of in found.items()}
+        return {name: resampled_estimate(of, len(hit)) for name, of in found.items()}
 
     @property
     def time_to_detection(self) -> float:

@@ -17,7 +17,7 @@ HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which ris
 
 
 def evidence(view: Mapping[str, Any], named: bool = True) -> str:
-    """What a viewer reports: who brakes ahead of the ego, or comes closest to it, or what it cannot see.
+    """Report who brakes ahead of the ego, or comes closest to it, or what the viewer cannot see.
 
     The gap is by how many seconds that vehicle is later than the ego where their ways meet. A vehicle that
     is not `named` in the prompt is no more than one.
@@ -41,7 +41,7 @@ def evidence(view: Mapping[str, Any], named: bool = True) -> str:
 
 
 def sights(view: Mapping[str, Any]) -> str:
-    """What the cameras of a viewer show, the nearest first: kinds, metres ahead and to the left, lamps."""
+    """Report what a viewer's cameras show, the nearest first: kinds, metres ahead and to the left, lamps."""
     seen = [node for node in view["nodes"] if "camera" in node["sensors"]]
     seen.sort(key=lambda node: float(np.hypot(node["forward_m"], node["left_m"])))
     parts = []
@@ -60,7 +60,7 @@ def _gap_s(conflict: Mapping[str, Any]) -> float | None:
 def message(
     view: Mapping[str, Any], intent: Floats, actions: Sequence[str], named: bool = True
 ) -> dict[str, Any]:
-    """A helper's message that states an intent, with what any prompt may show of it."""
+    """Return a helper's message that states an intent, with what any prompt may show of it."""
     stated = rounded(intent.tolist(), PARTS)
     best = int(np.argmax(intent))
     braking = stated[0]  # the most careful action comes first
@@ -77,18 +77,18 @@ def answer(
     prompt: Prompt, view: Mapping[str, Any], intent: Floats, actions: Sequence[str], *, bare: bool = False,
     named: bool = True,
 ) -> str:  # fmt: skip
-    """The answer that states an intent; `bare` without free text, as a constrained answer has to begin."""
-    said = message(view, intent, actions, named)
-    numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, said["intent"], strict=True))
+    """Return the answer that states an intent; `bare` without free text, as a constrained answer begins."""
+    sent = message(view, intent, actions, named)
+    numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, sent["intent"], strict=True))
     body = f'"action_distribution":{{{numbers}}}'
-    best, confidence = said["recommended_maneuver"], f'"confidence":{said["confidence"]:.2f}'
+    best, confidence = sent["recommended_maneuver"], f'"confidence":{sent["confidence"]:.2f}'
     shape = prompt.shape(view["role"], actions)
     if key := shape.named:
         body = f'"{key}":"{best}",{confidence}'
     if view["role"] == "helper":
-        reported = "" if bare else said["evidence"]
-        body = f'"evidence":{canonical_json(reported)},"risk":"{said["risk"]}",{body}'
+        reported = "" if bare else sent["evidence"]
+        body = f'"evidence":{canonical_json(reported)},"risk":"{sent["risk"]}",{body}'
     for name, schema in reversed(shape.further.items()):
         body = f'"{name}":{canonical_json(plainest(schema))},{body}'
     reasons_first = view["role"] in prompt.reasons_first and not bare
-    return f"{said['evidence']}. {{{body}}}" if reasons_first else f"{{{body}}}"
+    return f"{sent['evidence']}. {{{body}}}" if reasons_first else f"{{{body}}}"

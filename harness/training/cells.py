@@ -15,7 +15,7 @@ STEP_M = 7.0  # from one to the next; the last has no end
 
 
 def cells(sight: Sight) -> Ints:
-    """The class of every token of a picture, (tokens,), row by row."""
+    """Return the class of every token of a picture, (tokens,), row by row."""
     frame, viewer = sight.frame, sight.state.vehicle(sight.viewer_id)
     classes = np.zeros(len(frame.ids) + 1, dtype=np.int64)  # the last is of pixels that nobody owns
     places = {v.id: (v.x_m, v.y_m) for v in sight.state.vehicles}

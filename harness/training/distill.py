@@ -36,7 +36,7 @@ class Curriculum:
     base: Path | None = None
 
     def settings(self) -> dict[str, Any]:
-        """What a run that goes on must have in common with what it began as, as plain values."""
+        """Return, as plain values, what a resumed training must have in common with its start."""
         return {
             "scenarios": {
                 scenario.name: sha256_bytes(canonical_json(scenario.parameters.stated()).encode())
@@ -61,7 +61,7 @@ def distill(
 ) -> dict[str, Any]:
     """Train a model in some scenarios and write checkpoint, tokenizer, GGUF file and model card to `out`.
 
-    Layouts and stages that an earlier, killed call finished are taken over, and a stage it had begun goes on.
+    Layouts and stages that a killed call finished are read, and a stage that it had begun resumes.
 
     Args:
         curriculum: what it learns from.
@@ -115,7 +115,7 @@ def _trained(learnt: Mapping[str, Any], student: Student, out: Path, progress: P
         "sees": hasattr(student.model.config, "vision_config"),
         "held_out": student.held_out_kl(),
         "curves": curves,
-    }  # fmt: skip
+    }
     student.model.eval()
     transformers.utils.logging.disable_progress_bar()  # of a file that is written in no time
     student.model.save_pretrained(out, state_dict=weights)
@@ -127,7 +127,7 @@ def _trained(learnt: Mapping[str, Any], student: Student, out: Path, progress: P
 
 
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
-    """README.md of a model's folder, from what `distill` returns: data, losses and limits."""
+    """Write README.md of a model's folder from what `distill` returns: data, losses and limits."""
     plan, base = facts["plan"], facts["base_sha256"]
     begins = f"from the weights with sha256 `{base}`" if base else "from random weights"
     before = " The base may have learnt from these layouts, as its own card says." if base else ""
@@ -136,10 +136,10 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
         f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} |"
         for stage, curve in facts["curves"].items()
     )
-    apart = "\n".join(
-        f"| `{of['scenario']}` | {facts['scenes'][of['scenario']]} | {of['layouts']} | {of['questions']} "
-        f"| {of['kl_nats']:.3f} | {of['kl_of_the_mean_nats']:.3f} |"
-        for of in facts["held_out"]
+    held_out = "\n".join(
+        f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | {row['questions']} "
+        f"| {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} |"
+        for row in facts["held_out"]
     )
     return f"""# {name}
 
@@ -158,7 +158,7 @@ label.{before}
 
 | scenario | scenes learnt | layouts held out | questions | KL | of the mean |
 |---|---|---|---|---|---|
-{apart}
+{held_out}
 
 | stage | sequences | first loss | last loss |
 |---|---|---|---|

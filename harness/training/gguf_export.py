@@ -66,7 +66,7 @@ def export(checkpoint: Path, out: Path, dtype: Dtype = "F16") -> None:
 
 
 def projector_of(out: Path) -> Path:
-    """Where the projector of an exported file goes."""
+    """Return where the projector of an exported file goes."""
     return out.with_name(f"{PROJECTOR}{out.name}")
 
 
@@ -79,7 +79,7 @@ def _write(
     writer = GGUFWriter(part, architecture)
     try:
         describe(writer, LlamaFileType.MOSTLY_F16 if dtype == "F16" else LlamaFileType.ALL_F32)
-        # Told first and written one by one: no more than one matrix is in memory.
+        # Announced first and written in turn: no more than one matrix is in memory.
         tensors = list(_tensors(checkpoint, names, dtype, shown))
         for name, tensor, kind in tensors:
             shape = _frame(name, np.broadcast_to(np.float32(0), tensor.shape)).shape
@@ -135,7 +135,7 @@ def _describe(saved: Saved, name: str, shown: str, writer: Any, file_type: int) 
 
 
 def _vocabulary(tokenizer: Mapping[str, Any], rows: int, shown: str) -> tuple[list[str], list[int]]:
-    """Texts and types of all tokens, by id; rows of the embedding without a token are unused."""
+    """Return texts and types of all tokens, by id; rows of the embedding without a token are unused."""
     from gguf import TokenType
 
     tokens = {i: (text, TokenType.NORMAL) for text, i in tokenizer["model"]["vocab"].items()}
@@ -149,7 +149,7 @@ def _vocabulary(tokenizer: Mapping[str, Any], rows: int, shown: str) -> tuple[li
 
 
 def _names(saved: Saved) -> dict[str, str]:
-    """Each tensor of the text part: its name in the GGUF, and in the checkpoint."""
+    """Return the name of each tensor of the text part in the GGUF, and in the checkpoint."""
     within = "model.language_model" if saved.vision else "model"
     names = {ours: f"{within}.{theirs}" for theirs, ours in _ENDS.items()}
     if not saved.config["tie_word_embeddings"]:  # else llama.cpp takes the embedding for it
@@ -162,7 +162,7 @@ def _names(saved: Saved) -> dict[str, str]:
 def _tensors(
     checkpoint: Path, names: Mapping[str, str], dtype: Dtype, shown: str
 ) -> Iterator[tuple[str, Any, np.dtype[Any]]]:
-    """Name in the GGUF, place in the checkpoint and number format of each tensor."""
+    """Yield each tensor's name in the GGUF, its place in the checkpoint and its number format."""
     from gguf.utility import SafetensorsLocal
 
     tensors = SafetensorsLocal(checkpoint / "model.safetensors").tensors
@@ -175,5 +175,5 @@ def _tensors(
 
 
 def _frame(name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Weights as they are; of those of a video's two frames, (out, in, 2, y, x), the name's frame."""
+    """Return weights as they are; of those of a video's two frames, (out, in, 2, y, x), the name's frame."""
     return values[:, :, int(name.endswith(".1"))] if values.ndim == 5 else values

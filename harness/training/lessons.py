@@ -1,6 +1,6 @@
 """The decision points that a model learns from, and what it should have intended there.
 
-They are drawn from the decision trees of train layouts: of each level up to `OF_A_LEVEL` points. So a model
+They are drawn from the decision trees of train layouts, up to `PER_LEVEL` points of each level. So a model
 sees the scenes that its own errors lead to. An episode passes one point of each level, so the levels of a
 layout weigh alike: the point at which every episode begins as much as all points of a later level together.
 
@@ -38,9 +38,13 @@ from harness.world.world import World
 
 TEACHER = "local-view"
 SOFTNESS_S = 0.25
-OF_A_LEVEL = 6  # decision points that are learnt from
-TRIED = 40  # at most, to find them
-CALM = {"FASTER": 0.3, "LANE_LEFT": 0.3, "LANE_RIGHT": 0.3}  # prior weight of an action, 1 if not named
+PER_LEVEL = 6  # decision points of a level that are learnt from
+MOST_TRIED = 40  # decision points of a level that are tried to find them
+PRIOR = {
+    "FASTER": 0.3,
+    "LANE_LEFT": 0.3,
+    "LANE_RIGHT": 0.3,
+}  # weight of an action beside equals, 1 if not named
 
 
 @dataclass(frozen=True)
@@ -54,39 +58,36 @@ class Lessons:
 
     @property
     def episodes(self) -> tuple[int, ...]:
-        """The layouts that are learnt from, by number."""
+        """Return the numbers of the layouts."""
         return tuple(dict.fromkeys(scene.record["episode"] for scene in self.scenes))
 
     @cached_property
     def weights(self) -> Mapping[str, float]:
-        """How often each scene is learnt from, by its id: each level of a layout in all as often."""
+        """Return how often each scene is learnt from, by its id: each level of a layout in all as often."""
         levels = [(scene.record["episode"], scene.record["step"]) for scene in self.scenes]
         points = Counter(levels)
         return {scene.id: 1 / points[level] for scene, level in zip(self.scenes, levels, strict=True)}
 
     def split(self, held_out: float) -> "tuple[Lessons, Lessons]":
-        """All but the last layouts, of which a share is held out, at least one; and those."""
+        """Split off a share of the layouts, the last ones, at least one: those that are kept, and those."""
         last = self.episodes[-max(1, round(len(self.episodes) * held_out)) :]
-        apart = [scene.record["episode"] in last for scene in self.scenes]
-        parts = (
-            tuple(s for s, out in zip(self.scenes, apart, strict=True) if out == of) for of in (False, True)
-        )
-        kept, held = (replace(self, scenes=part) for part in parts)
-        return kept, held
+        kept = tuple(scene for scene in self.scenes if scene.record["episode"] not in last)
+        held = tuple(scene for scene in self.scenes if scene.record["episode"] in last)
+        return replace(self, scenes=kept), replace(self, scenes=held)
 
 
 def draw(
     scenario: Scenario, prompts: Sequence[Prompt], layouts: int, seed: int, place: Path, workers: Workers,
     progress: Callable[[int], None],
 ) -> Lessons:  # fmt: skip
-    """Draw what is missing in the folder `place`, a file a layout, and read all of it.
+    """Draw the layouts that the folder `place` lacks, a file each, and read all of them.
 
     Args:
         scenario: what is decided in.
         prompts: versions that are learnt.
         layouts: how many; number n has layout seed `seed + n`.
         seed: first layout seed.
-        place: folder of what is drawn, which a killed call goes on with.
+        place: folder of what is drawn, from which a killed call resumes.
         workers: who draws.
         progress: called with the number of layouts just done.
     """
@@ -95,34 +96,34 @@ def draw(
     todo = [n for n, file in enumerate(files) if not file.is_file()]
     progress(layouts - len(todo))
 
-    def took(at: int, data: bytes) -> None:
+    def keep(at: int, data: bytes) -> None:
         write_whole(files[todo[at]], data)
         progress(1)
 
-    each(partial(_drawn, scenario, seed), todo, workers, took, lambda number: f"layout {number}")
+    each(partial(_encoded, scenario, seed), todo, workers, keep, lambda number: f"layout {number}")
     points = [point for file in files for point in msgspec.json.decode(bytes_of(file, "record"))]
     scenes = tuple(Scene(point["moment"]) for point in points)
     labels = {point["moment"]["scene"]: np.array(point["label"]) for point in points}
     return Lessons(scenario, tuple(prompts), scenes, labels)
 
 
-def _drawn(scenario: Scenario, seed: int, number: int) -> bytes:
-    return msgspec.json.encode(drawn(scenario, seed + number, number))
+def _encoded(scenario: Scenario, seed: int, number: int) -> bytes:
+    return msgspec.json.encode(decision_points(scenario, seed + number, number))
 
 
-def drawn(scenario: Scenario, seed: int, number: int) -> list[dict[str, Any]]:
-    """A layout's decision points that are learnt from: each one's `moment` and soft `label`."""
+def decision_points(scenario: Scenario, seed: int, number: int) -> list[dict[str, Any]]:
+    """Draw a layout's decision points that are learnt from: the `moment` and the soft `label` of each."""
     rng = noise.generator("lessons", scenario.name, seed)
     reference, points = drive(scenario, PRIVILEGED, seed), []
     level = [World.start(scenario, seed)]
     while level:
         following: dict[str, World] = {}
-        taken, left = 0, rng.permutation(len(level))[:TRIED].tolist()
-        while left and taken < OF_A_LEVEL:
-            tried, left = left[: OF_A_LEVEL - taken], left[OF_A_LEVEL - taken :]
-            ways, children = edges([level[n] for n in tried], number)
+        taken, left = 0, rng.permutation(len(level))[:MOST_TRIED].tolist()
+        while left and taken < PER_LEVEL:
+            tried, left = left[: PER_LEVEL - taken], left[PER_LEVEL - taken :]
+            branches, children = edges([level[n] for n in tried], number)
             outcomes = finish([child.branch() for child in children], [TEACHER] * len(children))
-            for n, out in zip(tried, ways, strict=True):
+            for n, out in zip(tried, branches, strict=True):
                 world, state = level[n], level[n].state()
                 ends_s = dict.fromkeys(world.actions, float(np.inf))
                 for edge in out:
@@ -132,18 +133,18 @@ def drawn(scenario: Scenario, seed: int, number: int) -> list[dict[str, Any]]:
                         ends_s.update(dict.fromkeys(edge.actions, outcome.time_s))
                 if np.isfinite(list(ends_s.values())).any():
                     taken += 1
-                    seen = moment(world, state, number, (state.ego, *state.helpers))
-                    points.append({"moment": seen, "label": label(ends_s).tolist()})
+                    record = moment(world, state, number, (state.ego, *state.helpers))
+                    points.append({"moment": record, "label": label(ends_s).tolist()})
             following.update({scene_id(number, child.state()): child for child in children})
         level = list(following.values())
     return points
 
 
 def label(ends_s: Mapping[str, float]) -> Floats:
-    """Soft label (A,) of a decision point, of when the episode succeeds after each action (inf for never).
+    """Return the soft label (A,) of a decision point from when the episode succeeds after each action.
 
-    At least one has to be finite.
+    These are seconds, inf for never; at least one has to be finite.
     """
     time_s = np.array(list(ends_s.values()))
-    weight = np.array([CALM.get(a, 1.0) for a in ends_s]) * np.exp((time_s.min() - time_s) / SOFTNESS_S)
+    weight = np.array([PRIOR.get(a, 1.0) for a in ends_s]) * np.exp((time_s.min() - time_s) / SOFTNESS_S)
     return np.asarray(weight / weight.sum())

@@ -41,7 +41,7 @@ EYES = {  # its vision encoder: a quarter of the weights
 
 
 def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
-    """A `Qwen3ForCausalLM` of half a million random weights, or a `Qwen3VLForConditionalGeneration`.
+    """Make a `Qwen3ForCausalLM` of half a million random weights, or a `Qwen3VLForConditionalGeneration`.
 
     Matrices are normal with a deviation of 1/sqrt(fan-in), less on what adds to the residual stream.
 
@@ -91,7 +91,7 @@ def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
 
 
 def take_over(model: Any, base: Path) -> None:
-    """Give a model the weights of a model of texts, in whose vocabulary its own begins.
+    """Give a model the weights of a model of texts whose vocabulary begins its own.
 
     Raises:
         UserError: the folder has no such weights, or those of another size.
@@ -117,7 +117,7 @@ def take_over(model: Any, base: Path) -> None:
 
 @lru_cache(maxsize=1)
 def image_processor() -> Any:
-    """What turns pictures into the model's patches."""
+    """Return what turns pictures into the model's patches."""
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
     pixels = {"shortest_edge": 1 << 12, "longest_edge": 1 << 20}
@@ -125,7 +125,7 @@ def image_processor() -> Any:
 
 
 def read_tokenizer(base: Path, sees: bool) -> Any:
-    """A model's tokenizer, with the tokens around pictures behind its own for one that `sees`."""
+    """Read a model's tokenizer; for one that `sees`, add the tokens around pictures behind its own."""
     from tokenizers import Tokenizer
 
     built = Tokenizer.from_str(tokenizer_of(base).to_str())  # of its own: that one is kept for others
@@ -135,7 +135,7 @@ def read_tokenizer(base: Path, sees: bool) -> Any:
 
 
 def train_tokenizer(texts: Iterable[str], sees: bool = False) -> Any:
-    """A byte-level BPE `tokenizers.Tokenizer` with Qwen2's pre-tokeniser: every digit stands alone."""
+    """Train a byte-level BPE `tokenizers.Tokenizer` with Qwen2's pre-tokeniser: every digit stands alone."""
     from tokenizers import models, pre_tokenizers, trainers
 
     tokenizer = byte_level(models.BPE())
@@ -157,9 +157,9 @@ def _special(texts: Sequence[str]) -> list[Any]:
 
 
 def chat(messages: Sequence[Mapping[str, str]]) -> tuple[str, str]:
-    """A prompt as the model reads it: its system message, and the rest up to the answer.
+    """Return a prompt as the model reads it: its system message, and the rest up to the answer.
 
-    A picture is there as often as it has tokens.
+    A picture's mark stands there once for each of its tokens.
     """
     picture = f"{BEGINS}{PICTURE * VISION.tokens}{ENDS}"
     parts = [f"{START}{m['role']}\n{picture * ('image' in m)}{m['content']}{END}\n" for m in messages]

@@ -21,12 +21,12 @@ from harness.runs.folder import Run, check_scenes, dataset_of
 from harness.runs.records import BLIND, FrozenScenes
 from harness.runs.sources import prompt_of
 from harness.training.answers import answer
-from harness.training.examples import question
 from harness.training.lessons import Lessons, label
+from harness.training.questions import question
 
 
 def write(run: Run, path: Path, report_seeds_too: bool, dataset: Path | None = None) -> Path:
-    """Write a run's pairs to a file.
+    """Write a run's pairs to a file, and return its path.
 
     Raises:
         UserError: the run was driven, its dataset or prompt is not here as it was, or its layouts are those
@@ -50,7 +50,7 @@ def write(run: Run, path: Path, report_seeds_too: bool, dataset: Path | None = N
 
 
 def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
-    """What each viewer was asked, fusion calls included, and the answer that the tree asks for.
+    """Yield what each viewer was asked, fusion calls included, and the answer that the tree asks for.
 
     A decision point after which no action succeeds teaches nothing and is left out.
 
@@ -81,28 +81,30 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
     ends_s = np.where(forest.safe, forest.delay_s, np.inf)
     labels = {
         name: label(dict(zip(dataset.actions, ends_s[n].tolist(), strict=True)))
-        for name in names if forest.value[n := forest.place[name]]
-    }  # fmt: skip
+        for name in names
+        if forest.value[n := forest.place[name]]
+    }
     scenes = tuple(dataset.scenes(list(labels)))
     lessons = Lessons(dataset.scenario, tuple(prompts.values()), scenes, labels)
     for scene in scenes:
-        answers = {one.key: one for one in run.answers_by_scene.get(scene.id, ())}
-        for one in (each for each in answers.values() if BLIND not in each.key):
-            if one.viewer not in scene.record["graphs"]:
+        answers = {stored.key: stored for stored in run.answers_by_scene.get(scene.id, ())}
+        for stored in (each for each in answers.values() if BLIND not in each.key):
+            if stored.viewer not in scene.record["graphs"]:
                 raise UserError(
-                    f"{printable(run.path / 'answers.jsonl')} has an answer of {printable(one.viewer)!r} in "
-                    f"{scene.id}, where {', '.join(scene.viewers)} were asked; make the run again"
+                    f"{printable(run.path / 'answers.jsonl')} has an answer of {printable(stored.viewer)!r} "
+                    f"in {scene.id}, where {', '.join(scene.viewers)} were asked; make the run again"
                 )
-            agent = run.agent(one)
+            agent = run.agent(stored)
             prompt = prompts[agent["prompt"]["version"]]
-            q = question(lessons, scene, one.viewer, prompt, messages_of(answers, one.heard, run.actions))
+            messages = messages_of(answers, stored.heard, run.actions)
+            q = question(lessons, scene, stored.viewer, prompt, messages)
             texts = shown(agent["image"], q.messages)
-            messages = in_mode(agent["answer"], prompt, texts, q.graph["role"], q.actions)
-            said = answer(prompt, q.graph, q.label, q.actions)
+            sent = in_mode(agent["answer"], prompt, texts, q.graph["role"], q.actions)
+            completion = answer(prompt, q.graph, q.label, q.actions)
             if agent["answer"] == "readout":
-                said = readout.letters(q.actions)[int(q.label.argmax())]
+                completion = readout.letters(q.actions)[int(q.label.argmax())]
             seed = int(scene.record["episode_seed"])
             yield {
-                "prompt": messages, "completion": [{"role": "assistant", "content": said}],
-                "scene": scene.id, "viewer": one.key, "layout_seed": seed, "purpose": purpose(seed, 1),
+                "prompt": sent, "completion": [{"role": "assistant", "content": completion}],
+                "scene": scene.id, "viewer": stored.key, "layout_seed": seed, "purpose": purpose(seed, 1),
             }  # fmt: skip

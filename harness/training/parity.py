@@ -26,7 +26,7 @@ from harness.parsing.parse import parse
 from harness.training.gguf_export import export, projector_of
 
 LEAST_TEXTS, MOST_READOUT = 0.98, 0.02
-# Other formats are measured, and held to nothing. Of a picture llama.cpp rounds pixels, the weights of their
+# Other formats are measured, and have no limit. Of a picture llama.cpp rounds pixels, the weights of their
 # patches and GELU to half precision in files of any format.
 MOST_LOGIT = {"F32": 1e-3, "F16": 0.1}
 SEEN = {"F32": 0.1, "F16": 0.1}

@@ -46,7 +46,7 @@ def describe(vision: Mapping[str, Any], name: str, writer: Any, file_type: int) 
 
 
 def names(vision: Mapping[str, Any]) -> dict[str, str]:
-    """Each tensor: its name in the projector, and in the checkpoint."""
+    """Return each tensor's name in the projector, and in the checkpoint."""
     pairs = {f"v.blk.{i}.{ours}": f"blocks.{i}.{theirs}" for i in range(vision["depth"])
              for theirs, ours in _BLOCK.items()}  # fmt: skip
     pairs |= {ours: f"merger.{theirs}" for theirs, ours in _MERGER.items()}
@@ -56,8 +56,8 @@ def names(vision: Mapping[str, Any]) -> dict[str, str]:
             for theirs, ours in _DEEPSTACK.items()
         }
     pairs["v.patch_embd"] = "patch_embed.proj"
-    found = {f"{a}.{end}": f"{b}.{end}" for a, b in pairs.items() for end in ("weight", "bias")}
+    tensors = {f"{a}.{end}": f"{b}.{end}" for a, b in pairs.items() for end in ("weight", "bias")}
     # A picture is a video of two equal frames, whose weights llama.cpp has apart.
-    found["v.patch_embd.weight.1"] = found["v.patch_embd.weight"]
-    found["v.position_embd.weight"] = "pos_embed.weight"
-    return {ours: f"model.visual.{theirs}" for ours, theirs in found.items()}
+    tensors["v.patch_embd.weight.1"] = tensors["v.patch_embd.weight"]
+    tensors["v.position_embd.weight"] = "pos_embed.weight"
+    return {ours: f"model.visual.{theirs}" for ours, theirs in tensors.items()}

@@ -39,7 +39,7 @@ class Saved(NamedTuple):
 
 
 def read(checkpoint: Path, shown: str) -> Saved:
-    """The small files of a checkpoint.
+    """Read the small files of a checkpoint.
 
     Raises:
         UserError: one is not there, or says what no GGUF can.
@@ -92,7 +92,7 @@ def _check(config: Mapping[str, Any], only: Mapping[str, Any], shown: str) -> No
 
 
 def rope(config: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Rope parameters, in a table of their own since transformers 5."""
+    """Return the rope parameters, in a table of their own since transformers 5."""
     parameters: Mapping[str, Any] = config.get("rope_parameters") or config
     return parameters
 
@@ -118,7 +118,7 @@ def _check_tokenizer(tokenizer: Mapping[str, Any], shown: str) -> None:
 
 
 def numbers(tensor: Any) -> NDArray[np.float32]:
-    """A tensor of `gguf.utility.SafetensorsLocal` as float32, read only now."""
+    """Read a tensor of `gguf.utility.SafetensorsLocal` as float32."""
     data = tensor.mmap_bytes()
     if tensor.dtype == "BF16":  # which numpy has not; its bits are float32's upper half
         values = (data.view("<u2").astype(np.uint32) << 16).view(np.float32)

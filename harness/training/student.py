@@ -15,9 +15,9 @@ from harness.core.files import text_of
 from harness.prompts import readout
 from harness.training.answers import answer, evidence, sights
 from harness.training.cells import CLASSES
-from harness.training.examples import Question, alone, excerpts, key, kl_nats, with_messages
 from harness.training.lessons import Lessons
 from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
+from harness.training.questions import Question, alone, excerpts, key, kl_nats, with_messages
 from harness.training.train import Plan, Sample, read_out, run_stage, save
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
@@ -55,7 +55,7 @@ class Student:
             self.taught = {_place(q): intent for q, intent in zip(texts, read, strict=True)}
 
     def reading(self, questions: Sequence[Question], seen: bool = False) -> list[Sample]:
-        """Samples where one letter is asked for; drawn by the target, it is followed by a report in words.
+        """Make samples that ask for one letter; drawn by the target, it is followed by a report in words.
 
         The target is the label. A picture's is what the base reads out of the same viewer's scene graph in
         words, if it learns both: a label depends on what nobody sees as well, which is noise to an eye that
@@ -72,26 +72,22 @@ class Student:
         return samples
 
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
-        """Samples whose answer states a distribution."""
+        """Make samples whose answer states a distribution."""
         bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
-        return [
-            self._sample(
-                q,
-                q.messages,
-                answer(q.prompt, q.graph, p, q.actions, bare=bool(b), named=q.named) + END,
-                None,
-            )
+        replies = [
+            answer(q.prompt, q.graph, p, q.actions, bare=bool(b), named=q.named) + END
             for q, p, b in zip(questions, intents, bare, strict=True)
         ]
+        return [self._sample(q, q.messages, text, None) for q, text in zip(questions, replies, strict=True)]
 
     @cached_property
     def asked(self) -> list[Sample]:
-        """The questions, each asking for one letter."""
+        """Return the questions, each asking for one letter."""
         return self.reading(self.questions)
 
     @cached_property
     def heard(self) -> list[Question]:
-        """The ego's questions with messages in some scenes, as the first stages' model reads helpers out.
+        """Return the ego's questions with messages in some scenes; the first stages' model states them.
 
         Raises:
             UserError: in the scenes that are taken no message reaches the ego.
@@ -101,19 +97,21 @@ class Student:
         some = [(each, self.some(each.scenes, most)) for each in self.lessons]
         helpers = {
             key(each, scene, helper, prompt)
-            for each, scenes in some for scene in scenes
-            for helper in scene.viewers[1:] for prompt in each.prompts
-        }  # fmt: skip
+            for each, scenes in some
+            for scene in scenes
+            for helper in scene.viewers[1:]
+            for prompt in each.prompts
+        }
         spoke = [
             (q.key, sample) for q, sample in zip(self.questions, self.asked, strict=True) if q.key in helpers
         ]
-        kept = self.work / "heard.pt"
-        if not kept.is_file():  # a later stage's model, after a kill, would read otherwise
+        file = self.work / "heard.pt"
+        if not file.is_file():  # after a kill, a later stage's model would read otherwise
             read = [torch.from_numpy(p) for p in self.read([sample for _, sample in spoke])]
-            save({"intents": read}, kept)
-        intents = [p.numpy() for p in torch.load(kept, weights_only=True)["intents"]]
-        said = dict(zip((name for name, _ in spoke), intents, strict=True))
-        heard = [q for each, scenes in some for q in with_messages(each, scenes, said)]
+            save({"intents": read}, file)
+        stored = [p.numpy() for p in torch.load(file, weights_only=True)["intents"]]
+        intents = dict(zip((name for name, _ in spoke), stored, strict=True))
+        heard = [q for each, scenes in some for q in with_messages(each, scenes, intents)]
         if not heard:
             raise UserError(
                 f"--samples: {self.plan.samples['messages']} sequences of the stage messages take too few "
@@ -122,7 +120,7 @@ class Student:
         return heard
 
     def samples(self, stage: str) -> list[Sample]:
-        """What a stage learns from; the last two rehearse the read-outs of earlier ones."""
+        """Make what a stage learns from; the last two rehearse the read-outs of earlier ones."""
         if stage == "excerpts":
             return self.reading(list(excerpts(self.questions)), seen=True)
         if stage == "alone":
@@ -140,12 +138,12 @@ class Student:
         return texts + self.some(self.asked + with_heard, int(REHEARSED * len(texts)))
 
     def some(self, items: Sequence[T], most: int) -> list[T]:
-        """At most so many of them, drawn by the plan's seed, in their order."""
+        """Draw at most so many items by the plan's seed, in their order."""
         places = np.random.default_rng(self.plan.seed).permutation(len(items))[:most]
         return [items[i] for i in sorted(places)]
 
     def stage(self, name: str, progress: Progress) -> list[tuple[int, float]]:
-        """Train one stage, or take it over where it is done already. Returns its curve."""
+        """Train one stage, or read it if it is done already; return its curve."""
         done = self.work / f"{name}.pt"
         if done.is_file():
             state = torch.load(done, weights_only=True)
@@ -161,8 +159,8 @@ class Student:
         return curve
 
     def rounded(self) -> dict[str, Any]:
-        """The weights in F16, to which the model's are rounded: every engine reads the same numbers."""
-        halves: dict[int, Any] = {}  # by place, since some are there under two names
+        """Round the model's weights to F16, so that every engine reads the same numbers, and return them."""
+        halves: dict[int, Any] = {}  # by address, since some have two names
         with torch.no_grad():
             for p in self.model.parameters():
                 halves[p.data_ptr()] = half = p.half()
@@ -170,7 +168,7 @@ class Student:
         return {name: halves.get(p.data_ptr(), p) for name, p in self.model.state_dict().items()}
 
     def held_out_kl(self) -> list[dict[str, Any]]:
-        """Of each scenario, KL (nats) of the read-out to the soft labels on held-out layouts.
+        """Return the KL (nats) of each scenario's read-out to the soft labels on held-out layouts.
 
         Beside it stands that of always answering the mean label.
         """
@@ -179,26 +177,28 @@ class Student:
             questions = list(alone(each))
             labels = np.stack([q.label for q in questions])
             mean = np.broadcast_to(labels.mean(axis=0), labels.shape)
-            facts.append({
-                "scenario": each.scenario.name,
-                "layouts": len(each.episodes),
-                "questions": len(questions),
-                "kl_nats": kl_nats(labels, np.stack(self.read(self.reading(questions)))),
-                "kl_of_the_mean_nats": kl_nats(labels, mean),
-            })  # fmt: skip
+            facts.append(
+                {
+                    "scenario": each.scenario.name,
+                    "layouts": len(each.episodes),
+                    "questions": len(questions),
+                    "kl_nats": kl_nats(labels, np.stack(self.read(self.reading(questions)))),
+                    "kl_of_the_mean_nats": kl_nats(labels, mean),
+                }
+            )
         return facts
 
     def read(self, samples: Sequence[Sample]) -> list[Floats]:
         return read_out(self.model, samples, self.letters)
 
     def _sample(
-        self, question: Question, messages: Sequence[Mapping[str, str]], said: str, target: Floats | None
+        self, question: Question, messages: Sequence[Mapping[str, str]], reply: str, target: Floats | None
     ) -> Sample:
         system, rest = chat(messages)
         if system not in self._shared:
             self._shared[system] = self._encode(system)
         head, asked = self._shared[system], self._encode(rest)
-        ids = np.concatenate([head, asked, self._encode(said)])
+        ids = np.concatenate([head, asked, self._encode(reply)])
         answer_at = len(head) + len(asked)
         return Sample(ids, len(head), system, answer_at, target, question.weight, question.image)
 
@@ -218,6 +218,6 @@ class Student:
 
 
 def _place(question: Question) -> str:
-    """Scenario, scene and viewer of a question, and whether messages are in it, whatever its prompt."""
+    """Name a question's scenario, scene and viewer, and whether messages are in it, whatever its prompt."""
     place, _, version = question.key.rpartition("/")
     return place + "+m" * version.endswith("+m")

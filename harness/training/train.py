@@ -125,7 +125,7 @@ def run_stage(
 
 
 def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.int64]:
-    """Places of the samples of each step, (steps, batch): of one kind and of like length, in random order."""
+    """Return each step's samples by number, (steps, batch): of one kind and like length, in random order."""
     rng = np.random.default_rng(plan.seed)
     weights = np.array([sample.weight for sample in samples])
     order = rng.choice(len(samples), count, p=weights / weights.sum())
@@ -133,11 +133,11 @@ def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.in
     lengths = np.array([len(samples[i].ids) for i in order])
     parts = []
     for kind in sorted(set(kinds)):
-        of_kind = order[kinds == kind]
+        same = order[kinds == kind]
         size = lengths[kinds == kind]
         window = plan.batch * 32
-        for start in range(0, len(of_kind), window):
-            part = of_kind[start : start + window]
+        for start in range(0, len(same), window):
+            part = same[start : start + window]
             part = part[np.argsort(size[start : start + window], kind="stable")]
             short = -len(part) % plan.batch
             part = np.concatenate([part, part[rng.integers(0, len(part), short)]])
@@ -147,7 +147,7 @@ def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.in
 
 
 def hidden_states(model: Any, batch: Sequence[Sample]) -> Any:
-    """States after the shared beginning, (n, longest rest, hidden); padding on the right is not seen."""
+    """Return states after the shared beginning, (n, longest rest, hidden); padding is not seen."""
     from transformers import DynamicCache
 
     device = next(model.parameters()).device
@@ -162,20 +162,21 @@ def hidden_states(model: Any, batch: Sequence[Sample]) -> Any:
 
 
 def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
-    """What a model that sees is given beside the tokens (n, width): patches, and where each token stands."""
+    """Return what a model that sees takes beside tokens (n, width): patches, and where each token stands."""
     images = [s.image.pixels for s in batch if s.image is not None]
     if not images:
         return {}
-    made = image_processor()(images=images, return_tensors="pt").to(ids.device)
+    patches = image_processor()(images=images, return_tensors="pt").to(ids.device)
     places, _ = model.model.get_rope_index(
-        ids, mm_token_type_ids=(ids == model.config.image_token_id).int(),
-        image_grid_thw=made["image_grid_thw"],
-    )  # fmt: skip
-    return {**made, "position_ids": places[:, :, batch[0].shared :]}
+        ids,
+        mm_token_type_ids=(ids == model.config.image_token_id).int(),
+        image_grid_thw=patches["image_grid_thw"],
+    )
+    return {**patches, "position_ids": places[:, :, batch[0].shared :]}
 
 
 def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any) -> Any:
-    """KL of the read-out to its target (nats), plus cross-entropies of text and of pictures, each a mean."""
+    """Return the KL of the read-out to its target (nats) plus mean cross-entropies of text and pictures."""
     hidden = hidden_states(model, batch)
     weight, device, shared = model.get_input_embeddings().weight, hidden.device, batch[0].shared
     rest = _padded([s.ids[shared:] for s in batch]).to(device)
@@ -196,8 +197,8 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any) -> A
         outside = torch.logsumexp(logits, -1) - torch.logsumexp(logits[:, letters], -1)
         kl_weight = SEEN_WEIGHT if pictures else 1.0
         total = total + (kl_weight * kl + 0.1 * outside.mean()) * len(reading) / len(batch)
-    said = [(i, s.answer_at + (s.target is not None), len(s.ids)) for i, s in enumerate(batch)]
-    writing = [(i, start, end) for i, start, end in said if start < end]
+    answers = [(i, s.answer_at + (s.target is not None), len(s.ids)) for i, s in enumerate(batch)]
+    writing = [(i, start, end) for i, start, end in answers if start < end]
     if writing:
         rows = np.concatenate([np.full(end - start, i) for i, start, end in writing])
         columns = np.concatenate([np.arange(start, end) for _, start, end in writing])
@@ -209,7 +210,7 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any) -> A
 
 
 def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample], ids: Any, picture: Any) -> Any:
-    """Cross-entropy of the prompt's own tokens behind the shared ones: it teaches to read numbers.
+    """Return the cross-entropy of the prompt's own tokens behind the shared ones: it teaches numbers.
 
     Tokens that stand for a `picture` are none of them; like `ids`, that mask is (n, longest rest).
     """
@@ -220,7 +221,7 @@ def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample], ids: Any, pi
 
 
 def _cells_loss(logits: Any, pictures: Sequence[Sight]) -> Any:
-    """Cross-entropy of what each token of the pictures shows, vehicles and nobody weighing alike."""
+    """Return the cross-entropy of what each picture's tokens show; vehicles and nobody weigh alike."""
     shown = np.concatenate([cells(picture) for picture in pictures])
     target = torch.from_numpy(shown).to(logits.device)
     weight = torch.full((logits.shape[1],), 1.0 / max(1, int((shown > 0).sum())), device=logits.device)
@@ -229,19 +230,19 @@ def _cells_loss(logits: Any, pictures: Sequence[Sight]) -> Any:
 
 
 def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batch: int = 64) -> list[Floats]:
-    """Distribution over the letters after each prompt, (A,) each."""
+    """Return the distribution over the letters after each prompt, (A,) each."""
     model.eval()
     device = next(model.parameters()).device
     of_letters = model.get_input_embeddings().weight[torch.tensor(letters, device=device)]
     p: dict[int, Floats] = {}
     order = sorted(range(len(samples)), key=lambda i: (samples[i].kind, samples[i].answer_at))
     for _, group in groupby(order, key=lambda i: samples[i].kind):
-        of_kind = list(group)
-        target = samples[of_kind[0]].target
+        same = list(group)
+        target = samples[same[0]].target
         assert target is not None
         weight = of_letters[: len(target)]
-        for start in range(0, len(of_kind), batch):
-            some = of_kind[start : start + batch]
+        for start in range(0, len(same), batch):
+            some = same[start : start + batch]
             asked = [replace(samples[i], ids=samples[i].ids[: samples[i].answer_at]) for i in some]
             last = torch.tensor([len(s.ids) - s.shared - 1 for s in asked], device=device)
             with torch.no_grad():

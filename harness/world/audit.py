@@ -2,8 +2,9 @@
 
 A small classifier learns, from the numbers of the ego's own scene graph while the danger is out of sight,
 whether there is a danger and where it comes from. A layout is never on both sides of the cross-validation.
-Only moments of one step are compared, since fewer dangers are still hidden at later steps, and only answers
-of one fold's model. If the classifier does better than chance, any model can: then an ego alone is not blind.
+Only decision points of one step are compared, since fewer dangers are still hidden at later steps, and only
+answers of one fold's model. If the classifier does better than chance, any model can: then an ego alone is
+not blind.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -30,6 +31,7 @@ FOLDS = 5
 RESAMPLES = 1999
 BLIND = ("cruise", "local-view")  # drivers that cannot know of what the ego does not see
 DANGER, NONE = "danger", ""
+Hidden = tuple[str, list[tuple[int, dict[str, float]]]]  # sector of a danger; steps and the ego's numbers
 INDICATORS = {"off": 0.0, "left": 1.0, "right": 2.0}
 BY_SIZE = {"car": 0.0, "van": 0.5, "truck": 1.0}
 
@@ -60,10 +62,10 @@ class Audit:
 
 
 @dataclass(frozen=True)
-class Moments:
-    """Moments of some layouts at which the danger is out of sight."""
+class HiddenPoints:
+    """Decision points of some layouts at which the danger is out of sight."""
 
-    layout: Ints  # index of each moment's layout, (m,)
+    layout: Ints  # index of each point's layout, (m,)
     step: Ints  # index of its decision, (m,)
     danger: Any  # sector that its danger comes from, (m,); `NONE` without a danger
     names: tuple[str, ...]  # name of each number
@@ -80,19 +82,19 @@ def audit(
     """
     extras.need("an audit", "sklearn")
     seeds = range(seed, seed + layouts)
-    moments = _moments(spread(partial(_hidden, scenario), seeds, workers, progress), scenario)
-    auc, told_by = judge(moments, tuple(scenario.road().sectors))
-    return Audit(scenario.name, layouts, seed, tuple(np.unique(moments.step).tolist()), auc, told_by)
+    points = _selected(spread(partial(_hidden, scenario), seeds, workers, progress), scenario)
+    auc, told_by = judge(points, tuple(scenario.road().sectors))
+    return Audit(scenario.name, layouts, seed, tuple(np.unique(points.step).tolist()), auc, told_by)
 
 
-def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[str, float]]]]:
+def _hidden(scenario: Scenario, seed: int) -> Hidden:
     """Return the sector of a layout's danger, and the ego's numbers at every step until it is in sight.
 
     A braking vehicle counts as the danger in sight, since it may brake for the danger.
     """
     start = World.start(scenario, seed)
     going: list[tuple[World, tuple[str, ...]]] = [(start, BLIND)]
-    found = []
+    hidden = []
     while going:
         world, drivers = going.pop()
         if world.outcome.ended or world.step >= scenario.parameters.decisions:
@@ -100,7 +102,7 @@ def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[st
         graph = scene_graph(scenario, world.state(), world.layout.spawns[0].id)
         if any(node["id"] == world.layout.danger_id or node.get("braking") for node in graph["nodes"]):
             continue
-        found.append((world.step, dict(numbers(graph, scenario.road()))))
+        hidden.append((world.step, dict(numbers(graph, scenario.road()))))
         ways: dict[str, tuple[str, ...]] = {}
         for driver in drivers:
             action = choose(scenario, driver, graph, None)
@@ -109,7 +111,7 @@ def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[st
             on = world if len(ways) == 1 else world.branch()
             on.act(action)
             going.append((on, some))
-    return start.layout.danger or NONE, found
+    return start.layout.danger or NONE, hidden
 
 
 def numbers(graph: Mapping[str, Any], road: Road) -> Iterator[tuple[str, float]]:
@@ -141,77 +143,78 @@ def _known(value: float | None) -> float:
     return np.nan if value is None else float(value)
 
 
-def _moments(found: list[tuple[str, list[tuple[int, dict[str, float]]]]], scenario: Scenario) -> Moments:
-    """All layouts' moments at the steps where at least half of the dangers are hidden."""
-    dangers = sum(danger != NONE for danger, _ in found)
-    for count, what in ((dangers, "have a danger"), (len(found) - dangers, "have none")):
+def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
+    """Return all layouts' decision points at the steps where at least half of the dangers are hidden."""
+    dangers = sum(danger != NONE for danger, _ in layouts)
+    for count, what in ((dangers, "have a danger"), (len(layouts) - dangers, "have none")):
         if count < FOLDS:
             raise UserError(
-                f"{count} of {len(found)} layouts of {scenario.name} {what}; an audit needs {FOLDS}, "
+                f"{count} of {len(layouts)} layouts of {scenario.name} {what}; an audit needs {FOLDS}, "
                 "give more with --layouts"
             )
     hidden = [
-        sum(danger != NONE and any(step == k for step, _ in moments) for danger, moments in found)
+        sum(danger != NONE and any(step == k for step, _ in points) for danger, points in layouts)
         for k in range(scenario.parameters.decisions)
     ]
     steps = [k for k, count in enumerate(hidden) if 2 * count >= dangers]
     rows = [
         (layout, step, danger, values)
-        for layout, (danger, moments) in enumerate(found) for step, values in moments if step in steps
-    ]  # fmt: skip
+        for layout, (danger, points) in enumerate(layouts)
+        for step, values in points
+        if step in steps
+    ]
     if not rows:
         raise UserError(
             f"scenario {scenario.name} hides no danger: most are in sight from the start, so there is "
             "nothing to audit"
         )
     layout, step, danger, values = zip(*rows, strict=True)
-    table = np.array([list(of.values()) for of in values])
-    return Moments(np.array(layout), np.array(step), np.array(danger), tuple(values[0]), table)
+    table = np.array([list(row.values()) for row in values])
+    return HiddenPoints(np.array(layout), np.array(step), np.array(danger), tuple(values[0]), table)
 
 
-def judge(moments: Moments, sectors: tuple[str, ...]) -> tuple[dict[str, Estimate], dict[str, float]]:
-    """The AUC of each question, and what gave the best answered one away (`Audit`)."""
+def judge(points: HiddenPoints, sectors: tuple[str, ...]) -> tuple[dict[str, Estimate], dict[str, float]]:
+    """Return the AUC of each question, and what gave the best answered one away (`Audit`)."""
     from sklearn.ensemble import HistGradientBoostingClassifier
     from sklearn.model_selection import StratifiedGroupKFold
 
-    of = moments
-    varies = [k for k, column in enumerate(of.numbers.T) if len(np.unique(column[~np.isnan(column)])) > 1]
-    table, names = of.numbers[:, varies], [of.names[k] for k in varies]
-    classes = np.unique(of.danger)
-    folds = list(StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(table, of.danger, of.layout))
-    models = [
-        HistGradientBoostingClassifier(max_iter=40, max_leaf_nodes=8, early_stopping=False, random_state=0)
-        .fit(table[learnt], of.danger[learnt])
-        for learnt, _ in folds
-    ]  # fmt: skip
+    layout, step, danger = points.layout, points.step, points.danger
+    varies = [k for k, column in enumerate(points.numbers.T) if len(np.unique(column[~np.isnan(column)])) > 1]
+    table, names = points.numbers[:, varies], [points.names[k] for k in varies]
+    classes = np.unique(danger)
+    folds = list(StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(table, danger, layout))
+    trees = partial(HistGradientBoostingClassifier, max_leaf_nodes=8, early_stopping=False, random_state=0)
+    models = [trees(max_iter=40).fit(table[learnt], danger[learnt]) for learnt, _ in folds]
 
     def answers(table: Floats) -> Floats:
-        """(m, classes), each by the model that has not seen its layout."""
-        told = np.zeros((len(table), len(classes)))
+        """Return probabilities (m, classes), each by the model that has not seen its layout."""
+        scores = np.zeros((len(table), len(classes)))
         for model, (_, asked) in zip(models, folds, strict=True):
-            told[np.ix_(asked, np.searchsorted(classes, model.classes_))] = model.predict_proba(table[asked])
-        return told
+            columns = np.searchsorted(classes, model.classes_)
+            scores[np.ix_(asked, columns)] = model.predict_proba(table[asked])
+        return scores
 
-    model_of = np.empty(len(of.layout), dtype=int)
+    model_of = np.empty(len(layout), dtype=int)
     for k, (_, asked) in enumerate(folds):
         model_of[asked] = k
-    alike = of.step * FOLDS + model_of  # scores of two models do not compare
+    alike = step * FOLDS + model_of  # scores of two models do not compare
 
-    def ranks(question: str, told: Floats) -> "Ranks":
+    def ranks(question: str, scores: Floats) -> "Ranks":
+        score = scores[:, classes == (NONE if question == DANGER else question)][:, 0]
         if question == DANGER:
-            return Ranks.of(of.layout, alike, 1 - told[:, classes == NONE][:, 0], of.danger != NONE)
-        return Ranks.of(of.layout, alike, told[:, classes == question][:, 0], of.danger == question)
+            return Ranks.compare(layout, alike, 1 - score, danger != NONE)
+        return Ranks.compare(layout, alike, score, danger == question)
 
-    told = answers(table)
-    counts = {sector: len(np.unique(of.layout[of.danger == sector])) for sector in sectors}
+    scores = answers(table)
+    counts = {sector: len(np.unique(layout[danger == sector])) for sector in sectors}
     questions = [DANGER, *(sector for sector, count in counts.items() if count >= FOLDS)]
-    auc = {question: ranks(question, told).estimate() for question in questions}
+    auc = {question: ranks(question, scores).estimate() for question in questions}
     worst = max(auc, key=lambda question: auc[question].value)
     lost: dict[str, float] = {}
     if auc[worst].value > MOST_AUC:
         for k, name in enumerate(names):
             shuffled = table.copy()
-            shuffled[:, k] = _shuffled(table[:, k], of.step, name)
+            shuffled[:, k] = _shuffled(table[:, k], step, name)
             lost[name] = auc[worst].value - ranks(worst, answers(shuffled)).auc
     most = sorted(lost, key=lambda name: -lost[name])[:5]
     return auc, {name: lost[name] for name in most if lost[name] > LEAST_AUC_LOST}
@@ -229,15 +232,15 @@ def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
 class Ranks:
     """Comparisons between layouts with the danger in question and layouts without."""
 
-    # number of pairs of moments in which the layout with it ranks higher, (with, without); a tie counts half
+    # number of pairs of points in which the layout with it ranks higher, (with, without); a tie counts half
     above: Floats
-    pairs: Floats  # number of all compared pairs of moments, (with, without)
+    pairs: Floats  # number of all compared pairs of points, (with, without)
 
     @classmethod
-    def of(cls, layout: Ints, alike: Ints, score: Floats, there: Bools) -> "Ranks":
-        """Compare the scores of moments (m,) of layouts with the danger (`there`, (m,)) and without.
+    def compare(cls, layout: Ints, alike: Ints, score: Floats, there: Bools) -> "Ranks":
+        """Compare the scores of points (m,) of layouts with the danger (`there`, (m,)) and without.
 
-        Only moments with the same value of `alike` (m,) are compared.
+        Only points with the same value of `alike` (m,) are compared.
         """
         have, have_not = np.unique(layout[there]), np.unique(layout[~there])
         above, pairs = np.zeros((2, len(have), len(have_not)))

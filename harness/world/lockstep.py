@@ -161,8 +161,10 @@ def _lanes(road: Callable[[], Road]) -> Lanes | None:
     graph = road().network().graph
     of = {
         (a, b, n): lane
-        for a, nodes in graph.items() for b, lanes in nodes.items() for n, lane in enumerate(lanes)
-    }  # fmt: skip
+        for a, nodes in graph.items()
+        for b, lanes in nodes.items()
+        for n, lane in enumerate(lanes)
+    }
     lanes = list(of.values())
     if any(type(lane) not in (StraightLane, CircularLane) for lane in lanes):
         return None

@@ -21,9 +21,8 @@ ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 class Outcome:
     """How an episode ended for the ego."""
 
-    # `cleared` (the only success), `collision`, or a forced failure: `time_out` (never cleared the
-    # intersection), `late` (cleared it too long after the full-view driver) or `off_road`; `running` while
-    # undecided
+    # `cleared` (the ego reached its goal, the only success), `collision`, or a forced failure: `time_out`
+    # (never), `late` (too long after the full-view driver) or `off_road`; `running` while undecided
     result: Result = "running"
     time_s: float | None = None  # when it was decided; None while running
     partner: str | None = None  # id of the vehicle that the ego collided with
@@ -39,11 +38,11 @@ class Outcome:
 
     @property
     def success(self) -> bool:
-        """Whether the ego cleared the intersection without a collision and without a forced failure."""
+        """Whether the ego reached its goal without a collision and without a forced failure."""
         return self.result == "cleared"
 
     def judged(self, reference: "Outcome", parameters: Parameters) -> "Outcome":
-        """Return this outcome, as `late` if the ego cleared too long after the full-view `reference`."""
+        """Return this outcome, as `late` if the ego came too long after the full-view `reference`."""
         if not self.success or not reference.success or self.time_s is None or reference.time_s is None:
             return self
         late = self.time_s - reference.time_s > parameters.delay_allowance_s + ROUNDING_S

@@ -83,11 +83,13 @@ def plans(scenario: Scenario, graphs: Sequence[Mapping[str, Any]]) -> list[str]:
     beside = [road.beside(own, at_m) for own, at_m in places]
     starts: list[Start] = [
         (
-            graph["ego"]["speed_mps"], graph["ego"]["target_speed_mps"], p.decisions - graph["step"],
+            graph["ego"]["speed_mps"],
+            graph["ego"]["target_speed_mps"],
+            p.decisions - graph["step"],
             (int("left" in ways), int("right" in ways)),
         )
         for graph, ways in zip(graphs, beside, strict=True)
-    ]  # fmt: skip
+    ]
     tried = _rollouts(scenario.actions, starts, p)
     return [
         _chosen(scenario, graph, at_m, ways["own"], _sequences(scenario.actions, *start[2:], p), tried[start])

@@ -205,9 +205,10 @@ class Road:
             return found
         x, y, _ = self.paths[key].at(arc_m)
         return {
-            side: way for side, way in found.items()
+            side: way
+            for side, way in found.items()
             if side == "own" or self.paths[way].project(x, y)[1] > ONE_LANE_M
-        }  # fmt: skip
+        }
 
     @cached_property
     def number(self) -> Mapping[PathKey, int]:

@@ -17,21 +17,21 @@ Place = tuple[float, float]
 
 
 def site(
-    moments: Sequence[tuple[WorldState, Sequence[str]]],
+    points: Sequence[tuple[WorldState, Sequence[str]]],
     units: Collection[Unit] = (),
     zone_m: Place = (0.0, 0.0),
 ) -> Site:
-    """Return the links at some moments, (n, ...), with those of roadside units.
+    """Return the links at some decision points, (n, ...), with those of roadside units.
 
     An antenna is at the centre of its vehicle. If a building and a vehicle stand between two antennas, the
     building counts.
 
     Args:
-        moments: states, each with the ids of the ego and its helpers, in this order.
+        points: states, each with the ids of the ego and its helpers, in this order.
         units: roadside units.
         zone_m: centroid of the conflict zone, the origin of the units' positions.
     """
-    there = [(state, [state.vehicle(name) for name in viewers]) for state, viewers in moments]
+    there = [(state, [state.vehicle(name) for name in viewers]) for state, viewers in points]
     among = _site([(state, ego, helpers) for state, (ego, *helpers) in there])
     of_units = {
         unit: replace(
@@ -43,13 +43,13 @@ def site(
     return replace(among, units=of_units)
 
 
-def _site(moments: Sequence[tuple[WorldState, VehicleState | Place, Sequence[VehicleState]]]) -> Site:
+def _site(points: Sequence[tuple[WorldState, VehicleState | Place, Sequence[VehicleState]]]) -> Site:
     """Return the links from one end, a vehicle or a place, to some vehicles."""
-    n, most = len(moments), max((len(others) for _, _, others in moments), default=0)
+    n, most = len(points), max((len(others) for _, _, others in points), default=0)
     xy_m = np.full((n, 1 + most, 2), np.nan)
     sight, blocker_m = np.full((n, most), CLEAR), np.zeros((n, most))
     corner_m = np.full((n, most, 2), np.nan)
-    for i, (state, first, others) in enumerate(moments):
+    for i, (state, first, others) in enumerate(points):
         xy_m[i, : 1 + len(others)] = [_xy(end) for end in (first, *others)]
         for h, other in enumerate(others):
             sight[i, h], blocker_m[i, h] = _between(state, first, other)

@@ -9,7 +9,7 @@ import one_way_crossing
 import pytest
 
 from harness.core.errors import UserError
-from harness.world.audit import Moments, Ranks, audit, judge, numbers
+from harness.world.audit import HiddenPoints, Ranks, audit, judge, numbers
 from harness.world.perception.graph import scene_graph
 from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, Parameters, layout
 from harness.world.world import World
@@ -20,7 +20,7 @@ pytest.importorskip("sklearn", reason="needs the audit extra")
 def moments(numbers, danger):
     """One moment a layout."""
     n, names = len(danger), tuple(f"number {k}" for k in range(numbers.shape[1]))
-    return Moments(np.arange(n), np.zeros(n, dtype=int), np.array(danger), names, numbers)
+    return HiddenPoints(np.arange(n), np.zeros(n, dtype=int), np.array(danger), names, numbers)
 
 
 def quiet(done):
@@ -32,20 +32,20 @@ def quiet(done):
 
 def test_an_auc_is_the_share_of_pairs_in_their_order_and_a_tie_is_half():
     score, there = np.array([0.9, 0.4, 0.4, 0.1, 0.95]), np.array([True, True, False, False, False])
-    ranks = Ranks.of(np.arange(5), np.zeros(5, dtype=int), score, there)
+    ranks = Ranks.compare(np.arange(5), np.zeros(5, dtype=int), score, there)
     assert ranks.auc == pytest.approx((2 + 1.5) / 6)
     assert ranks.estimate().n == 5
 
 
-def test_only_moments_that_are_alike_are_compared():
+def test_only_points_that_are_alike_are_compared():
     """Late moments rank high whatever is hidden: that fewer dangers are left then is no tell."""
     score, there = np.array([0.2, 0.1, 0.8, 0.9]), np.array([True, False, True, False])
-    assert Ranks.of(np.arange(4), np.array([0, 0, 1, 1]), score, there).auc == 0.5
+    assert Ranks.compare(np.arange(4), np.array([0, 0, 1, 1]), score, there).auc == 0.5
 
 
 def test_no_interval_has_zero_width():
     there = np.array([True, False] * 10)
-    found = Ranks.of(np.arange(20), np.zeros(20, dtype=int), there.astype(float), there).estimate()
+    found = Ranks.compare(np.arange(20), np.zeros(20, dtype=int), there.astype(float), there).estimate()
     assert (found.value, found.high) == (1.0, 1.0)
     assert found.low == pytest.approx(10 / (10 + 1.96**2), abs=1e-4)  # Wilson, 10 of 10
 
@@ -53,9 +53,9 @@ def test_no_interval_has_zero_width():
 def test_layouts_are_drawn_whole():
     """Ten moments that are copies of one say no more than it does."""
     layout, there, score = np.arange(40), np.arange(40) % 2 == 0, np.random.default_rng(0).random(40)
-    once = Ranks.of(layout, np.zeros(40, dtype=int), score, there).estimate()
+    once = Ranks.compare(layout, np.zeros(40, dtype=int), score, there).estimate()
     copies = (np.repeat(of, 10) for of in (layout, score, there))
-    often = Ranks.of(next(copies), np.tile(np.arange(10), 40), *copies).estimate()
+    often = Ranks.compare(next(copies), np.tile(np.arange(10), 40), *copies).estimate()
     assert (often.low, often.high) == pytest.approx((once.low, once.high))
 
 

@@ -222,9 +222,11 @@ class Constants:
         from highway_env.vehicle import behavior, controller, kinematics
 
         kinds = {
-            kind for module in (behavior, controller, kinematics) for kind in vars(module).values()
+            kind
+            for module in (behavior, controller, kinematics)
+            for kind in vars(module).values()
             if isinstance(kind, type) and kind.__module__ == module.__name__
-        }  # fmt: skip
+        }
         return cls({(kind, key): v for kind in kinds for key, v in vars(kind).items() if key.isupper()})
 
     def restore(self) -> None:

@@ -65,8 +65,10 @@ def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
     """Return where a network's lanes begin and end, m."""
     return {
         (a, b, n): tuple(np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3).ravel().tolist())
-        for a, nodes in network.graph.items() for b, lanes in nodes.items() for n, lane in enumerate(lanes)
-    }  # fmt: skip
+        for a, nodes in network.graph.items()
+        for b, lanes in nodes.items()
+        for n, lane in enumerate(lanes)
+    }
 
 
 @lru_cache(maxsize=16)
@@ -87,9 +89,11 @@ def place(name: str) -> Place:
     begin_m = found.paths[key].project(*(ego.position - origin))[0]
     goal_m = goal(begin_m, p)
     meetings = {
-        other: at for way in (*ways, key) for other, at in crossings(found.paths, way).items()
+        other: at
+        for way in (*ways, key)
+        for other, at in crossings(found.paths, way).items()
         if begin_m < at.ego_arc_m < goal_m + BEYOND_M
-    }  # fmt: skip
+    }
     zone_m = min((goal_m, *(at.ego_arc_m for at in meetings.values())))
     road = Road(
         facts={"kind": type(env).__name__, "ego": "/".join(key)},
@@ -141,9 +145,11 @@ def _parameters(name: str, env: Any, actions: int) -> Parameters:
 
 
 def _sectors(
-    paths: Mapping[PathKey, Path], ways: Sequence[PathKey], meetings: Mapping[PathKey, Any],
+    paths: Mapping[PathKey, Path],
+    ways: Sequence[PathKey],
+    meetings: Mapping[PathKey, Any],
     watched_m: tuple[float, float],
-) -> dict[str, Floats]:  # fmt: skip
+) -> dict[str, Floats]:
     """Return the points that must be seen: of the ego's ways, and of paths before they meet it."""
     sectors: dict[str, Floats] = {}
     for key in ways:

@@ -194,11 +194,13 @@ def _labels(network: Any, every: Sequence[Route]) -> list[str]:
     by_turn, by_end, begin = Counter(turns), Counter(ends), Counter(route[0][0] for route in every)
     told = {a: begin[a] > 1 and all(n == 1 for key, n in by_turn.items() if key[0] == a) for a in begin}
     return [
-        turn[1] if told[turn[0]]
-        else end[1] if by_end[end] == 1
+        turn[1]
+        if told[turn[0]]
+        else end[1]
+        if by_end[end] == 1
         else f"{end[1]} by {' '.join(node for _, node in route[:-1])}"
         for turn, end, route in zip(turns, ends, every, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def _turn(network: Any, route: Route) -> str:

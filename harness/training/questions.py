@@ -37,7 +37,7 @@ class Question:
 
     @property
     def named(self) -> bool:
-        """Whether the prompt names those whom the answer may speak of; a picture names nobody."""
+        """Whether the prompt names those of whom the answer may speak; a picture names nobody."""
         return any(f"{c['with']} " in self.messages[-1]["content"] for c in self.graph["conflicts"])
 
     @property
@@ -46,14 +46,14 @@ class Question:
 
     @property
     def read_out(self) -> tuple[Mapping[str, str], ...]:
-        """The chat messages that ask for a letter."""
+        """Return the chat messages that ask for a letter."""
         shown, words = self.excerpt or self.graph, self.scenario.prompt_words
         messages = self.prompt.render(shown, self.actions, self.heard, words, letter=True)
         return in_mode("readout", self.prompt, messages, self.graph["role"], self.actions)
 
 
 def alone(lessons: Lessons) -> Iterator[Question]:
-    """Every viewer on its own."""
+    """Ask every viewer on its own."""
     for scene in lessons.scenes:
         for viewer in scene.viewers:
             for prompt in lessons.prompts:
@@ -61,7 +61,7 @@ def alone(lessons: Lessons) -> Iterator[Question]:
 
 
 def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
-    """The same questions with no text in them but the conflicts; those that have any, or a picture."""
+    """Repeat the questions that have conflicts or a picture, with no text in them but the conflicts."""
     for q in questions:
         if q.graph["conflicts"] or q.image:
             shown = {**q.graph, "nodes": [], "sectors": []}
@@ -72,7 +72,7 @@ def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
 def with_messages(
     lessons: Lessons, scenes: Sequence[Scene], intents: Mapping[str, Floats]
 ) -> Iterator[Question]:
-    """The ego with what some of its helpers sent; `intents` are the helpers' read-outs, by key."""
+    """Ask the ego with what some of its helpers sent; `intents` are the helpers' read-outs, by key."""
     for scene in scenes:
         graphs = scene.record["graphs"]
         ego, *helpers = scene.viewers
@@ -82,8 +82,8 @@ def with_messages(
             for h, u in zip(helpers, draws, strict=True):
                 if u < ARRIVES:
                     asked = question(lessons, scene, h, prompt)
-                    said = message(graphs[h], intents[asked.key], asked.actions, asked.named)
-                    heard.append({"sender": h, **said})
+                    sent = message(graphs[h], intents[asked.key], asked.actions, asked.named)
+                    heard.append({"sender": h, **sent})
             if heard:
                 yield question(lessons, scene, ego, prompt, heard)
 
@@ -91,7 +91,7 @@ def with_messages(
 def question(
     lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt, heard: Sequence[Mapping[str, Any]] = ()
 ) -> Question:
-    """What a viewer is asked in a scene, with the messages that it heard."""
+    """Return what a viewer is asked in a scene, with the messages that it heard."""
     graph, scenario = scene.record["graphs"][viewer], lessons.scenario
     sent = prompt.render(graph, scenario.actions, heard, scenario.prompt_words)
     name = key(lessons, scene, viewer, prompt) + ("+m" if heard else "")
@@ -101,12 +101,12 @@ def question(
 
 
 def key(lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt) -> str:
-    """A viewer's question."""
+    """Return the name of a viewer's question."""
     return f"{lessons.scenario.name}/{scene.id}/{viewer}/{prompt.version}"
 
 
 def kl_nats(labels: Floats, p: Floats) -> float:
-    """Mean KL divergence of answers (n, A) from soft labels (n, A)."""
+    """Return the mean KL divergence of answers (n, A) from soft labels (n, A)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.where(labels > 0, labels * np.log(labels / np.maximum(p, 1e-12)), 0.0)
     return float(terms.sum(axis=1).mean())
