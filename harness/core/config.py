@@ -20,14 +20,13 @@ import dataclasses
 import math
 import re
 import tomllib
-from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import msgspec
-from msgspec.inspect import type_info
 
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import text_of
@@ -45,7 +44,6 @@ def between(least: float, most: float) -> msgspec.Meta:
     return msgspec.Meta(ge=least, le=most, description=f"a number from {least:g} to {most:g}")
 
 
-_type_info = cache(type_info)
 _MISSING = re.compile(r"Object missing required field `(.+)`")
 _STEPS = re.compile(r"\.([^.\[`]+)|\[(\d+)\]|(\[\.{3}\])")  # the steps of a path such as `$.points[1].loss`
 _OF_VALUES = ("Expected", "Invalid", "Number out of range", "Integer")
@@ -100,8 +98,7 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
     Raises:
         UserError: an unknown or missing key, or a value that is not allowed.
     """
-    info = _type_info(cast("Hashable", kind))
-    for path, key, known in _unknown_keys(table, info, (), given):
+    for path, key, known in _unknown_keys(table, kind, (), given):
         raise unknown(f"key in {_place(where, path)}", key, known)
     try:
         record = msgspec.convert({**table, **given}, kind)
@@ -164,17 +161,19 @@ def _place(where: str, path: Sequence[str]) -> str:
 
 
 def _unknown_keys(
-    value: Any, kind: Any, path: tuple[str, ...], exempt: Collection[str] = ()
+    value: Any, hint: Any, path: tuple[str, ...], exempt: Collection[str] = ()
 ) -> Iterator[tuple[tuple[str, ...], str, list[str]]]:
     """Yield each unknown key: the path of its table, the key, and the names of the known fields."""
-    if isinstance(value, Mapping) and (fields := _fields(kind)):
-        for key, inner in value.items():
-            if key in exempt or key not in fields:
-                yield path, key, [name for name in fields if name not in exempt]
-            else:
-                yield from _unknown_keys(inner, fields[key], (*path, key))
-    elif isinstance(value, Mapping | list) and (item := _item(kind)):
-        for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
+    members = [member for member in _members(hint) if member is not NoneType]
+    if len(members) != 1 or not isinstance(value, Mapping | list):
+        return
+    entries: Iterable[tuple[Any, Any]] = value.items() if isinstance(value, Mapping) else enumerate(value)
+    fields = _hints(members[0]) if isinstance(value, Mapping) else {}
+    for key, inner in entries:
+        if fields and (key in exempt or key not in fields):
+            yield path, key, [name for name in fields if name not in exempt]
+            continue
+        for item in [fields[key]] if fields else _items(members[0], str(key)):
             yield from _unknown_keys(inner, item, (*path, str(key)))
 
 
@@ -201,14 +200,13 @@ def _mistake(message: str, table: Mapping[str, Any], kind: Any, where: str) -> U
     if of_key:
         wrong = next((name for name in value if not _fits(name, hint)), "")
         return UserError(f"{here}: {printable(repr(wrong))} is no name for this; {printable(problem)}")
-    info = type_info(hint)
-    if problem.startswith("Invalid") and (names := _names(info)):
+    if problem.startswith("Invalid") and (names := _names(hint)):
         return unknown(f"{key} in {_place(where, tables)}", str(value), names)
     expected, _, got = problem.removeprefix("Expected ").replace("`", "").partition(", got ")
     kinds = " or ".join(_IN_WORDS.get(name, name) for name in expected.split(" | ") if name != "null")
-    allowed = kinds if got else _description(info) or kinds
+    allowed = kinds if got else _description(hint) or kinds
     if not problem.startswith("Expected"):
-        allowed = _description(info) or "a number that a computer holds"
+        allowed = _description(hint) or "a number that a computer holds"
     return UserError(f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}")
 
 
@@ -258,7 +256,7 @@ def _fits(value: Any, hint: Any) -> bool:
     return True
 
 
-def _members(hint: Any, value: Any) -> list[Any]:
+def _members(hint: Any, value: Any = None) -> list[Any]:
     """Return the types of a union, without descriptions; of tagged records the one that a value names."""
     while get_origin(hint) is Annotated:
         hint = get_args(hint)[0]
@@ -274,6 +272,7 @@ def _members(hint: Any, value: Any) -> list[Any]:
     return named or members
 
 
+@cache
 def _hints(kind: Any) -> dict[str, Any]:
     """Return the types of a record's fields by their names in a file; empty for any other type."""
     if not hasattr(kind, "__struct_fields__") and not dataclasses.is_dataclass(kind):
@@ -299,27 +298,13 @@ def _items(hint: Any, index: str) -> list[Any]:
     return [arguments[0]]
 
 
-def _names(info: Any) -> list[str]:
-    return [str(name) for name in getattr(_plain(info), "values", ())]
+def _names(hint: Any) -> list[str]:
+    """Return the choices of a type; none if it has no list of them."""
+    return [str(name) for kind in _members(hint) if get_origin(kind) is Literal for name in get_args(kind)]
 
 
-def _fields(kind: Any) -> dict[str, Any]:
-    return {field.encode_name: field.type for field in getattr(_plain(kind), "fields", ())}
-
-
-def _item(kind: Any) -> Any:
-    plain = _plain(kind)
-    return getattr(plain, "item_type", None) or getattr(plain, "value_type", None)
-
-
-def _plain(kind: Any) -> Any:
-    """Strip the description and the null option from a type."""
-    if hasattr(kind, "extra_json_schema"):
-        return _plain(kind.type)
-    members = [member for member in getattr(kind, "types", ()) if type(member).__name__ != "NoneType"]
-    return _plain(members[0]) if len(members) == 1 else kind
-
-
-def _description(kind: Any) -> str | None:
-    description: str | None = (getattr(kind, "extra_json_schema", None) or {}).get("description")
-    return description or next(filter(None, map(_description, getattr(kind, "types", ()))), None)
+def _description(hint: Any) -> str | None:
+    """Return the text of a type's `Meta(description=...)`."""
+    texts = (meta.description for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, msgspec.Meta))
+    members = get_args(hint) if get_origin(hint) in (Annotated, Union, UnionType) else ()
+    return next(filter(None, (*texts, *map(_description, members))), None)
