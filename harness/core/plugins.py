@@ -34,8 +34,8 @@ class Plugins(Mapping[str, T], Generic[T]):
         return self._loaded[name]
 
     def usable(self) -> dict[str, T]:
-        found = resources.each(self, self.__getitem__)
-        return {name: plugin for name, plugin in found.items() if not isinstance(plugin, UserError)}
+        loaded = resources.each(self, self.__getitem__)
+        return {name: plugin for name, plugin in loaded.items() if not isinstance(plugin, UserError)}
 
     def __iter__(self) -> Iterator[str]:
         return iter({**self.built_in, **self._entries()})

@@ -42,13 +42,13 @@ def names(kind: str) -> list[str]:
 
 def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserError]:
     """Load all that a list shows; one that is wrong stands there as its error, and takes no other with it."""
-    found: dict[str, T | UserError] = {}
+    loaded: dict[str, T | UserError] = {}
     for name in names:
         try:
-            found[name] = load(name)
+            loaded[name] = load(name)
         except UserError as error:
-            found[name] = error
-    return found
+            loaded[name] = error
+    return loaded
 
 
 def find(kind: str, name: str) -> Path:

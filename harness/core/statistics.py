@@ -182,8 +182,8 @@ def rate_difference(a: Floats, b: Floats, level: float = 0.95) -> Estimate:
     spread = math.sqrt(float(np.mean(p_off**2) * np.mean(q_off**2)))
     correlation = covariance / spread if spread > 0 else 0.0
 
-    def reach(one: float, two: float) -> float:
-        return math.sqrt(max(one**2 - 2 * correlation * one * two + two**2, 0.0))
+    def reach(below: float, above: float) -> float:
+        return math.sqrt(max(below**2 - 2 * correlation * below * above + above**2, 0.0))
 
     low, high = value - reach(p - p_low, q_high - q), value + reach(p_high - p, q - q_low)
     return Estimate(value, low, high, n, n_excluded)

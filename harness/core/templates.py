@@ -109,17 +109,17 @@ def _size(value: Any) -> int:
     """
     most, total, unread = _account.left, 0, [value]
     while unread:
-        one = unread.pop()
+        item = unread.pop()
         total += 1
-        if isinstance(one, str | bytes):
-            total += len(one) >> 3
-        elif isinstance(one, int):
-            total += one.bit_length() >> 6
-        elif isinstance(one, _LISTS):
-            if total + len(one) <= most:
-                unread.extend(one)
-            total += len(one)
-        elif (members := _members(one)) is not None:
+        if isinstance(item, str | bytes):
+            total += len(item) >> 3
+        elif isinstance(item, int):
+            total += item.bit_length() >> 6
+        elif isinstance(item, _LISTS):
+            if total + len(item) <= most:
+                unread.extend(item)
+            total += len(item)
+        elif (members := _members(item)) is not None:
             if total + len(members) <= most:
                 unread += chain(members, members.values())
             total += len(members)
@@ -475,10 +475,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
 
     def wrap_str_format(self, value: Any) -> Callable[..., str] | None:
         """Return the method `format` of a text as one that pays."""
-        made = super().wrap_str_format(value)
-        if made is None:
+        method = super().wrap_str_format(value)
+        if method is None:
             return None
-        text, form = value.__self__, made
+        text, form = value.__self__, method
 
         def paid(*given: Any, **named: Any) -> str:
             _formatted(text, *given, *named.values())

@@ -45,13 +45,13 @@ def network(name: str) -> Network:
 @lru_cache(maxsize=64)
 def _read(path: Path, mtime_ns: int) -> Network:
     where = f"network file {printable(path)}"
-    found = convert(toml(path, where), Network, where)
+    network = convert(toml(path, where), Network, where)
     try:
-        percents = [float(percent) for percent in found.quantiles_ms]
+        percents = [float(percent) for percent in network.quantiles_ms]
     except ValueError:
         percents = []
-    times_ms = list(found.quantiles_ms.values())
+    times_ms = list(network.quantiles_ms.values())
     ends = percents[:1] == [0.0] and percents[-1:] == [100.0] and min(times_ms) >= 0
     if not (ends and np.all(np.diff(percents) > 0) and np.all(np.diff(times_ms) >= 0)):
         raise UserError(f"{where}: quantiles_ms must go from 0 to 100, percentages and milliseconds growing")
-    return found
+    return network

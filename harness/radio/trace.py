@@ -97,14 +97,14 @@ class Trace:
 
     def _at(self, distance_m: Floats, sight: Ints | int, what: Literal["reception", "latency_s"]) -> Floats:
         """Interpolate a column of the table at these distances, for what stands between."""
-        found = np.full(np.broadcast_shapes(np.shape(distance_m), np.shape(sight)), np.nan)
+        values = np.full(np.broadcast_shapes(np.shape(distance_m), np.shape(sight)), np.nan)
         for name, number in SIGHTS.items():
             rows = [p for p in self.receptions.points if p.sight in (None, name)]
             column = [p.reception if what == "reception" else self._latency_s(p) for p in rows]
             last = 0.0 if (what, self.beyond) == ("reception", "zero") else None
             curve = np.interp(distance_m, [p.distance_m for p in rows], column, right=last)
-            found = np.where(np.equal(sight, number), curve, found)
-        return found
+            values = np.where(np.equal(sight, number), curve, values)
+        return values
 
 
 def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace:
@@ -137,9 +137,9 @@ def read(path: Path) -> tuple[Point, ...]:
         raise UserError(f"{shown}: cannot be read as a table ({printable(problem)})") from None
     if not points:
         raise UserError(f"{shown}: has no rows; give reception at one distance at least")
-    said = {p.sight for p in points}
-    if said != {None} and said != {*SIGHTS}:
-        lacks = next(name for name in SIGHTS if name not in said)
+    sights = {p.sight for p in points}
+    if sights != {None} and sights != {*SIGHTS}:
+        lacks = next(name for name in SIGHTS if name not in sights)
         raise UserError(f"{shown}: has no row of sight {lacks!r}; with sight it needs {', '.join(SIGHTS)}")
     points.sort(key=lambda p: (SIGHTS[p.sight] if p.sight else CLEAR, p.distance_m))
     for a, b in pairwise(points):

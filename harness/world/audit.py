@@ -245,9 +245,9 @@ class Ranks:
         have, have_not = np.unique(layout[there]), np.unique(layout[~there])
         above, pairs = np.zeros((2, len(have), len(have_not)))
         for k in np.unique(alike):
-            one, other = (np.flatnonzero((alike == k) & side) for side in (there, ~there))
-            at = np.ix_(np.searchsorted(have, layout[one]), np.searchsorted(have_not, layout[other]))
-            apart = score[one][:, None] - score[other]
+            with_it, without = (np.flatnonzero((alike == k) & side) for side in (there, ~there))
+            at = np.ix_(np.searchsorted(have, layout[with_it]), np.searchsorted(have_not, layout[without]))
+            apart = score[with_it][:, None] - score[without]
             np.add.at(above, at, (apart > 0) + 0.5 * (apart == 0))
             np.add.at(pairs, at, 1.0)
         return cls(above, pairs)
@@ -260,9 +260,9 @@ class Ranks:
         """Return the AUC with a 95 % interval: percentiles of a bootstrap over the n layouts."""
         have, have_not = self.pairs.shape
         draws = noise.generator("audit", "bootstrap")
-        one = draws.multinomial(have, np.full(have, 1 / have), RESAMPLES)
-        other = draws.multinomial(have_not, np.full(have_not, 1 / have_not), RESAMPLES)
-        above, pairs = (((one @ of) * other).sum(axis=1) for of in (self.above, self.pairs))
+        times = draws.multinomial(have, np.full(have, 1 / have), RESAMPLES)
+        times_not = draws.multinomial(have_not, np.full(have_not, 1 / have_not), RESAMPLES)
+        above, pairs = (((times @ of) * times_not).sum(axis=1) for of in (self.above, self.pairs))
         low, high = np.quantile((above / pairs)[pairs > 0], [0.025, 0.975])
         if low == high:  # AUC of 0 or 1: resampled layouts cannot differ
             low, high = wilson(self.auc, min(have, have_not))

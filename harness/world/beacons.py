@@ -141,7 +141,7 @@ def _sent(
     phase, errors, uniforms = _draws(p, seed, sender, receivers)
     every, lead = p.simulation_hz / p.beacon_hz, _lead_frames(p)  # frames
 
-    def said(number: int, frame: int, heard_by: tuple[str, ...] = ()) -> Beacon:
+    def sent(number: int, frame: int, heard_by: tuple[str, ...] = ()) -> Beacon:
         x, y, heading, speed = (poses[frame - first_frame] + errors[number]).tolist()
         time_s = frame / p.simulation_hz
         return Beacon(
@@ -163,22 +163,22 @@ def _sent(
             checks.append((number, frame))
         number -= 1
     if p.beacon_rule == "fixed":
-        yield from (said(number, frame, hear(number, frame)) for number, frame in checks)
+        yield from (sent(number, frame, hear(number, frame)) for number, frame in checks)
         return
     last, due = before[-1] if before else None, list[tuple[int, int, Beacon]]()
     for number, frame in reversed(checks):
-        if cam := _cam(said(number, frame), poses[frame - first_frame].tolist(), last):
+        if cam := _cam(sent(number, frame), poses[frame - first_frame].tolist(), last):
             due.append((number, frame, cam))
             last = cam
     for number, frame, cam in reversed(due):
         yield replace(cam, heard_by=hear(number, frame))
 
 
-def _cam(said: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon | None:
+def _cam(beacon: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon | None:
     """Return the CAM if one is due by the last one and the vehicle's true pose (EN 302 637-2, 6.1.3)."""
     if last is None or last.interval_s is None:
-        return replace(said, interval_s=LONGEST_S)
-    age_s = said.time_s - last.time_s + ROUNDING_S
+        return replace(beacon, interval_s=LONGEST_S)
+    age_s = beacon.time_s - last.time_s + ROUNDING_S
     x, y, heading, speed = pose
     turned_rad = abs(math.remainder(heading - last.heading_rad, math.tau))
     moved = (
@@ -187,10 +187,12 @@ def _cam(said: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon | N
         or abs(speed - last.speed_mps) > CHANGE_MPS
     )
     if age_s >= SHORTEST_S and moved:
-        return replace(said, interval_s=round(age_s, 3))
+        return replace(beacon, interval_s=round(age_s, 3))
     if age_s >= last.interval_s:
         unmoved = min(last.unmoved + 1, UNMOVED)
-        return replace(said, interval_s=LONGEST_S if unmoved == UNMOVED else last.interval_s, unmoved=unmoved)
+        return replace(
+            beacon, interval_s=LONGEST_S if unmoved == UNMOVED else last.interval_s, unmoved=unmoved
+        )
     return None
 
 

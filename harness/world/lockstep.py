@@ -25,7 +25,7 @@ from highway_env.vehicle.controller import ControlledVehicle
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import printable
 from harness.world.perception.rays import turned
-from harness.world.road import Lane, Road
+from harness.world.road import Lane, Road, lanes_of
 from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M, Traffic
 from harness.world.state import separation_m
 from harness.world.world import World, least_gaps_m
@@ -158,13 +158,7 @@ class Lanes:
 @lru_cache(maxsize=64)
 def _lanes(road: Callable[[], Road]) -> Lanes | None:
     """Return the lanes of a road; None if some are neither straight nor arcs."""
-    graph = road().network().graph
-    of = {
-        (a, b, n): lane
-        for a, nodes in graph.items()
-        for b, lanes in nodes.items()
-        for n, lane in enumerate(lanes)
-    }
+    of = lanes_of(road().network())
     lanes = list(of.values())
     if any(type(lane) not in (StraightLane, CircularLane) for lane in lanes):
         return None
@@ -172,7 +166,10 @@ def _lanes(road: Callable[[], Road]) -> Lanes | None:
 
     def each(name: str, other: Any, arcs: bool) -> Floats:
         return np.array(
-            [getattr(lane, name) if one == arcs else other for lane, one in zip(lanes, arc, strict=True)],
+            [
+                getattr(lane, name) if is_arc == arcs else other
+                for lane, is_arc in zip(lanes, arc, strict=True)
+            ],
             dtype=float,
         )
 
@@ -304,7 +301,7 @@ class Fleet:
         return np.clip(steering, -self.most_steering, self.most_steering)
 
     def _acceleration(self) -> Floats:
-        found = np.zeros_like(self.speed)
+        acceleration = np.zeros_like(self.speed)
         faster = (self.lane_now[:, :, None] == self.lane_now[:, None]) & (
             self.speed[:, :, None] > self.speed[:, None]
         )
@@ -315,15 +312,17 @@ class Fleet:
             room = ahead - (self.size[b, n, 0] + self.size[b, other, 0]) / 2 - Traffic.standoff_m
             closing = self.speed[b, n] - self.speed[b, other]
             brakes = (ahead > 0) & (closing**2 > 2 * Traffic.braking_mps2 * room)
-            found[b[brakes], n[brakes]] = -2 * Traffic.braking_mps2
+            acceleration[b[brakes], n[brakes]] = -2 * Traffic.braking_mps2
         by_itself = self.frame[:, None] / self.scenario.parameters.simulation_hz >= self.brakes_at
         if by_itself.any():
             above = np.maximum(self.speed - self.brakes_to, 0.0)
             by_itself &= above > 0
-            found = np.where(by_itself, -np.minimum(self.brakes_mps2, above * BRAKES_OFF_HZ), found)
+            acceleration = np.where(
+                by_itself, -np.minimum(self.brakes_mps2, above * BRAKES_OFF_HZ), acceleration
+            )
         ego = ControlledVehicle.KP_A * (self.target[:, 0] - self.speed[:, 0])
-        found[:, 0] = np.clip(ego, *self.limits)
-        return found
+        acceleration[:, 0] = np.clip(ego, *self.limits)
+        return acceleration
 
     def _move(self) -> None:
         steering, acceleration = self.steering, self.acceleration
@@ -379,14 +378,14 @@ class Fleet:
 
     def _collide(self) -> None:
         """Do what `_Road.step` does: highway-env checks the pairs that may touch."""
-        for row, one, two in self._near().tolist():
+        for row, first, second in self._near().tolist():
             vehicles = self.worlds[row].vehicles
-            for k in (one, two):
+            for k in (first, second):
                 v, at = vehicles[k], (row, k)
                 v.position, v.heading, v.speed = self.xy[at], float(self.heading[at]), float(self.speed[at])
                 v.impact, v.crashed = None, False
-            vehicles[one].handle_collisions(vehicles[two], self.dt)
-            for k in (one, two):
+            vehicles[first].handle_collisions(vehicles[second], self.dt)
+            for k in (first, second):
                 v, at = vehicles[k], (row, k)
                 self.crashed[at] |= v.crashed
                 if v.impact is not None:

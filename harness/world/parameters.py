@@ -88,7 +88,7 @@ class Parameters:
             if least is not None and bounds.get(field.name, (True, ""))[0]:
                 each = value if isinstance(value, tuple) else (value,)
                 bounds[field.name] = (
-                    all(least <= one <= most for one in each),
+                    all(least <= number <= most for number in each),
                     f"from {least:g} to {most:g}",
                 )
         for name, (fits, allowed) in bounds.items():

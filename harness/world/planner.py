@@ -160,7 +160,7 @@ def _rollouts(
     alike: dict[tuple[int, tuple[int, int]], list[Start]] = {}
     for start in dict.fromkeys(starts):
         alike.setdefault(start[2:], []).append(start)
-    found = {}
+    rollouts = {}
     for (left, sides), some in alike.items():
         tried = _sequences(actions, left, sides, parameters)
         speeds, targets = np.array([start[:2] for start in some]).T
@@ -173,8 +173,8 @@ def _rollouts(
             if not np.array_equal(travelled[first][motion], travelled):  # others come as far in the end
                 first = motion = np.arange(len(travelled))
             right_m = None if tried.right_m is None else tried.right_m[first]
-            found[start] = Rollouts(travelled[first], right_m, motion)
-    return found
+            rollouts[start] = Rollouts(travelled[first], right_m, motion)
+    return rollouts
 
 
 def travelled_m(

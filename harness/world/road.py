@@ -200,13 +200,13 @@ class Road:
             return {"own": key}
         place = self.ways.index(key)
         places = {"own": place, "left": place - 1, "right": place + 1}
-        found = {side: self.ways[n] for side, n in places.items() if 0 <= n < len(self.ways)}
+        sides = {side: self.ways[n] for side, n in places.items() if 0 <= n < len(self.ways)}
         if arc_m is None:
-            return found
+            return sides
         x, y, _ = self.paths[key].at(arc_m)
         return {
             side: way
-            for side, way in found.items()
+            for side, way in sides.items()
             if side == "own" or self.paths[way].project(x, y)[1] > ONE_LANE_M
         }
 
@@ -318,11 +318,11 @@ class _Cells:
         point = np.arange(len(asked)) + (begin - starts)[asked]
         gap = np.hypot(self.points[0][point] - x_m[asked], self.points[1][point] - y_m[asked])
         nearest = np.flatnonzero(gap == np.minimum.reduceat(gap, starts)[asked])
-        found = nearest[np.searchsorted(nearest, starts)]  # the first of equally near ones
-        x, y, arc, heading, cos, sin = self.points[:, point[found]]
+        first_nearest = nearest[np.searchsorted(nearest, starts)]  # the first of equally near ones
+        x, y, arc, heading, cos, sin = self.points[:, point[first_nearest]]
         along = (x_m - x) * cos + (y_m - y) * sin
         # The squares of Python are those of `Path.project`; NumPy's are rounded otherwise.
-        squares = [g**2 - a**2 for g, a in zip(gap[found].tolist(), along.tolist(), strict=True)]
+        squares = [g**2 - a**2 for g, a in zip(gap[first_nearest].tolist(), along.tolist(), strict=True)]
         return arc + along, np.sqrt(np.maximum(squares, 0.0)), heading
 
 
@@ -347,20 +347,20 @@ def _bends(points: Floats) -> tuple[float, float]:
 def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Crossing]:
     """Find where paths of other approaches first meet the ego's, by approach and route."""
     mine = paths[ego]
-    found = {}
+    meetings = {}
     for key, path in paths.items():
         if key[0] == ego[0]:
             continue
         shared = [lane for lane in mine.lanes if lane in path.lanes]
         if shared:
             begin, its_begin = ((0.0, *p.ends_m)[p.lanes.index(shared[0])] for p in (mine, path))
-            found[key] = Crossing(*mine.at(begin)[:2], begin, its_begin, "merging")
+            meetings[key] = Crossing(*mine.at(begin)[:2], begin, its_begin, "merging")
             continue
         point = intersection(LineString(mine.points), LineString(path.points))
         if point.geom_type == "Point":
             x, y = float(point.x), float(point.y)
-            found[key] = Crossing(x, y, mine.project(x, y)[0], path.project(x, y)[0])
-    return found
+            meetings[key] = Crossing(x, y, mine.project(x, y)[0], path.project(x, y)[0])
+    return meetings
 
 
 def straights(width_m: float, *lanes: tuple[str, str, float, float, float, tuple[int, int]]) -> Any:
@@ -396,6 +396,16 @@ def to_the_left(begin: tuple[float, float], end: tuple[float, float], width_m: f
         for centre, at, clockwise in zip(centres, angles, (False, True), strict=True)
     )
     return first, second
+
+
+def lanes_of(network: Any) -> dict[Lane, Any]:
+    """Return highway-env's lanes by their index."""
+    return {
+        (a, b, n): lane
+        for a, nodes in network.graph.items()
+        for b, lanes in nodes.items()
+        for n, lane in enumerate(lanes)
+    }
 
 
 def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0)) -> Ground:

@@ -195,9 +195,9 @@ class World:
 
     def _in_road_frame(self, poses: Sequence[Any]) -> Floats:
         """Convert poses (..., V, 4) to the frame of the scenario's road."""
-        found = np.array(poses)
-        found[..., :2] -= self.scenario.road().origin_m
-        return found
+        moved = np.array(poses)
+        moved[..., :2] -= self.scenario.road().origin_m
+        return moved
 
     def _broadcast(self, poses: Floats, first_frame: int) -> None:
         """Add the beacons of the ego and the helpers in some frames, whose poses are (F, V, 4)."""

@@ -45,17 +45,17 @@ def examine(scenario: Scenario, seed: int) -> None:
 
 
 def _stepped(scenario: Scenario, seed: int, actions: Sequence[str]) -> list[Places]:
-    env, found = reset(scenario.name, seed), []
+    env, places = reset(scenario.name, seed), []
     kind = meta_actions(scenario.name, env)
     for action in actions:
         try:
             *_, terminated, _, _ = env.step(numbered(env, kind, action))
         except Exception as error:
             raise UserError(f"{shown(scenario.name)}: its step() fails: {raised(error)}") from None
-        found.append(_places(env))
+        places.append(_places(env))
         if terminated:
             break
-    return found
+    return places
 
 
 def _places(env: object) -> Places:

@@ -13,7 +13,7 @@ from harness.world.environments import environment
 from harness.world.environments.environment import lane_of, reset
 from harness.world.environments.routes import Routes, routes
 from harness.world.parameters import Parameters as Common
-from harness.world.road import ONE_LANE_M, Lane, Path, PathKey, Road, crossings, ground
+from harness.world.road import ONE_LANE_M, Lane, Path, PathKey, Road, crossings, ground, lanes_of
 
 CAREFUL_FIRST = ("SLOWER", "IDLE", "FASTER", "LANE_LEFT", "LANE_RIGHT")
 MOST_HZ = 1000
@@ -64,10 +64,8 @@ def first_target_mps(ego: Any) -> float:
 def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
     """Return where a network's lanes begin and end, m."""
     return {
-        (a, b, n): tuple(np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3).ravel().tolist())
-        for a, nodes in network.graph.items()
-        for b, lanes in nodes.items()
-        for n, lane in enumerate(lanes)
+        index: tuple(np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3).ravel().tolist())
+        for index, lane in lanes_of(network).items()
     }
 
 
@@ -84,24 +82,24 @@ def place(name: str) -> Place:
     key = whole.keys(lane, ego.route)[0]
     way = whole.paths[key]
     origin = way.at(way.project(*ego.position)[0] + HALFWAY * goal(0.0, p))[:2]
-    found = routes(name, network, lane[:2], origin, REACH_M)
-    ways = next((ways for ways in found.ways.values() if key in ways), (key,))
-    begin_m = found.paths[key].project(*(ego.position - origin))[0]
+    near = routes(name, network, lane[:2], origin, REACH_M)
+    ways = next((ways for ways in near.ways.values() if key in ways), (key,))
+    begin_m = near.paths[key].project(*(ego.position - origin))[0]
     goal_m = goal(begin_m, p)
     meetings = {
         other: at
         for way in (*ways, key)
-        for other, at in crossings(found.paths, way).items()
+        for other, at in crossings(near.paths, way).items()
         if begin_m < at.ego_arc_m < goal_m + BEYOND_M
     }
     zone_m = min((goal_m, *(at.ego_arc_m for at in meetings.values())))
     road = Road(
         facts={"kind": type(env).__name__, "ego": "/".join(key)},
-        paths=found.paths,
+        paths=near.paths,
         ego=key,
         crossings=meetings,
-        zone_m=found.paths[key].at(zone_m)[:2],
-        sectors=_sectors(found.paths, ways, meetings, (begin_m - BEHIND_M, goal_m + BEYOND_M)),
+        zone_m=near.paths[key].at(zone_m)[:2],
+        sectors=_sectors(near.paths, ways, meetings, (begin_m - BEHIND_M, goal_m + BEYOND_M)),
         network=lambda: network,
         ground=partial(ground, network, origin_m=origin),
         ways=ways,
@@ -109,7 +107,7 @@ def place(name: str) -> Place:
         goal_m=partial(goal, begin_m),
     )
     actions = tuple(action for action in CAREFUL_FIRST if action in available)
-    return Place(found, ends_of(network), road, actions, p, type(env).__name__)
+    return Place(near, ends_of(network), road, actions, p, type(env).__name__)
 
 
 def _goal_m(speed_mps: float, begin_m: float, parameters: Parameters) -> float:

@@ -119,11 +119,11 @@ def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
     streets = _streets(network)
     after = {s: [t for t in streets if t[0] == s[1] and _goes_on(network, s, t)] for s in streets}
     led_to = {street for following in after.values() for street in following}
-    found: list[Route] = []
+    complete: list[Route] = []
     rings: list[Route] = []
 
     def extend(route: Route) -> None:
-        if len(found) + len(rings) > MOST_ROUTES:
+        if len(complete) + len(rings) > MOST_ROUTES:
             raise UserError(
                 f"{printable(name)}: its road has more than {MOST_ROUTES} routes; give it fewer junctions"
             )
@@ -131,17 +131,17 @@ def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
         for street in following:
             extend((*route, street))
         if not following:
-            (rings if after[route[-1]] else found).append(route)
+            (rings if after[route[-1]] else complete).append(route)
 
     for street in streets:
         if street not in led_to:
             extend((street,))
     for street in (begin, *streets):  # a ring has no beginning
-        if not any(street in route for route in found):
+        if not any(street in route for route in complete):
             extend((street,))
-            found += rings[:1]
+            complete += rings[:1]
         rings.clear()
-    yield from found
+    yield from complete
 
 
 def _goes_on(network: Any, street: Street, following: Street) -> bool:
@@ -165,7 +165,7 @@ def _apart_m(lane: Any, following: Any) -> float:
 def _variants(network: Any, route: Route) -> list[list[Lane]]:
     """Return the lanes of a route's paths, from left to right: one path for each lane of its widest road."""
     widest = max(range(len(route)), key=lambda n: len(_lanes(network, route[n])))
-    found = []
+    variants = []
     for number in range(len(_lanes(network, route[widest]))):
         lanes = [(*route[widest], number)]
         for street in route[widest + 1 :]:
@@ -173,9 +173,9 @@ def _variants(network: Any, route: Route) -> list[list[Lane]]:
         for street in reversed(route[:widest]):
             lanes.insert(0, (*street, _beside(network, lanes[0], street, False)))
         joined = [_apart_m(network.get_lane(a), network.get_lane(b)) for a, b in pairwise(lanes)]
-        if max(joined, default=0.0) <= GAP_M and lanes not in found:
-            found.append(lanes)
-    return found
+        if max(joined, default=0.0) <= GAP_M and lanes not in variants:
+            variants.append(lanes)
+    return variants
 
 
 def _beside(network: Any, lane: Lane, street: Street, after: bool) -> int:
@@ -192,10 +192,12 @@ def _labels(network: Any, every: Sequence[Route]) -> list[str]:
     turns = [(route[0][0], _turn(network, route)) for route in every]
     ends = [(route[0][0], f"to {route[-1][1]}") for route in every]
     by_turn, by_end, begin = Counter(turns), Counter(ends), Counter(route[0][0] for route in every)
-    told = {a: begin[a] > 1 and all(n == 1 for key, n in by_turn.items() if key[0] == a) for a in begin}
+    by_turn_alone = {
+        a: begin[a] > 1 and all(n == 1 for key, n in by_turn.items() if key[0] == a) for a in begin
+    }
     return [
         turn[1]
-        if told[turn[0]]
+        if by_turn_alone[turn[0]]
         else end[1]
         if by_end[end] == 1
         else f"{end[1]} by {' '.join(node for _, node in route[:-1])}"

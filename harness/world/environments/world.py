@@ -222,5 +222,5 @@ def _buildings(env: Any, origin_m: tuple[float, float]) -> tuple[Building, ...]:
     )
 
 
-def _apart_m(one: Any, other: Any) -> float:
-    return float(np.hypot(*(one.position - other.position)))
+def _apart_m(first: Any, second: Any) -> float:
+    return float(np.hypot(*(first.position - second.position)))
