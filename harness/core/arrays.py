@@ -29,7 +29,7 @@ def any_of(flags: Bools) -> Bools:
 
 
 def count_of(flags: Bools) -> Ints:
-    """How many are true along a short last axis, such as that of helpers; faster than `np.sum`."""
+    """Count those that are true along a short last axis, such as that of helpers; faster than `np.sum`."""
     none = np.zeros(flags.shape[:-1], dtype=np.int64)
     count: Ints = reduce(np.add, [flags[..., k] for k in range(flags.shape[-1])], none)
     return count

@@ -65,7 +65,7 @@ class Parameters(Common):
 
 @cache
 def network() -> Any:
-    """As highway-env's `MergeEnv`, but shorter, and the ramp's lane runs into the right lane."""
+    """Build highway-env's `MergeEnv`, but shorter; the ramp's lane runs into the right lane."""
     from highway_env.road.lane import LineType
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
@@ -85,7 +85,7 @@ def network() -> Any:
 
 @cache
 def road() -> Road:
-    """The main road and its ramp. Their conflict zone is where the ramp has run into the right lane."""
+    """Return the main road and its ramp; the conflict zone is where the ramp has run into the right lane."""
     ego, main = ("ramp", "merge"), ("main", "straight")
     ways: dict[PathKey, tuple[list[Lane], list[str], int]] = {
         main: ([("a", "b", 1), ("b", "c", 1)], ["right lane behind", "right lane"], 1),
@@ -120,11 +120,11 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     start = draws.between("ego_start", p.ego_start_m)
 
-    def back_m(speed: float, late_s: float) -> float:
-        """Arc length on the main road from which one is beside the merge so long after a cruising ego."""
+    def arc_m(speed: float, late_s: float) -> float:
+        """Return the arc length from which a car is beside the merge so long after a cruising ego."""
         return at.other_arc_m - speed * (start / p.ego_speed_mps + late_s)
 
-    truck = back_m(
+    truck = arc_m(
         speed := draws.between("truck_speed", p.truck_mps), draws.between("truck_offset", p.truck_offset_s)
     )
     spawns = [
@@ -147,7 +147,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     for what, (approach, share, offset_s) in cars.items():
         if draws.share(what) < share:
             speed = draws.between(f"{what}_speed", p.main_mps)
-            arc = back_m(speed, draws.between(f"{what}_offset", offset_s))
+            arc = arc_m(speed, draws.between(f"{what}_offset", offset_s))
             others.append(Spawn(ids[what], "car", "other", approach, "straight", arc, speed))
     spawns += sorted(others, key=lambda spawn: spawn.id)
 

@@ -61,7 +61,7 @@ class Parameters(Common):
 
 @cache
 def road() -> Road:
-    """A lane to the east and one to the west, as in highway-env's `TwoWayEnv`."""
+    """Return a lane to the east and one to the west, as in highway-env's `TwoWayEnv`."""
     paths: dict[PathKey, Path] = {
         ("own", BESIDE): Path.along(network(), "own", BESIDE, [("a", "b", 0)], [BESIDE], 0),
         ("own", OWN): Path.along(network(), "own", OWN, [("a", "b", 1)], [OWN], 1),

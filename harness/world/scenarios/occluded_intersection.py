@@ -75,7 +75,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     ego_arc = crossings["right", "straight"].ego_arc_m - 1.46 - start
 
     def timed(approach: str, speed: float, late: float) -> float:
-        """Arc length from which a vehicle is at its conflict point `late` s after a cruising ego."""
+        """Return the arc from which a vehicle is at its conflict point `late` s after a cruising ego."""
         at = crossings[approach, ROUTES[approach]]
         return at.other_arc_m - speed * ((at.ego_arc_m - ego_arc) / p.ego_speed_mps + late)
 
@@ -125,10 +125,10 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mps: float) -> float:
-    """When a car from a side is at its conflict point, at the soonest, if it passes behind the truck.
+    """Return when a car from a side can be at its conflict point, at the soonest, behind the truck.
 
-    Seconds from the start. Their ways cross at a right angle and both keep their speed, so they touch if both
-    are on the crossing at once.
+    In seconds from the start. Their ways cross at a right angle and both keep their speed, so they touch if
+    both are on the crossing at once.
     """
     at, truck, car = (
         road().crossings[approach, "straight"],

@@ -66,7 +66,7 @@ class Parameters(Common):
 
 @cache
 def network() -> Any:
-    """A lane to the east and one to the west, what is parked beside each, and the ego's way out."""
+    """Build a lane to the east and one to the west, what is parked beside each, and the ego's way out."""
     from highway_env.road.lane import LineType
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
@@ -88,7 +88,7 @@ def network() -> Any:
 
 @cache
 def road() -> Road:
-    """The street. Its conflict zone is where the ego's way has come into the lane."""
+    """Return the street. Its conflict zone is where the ego's way has come into the lane."""
     ego, behind = ("own", "pull-out"), ("behind", "straight")
     own = [("space", "pull", 0), ("pull", "swing", 0), ("swing", "out", 0), ("out", "east", 0)]
     ways: dict[PathKey, tuple[list[Lane], list[str], int]] = {
@@ -133,7 +133,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         return Spawn(id_, kind, part, side, "parked", x_m - BEGIN_M if side == "kerb" else END_M - x_m, 0.0)
 
     def coming(id_: str, what: str, bounds: tuple[float, float]) -> Spawn:
-        """A car from behind that is where the ego comes into the lane so long after a cruising ego."""
+        """Return a car from behind that is where the ego enters the lane so long after a cruising ego."""
         speed = draws.between(f"{what}_speed", p.lane_mps)
         after_s = (at.ego_arc_m - ego) / p.ego_speed_mps + draws.between(f"{what}_offset", bounds)
         return Spawn(id_, "car", "other", "behind", "straight", at.other_arc_m - speed * after_s, speed)

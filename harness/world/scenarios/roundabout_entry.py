@@ -78,7 +78,7 @@ class Parameters(Common):
 
 @cache
 def network() -> Any:
-    """A ring with four arms, of highway-env's lanes, which meet without a gap; its own ring has gaps."""
+    """Build a ring with four arms of highway-env's lanes, which meet; its own ring has gaps."""
     from highway_env.road.lane import CircularLane, LineType, StraightLane
     from highway_env.road.road import RoadNetwork
 
@@ -113,13 +113,13 @@ def network() -> Any:
 
 
 def _ring_rad(node: int) -> float:
-    """Where the ring's nth node is; angles fall the way cars go round."""
+    """Return the angle of the ring's nth node; angles fall the way cars go round."""
     exits = TOUCH_RAD if node % 2 == 0 else math.pi / 2 - TOUCH_RAD
     return exits - math.pi / 2 * (node // 2)
 
 
 def _path(approach: str, route: str, begin: str, end: str, priority: int) -> Path:
-    """From the arm of `begin`, on the ring, and out at the arm of `end` (arms by their first letter)."""
+    """Build the path from the arm of `begin`, by the ring, to the arm of `end` (arms by first letter)."""
     first, last = RING.index(f"{begin}e"), RING.index(f"{end}x")
     nodes = [RING[k % len(RING)] for k in range(first, last + 1 if last > first else last + len(RING) + 1)]
     lanes: list[Lane] = [(f"{begin}er", f"{begin}es", 0), (f"{begin}es", f"{begin}e", 0)]
@@ -129,7 +129,7 @@ def _path(approach: str, route: str, begin: str, end: str, priority: int) -> Pat
 
 
 def _role(lane: Lane) -> str:
-    """What a lane is called, from the ego's seat."""
+    """Name a lane as the ego sees it."""
     where = {c[0]: arm for arm, c in SEEN_AS.items()}[lane[1][0]]
     if lane[0] in RING and lane[1] in RING:
         return f"ring-{where}"  # before the exit of that arm, or between its exit and its entry
@@ -138,7 +138,7 @@ def _role(lane: Lane) -> str:
 
 @cache
 def road() -> Road:
-    """The roundabout. Its conflict zone is where the ego's way joins the ring."""
+    """Return the roundabout. Its conflict zone is where the ego's way joins the ring."""
     ego = ("own", "straight")
     # Routes are named at the ego's arm: `right` leaves there and shows it, `straight` goes on past it.
     paths = {
@@ -193,7 +193,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     ]  # fmt: skip
 
     def car(what: str, sector: str, route: str, bounds: tuple[float, float]) -> Spawn:
-        """A car that is, or would be, where the ego enters so long after a cruising ego."""
+        """Return a car that is, or would be, where the ego enters so long after a cruising ego."""
         late_s = draws.between(f"{what}_offset", bounds)
         back_m = ring_mps * (start / p.ego_speed_mps + late_s)
         arc = meetings[sector, "straight"].other_arc_m - back_m
