@@ -86,17 +86,11 @@ class Run(Tables):
 
 @dataclass(frozen=True)
 class DecisionPoint:
-    """A decision point of a run. A notebook shows its picture, the answers and the decisions.
+    """A decision point of a run. A notebook shows its picture, the answers and the decisions."""
 
-    Attributes:
-        run: the run.
-        scene: who is where, and what each vehicle sees.
-        viewer: whose view the picture shows; None for the ego's.
-    """
-
-    run: Run
-    scene: "Scene"
-    viewer: str | None = None
+    run: Run  # the run
+    scene: "Scene"  # who is where, and what each vehicle sees
+    viewer: str | None = None  # whose view the picture shows; None for the ego's
 
     @property
     def answers(self) -> "pd.DataFrame":
@@ -132,15 +126,10 @@ class DecisionPoint:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Run B against run A. A notebook shows what became of success, and the differences.
+    """Run B against run A. A notebook shows what became of success, and the differences."""
 
-    Attributes:
-        report: what `harness compare --json` prints.
-        findings: what became of success in each condition, in a sentence.
-    """
-
-    report: Mapping[str, Any]
-    findings: tuple[str, ...]
+    report: Mapping[str, Any]  # what `harness compare --json` prints
+    findings: tuple[str, ...]  # what became of success in each condition, in a sentence
 
     @cached_property
     def differences(self) -> "pd.DataFrame":

@@ -49,28 +49,23 @@ class Looks:
 
 @dataclass(frozen=True)
 class Checkup:
-    """Result of checking a model.
+    """Result of checking a model."""
 
-    Attributes:
-        prompt: the first question as the model reads it, or as a server is sent it.
-        tokens: its token ids, each with its text; None if only a server knows them.
-        bos_tokens: number of BOS tokens that it begins with; more than one harms most models. Further on,
-            BOS may be the mark of a turn.
-        turn_end: text of the token with which its chat template ends an answer; None if there is no such
-            token, and for a server's.
-        thinking: what the model's own template can do, whatever its card says; None for a server's.
-        answers: one answer in each answer mode, asked alone after a warm-up; the seconds are of batch size 1.
-        looks: answers to pictures; None if the card says that the model takes none.
-    """
-
-    prompt: str
+    prompt: str  # the first question as the model reads it, or as a server is sent it
+    # its token ids, each with its text; None if only a server knows them
     tokens: list[tuple[int, str]] | None
+    # number of BOS tokens that it begins with; more than one harms most models. Further on, BOS may be the
+    # mark of a turn
     bos_tokens: int | None
+    # text of the token with which its chat template ends an answer; None if there is no such token, and for a
+    # server's
     turn_end: str | None
+    # what the model's own template can do, whatever its card says; None for a server's
     thinking: Thinking | None
+    # one answer in each answer mode, asked alone after a warm-up; the seconds are of batch size 1
     answers: dict[AnswerMode, Completion]
     identity: dict[str, Any]
-    looks: Looks | None = None
+    looks: Looks | None = None  # answers to pictures; None if the card says that the model takes none
 
 
 def check(

@@ -59,17 +59,11 @@ class Session(Protocol):
 
 
 class Engine(Protocol):
-    """A loaded model.
+    """A loaded model."""
 
-    Attributes:
-        chat: its tokenizer and chat template.
-        context_tokens: most tokens of one sequence.
-        stops: token ids that end an answer, sorted.
-    """
-
-    chat: Chat
-    context_tokens: int
-    stops: Sequence[int]
+    chat: Chat  # its tokenizer and chat template
+    context_tokens: int  # most tokens of one sequence
+    stops: Sequence[int]  # token ids that end an answer, sorted
 
     def look(self, image: Image) -> list[int]:
         """Return the tokens that stand for a picture in a prompt. Raises ValueError if the model takes none.

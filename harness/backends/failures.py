@@ -18,24 +18,15 @@ class Failures:
     """The share of answers with each failure, drawn for each request on its own; the others are good.
 
     A text is spoilt in one way at most; any answer may be slow as well.
-
-    Attributes:
-        fence: the answer is in a code fence. Recovered.
-        prose: the answer is between sentences. Recovered.
-        truncation: the answer is cut off inside its JSON. Failed, `truncated_json`.
-        nan: one probability is NaN. Failed, `non_finite`.
-        unknown_action: no action's name is one of the scenario's. Failed, `unknown_action`.
-        unclosed_think: the answer is in a thought that never ends. Failed, `truncated_reasoning`.
-        slow_tail: the answer takes `slow_s` seconds longer than the card's latency.
     """
 
-    fence: Share = 0.0
-    prose: Share = 0.0
-    truncation: Share = 0.0
-    nan: Share = 0.0
-    unknown_action: Share = 0.0
-    unclosed_think: Share = 0.0
-    slow_tail: Share = 0.0
+    fence: Share = 0.0  # the answer is in a code fence. Recovered
+    prose: Share = 0.0  # the answer is between sentences. Recovered
+    truncation: Share = 0.0  # the answer is cut off inside its JSON. Failed, `truncated_json`
+    nan: Share = 0.0  # one probability is NaN. Failed, `non_finite`
+    unknown_action: Share = 0.0  # no action's name is one of the scenario's. Failed, `unknown_action`
+    unclosed_think: Share = 0.0  # the answer is in a thought that never ends. Failed, `truncated_reasoning`
+    slow_tail: Share = 0.0  # the answer takes `slow_s` seconds longer than the card's latency
     slow_s: Seconds = 0.0
 
     def __post_init__(self) -> None:

@@ -17,18 +17,12 @@ MOST = 0.5  # letter share from which the letter explains more than all else
 
 
 class Moved(Struct, frozen=True):
-    """How the `n` pairs of questions that differ in one fact were answered.
+    """How the `n` pairs of questions that differ in one fact were answered."""
 
-    Attributes:
-        fact: the kind of fact.
-        moved: in how many the expected action became clearly likelier with the fact.
-        mean: mean change of its probability.
-    """
-
-    fact: str
+    fact: str  # the kind of fact
     n: int
-    moved: int
-    mean: float
+    moved: int  # in how many the expected action became clearly likelier with the fact
+    mean: float  # mean change of its probability
 
     @property
     def change(self) -> str:
@@ -42,25 +36,15 @@ class Moved(Struct, frozen=True):
 
 
 class Findings(Struct, frozen=True):
-    """What fixed questions showed of a model.
+    """What fixed questions showed of a model."""
 
-    Attributes:
-        prompt: the prompt version that they were asked with.
-        letters: how the letters of the pairs were read, `raw` or `cyclic`.
-        n: number of questions that were read over cyclic orders.
-        letter_share: mean share of the variance that followed the letter.
-        follows_letter: in how many questions one letter was the likeliest in every order.
-        label_mass: mean probability of the letters.
-        pairs: the pairs, by kind of fact.
-    """
-
-    prompt: str
-    letters: str
-    n: int
-    letter_share: float
-    follows_letter: int
-    label_mass: float
-    pairs: tuple[Moved, ...]
+    prompt: str  # the prompt version that they were asked with
+    letters: str  # how the letters of the pairs were read, `raw` or `cyclic`
+    n: int  # number of questions that were read over cyclic orders
+    letter_share: float  # mean share of the variance that followed the letter
+    follows_letter: int  # in how many questions one letter was the likeliest in every order
+    label_mass: float  # mean probability of the letters
+    pairs: tuple[Moved, ...]  # the pairs, by kind of fact
 
     @property
     def reads_scene(self) -> bool:

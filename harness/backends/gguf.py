@@ -18,19 +18,12 @@ _TEXT, _ARRAY = 8, 9
 
 @dataclass(frozen=True)
 class ModelFacts:
-    """What a file states of its model; None where it does not.
+    """What a file states of its model; None where it does not."""
 
-    Attributes:
-        name: the model's name.
-        licence: SPDX id of its licence, or its name, as the file writes it.
-        context_tokens: the longest sequence that it was trained for.
-        template: its chat template.
-    """
-
-    name: str | None = None
-    licence: str | None = None
-    context_tokens: int | None = None
-    template: str | None = None
+    name: str | None = None  # the model's name
+    licence: str | None = None  # SPDX id of its licence, or its name, as the file writes it
+    context_tokens: int | None = None  # the longest sequence that it was trained for
+    template: str | None = None  # its chat template
 
 
 def facts(file: Path) -> ModelFacts:

@@ -18,20 +18,14 @@ LEAST_P = 1e-9  # a letter to which a server's list leaves nothing
 
 @dataclass(frozen=True)
 class Averaged:
-    """A read-out over all orders.
+    """A read-out over all orders."""
 
-    Attributes:
-        text: the answer.
-        label_mass: total probability of the letters, the mean over the orders.
-        letter_share: share of the variance of the log-probabilities, over actions and orders, that goes with
-            the letter and not with the action; 0 if there is no variance.
-        follows_letter: whether one letter is the likeliest in every order.
-    """
-
-    text: str
-    label_mass: float
+    text: str  # the answer
+    label_mass: float  # total probability of the letters, the mean over the orders
+    # share of the variance of the log-probabilities, over actions and orders, that goes with the letter and
+    # not with the action; 0 if there is no variance
     letter_share: float
-    follows_letter: bool
+    follows_letter: bool  # whether one letter is the likeliest in every order
 
 
 def averaged(actions: Sequence[str], letters_p: Sequence[Sequence[float]]) -> Averaged:

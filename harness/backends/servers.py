@@ -37,26 +37,17 @@ class Fields:
 
     Each is true (as it is), false (left out), or the name under which it is sent, as in `max_tokens =
     "max_completion_tokens"`. No other field can be changed.
-
-    Attributes:
-        max_tokens: most tokens of the answer.
-        temperature: 0, or that of `--temperature`. Left out, the server draws its answers as it likes.
-        seed: number of the answer among several to one question.
-        top_p: 1, if answers are drawn.
-        top_k: all tokens, if answers are drawn.
-        min_p: 0, if answers are drawn.
-        repetition_penalty: 1, for `vllm`.
-        repeat_penalty: 1, for the kinds of llama.cpp.
     """
 
-    max_tokens: _Sent = True
+    max_tokens: _Sent = True  # most tokens of the answer
+    # 0, or that of `--temperature`. Left out, the server draws its answers as it likes
     temperature: _Sent = True
-    seed: _Sent = True
-    top_p: _Sent = True
-    top_k: _Sent = True
-    min_p: _Sent = True
-    repetition_penalty: _Sent = True
-    repeat_penalty: _Sent = True
+    seed: _Sent = True  # number of the answer among several to one question
+    top_p: _Sent = True  # 1, if answers are drawn
+    top_k: _Sent = True  # all tokens, if answers are drawn
+    min_p: _Sent = True  # 0, if answers are drawn
+    repetition_penalty: _Sent = True  # 1, for `vllm`
+    repeat_penalty: _Sent = True  # 1, for the kinds of llama.cpp
 
     def __post_init__(self) -> None:
         others = [other for other in vars(self).values() if isinstance(other, str)]
@@ -88,28 +79,23 @@ _OF_MODELS = {
 
 @dataclass(frozen=True)
 class Server:
-    """A server that speaks OpenAI's chat completions.
+    """A server that speaks OpenAI's chat completions."""
 
-    Attributes:
-        base_url: URL up to and with `/v1`; http or https, without credentials, query or fragment. With a list
-            of servers, any of them may answer, and each must list the model.
-        kind: decides how a constrained answer is asked for; `generic` is OpenAI's own way.
-        key_env: environment variable with the key; it need not be set for a server without one. Its name
-            tells that it is a key of models (`readable`), or the user lists it in SWARMDRIVE_KEYS.
-        timeout_s: longest time of one attempt, from connecting to the last byte, in seconds.
-        retries: attempts after the first, if a server was busy, broke down or was not reached; of several
-            servers, each is tried at least once.
-        top_logprobs: log-probabilities that it is asked for in a read-out; None asks for 20, the usual limit.
-        fields: fields of a request that it is sent otherwise; None if there are none.
-    """
-
+    # URL up to and with `/v1`; http or https, without credentials, query or fragment. With a list of servers,
+    # any of them may answer, and each must list the model
     base_url: str | tuple[str, ...]
-    kind: Kind = "generic"
+    kind: Kind = "generic"  # decides how a constrained answer is asked for; `generic` is OpenAI's own way
+    # environment variable with the key; it need not be set for a server without one. Its name tells that it
+    # is a key of models (`readable`), or the user lists it in SWARMDRIVE_KEYS
     key_env: str = "OPENAI_API_KEY"
+    # longest time of one attempt, from connecting to the last byte, in seconds
     timeout_s: Annotated[float, Meta(gt=0, le=float_info.max, description="seconds, more than 0")] = 120.0
+    # attempts after the first, if a server was busy, broke down or was not reached; of several servers, each
+    # is tried at least once
     retries: Annotated[int, Meta(ge=0, le=10, description="0 to 10")] = 3
+    # log-probabilities that it is asked for in a read-out; None asks for 20, the usual limit
     top_logprobs: _Listed | None = None
-    fields: Fields | None = None
+    fields: Fields | None = None  # fields of a request that it is sent otherwise; None if there are none
 
     def __post_init__(self) -> None:
         # A refused URL is not shown, since it may hold a password.

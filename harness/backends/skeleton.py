@@ -33,19 +33,12 @@ class Way(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A place where the model decides, and then goes on in one of several ways.
+    """A place where the model decides, and then goes on in one of several ways."""
 
-    Attributes:
-        options: texts to choose from; one empty text where only the way is chosen.
-        most: most characters of a text that the model writes instead of a choice; 0 for a choice.
-        ways: what may follow.
-        instead: what may stand here instead: the end of a list that has no numbers.
-    """
-
-    options: tuple[str, ...]
-    most: int
-    ways: tuple[Way, ...]
-    instead: tuple[Way, ...] = ()
+    options: tuple[str, ...]  # texts to choose from; one empty text where only the way is chosen
+    most: int  # most characters of a text that the model writes instead of a choice; 0 for a choice
+    ways: tuple[Way, ...]  # what may follow
+    instead: tuple[Way, ...] = ()  # what may stand here instead: the end of a list that has no numbers
 
 
 def ways_of(schema: Mapping[str, Any], ways: Sequence[Way]) -> list[Way]:

@@ -16,23 +16,16 @@ class Vision:
 
     A token stands for a square of `merge` x `merge` patches. A picture is scaled so that both sides hold
     whole squares and its area lies within the limits (Qwen2-VL's `smart_resize`), or to one size (Idefics3).
-
-    Attributes:
-        width_px: width of the pictures that the model is shown.
-        height_px: their height; even, since one camera's picture is above the other's.
-        patch_px: side of a patch.
-        merge: number of patches along a side of a token's square.
-        least_px: least area of a picture; a smaller one is enlarged. None if there is no limit.
-        most_px: greatest area; a larger one is scaled down. None if there is no limit.
-        scaled_to_px: width and height that every picture is scaled to; None if pictures keep their size.
     """
 
-    width_px: Count
-    height_px: Count
-    patch_px: Count
-    merge: Count
+    width_px: Count  # width of the pictures that the model is shown
+    height_px: Count  # their height; even, since one camera's picture is above the other's
+    patch_px: Count  # side of a patch
+    merge: Count  # number of patches along a side of a token's square
+    # least area of a picture; a smaller one is enlarged. None if there is no limit
     least_px: Count | None = None
-    most_px: Count | None = None
+    most_px: Count | None = None  # greatest area; a larger one is scaled down. None if there is no limit
+    # width and height that every picture is scaled to; None if pictures keep their size
     scaled_to_px: tuple[Count, Count] | None = None
 
     def __post_init__(self) -> None:

@@ -22,16 +22,11 @@ COLUMNS = 64  # of a picture in a terminal
 
 @dataclass(frozen=True)
 class Taker:
-    """A model that takes an image prompt's picture, by its card.
+    """A model that takes an image prompt's picture, by its card."""
 
-    Attributes:
-        card: the model's.
-        vision: how it takes pictures.
-        processor_tokens: what its own image processor makes of one; None where that is not here.
-    """
-
-    card: "Card"
-    vision: "Vision"
+    card: "Card"  # the model's
+    vision: "Vision"  # how it takes pictures
+    # what its own image processor makes of one; None where that is not here
     processor_tokens: int | None = None
 
     @property

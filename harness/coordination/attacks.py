@@ -28,31 +28,21 @@ Share = Annotated[float, Meta(ge=0, le=1, description="a share of the helpers fr
 
 @dataclass(frozen=True)
 class Turn:
-    """What an attack may use, in decisions `(n,)` with H helpers.
+    """What an attack may use, in decisions `(n,)` with H helpers."""
 
-    Attributes:
-        truth: what every vehicle intends and knows.
-        attackers: who attacks, `(n, H)`.
-        first: what each helper intended at the episode's first step, `(n, H, A)`.
-        past: what each helper intended one step ago, two, ..., `(n, K, H, A)`; NaN if there was no such step.
-        uniforms: draws in [0, 1) for this step, `(n, H)`.
-    """
-
-    truth: Intents
-    attackers: Bools
-    first: Floats
+    truth: Intents  # what every vehicle intends and knows
+    attackers: Bools  # who attacks, `(n, H)`
+    first: Floats  # what each helper intended at the episode's first step, `(n, H, A)`
+    # what each helper intended one step ago, two, ..., `(n, K, H, A)`; NaN if there was no such step
     past: Floats
-    uniforms: Floats
+    uniforms: Floats  # draws in [0, 1) for this step, `(n, H)`
 
 
 @dataclass(frozen=True)
 class Attack:
-    """One attack: a pure function of arrays.
+    """One attack: a pure function of arrays."""
 
-    Attributes:
-        share: the share of the helpers present that attack, to the nearest whole number of helpers.
-    """
-
+    # the share of the helpers present that attack, to the nearest whole number of helpers
     share: Share = 1 / 3
     by_moment: ClassVar[bool] = False  # whether it depends only on the scene and on who attacks
     in_text: ClassVar[bool] = False  # whether it changes what a fusion prompt shows
@@ -78,13 +68,10 @@ class Attack:
 
 @dataclass(frozen=True)
 class Liar(Attack):
-    """Says the opposite of what it intends, from a true place.
+    """Says the opposite of what it intends, from a true place."""
 
-    Attributes:
-        says: `one-hot` is sure of the action that it finds least likely; `permuted` is its own distribution
-            with the largest probability where the smallest was, and so on.
-    """
-
+    # `one-hot` is sure of the action that it finds least likely; `permuted` is its own distribution with the
+    # largest probability where the smallest was, and so on
     says: Literal["one-hot", "permuted"] = "one-hot"
     by_moment: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
@@ -113,13 +100,9 @@ class Stuck(Attack):
 
 @dataclass(frozen=True)
 class Stale(Attack):
-    """Says what it intended some decisions ago, as if it were new; at first, the oldest intent that it has.
+    """Says what it intended some decisions ago, as if it were new; at first, its oldest intent."""
 
-    Attributes:
-        decisions: how many decisions ago.
-    """
-
-    decisions: Annotated[int, Meta(ge=1, le=16)] = 1
+    decisions: Annotated[int, Meta(ge=1, le=16)] = 1  # how many decisions ago
 
     @property
     def steps(self) -> int:
@@ -169,13 +152,9 @@ class FeignedBraking(Attack):
 
 @dataclass(frozen=True)
 class Overconfident(Attack):
-    """Says what it intends, but is surer than it should be: p to a power, scaled to sum to 1.
+    """Says what it intends, but is surer than it should be: p to a power, scaled to sum to 1."""
 
-    Attributes:
-        power: the exponent; 1 changes nothing.
-    """
-
-    power: Annotated[float, Meta(ge=1, le=100)] = 5.0
+    power: Annotated[float, Meta(ge=1, le=100)] = 5.0  # the exponent; 1 changes nothing
     by_moment: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
 
@@ -190,11 +169,9 @@ class Spoof(Attack):
     """Claims a place on the ego's way, just before the conflict zone; Eq. 2 gives weight by that claim.
 
     Alone, it says the truth from a false place. With `liar`, it is the worst case for a weighted rule.
-
-    Attributes:
-        distance_m: claimed distance to the centroid of the conflict zone.
     """
 
+    # claimed distance to the centroid of the conflict zone
     distance_m: Annotated[float, Meta(ge=0, le=1000)] = 3.0
     by_moment: ClassVar[bool] = True
 
@@ -213,13 +190,9 @@ class Spoof(Attack):
 
 @dataclass(frozen=True)
 class Jump(Attack):
-    """Claims another place at each step, some distance from its true one in a direction that is drawn anew.
+    """Claims another place at each step, some way from its true one in a direction that is drawn anew."""
 
-    Attributes:
-        offset_m: the distance from the true place.
-    """
-
-    offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0
+    offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0  # the distance from the true place
     needs: ClassVar[tuple[str, ...]] = ("claims",)
 
     def act(self, said: Intents, turn: Turn) -> Intents:
@@ -261,12 +234,9 @@ class Sybil(Attack):
     """Has several voices, 2 m apart, which all say the same.
 
     Voices are asked like vehicles, nearest first, and take the places of others.
-
-    Attributes:
-        voices: the number of voices of each attacker.
     """
 
-    voices: Annotated[int, Meta(ge=2, le=MOST_VOICES)] = 3
+    voices: Annotated[int, Meta(ge=2, le=MOST_VOICES)] = 3  # the number of voices of each attacker
 
     def act(self, said: Intents, turn: Turn) -> Intents:
         return with_voices(said, turn.attackers, self.voices)
@@ -286,13 +256,9 @@ class Flood(Sybil):
 
 @dataclass(frozen=True)
 class Injection(Attack):
-    """Writes instructions to the reading model into a message's evidence; its intent stays true.
+    """Writes instructions to the reading model into a message's evidence; its intent stays true."""
 
-    Attributes:
-        language: language of the instructions, a key of `INSTRUCTIONS`.
-    """
-
-    language: str = "english"
+    language: str = "english"  # language of the instructions, a key of `INSTRUCTIONS`
     by_moment: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
 

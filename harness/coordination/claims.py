@@ -12,25 +12,18 @@ from harness.core.arrays import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class Claims:
-    """The claimed places and speeds of H helpers, and what the ego can check them against.
+    """The claimed places and speeds of H helpers, and what the ego can check them against."""
 
-    Attributes:
-        xy_m: claimed place, m to the east and to the south of the centroid of the conflict zone,
-            `(..., 1+H, 2)`, the ego first; NaN for a helper that is absent.
-        speed_mps: claimed speed, `(..., H)`.
-        time_s: time of the claim since the start of the episode, `(...)`.
-        error_m: standard deviation on each axis by which the beacons' declared noise moves a true place,
-            `(...)`.
-        sensed_m: the helper's distance to that centroid by the ego's own sensors, `(..., H)`; NaN if they do
-            not see it.
-        from_road_m: the map: returns metres from places `(..., 2)` to the middle of the nearest lane.
-    """
-
+    # claimed place, m to the east and to the south of the centroid of the conflict zone, `(..., 1+H, 2)`, the
+    # ego first; NaN for a helper that is absent
     xy_m: Floats
-    speed_mps: Floats
-    time_s: Floats
+    speed_mps: Floats  # claimed speed, `(..., H)`
+    time_s: Floats  # time of the claim since the start of the episode, `(...)`
+    # standard deviation on each axis by which the beacons' declared noise moves a true place, `(...)`
     error_m: Floats
+    # the helper's distance to that centroid by the ego's own sensors, `(..., H)`; NaN if they do not see it
     sensed_m: Floats
+    # the map: returns metres from places `(..., 2)` to the middle of the nearest lane
     from_road_m: Callable[[Floats], Floats]
 
     @cached_property

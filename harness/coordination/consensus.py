@@ -16,43 +16,31 @@ from harness.core.arrays import Bools, Floats, summed
 
 @dataclass(frozen=True)
 class Messages:
-    """What an ego has to fuse. Index 0 is the ego, 1+h is helper h.
+    """What an ego has to fuse. Index 0 is the ego, 1+h is helper h."""
 
-    Attributes:
-        intents: what each vehicle intends, `(..., 1+H, A)`; the row of a helper not heard may hold anything.
-        weights: paper Eq. 2, `(..., 1+H)`, summing to 1; 0 for a helper not heard.
-        heard: which replies came in time, `(..., H)`.
-        arrival_s: when they came, from the start of the decision, `(..., H)`; inf if lost or not asked. This
-            is also a message's age, since every vehicle sees the scene at 0.
-        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`; the ego's is what its
-            operating point declares, if it declares one.
-        range_m: distance to the ego, `(..., H)`.
-        claims: what helpers claim about themselves, for a rule whose `needs` names it; else None.
-    """
-
+    # what each vehicle intends, `(..., 1+H, A)`; the row of a helper not heard may hold anything
     intents: Floats
-    weights: Floats
-    heard: Bools
+    weights: Floats  # paper Eq. 2, `(..., 1+H)`, summing to 1; 0 for a helper not heard
+    heard: Bools  # which replies came in time, `(..., H)`
+    # when they came, from the start of the decision, `(..., H)`; inf if lost or not asked. This is also a
+    # message's age, since every vehicle sees the scene at 0
     arrival_s: Floats
+    # distance to the centroid of the conflict zone, `(..., 1+H)`; the ego's is what its operating point
+    # declares, if it declares one
     distance_m: Floats
-    range_m: Floats
+    range_m: Floats  # distance to the ego, `(..., H)`
+    # what helpers claim about themselves, for a rule whose `needs` names it; else None
     claims: Claims | None = None
 
 
 class Fused(NamedTuple):
-    """The result of a rule.
+    """The result of a rule."""
 
-    Attributes:
-        policy: the distributions after fusion, `(..., A)`.
-        weights: each vehicle's weight in the policy, `(..., 1+H)`; NaN if the rule has no weights.
-        state: the rule's memory at the next step, `(..., K)`; K may be 0.
-        trust: how far the rule trusts each helper that it heard, from 0 to 1, `(..., H)`; below 0.5 it treats
-            the helper as an attacker. NaN for a helper not heard. None if the rule rates no trust.
-    """
-
-    policy: Floats
-    weights: Floats
-    state: Floats
+    policy: Floats  # the distributions after fusion, `(..., A)`
+    weights: Floats  # each vehicle's weight in the policy, `(..., 1+H)`; NaN if the rule has no weights
+    state: Floats  # the rule's memory at the next step, `(..., K)`; K may be 0
+    # how far the rule trusts each helper that it heard, from 0 to 1, `(..., H)`; below 0.5 it treats the
+    # helper as an attacker. NaN for a helper not heard. None if the rule rates no trust
     trust: Floats | None = None
 
 

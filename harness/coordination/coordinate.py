@@ -32,46 +32,34 @@ TIE = 1e-9  # probabilities that differ by less are equal: pooling rounds
 
 @dataclass(frozen=True)
 class Fusion:
-    """What fusion needs beyond the messages.
+    """What fusion needs beyond the messages."""
 
-    Attributes:
-        call: the fusion call; required if the point's consensus is `ego-prompt`.
-        state: the rule's memory of each decision's episode, `(..., K)`: `Coordination.state` of the episode's
-            last step. None at the first step.
-        ties: the draws that decide between actions that are equally likely; None takes the first of them.
-    """
-
-    call: FusionCall | None = None
+    call: FusionCall | None = None  # the fusion call; required if the point's consensus is `ego-prompt`
+    # the rule's memory of each decision's episode, `(..., K)`: `Coordination.state` of the episode's last
+    # step. None at the first step
     state: Floats | None = None
+    # the draws that decide between actions that are equally likely; None takes the first of them
     ties: TieDraws | None = None
 
 
 @dataclass(frozen=True)
 class Coordination(Exchange):
-    """What happened in each decision. Times are seconds from the start of the decision.
+    """What happened in each decision. Times are seconds from the start of the decision."""
 
-    Attributes:
-        weights: each vehicle's weight in the policy, `(..., 1+H)`; NaN where a fusion call answered.
-        fused: the policy, `(..., A)`.
-        action: index of its most probable action, `(...)`. A tie is drawn; without draws it goes to the
-            earlier action, the more careful one.
-        fusion_failed: whether the fusion call's answer was unusable, so that `fused` is the ego's own intent,
-            `(...)`.
-        latency_s: when the ego acts, `(...)`: end of exchange and fusion. The paper's `latency_proxy`.
-            NaN where the ego's inference time is unknown.
-        deadline_missed: whether that is after the window, `(...)`.
-        state: the rule's memory at the episode's next step, `(..., K)`; K is 0 for a rule without memory.
-        trust: how far the rule trusts each helper, `(..., H)`; NaN if it rates none (`consensus.Fused`).
-    """
-
-    weights: Floats
-    fused: Floats
+    weights: Floats  # each vehicle's weight in the policy, `(..., 1+H)`; NaN where a fusion call answered
+    fused: Floats  # the policy, `(..., A)`
+    # index of its most probable action, `(...)`. A tie is drawn; without draws it goes to the earlier action,
+    # the more careful one
     action: Ints
+    # whether the fusion call's answer was unusable, so that `fused` is the ego's own intent, `(...)`
     fusion_failed: Bools
+    # when the ego acts, `(...)`: end of exchange and fusion. The paper's `latency_proxy`. NaN where the ego's
+    # inference time is unknown
     latency_s: Floats
-    deadline_missed: Bools
+    deadline_missed: Bools  # whether that is after the window, `(...)`
+    # the rule's memory at the episode's next step, `(..., K)`; K is 0 for a rule without memory
     state: Floats
-    trust: Floats
+    trust: Floats  # how far the rule trusts each helper, `(..., H)`; NaN if it rates none (`consensus.Fused`)
 
     @property
     def fusion_s(self) -> Floats:

@@ -41,47 +41,35 @@ from harness.radio.wrapped import innermost
 
 @dataclass(frozen=True)
 class Exchange:
-    """What was sent and heard in each decision. Times are seconds from the start of the decision.
+    """What was sent and heard in each decision. Times are seconds from the start of the decision."""
 
-    Attributes:
-        own: the ego's intent after the fallback, `(..., A)`.
-        own_failed: whether the ego's answer was unusable, so that `own` is the fallback, `(...)`.
-        entropy_nats: entropy of `own`, `(...)`.
-        triggered: whether the ego asks at least one helper, `(...)`. By default it asks those in the radius
-            if the entropy is above tau. Without a channel, or with nobody in the radius, it asks nobody.
-        asked: which helpers are asked; each has a scheduled reply, `(..., H)`.
-        infers: which helpers' computers infer for this decision, `(..., H)`: those in the radius, asked or
-            not, or on demand those that are asked. None without a channel.
-        requests: number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of a unit
-            that asks for the ego; 0 if nobody is asked.
-        request_bits: size of the requests, `(...)`; 0 if nobody is asked.
-        reply_bits: size of all scheduled replies, and of the policy that a unit sends, `(...)`.
-        airtime_s: total time on air of the request and the scheduled replies, `(...)`; NaN if the channel
-            model does not have it.
-        loss: packet loss, the probability that one transmission was lost, `(...)`: the mean over the helpers
-            asked if links differ; NaN without a channel.
-        delivered: whether the helper was asked, and request and reply crossed, `(..., H)`; if a unit fuses,
-            its policy must have crossed, too.
-        arrival_s: end of the reply at whoever fuses, `(..., H)`; inf if lost or not asked.
-        on_time: whether it arrived within the window and so is fused, `(..., H)`.
-        exchange_s: end of the whole exchange, `(...)`.
-    """
-
-    own: Floats
-    own_failed: Bools
-    entropy_nats: Floats
+    own: Floats  # the ego's intent after the fallback, `(..., A)`
+    own_failed: Bools  # whether the ego's answer was unusable, so that `own` is the fallback, `(...)`
+    entropy_nats: Floats  # entropy of `own`, `(...)`
+    # whether the ego asks at least one helper, `(...)`. By default it asks those in the radius if the entropy
+    # is above tau. Without a channel, or with nobody in the radius, it asks nobody
     triggered: Bools
-    asked: Bools
+    asked: Bools  # which helpers are asked; each has a scheduled reply, `(..., H)`
+    # which helpers' computers infer for this decision, `(..., H)`: those in the radius, asked or not, or on
+    # demand those that are asked. None without a channel
     infers: Bools
+    # number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of a unit that asks for
+    # the ego; 0 if nobody is asked
     requests: Ints
-    request_bits: Floats
-    reply_bits: Floats
+    request_bits: Floats  # size of the requests, `(...)`; 0 if nobody is asked
+    reply_bits: Floats  # size of all scheduled replies, and of the policy that a unit sends, `(...)`
+    # total time on air of the request and the scheduled replies, `(...)`; NaN if the channel model does not
+    # have it
     airtime_s: Floats
+    # packet loss, the probability that one transmission was lost, `(...)`: the mean over the helpers asked if
+    # links differ; NaN without a channel
     loss: Floats
+    # whether the helper was asked, and request and reply crossed, `(..., H)`; if a unit fuses, its policy
+    # must have crossed, too
     delivered: Bools
-    arrival_s: Floats
-    on_time: Bools
-    exchange_s: Floats
+    arrival_s: Floats  # end of the reply at whoever fuses, `(..., H)`; inf if lost or not asked
+    on_time: Bools  # whether it arrived within the window and so is fused, `(..., H)`
+    exchange_s: Floats  # end of the whole exchange, `(...)`
 
     @cached_property
     def normalised_entropy(self) -> Floats:

@@ -14,40 +14,30 @@ from harness.radio.channel import Site
 
 @dataclass(frozen=True)
 class Intents:
-    """What every vehicle intends, and what the reply to a request would cost; H helpers, A actions.
+    """What every vehicle intends, and what the reply to a request would cost; H helpers, A actions."""
 
-    Attributes:
-        own: the ego's intent, `(..., A)`; a row with a NaN is a failed answer.
-        helpers: helpers' intents, `(..., H, A)`.
-        valid: whether the helper exists and its answer parsed, `(..., H)`. Any other helper sends nothing,
-            takes no slot, and may hold NaN in every array.
-        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`, the ego first; that of a
-            helper is as the ego knows it, from beacons.
-        range_m: distance to the ego, `(..., H)`, as the ego knows it.
-        payload_bits: size of the reply, `(..., H)`.
-        inference_s: seconds of inference, `(..., 1+H)`, the ego first; NaN where unknown.
-        site: where the vehicles truly are, if the channel needs it; else None.
-        silent: whether the helper, if asked, sends nothing in its slot, `(..., H)`. None if no helper is.
-        voice_of: index of the vehicle behind each of the H voices, `(..., H)`. None if each vehicle has one
-            voice.
-        outlook: what the ego sees and what helpers would add, if a schedule needs it; else None.
-        claims: what helpers claim about themselves, if a rule or an attack needs it; else None.
-        unasked: whether the helper's model was not asked yet, `(..., H)`; until then it counts as valid. None
-            if the models of all were.
-    """
-
-    own: Floats
-    helpers: Floats
+    own: Floats  # the ego's intent, `(..., A)`; a row with a NaN is a failed answer
+    helpers: Floats  # helpers' intents, `(..., H, A)`
+    # whether the helper exists and its answer parsed, `(..., H)`. Any other helper sends nothing, takes no
+    # slot, and may hold NaN in every array
     valid: Bools
+    # distance to the centroid of the conflict zone, `(..., 1+H)`, the ego first; that of a helper is as the
+    # ego knows it, from beacons
     distance_m: Floats
-    range_m: Floats
-    payload_bits: Floats
-    inference_s: Floats
-    site: Site | None = None
+    range_m: Floats  # distance to the ego, `(..., H)`, as the ego knows it
+    payload_bits: Floats  # size of the reply, `(..., H)`
+    inference_s: Floats  # seconds of inference, `(..., 1+H)`, the ego first; NaN where unknown
+    site: Site | None = None  # where the vehicles truly are, if the channel needs it; else None
+    # whether the helper, if asked, sends nothing in its slot, `(..., H)`. None if no helper is
     silent: Bools | None = None
+    # index of the vehicle behind each of the H voices, `(..., H)`. None if each vehicle has one voice
     voice_of: Ints | None = None
+    # what the ego sees and what helpers would add, if a schedule needs it; else None
     outlook: Outlook | None = None
+    # what helpers claim about themselves, if a rule or an attack needs it; else None
     claims: Claims | None = None
+    # whether the helper's model was not asked yet, `(..., H)`; until then it counts as valid. None if the
+    # models of all were
     unasked: Bools | None = None
 
     def take(self, at: Any) -> "Intents":

@@ -18,23 +18,14 @@ INPUTS = (
 
 @dataclass(frozen=True)
 class Network:
-    """A network with one hidden layer, of F inputs and J units.
+    """A network with one hidden layer, of F inputs and J units."""
 
-    Attributes:
-        centre: what is subtracted from each input, (F,).
-        scale: what each input is then divided by, (F,).
-        into: weights from the inputs to the units, (F, J).
-        bias: bias of each unit, (J,).
-        out: weights from the units to the output, (J,).
-        base: bias of the output.
-    """
-
-    centre: Floats
-    scale: Floats
-    into: Floats
-    bias: Floats
-    out: Floats
-    base: float
+    centre: Floats  # what is subtracted from each input, (F,)
+    scale: Floats  # what each input is then divided by, (F,)
+    into: Floats  # weights from the inputs to the units, (F, J)
+    bias: Floats  # bias of each unit, (J,)
+    out: Floats  # weights from the units to the output, (J,)
+    base: float  # bias of the output
 
     def __call__(self, inputs: Floats) -> Floats:
         """Return the output `(...)` for inputs `(..., F)`."""
@@ -69,27 +60,16 @@ class Weights:
 
 @dataclass(frozen=True)
 class Stated:
-    """The content of a file of `schedules/`.
+    """The content of a file of `schedules/`."""
 
-    Attributes:
-        description: one sentence.
-        command: the command that made the file.
-        learnt_from: the runs that it was learnt from, with their layout seeds.
-        tuned_on: the runs on which the threshold was chosen, with their layout seeds.
-        condition: the operating point under which it was learnt.
-        threshold: the schedule's threshold.
-        inputs: the names of the network's inputs, `INPUTS`.
-        network: the network's weights.
-    """
-
-    description: str
-    command: str
-    learnt_from: tuple[str, ...]
-    tuned_on: tuple[str, ...]
-    condition: str
-    threshold: float
-    inputs: tuple[str, ...]
-    network: Weights
+    description: str  # one sentence
+    command: str  # the command that made the file
+    learnt_from: tuple[str, ...]  # the runs that it was learnt from, with their layout seeds
+    tuned_on: tuple[str, ...]  # the runs on which the threshold was chosen, with their layout seeds
+    condition: str  # the operating point under which it was learnt
+    threshold: float  # the schedule's threshold
+    inputs: tuple[str, ...]  # the names of the network's inputs, `INPUTS`
+    network: Weights  # the network's weights
 
     def schedule(self, where: str) -> Learnt:
         """Return the schedule. Raises UserError for other inputs than `INPUTS`, or weights of other sizes."""

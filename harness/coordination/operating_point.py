@@ -37,17 +37,11 @@ TEXTS = (
 
 
 class Rewrites(NamedTuple):
-    """How a fusion call shows messages.
+    """How a fusion call shows messages."""
 
-    Attributes:
-        blind: whether they come from helpers that are shown nothing.
-        attack: the attack that changes attackers' messages (`attacks.in_text`); empty for none.
-        defences: the defences that change every message.
-    """
-
-    blind: bool = False
-    attack: str = ""
-    defences: tuple[str, ...] = ()
+    blind: bool = False  # whether they come from helpers that are shown nothing
+    attack: str = ""  # the attack that changes attackers' messages (`attacks.in_text`); empty for none
+    defences: tuple[str, ...] = ()  # the defences that change every message
 
 
 AS_SENT = Rewrites()
@@ -55,86 +49,67 @@ AS_SENT = Rewrites()
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """The settings of one condition. Raises UserError for a value that is not allowed.
+    """The settings of one condition. Raises UserError for a value that is not allowed."""
 
-    Attributes:
-        name: its name in reports.
-        profile: channel profile; None disables V2V.
-        tau_nats: the entropy above which the ego asks.
-        schedule: the rule for whom the ego asks and when: `entropy`, the paper's, or another of `SCHEDULES`.
-        threshold: the worth above which another schedule asks, in that schedule's unit; None keeps the
-            schedule's own.
-        window_s: decision window, from the start of the decision; a later reply is not fused.
-        radius_m: the paper's R; helpers farther from the ego are not asked.
-        max_helpers: the cooperative neighbourhood; if there are more helpers, the nearest are asked.
-        min_distance_m: lower bound of d in the paper's Eq. 2.
-        ego_distance_m: the ego's d in Eq. 2; None takes its distance to the centroid of the conflict zone.
-            The paper's preset declares a proxy of 3.5 m (section IV-A).
-        fallback: what replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass
-            on the first action, which is the most conservative one.
-        consensus: consensus rule, or `ego-prompt`.
-        request_bits: size of the ego's request. The default is 50 bytes: who asks whom and until when, as
-            compact JSON without a signature or headers. Replies are counted in the same way.
-        loss: probability that one transmission is lost; None keeps that of the profile or of the link.
-        latency_s: nominal seconds of one exchange; None keeps the profile's.
-        density_coupled: whether loss follows the number of active vehicles, instead of the profile's loss.
-        helper_rounds: whether a helper whose entropy is above tau opens a round of its own, which loads the
-            channel.
-        edge: what a roadside unit does: `relay` sends replies once more; `fusion` asks the helpers for the
-            ego and fuses (`harness.radio.roadside`). With the constant model a relay has no place
-            (`constant.Radio`).
-        edge_delay_s: time from the end of what the unit receives to the start of what it sends: processing
-            and backhaul. The default, 0, is declared: a unit that has nothing to wait for.
-        edge_x_m: the unit's place, m to the east of the centroid of the conflict zone; 0 and 0 is a gantry
-            above it.
-        edge_y_m: the unit's place, m to the south of the centroid.
-        edge_antenna_m: height of its antenna; by default 5 m (TR 37.885, table 6.1.4-1, a roadside unit).
-        on_demand: whether a helper infers only when it is asked, and not in parallel with the ego.
-        messages: what the ego hears: its `own` helpers, or as a control what helpers say in another layout
-            (`shuffled`) or what helpers say that are shown nothing (`blind`). A gain that remains under a
-            control does not come from what helpers see.
-        round_trip: network over which the ego asks its model in a cloud, a name of `harness.radio.networks`.
-            Each decision draws a round trip, which is added to the model's inference.
-        round_trip_s: seconds from the ego's question to the answer of a model in a cloud; they replace the
-            ego's own inference.
-        radio: further settings of the profile's channel, such as `density_per_km=200,power_dbm=23`.
-        attack: what some helpers do instead of saying what they intend, such as `liar:share=1/3+spoof`
-            (`harness.coordination.attacks`); empty for honest helpers.
-        defence: what guards a fusion call, some of `DEFENCES` joined by `+`: `quoted` makes evidence a JSON
-            string; `schema` removes free text from messages; `majority` lets an action on which most voices
-            agree win against the call's.
-        weight_cap: largest share of the weight that one helper may have (`consensus.capped`); 1 caps nothing.
-    """
-
-    name: str
-    profile: str | None
-    tau_nats: float = 0.7
+    name: str  # its name in reports
+    profile: str | None  # channel profile; None disables V2V
+    tau_nats: float = 0.7  # the entropy above which the ego asks
+    # the rule for whom the ego asks and when: `entropy`, the paper's, or another of `SCHEDULES`
     schedule: str = PAPER
+    # the worth above which another schedule asks, in that schedule's unit; None keeps the schedule's own
     threshold: float | None = None
-    window_s: float = 0.2
-    radius_m: float = 100.0
-    max_helpers: int = 3
-    min_distance_m: float = 1.0
+    window_s: float = 0.2  # decision window, from the start of the decision; a later reply is not fused
+    radius_m: float = 100.0  # the paper's R; helpers farther from the ego are not asked
+    max_helpers: int = 3  # the cooperative neighbourhood; if there are more helpers, the nearest are asked
+    min_distance_m: float = 1.0  # lower bound of d in the paper's Eq. 2
+    # the ego's d in Eq. 2; None takes its distance to the centroid of the conflict zone. The paper's preset
+    # declares a proxy of 3.5 m (section IV-A)
     ego_distance_m: float | None = None
+    # what replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass on the
+    # first action, which is the most conservative one
     fallback: str = "uniform"
-    consensus: str = "linear"
+    consensus: str = "linear"  # consensus rule, or `ego-prompt`
+    # size of the ego's request. The default is 50 bytes: who asks whom and until when, as compact JSON
+    # without a signature or headers. Replies are counted in the same way
     request_bits: float = 400.0
+    # probability that one transmission is lost; None keeps that of the profile or of the link
     loss: float | None = None
-    latency_s: float | None = None
+    latency_s: float | None = None  # nominal seconds of one exchange; None keeps the profile's
+    # whether loss follows the number of active vehicles, instead of the profile's loss
     density_coupled: bool = False
+    # whether a helper whose entropy is above tau opens a round of its own, which loads the channel
     helper_rounds: bool = False
+    # what a roadside unit does: `relay` sends replies once more; `fusion` asks the helpers for the ego and
+    # fuses (`harness.radio.roadside`). With the constant model a relay has no place (`constant.Radio`)
     edge: str = "none"
+    # time from the end of what the unit receives to the start of what it sends: processing and backhaul. The
+    # default, 0, is declared: a unit that has nothing to wait for
     edge_delay_s: float = 0.0
+    # the unit's place, m to the east of the centroid of the conflict zone; 0 and 0 is a gantry above it
     edge_x_m: float = 0.0
-    edge_y_m: float = 0.0
+    edge_y_m: float = 0.0  # the unit's place, m to the south of the centroid
+    # height of its antenna; by default 5 m (TR 37.885, table 6.1.4-1, a roadside unit)
     edge_antenna_m: float = 5.0
-    on_demand: bool = False
+    on_demand: bool = False  # whether a helper infers only when it is asked, and not in parallel with the ego
+    # what the ego hears: its `own` helpers, or as a control what helpers say in another layout (`shuffled`)
+    # or what helpers say that are shown nothing (`blind`). A gain that remains under a control does not come
+    # from what helpers see
     messages: str = "own"
+    # seconds from the ego's question to the answer of a model in a cloud; they replace the ego's own
+    # inference
     round_trip_s: float | None = None
+    # network over which the ego asks its model in a cloud, a name of `harness.radio.networks`. Each decision
+    # draws a round trip, which is added to the model's inference
     round_trip: str = ""
-    radio: str = ""
+    radio: str = ""  # further settings of the profile's channel, such as `density_per_km=200,power_dbm=23`
+    # what some helpers do instead of saying what they intend, such as `liar:share=1/3+spoof`
+    # (`harness.coordination.attacks`); empty for honest helpers
     attack: str = ""
+    # what guards a fusion call, some of `DEFENCES` joined by `+`: `quoted` makes evidence a JSON string;
+    # `schema` removes free text from messages; `majority` lets an action on which most voices agree win
+    # against the call's
     defence: str = ""
+    # largest share of the weight that one helper may have (`consensus.capped`); 1 caps nothing
     weight_cap: float = 1.0
 
     def __post_init__(self) -> None:

@@ -17,19 +17,14 @@ from harness.core.arrays import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class Outlook:
-    """What the ego sees of the scenario's R regions, and what it can infer that its helpers see.
+    """What the ego sees of the scenario's R regions, and what it can infer that its helpers see."""
 
-    Attributes:
-        unseen: share of each region that the ego does not see, `(..., R)`.
-        added: share of each region that a helper sees and the ego does not, `(..., H, R)`. It follows from
-            the place in the helper's last beacon and the obstacles that the ego knows. NaN for a helper that
-            is absent.
-        to_zone_s: seconds until the ego reaches the conflict zone at its speed, `(...)`; 0 once it is there,
-            and inf at a standstill.
-    """
-
-    unseen: Floats
+    unseen: Floats  # share of each region that the ego does not see, `(..., R)`
+    # share of each region that a helper sees and the ego does not, `(..., H, R)`. It follows from the place
+    # in the helper's last beacon and the obstacles that the ego knows. NaN for a helper that is absent
     added: Floats
+    # seconds until the ego reaches the conflict zone at its speed, `(...)`; 0 once it is there, and inf at a
+    # standstill
     to_zone_s: Floats
 
     def take(self, at: Any) -> "Outlook":
@@ -43,28 +38,18 @@ class Outlook:
 
 @dataclass(frozen=True)
 class Known:
-    """What the ego knows before it asks. Values for a helper that may not be asked are arbitrary.
+    """What the ego knows before it asks. Values for a helper that may not be asked are arbitrary."""
 
-    Attributes:
-        own: the ego's intent after the fallback, `(..., A)`.
-        entropy_nats: entropy of `own`, `(...)`.
-        may_ask: which helpers are in the radius and would answer, `(..., H)`.
-        range_m: distance to the ego, `(..., H)`.
-        distance_m: distance to the conflict zone, `(..., 1+H)`, the ego first.
-        in_time: probability that request and reply are received within the window, `(..., H)`, by the
-            channel's model for such links, if all who may be asked are asked.
-        outlook: what the ego sees, and what helpers would add.
-        lot: a draw in [0, 1), new at each decision, `(...)`.
-    """
-
-    own: Floats
-    entropy_nats: Floats
-    may_ask: Bools
-    range_m: Floats
-    distance_m: Floats
+    own: Floats  # the ego's intent after the fallback, `(..., A)`
+    entropy_nats: Floats  # entropy of `own`, `(...)`
+    may_ask: Bools  # which helpers are in the radius and would answer, `(..., H)`
+    range_m: Floats  # distance to the ego, `(..., H)`
+    distance_m: Floats  # distance to the conflict zone, `(..., 1+H)`, the ego first
+    # probability that request and reply are received within the window, `(..., H)`, by the channel's model
+    # for such links, if all who may be asked are asked
     in_time: Floats | None = None
-    outlook: Outlook | None = None
-    lot: Floats | None = None
+    outlook: Outlook | None = None  # what the ego sees, and what helpers would add
+    lot: Floats | None = None  # a draw in [0, 1), new at each decision, `(...)`
 
 
 @runtime_checkable
@@ -88,16 +73,13 @@ class Schedule(Protocol):
 
 @dataclass(frozen=True)
 class Formula:
-    """A schedule that is one function of `Known`.
-
-    Attributes:
-        by_presence: whether what one helper is worth depends on which others may be asked. That of a schedule
-            that does not say may.
-    """
+    """A schedule that is one function of `Known`."""
 
     formula: Callable[[Known], Floats]
     threshold: float | None = None
     needs: tuple[str, ...] = ()
+    # whether what one helper is worth depends on which others may be asked. That of a schedule that does not
+    # say may
     by_presence: bool = False
 
     def worth(self, known: Known) -> Floats:

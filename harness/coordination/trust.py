@@ -29,30 +29,20 @@ CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, tim
 
 @dataclass(frozen=True)
 class Trust:
-    """Reputation with memory. All numbers were chosen on layouts of the tuning range (`docs/trust.md`).
+    """Reputation with memory. All numbers were chosen on layouts of the tuning range (`docs/trust.md`)."""
 
-    Attributes:
-        faith: what counts for and against a helper before its first message.
-        kept: share of what counts for and against a helper that is left at the next step.
-        contradiction: how much more a full contradiction counts than a full agreement.
-        place_tolerance_m: how far a claimed distance may be from the sensed one.
-        lane_tolerance_m: how far from the middle of a lane a claimed place may be, in addition to `noise`.
-        speed_tolerance_mps: how much the mean speed between two claimed places may differ from the mean of
-            the claimed speeds, in addition to `noise`.
-        top_mps: the highest speed of a vehicle.
-        apart_m: the smallest distance between two vehicles.
-        noise: how many standard deviations of a beacon's error a true place may be off.
-    """
-
-    faith: tuple[float, float] = (2.5, 0.5)
-    kept: float = 0.6
-    contradiction: float = 4.0
-    place_tolerance_m: float = 5.0
+    faith: tuple[float, float] = (2.5, 0.5)  # what counts for and against a helper before its first message
+    kept: float = 0.6  # share of what counts for and against a helper that is left at the next step
+    contradiction: float = 4.0  # how much more a full contradiction counts than a full agreement
+    place_tolerance_m: float = 5.0  # how far a claimed distance may be from the sensed one
+    # how far from the middle of a lane a claimed place may be, in addition to `noise`
     lane_tolerance_m: float = 2.0
+    # how much the mean speed between two claimed places may differ from the mean of the claimed speeds, in
+    # addition to `noise`
     speed_tolerance_mps: float = 2.0
-    top_mps: float = 60.0
-    apart_m: float = 2.5
-    noise: float = 4.0
+    top_mps: float = 60.0  # the highest speed of a vehicle
+    apart_m: float = 2.5  # the smallest distance between two vehicles
+    noise: float = 4.0  # how many standard deviations of a beacon's error a true place may be off
     needs: ClassVar[tuple[str, ...]] = ("claims",)
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:

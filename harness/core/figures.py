@@ -27,17 +27,11 @@ class Counted(Bounded, Protocol):
 
 @dataclass(frozen=True)
 class Unit:
-    """How a quantity is written. An unknown value is a dash, and no number is -0.
+    """How a quantity is written. An unknown value is a dash, and no number is -0."""
 
-    Attributes:
-        name: stands behind the number.
-        decimals: digits behind the point.
-        factor: what a stored value is multiplied by.
-    """
-
-    name: str = ""
-    decimals: int = 1
-    factor: float = 1.0
+    name: str = ""  # stands behind the number
+    decimals: int = 1  # digits behind the point
+    factor: float = 1.0  # what a stored value is multiplied by
 
     def number(self, value: float | None, sign: str = "", digits: int | None = None) -> str:
         """Write a value without the unit's name.

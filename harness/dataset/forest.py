@@ -22,37 +22,21 @@ from harness.world.outcome import ROUNDING_S
 
 @dataclass(frozen=True)
 class Forest:
-    """E trees with N decision points and A actions; within a tree, decision points are ordered by level.
+    """E trees with N decision points and A actions; within a tree, decision points are ordered by level."""
 
-    Attributes:
-        actions: the meta-actions.
-        allowance_s: needless delay that an episode may have.
-        episodes: the episode's number of each tree, (E,).
-        seeds: the layout seed of each tree, (E,).
-        dangers: the sector from which each tree's danger comes; None without one.
-        root: the first decision point of each tree, (E,).
-        ids: the ids of the decision points.
-        tree: the tree of each decision point, (N,).
-        step: the step of each decision point, (N,).
-        child: the decision point to which an action leads, (N, A); -1 if the episode ends.
-        edge: the edge that an action takes, (N, A).
-        edges: the edges of all trees.
-        drivers: the index of each reference driver's action, (N,).
-    """
-
-    actions: tuple[str, ...]
-    allowance_s: float
-    episodes: Ints
-    seeds: Ints
-    dangers: tuple[str | None, ...]
-    root: Ints
-    ids: tuple[str, ...]
-    tree: Ints
-    step: Ints
-    child: Ints
-    edge: Ints
-    edges: tuple[Edge, ...]
-    drivers: Mapping[str, Ints]
+    actions: tuple[str, ...]  # the meta-actions
+    allowance_s: float  # needless delay that an episode may have
+    episodes: Ints  # the episode's number of each tree, (E,)
+    seeds: Ints  # the layout seed of each tree, (E,)
+    dangers: tuple[str | None, ...]  # the sector from which each tree's danger comes; None without one
+    root: Ints  # the first decision point of each tree, (E,)
+    ids: tuple[str, ...]  # the ids of the decision points
+    tree: Ints  # the tree of each decision point, (N,)
+    step: Ints  # the step of each decision point, (N,)
+    child: Ints  # the decision point to which an action leads, (N, A); -1 if the episode ends
+    edge: Ints  # the edge that an action takes, (N, A)
+    edges: tuple[Edge, ...]  # the edges of all trees
+    drivers: Mapping[str, Ints]  # the index of each reference driver's action, (N,)
 
     @classmethod
     def of(cls, trees: Sequence[Tree], actions: tuple[str, ...], allowance_s: float) -> "Forest":

@@ -12,21 +12,13 @@ NONE = "none"  # the `danger` of layouts without one
 
 @dataclass(frozen=True)
 class Selection:
-    """Conditions that an episode must all meet; without any, all episodes are selected.
+    """Conditions that an episode must all meet; without any, all episodes are selected."""
 
-    Attributes:
-        limit: keeps the first so many of those that the other conditions leave.
-        only: numbers and ranges such as `3,10:20`; a range leaves out its end.
-        danger: the sector that the hidden danger comes from, or `none`.
-        sample: how many to draw; a larger sample with the same seed contains the smaller one.
-        sample_seed: seed of the draw.
-    """
-
-    limit: int | None = None
-    only: str | None = None
-    danger: str | None = None
-    sample: int | None = None
-    sample_seed: int = 0
+    limit: int | None = None  # keeps the first so many of those that the other conditions leave
+    only: str | None = None  # numbers and ranges such as `3,10:20`; a range leaves out its end
+    danger: str | None = None  # the sector that the hidden danger comes from, or `none`
+    sample: int | None = None  # how many to draw; a larger sample with the same seed contains the smaller one
+    sample_seed: int = 0  # seed of the draw
 
     def __post_init__(self) -> None:
         if self.limit is not None and self.limit < 1:

@@ -17,16 +17,11 @@ PREFIX = "suite:"  # marks a suite's name where a dataset's name is expected
 
 
 class Suite(Struct, frozen=True, forbid_unknown_fields=True):
-    """One suite.
+    """One suite."""
 
-    Attributes:
-        name: the suite's name.
-        description: its purpose.
-        datasets: the names of its datasets, in the order of tables.
-    """
-
-    name: str
-    description: str
+    name: str  # the suite's name
+    description: str  # its purpose
+    # the names of its datasets, in the order of tables
     datasets: Annotated[
         tuple[str, ...], Meta(min_length=1, description="a list of datasets' names, one or more")
     ]

@@ -23,17 +23,11 @@ from harness.radio.fading import Trips
 
 @dataclass(frozen=True)
 class Said:
-    """What H voices say to the channel in decisions (n,).
+    """What H voices say to the channel in decisions (n,)."""
 
-    Attributes:
-        intents: the intents and claims of each voice.
-        draws: the channel's draws for each voice.
-        attackers: which voices are an attacker's, (n, H).
-    """
-
-    intents: Intents
-    draws: Draws
-    attackers: Bools
+    intents: Intents  # the intents and claims of each voice
+    draws: Draws  # the channel's draws for each voice
+    attackers: Bools  # which voices are an attacker's, (n, H)
 
     def take(self, at: Any) -> "Said":
         """Return what is said in the decisions at these indices."""

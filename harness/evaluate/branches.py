@@ -16,49 +16,31 @@ from harness.world.world import Target, World
 
 @dataclass
 class Decision:
-    """A decision of the ego, and when it acts.
+    """A decision of the ego, and when it acts."""
 
-    Attributes:
-        action: the meta-action.
-        frame: the frame in which it acts.
-        acted: whether it has acted.
-    """
-
-    action: str
-    frame: int
-    acted: bool = False
+    action: str  # the meta-action
+    frame: int  # the frame in which it acts
+    acted: bool = False  # whether it has acted
 
 
 @dataclass
 class Course:
-    """One layout under one condition and seed.
+    """One layout under one condition and seed."""
 
-    Attributes:
-        point: the condition.
-        seed: seed of the channel's draws.
-        open: the decision that has not acted yet; until it does, the ego keeps to its last action.
-        skipped: how many decisions did not begin, since one was still open when they were due.
-    """
-
-    point: OperatingPoint
-    seed: int
+    point: OperatingPoint  # the condition
+    seed: int  # seed of the channel's draws
+    # the decision that has not acted yet; until it does, the ego keeps to its last action
     open: Decision | None = None
-    skipped: int = 0
+    skipped: int = 0  # how many decisions did not begin, since one was still open when they were due
 
 
 @dataclass
 class Trajectory:
-    """A world, and the courses that share it so far.
+    """A world, and the courses that share it so far."""
 
-    Attributes:
-        number: the episode's number.
-        world: the world.
-        courses: the episode under each condition and seed.
-    """
-
-    number: int
-    world: World
-    courses: list[Course]
+    number: int  # the episode's number
+    world: World  # the world
+    courses: list[Course]  # the episode under each condition and seed
 
     def act(self) -> list["Trajectory"]:
         """Let the decisions that are ready act; return one trajectory for each target the egos then have."""

@@ -21,17 +21,11 @@ from harness.runs.records import BLIND, REWRITTEN, Answer
 
 @dataclass(frozen=True)
 class FusionAnswers:
-    """The ego's answers to K sets of messages; H helpers, A actions.
+    """The ego's answers to K sets of messages; H helpers, A actions."""
 
-    Attributes:
-        codes: the moment of each set and who was heard in it (`codes_of`), ascending, (K,).
-        intents: the intent after each set, (K, A); NaN where the answer failed.
-        seconds: time of each fusion call, (K,).
-    """
-
-    codes: Ints
-    intents: Floats
-    seconds: Floats
+    codes: Ints  # the moment of each set and who was heard in it (`codes_of`), ascending, (K,)
+    intents: Floats  # the intent after each set, (K, A); NaN where the answer failed
+    seconds: Floats  # time of each fusion call, (K,)
 
     def at(self, moments: Ints, attackers: Bools | None = None) -> "FusionAnswersAt":
         """Return the call for decisions at moments (n,), with attackers (n, H) if the text shows them."""

@@ -19,17 +19,11 @@ CLEAR = 1.2  # times as fast as another, which chance on a shared machine does n
 
 @dataclass(frozen=True)
 class Pace:
-    """An engine's wall time of an answer that is asked alone, after a warm-up.
+    """An engine's wall time of an answer that is asked alone, after a warm-up."""
 
-    Attributes:
-        engine: its name.
-        readout_s: of a read-out whose letters are read once.
-        text_s: of the first `TOKENS` tokens of a free answer.
-    """
-
-    engine: str
-    readout_s: float
-    text_s: float
+    engine: str  # its name
+    readout_s: float  # of a read-out whose letters are read once
+    text_s: float  # of the first `TOKENS` tokens of a free answer
 
 
 def paces(stem: str) -> list[Pace]:

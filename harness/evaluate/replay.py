@@ -25,23 +25,14 @@ STILLS_HZ = 10  # while no decision is open
 
 @dataclass(frozen=True)
 class Played:
-    """One episode of a finished closed-loop run.
+    """One episode of a finished closed-loop run."""
 
-    Attributes:
-        manifest: the run's manifest.
-        condition: name of the condition.
-        seed: seed of the channel's draws.
-        episode: the episode's number.
-        layout_seed: seed of its layout.
-        decisions: its decisions, by step.
-    """
-
-    manifest: Manifest
-    condition: str
-    seed: int
-    episode: int
-    layout_seed: int
-    decisions: list[Decision]
+    manifest: Manifest  # the run's manifest
+    condition: str  # name of the condition
+    seed: int  # seed of the channel's draws
+    episode: int  # the episode's number
+    layout_seed: int  # seed of its layout
+    decisions: list[Decision]  # its decisions, by step
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -53,25 +44,15 @@ class Played:
 
 @dataclass(frozen=True)
 class Still:
-    """One picture of an episode.
+    """One picture of an episode."""
 
-    Attributes:
-        state: the state of the world.
-        seen: the state when the last decision began.
-        decision: that decision, open or taken.
-        since_s: seconds since it began.
-        open: whether it has not acted yet.
-        outcome: how the episode ended; empty until it has.
-        danger: id of the dangerous vehicle, or None.
-    """
-
-    state: WorldState
-    seen: WorldState
-    decision: Decision
-    since_s: float
-    open: bool
-    outcome: str
-    danger: str | None
+    state: WorldState  # the state of the world
+    seen: WorldState  # the state when the last decision began
+    decision: Decision  # that decision, open or taken
+    since_s: float  # seconds since it began
+    open: bool  # whether it has not acted yet
+    outcome: str  # how the episode ended; empty until it has
+    danger: str | None  # id of the dangerous vehicle, or None
 
 
 def find(path: Path, episode: int, condition: str | None, seed: int | None) -> Played:

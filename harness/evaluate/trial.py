@@ -24,38 +24,22 @@ CHUNK = 8  # requests that are asked together
 
 
 class Answers(Struct, frozen=True):
-    """What one role's answers to the fixed questions are like.
+    """What one role's answers to the fixed questions are like."""
 
-    Attributes:
-        role: the role.
-        n: number of questions.
-        readable: answers that say what to do.
-        strict: answers that need no repair.
-        distinct: answers that differ in their text.
-        action: the commonest likeliest action of the readable ones; None without any.
-        action_count: in how many of them it is the likeliest.
-        example_copies: answers that are one of the prompt's examples' answers.
-        placeholder_copies: answers that copy a placeholder of the prompt.
-        bad_sums: answers whose numbers do not sum to one.
-        at_limit: answers that ran to the limit of tokens.
-        faults: how many answers have each fault for which they cannot be read, by status; an answer may have
-            several.
-        sample: the first text of the commonest kind.
-    """
-
-    role: Role
-    n: int
-    readable: int
-    strict: int
-    distinct: int
-    action: str | None
-    action_count: int
-    example_copies: int
-    placeholder_copies: int
-    bad_sums: int
-    at_limit: int
+    role: Role  # the role
+    n: int  # number of questions
+    readable: int  # answers that say what to do
+    strict: int  # answers that need no repair
+    distinct: int  # answers that differ in their text
+    action: str | None  # the commonest likeliest action of the readable ones; None without any
+    action_count: int  # in how many of them it is the likeliest
+    example_copies: int  # answers that are one of the prompt's examples' answers
+    placeholder_copies: int  # answers that copy a placeholder of the prompt
+    bad_sums: int  # answers whose numbers do not sum to one
+    at_limit: int  # answers that ran to the limit of tokens
+    # how many answers have each fault for which they cannot be read, by status; an answer may have several
     faults: dict[str, int]
-    sample: str
+    sample: str  # the first text of the commonest kind
 
     def sentences(self) -> Iterator[str]:
         """Yield what the role's answers do with the prompt, the most telling first."""
@@ -79,19 +63,12 @@ class Answers(Struct, frozen=True):
 
 
 class Trial(Struct, frozen=True):
-    """What a model does with a prompt.
+    """What a model does with a prompt."""
 
-    Attributes:
-        model: name of the model.
-        prompt: the prompt version.
-        roles: each role's answers.
-        pairs: how the ego's answers moved in pairs of scenes that differ in one fact.
-    """
-
-    model: str
-    prompt: str
-    roles: tuple[Answers, ...]
-    pairs: tuple[Moved, ...]
+    model: str  # name of the model
+    prompt: str  # the prompt version
+    roles: tuple[Answers, ...]  # each role's answers
+    pairs: tuple[Moved, ...]  # how the ego's answers moved in pairs of scenes that differ in one fact
 
 
 def try_out(backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None) -> Trial:

@@ -26,16 +26,11 @@ _STRAY = frozenset("[](){},;:.\"'`*\\")
 
 @dataclass(frozen=True)
 class Candidate:
-    """An object shaped like an answer.
+    """An object shaped like an answer."""
 
-    Attributes:
-        members: what it holds.
-        repairs: the repairs that reading it took.
-        lost: repairs that would say of members which could not be read that they were not given.
-    """
-
-    members: dict[str, Any]
-    repairs: frozenset[Repair] = frozenset()
+    members: dict[str, Any]  # what it holds
+    repairs: frozenset[Repair] = frozenset()  # the repairs that reading it took
+    # repairs that would say of members which could not be read that they were not given
     lost: frozenset[Repair] = frozenset()
 
 

@@ -41,29 +41,21 @@ _ECHO = re.compile(r"\blow ?\| ?medium\b|[\"']\s*:\s*[\"']?p\d?[\"']?\s*[,}]|[\"
 
 
 class Parsed(Struct, frozen=True):
-    """The result of parsing one completion.
+    """The result of parsing one completion."""
 
-    Attributes:
-        status: the outcome.
-        repairs: the repairs, in the order of `Repair`; empty unless recovered.
-        intent: probabilities in the order of the actions, summing to 1; None if failed.
-        mass: the sum as the model wrote it; None if it wrote none (a recommendation, most failures).
-        message: a helper's evidence, risk, recommended_maneuver and confidence. For a distribution, the
-            maneuver is the most probable action (the first of equals) and the confidence its probability.
-        reasoning: the thought, or None; the whole text if the thought was never closed.
-        detail: one sentence for people, safe to print.
-        faults: if failed, all that is wrong with it, the status first.
-        extension: the further members that were asked for; None without any, or if they do not fit.
-    """
-
-    status: Status
-    repairs: tuple[Repair, ...] = ()
+    status: Status  # the outcome
+    repairs: tuple[Repair, ...] = ()  # the repairs, in the order of `Repair`; empty unless recovered
+    # probabilities in the order of the actions, summing to 1; None if failed
     intent: tuple[float, ...] | None = None
+    # the sum as the model wrote it; None if it wrote none (a recommendation, most failures)
     mass: float | None = None
+    # a helper's evidence, risk, recommended_maneuver and confidence. For a distribution, the maneuver is the
+    # most probable action (the first of equals) and the confidence its probability
     message: dict[str, Any] | None = None
-    reasoning: str | None = None
-    detail: str = ""
-    faults: tuple[Status, ...] = ()
+    reasoning: str | None = None  # the thought, or None; the whole text if the thought was never closed
+    detail: str = ""  # one sentence for people, safe to print
+    faults: tuple[Status, ...] = ()  # if failed, all that is wrong with it, the status first
+    # the further members that were asked for; None without any, or if they do not fit
     extension: dict[str, Any] | None = None
 
     @property

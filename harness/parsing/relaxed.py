@@ -84,19 +84,12 @@ DECODER = json.JSONDecoder(object_pairs_hook=from_pairs, parse_int=float)
 
 @dataclass(frozen=True)
 class Token:
-    """A token of the text.
+    """A token of the text."""
 
-    Attributes:
-        kind: a group of the pattern; `other` for a character that begins no token, `end` at the text's end.
-        text: the text as written, with full-width numbers and marks as ASCII.
-        end: where the next token may begin.
-        repairs: repairs for the token and the comments before it.
-    """
-
-    kind: str
-    text: str
-    end: int
-    repairs: frozenset[Repair] = frozenset()
+    kind: str  # a group of the pattern; `other` for a character that begins no token, `end` at the text's end
+    text: str  # the text as written, with full-width numbers and marks as ASCII
+    end: int  # where the next token may begin
+    repairs: frozenset[Repair] = frozenset()  # repairs for the token and the comments before it
 
 
 def next_token(text: str, at: int) -> Token:

@@ -20,19 +20,13 @@ EVIDENCE_CHARS = 200
 
 
 class Shape(NamedTuple):
-    """What decides the JSON of an answer.
+    """What decides the JSON of an answer."""
 
-    Attributes:
-        role: `ego` or `helper`.
-        actions: meta-action names, in the environment's order.
-        form: one of the role's `FORMS`; None for any of them.
-        extension: JSON text of the schemas of further members by name (`harness.prompts.extension`), which
-            come first; empty for none.
-    """
-
-    role: str
-    actions: tuple[str, ...]
-    form: str | None = None
+    role: str  # `ego` or `helper`
+    actions: tuple[str, ...]  # meta-action names, in the environment's order
+    form: str | None = None  # one of the role's `FORMS`; None for any of them
+    # JSON text of the schemas of further members by name (`harness.prompts.extension`), which come first;
+    # empty for none
     extension: str = ""
 
     @property

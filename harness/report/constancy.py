@@ -16,21 +16,13 @@ DRIVERS = {action: driver for driver, action in ALWAYS.items()}
 
 @dataclass(frozen=True)
 class Commonest:
-    """What an ego answers most often.
+    """What an ego answers most often."""
 
-    Attributes:
-        actions: the likeliest action of these answers; several where they are equally likely.
-        count: in how many readable answers.
-        n: how many are readable.
-        moves: standard deviation of the action's probability over all readable answers.
-        all_read: whether every answer could be read.
-    """
-
-    actions: Sequence[str]
-    count: int
-    n: int
-    moves: float
-    all_read: bool
+    actions: Sequence[str]  # the likeliest action of these answers; several where they are equally likely
+    count: int  # in how many readable answers
+    n: int  # how many are readable
+    moves: float  # standard deviation of the action's probability over all readable answers
+    all_read: bool  # whether every answer could be read
 
     @property
     def likeliest(self) -> str:

@@ -23,35 +23,23 @@ WIDTH, HEIGHT = 240, 22  # of the picture of a line
 
 @dataclass(frozen=True)
 class Line:
-    """One run.
+    """One run."""
 
-    Attributes:
-        name: its folder, from the folder that is looked through.
-        date: when it began.
-        run: as it was read.
-        score: its value in the group's condition; None where it has none.
-    """
-
-    name: str
-    date: datetime
-    run: Run
-    score: Score | None
+    name: str  # its folder, from the folder that is looked through
+    date: datetime  # when it began
+    run: Run  # as it was read
+    score: Score | None  # its value in the group's condition; None where it has none
 
 
 @dataclass(frozen=True)
 class Group:
-    """Runs of the same scenes.
+    """Runs of the same scenes."""
 
-    Attributes:
-        of: the scenes, for people: a dataset with its digest, or a scenario with its layouts.
-        condition: of the values: the one that was asked for, or the last of those that most of the runs have;
-            `all` of a metric that depends on none.
-        lines: by date, the oldest first.
-    """
-
-    of: str
+    of: str  # the scenes, for people: a dataset with its digest, or a scenario with its layouts
+    # of the values: the one that was asked for, or the last of those that most of the runs have; `all` of a
+    # metric that depends on none
     condition: str
-    lines: tuple[Line, ...]
+    lines: tuple[Line, ...]  # by date, the oldest first
 
 
 def history(

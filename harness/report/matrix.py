@@ -23,15 +23,12 @@ BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 
 @dataclass(frozen=True)
 class Behind:
-    """A run against the best one, over the episodes that both have.
+    """A run against the best one, over the episodes that both have."""
 
-    Attributes:
-        change: its success minus the best one's, with a 95 % interval over the episodes that both have.
-        p_value: of no difference, by that interval, corrected by Holm's method for the pairs of runs under
-            all conditions.
-    """
-
+    # its success minus the best one's, with a 95 % interval over the episodes that both have
     change: Estimate
+    # of no difference, by that interval, corrected by Holm's method for the pairs of runs under all
+    # conditions
     p_value: float
 
     @property
@@ -42,43 +39,27 @@ class Behind:
 
 @dataclass(frozen=True)
 class Line:
-    """One run under one condition.
+    """One run under one condition."""
 
-    Attributes:
-        name: of the run.
-        model: of its card.
-        prompt: version.
-        answer: answer mode.
-        condition: operating point.
-        scores: metrics by name; None where the run has none.
-        tokens: median tokens of a prompt and of an answer; None where the engine counts none.
-        mark: `BEST` under its condition, `CLOSE` or `WORSE`; empty where no run is the best.
-        behind: how it stands to the best; None for the best.
-    """
-
-    name: str
-    model: str
-    prompt: str
-    answer: str
-    condition: str
-    scores: Mapping[str, Score | None]
+    name: str  # of the run
+    model: str  # of its card
+    prompt: str  # version
+    answer: str  # answer mode
+    condition: str  # operating point
+    scores: Mapping[str, Score | None]  # metrics by name; None where the run has none
+    # median tokens of a prompt and of an answer; None where the engine counts none
     tokens: tuple[float | None, float | None]
-    mark: str
-    behind: Behind | None
+    mark: str  # `BEST` under its condition, `CLOSE` or `WORSE`; empty where no run is the best
+    behind: Behind | None  # how it stands to the best; None for the best
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Success under one condition, prompts across and models down.
+    """Success under one condition, prompts across and models down."""
 
-    Attributes:
-        condition: operating point.
-        prompts: heads of the columns: version, and the answer mode where runs differ in it.
-        rows: a model, and what was run with each of these prompts: several if it was run again.
-    """
-
-    condition: str
-    prompts: tuple[str, ...]
+    condition: str  # operating point
+    prompts: tuple[str, ...]  # heads of the columns: version, and the answer mode where runs differ in it
+    # a model, and what was run with each of these prompts: several if it was run again
     rows: tuple[tuple[str, tuple[tuple[Line, ...], ...]], ...]
 
 

@@ -16,21 +16,13 @@ BUDGET = (200, 400)  # tokens of a prompt: the paper's
 
 @dataclass(frozen=True)
 class Panel:
-    """One chart of the page.
+    """One chart of the page."""
 
-    Attributes:
-        id: its name in the page, and of the files it is saved as.
-        part: of the page.
-        title: what is drawn over what.
-        caption: how to read it, and what it is conditional on.
-        spec: Vega-Lite.
-    """
-
-    id: str
-    part: Part
-    title: str
-    caption: str
-    spec: dict[str, Any]
+    id: str  # its name in the page, and of the files it is saved as
+    part: Part  # of the page
+    title: str  # what is drawn over what
+    caption: str  # how to read it, and what it is conditional on
+    spec: dict[str, Any]  # Vega-Lite
 
 
 def panels(runs: Runs) -> Iterator[Panel]:

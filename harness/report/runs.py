@@ -17,17 +17,11 @@ from harness.world.scenario import Scenario
 
 @dataclass(frozen=True)
 class Runs:
-    """Finished runs on the same scenes, all frozen or all closed-loop.
+    """Finished runs on the same scenes, all frozen or all closed-loop."""
 
-    Attributes:
-        runs: in the order given.
-        names: model, prompt and, where two would be equal, more.
-        dataset: where the scenes of frozen runs are from; None for closed-loop runs.
-    """
-
-    runs: tuple[Run, ...]
-    names: tuple[str, ...]
-    dataset: Dataset | None
+    runs: tuple[Run, ...]  # in the order given
+    names: tuple[str, ...]  # model, prompt and, where two would be equal, more
+    dataset: Dataset | None  # where the scenes of frozen runs are from; None for closed-loop runs
 
     @property
     def live(self) -> bool:

@@ -26,34 +26,21 @@ MEAN = "mean over families"
 
 @dataclass(frozen=True)
 class Cell:
-    """One family under one condition.
+    """One family under one condition."""
 
-    Attributes:
-        success: success rate.
-        gain: over `BASELINE`, paired; None where there is none.
-        verdict: `better` or `worse` where the gain is not chance, its p at most 0.05 by Holm's method.
-    """
-
-    success: Score | None
-    gain: Score | None
-    verdict: str
+    success: Score | None  # success rate
+    gain: Score | None  # over `BASELINE`, paired; None where there is none
+    verdict: str  # `better` or `worse` where the gain is not chance, its p at most 0.05 by Holm's method
 
 
 @dataclass(frozen=True)
 class Line:
-    """One family, or the mean over families.
+    """One family, or the mean over families."""
 
-    Attributes:
-        name: the family's.
-        run: its run; None for the mean.
-        drivers: success of each reference, which needs no model, in the same episodes.
-        cells: by condition.
-    """
-
-    name: str
-    run: Run | None
-    drivers: Mapping[str, Score]
-    cells: Mapping[str, Cell]
+    name: str  # the family's
+    run: Run | None  # its run; None for the mean
+    drivers: Mapping[str, Score]  # success of each reference, which needs no model, in the same episodes
+    cells: Mapping[str, Cell]  # by condition
 
 
 def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> list[Line]:

@@ -16,17 +16,11 @@ _ANSWER = msgspec.json.Decoder(Answer)
 
 @dataclass(frozen=True)
 class Answered:
-    """What the questions of a run came to that got an answer.
+    """What the questions of a run came to that got an answer."""
 
-    Attributes:
-        count: how many answers there are, by role.
-        failed: how many could not be read, by role and status.
-        ego: distributions over the actions that the ego answered and could be read, (n, A).
-    """
-
-    count: Counter[str]
-    failed: Mapping[str, Counter[str]]
-    ego: Floats
+    count: Counter[str]  # how many answers there are, by role
+    failed: Mapping[str, Counter[str]]  # how many could not be read, by role and status
+    ego: Floats  # distributions over the actions that the ego answered and could be read, (n, A)
 
 
 class Answers:

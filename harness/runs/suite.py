@@ -36,19 +36,12 @@ class Contents(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class SuiteRun:
-    """Finished runs of one model, one for each family, under the same conditions and seeds.
+    """Finished runs of one model, one for each family, under the same conditions and seeds."""
 
-    Attributes:
-        path: the folder that holds the runs' folders.
-        name: the suite's name.
-        description: the suite's purpose.
-        runs: the runs by family, which is the scenario's name.
-    """
-
-    path: Path
-    name: str
-    description: str
-    runs: Mapping[str, Run]
+    path: Path  # the folder that holds the runs' folders
+    name: str  # the suite's name
+    description: str  # the suite's purpose
+    runs: Mapping[str, Run]  # the runs by family, which is the scenario's name
 
     @property
     def manifest(self) -> Manifest:

@@ -43,19 +43,13 @@ from harness.runs.records import Answer, AnswerFacts, Episode, Score
 
 @dataclass(frozen=True)
 class Figures:
-    """What the scores of some episodes of a run are computed from.
+    """What the scores of some episodes of a run are computed from."""
 
-    Attributes:
-        grid: the episodes.
-        values: each metric's values by episode, (C, S, E).
-        latency_ms: the decisions' latencies for each condition and seed, in the order of the grid.
-        answers: the answers, each with its episode.
-    """
-
-    grid: Grid
-    values: Mapping[str, Floats]
+    grid: Grid  # the episodes
+    values: Mapping[str, Floats]  # each metric's values by episode, (C, S, E)
+    # the decisions' latencies for each condition and seed, in the order of the grid
     latency_ms: Sequence[Floats]
-    answers: Sequence[tuple[Answer | AnswerFacts, int]]
+    answers: Sequence[tuple[Answer | AnswerFacts, int]]  # the answers, each with its episode
 
     @classmethod
     def of(

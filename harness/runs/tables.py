@@ -31,16 +31,11 @@ class Tables:
     """A finished run, frozen or closed-loop, as tables.
 
     Each table is read on first use, and raises UserError if its file is missing or broken.
-
-    Attributes:
-        path: the run's folder.
-        config: the content of run.json.
-        source: the run's records.
     """
 
-    path: Path
-    config: Mapping[str, Any] = field(repr=False)
-    source: Run = field(repr=False)
+    path: Path  # the run's folder
+    config: Mapping[str, Any] = field(repr=False)  # the content of run.json
+    source: Run = field(repr=False)  # the run's records
 
     @cached_property
     def summary(self) -> "pd.DataFrame":

@@ -30,23 +30,14 @@ Value = float | str
 
 @dataclass(frozen=True)
 class Axis:
-    """One thing that varies.
+    """One thing that varies."""
 
-    Attributes:
-        name: what `--over` calls it.
-        label: what an axis of a figure says, with its unit.
-        field: the operating point's setting; None for the number of vehicles.
-        scale: what a value is multiplied by to be that setting.
-        usual: the grid if none is given; empty if one must be.
-        worded: its values are words, not numbers.
-    """
-
-    name: str
-    label: str
-    field: str | None
-    scale: float
-    usual: str
-    worded: bool = False
+    name: str  # what `--over` calls it
+    label: str  # what an axis of a figure says, with its unit
+    field: str | None  # the operating point's setting; None for the number of vehicles
+    scale: float  # what a value is multiplied by to be that setting
+    usual: str  # the grid if none is given; empty if one must be
+    worded: bool = False  # its values are words, not numbers
 
     def at(self, point: OperatingPoint, value: Value) -> OperatingPoint:
         """Return the operating point with this setting. Raises UserError where it is not allowed."""
@@ -138,21 +129,13 @@ def _values(axis: Axis, part: str) -> Sequence[float]:
 
 @dataclass(frozen=True)
 class Setting:
-    """One grid point of a panel.
+    """One grid point of a panel."""
 
-    Attributes:
-        condition: name of the operating point that it is a change of.
-        point: the operating point.
-        vehicles: how many, the ego included.
-        variable: what varies in the panel; empty where conditions are compared.
-        value: its value there; where axes are crossed, one of each.
-    """
-
-    condition: str
-    point: OperatingPoint
-    vehicles: int
-    variable: str = ""
-    value: Value | tuple[Value, ...] | None = None
+    condition: str  # name of the operating point that it is a change of
+    point: OperatingPoint  # the operating point
+    vehicles: int  # how many, the ego included
+    variable: str = ""  # what varies in the panel; empty where conditions are compared
+    value: Value | tuple[Value, ...] | None = None  # its value there; where axes are crossed, one of each
 
     @property
     def place(self) -> dict[str, Value | None]:

@@ -45,31 +45,21 @@ TIES = "first"  # no two actions that these intents lead to are alike
 
 @dataclass(frozen=True)
 class Parameters:
-    """What `harness/studies/fit.py` gives; nothing of it knows a panel or a grid point.
+    """What `harness/studies/fit.py` gives; nothing of it knows a panel or a grid point."""
 
-    Attributes:
-        left_share: share of episodes whose danger comes from the approach that the nearest helper watches.
-        right_share: the same for the second helper; the rest comes from the third's.
-        guess_right: share of episodes in which an ego that does not see the danger intends rightly.
-        know_right: share of episodes in which one that does see it intends rightly, `guess_right` or more.
-        ego_nats: mean entropy of the ego's intent.
-        ego_sd_nats: its standard deviation over decisions.
-        others_nats: mean entropy of a helper that sees no danger.
-        others_sd_nats: its standard deviation.
-        witness_nats: entropy of the helper that sees the danger.
-        inference_s: seconds of one inference.
-    """
-
+    # share of episodes whose danger comes from the approach that the nearest helper watches
     left_share: float = 0.406
-    right_share: float = 0.282
+    right_share: float = 0.282  # the same for the second helper; the rest comes from the third's
+    # share of episodes in which an ego that does not see the danger intends rightly
     guess_right: float = 0.689
+    # share of episodes in which one that does see it intends rightly, `guess_right` or more
     know_right: float = 0.953
-    ego_nats: float = 0.823
-    ego_sd_nats: float = 0.0502
-    others_nats: float = 0.625
-    others_sd_nats: float = 0.01
-    witness_nats: float = 0.45
-    inference_s: float = 0.145
+    ego_nats: float = 0.823  # mean entropy of the ego's intent
+    ego_sd_nats: float = 0.0502  # its standard deviation over decisions
+    others_nats: float = 0.625  # mean entropy of a helper that sees no danger
+    others_sd_nats: float = 0.01  # its standard deviation
+    witness_nats: float = 0.45  # entropy of the helper that sees the danger
+    inference_s: float = 0.145  # seconds of one inference
 
 
 # Every number that was chosen with rows of the paper (`paper_numbers.csv`) in sight, and those rows.
@@ -94,21 +84,13 @@ FITTED_ON: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class _Drawn:
-    """E episodes of S decisions as n = E x S rows; H helpers.
+    """E episodes of S decisions as n = E x S rows; H helpers."""
 
-    Attributes:
-        right: the action that is right in each row's episode, (n,).
-        intents: what every vehicle intends, the ego as long as it guesses.
-        knowing: the ego's intent once it has heard the witness, (n, A).
-        witness: which helper sees the danger, (n, H).
-        draws: of the channel; a link is up or down for a whole episode.
-    """
-
-    right: Ints
-    intents: Intents
-    knowing: Floats
-    witness: Bools
-    draws: Draws
+    right: Ints  # the action that is right in each row's episode, (n,)
+    intents: Intents  # what every vehicle intends, the ego as long as it guesses
+    knowing: Floats  # the ego's intent once it has heard the witness, (n, A)
+    witness: Bools  # which helper sees the danger, (n, H)
+    draws: Draws  # of the channel; a link is up or down for a whole episode
 
     def step(self, number: int) -> "_Drawn":
         """The rows of one step."""

@@ -40,21 +40,13 @@ PRICE = 1e-6  # of a message in successes, where the fewest messages break a tie
 
 @dataclass(frozen=True)
 class Level:
-    """Decision points N of one step, seeds S, sets of helpers K.
+    """Decision points N of one step, seeds S, sets of helpers K."""
 
-    Attributes:
-        at: the points, ascending, (N,).
-        action: what the ego does if it asks a set, (S, N, K).
-        costs: `COSTS` of asking a set, (S, N, K, C); NaN where unknown.
-        intents: what the vehicles of each decision intend, with the outlook, (S x N, ...).
-        draws: the channel's, (S x N, ...).
-    """
-
-    at: Ints
-    action: Ints
-    costs: Floats
-    intents: Intents
-    draws: Draws
+    at: Ints  # the points, ascending, (N,)
+    action: Ints  # what the ego does if it asks a set, (S, N, K)
+    costs: Floats  # `COSTS` of asking a set, (S, N, K, C); NaN where unknown
+    intents: Intents  # what the vehicles of each decision intend, with the outlook, (S x N, ...)
+    draws: Draws  # the channel's, (S x N, ...)
 
 
 Choose = Callable[[Level, Floats, Floats], Ints]
@@ -62,17 +54,11 @@ Choose = Callable[[Level, Floats, Floats], Ints]
 
 @dataclass(frozen=True)
 class Choices:
-    """What each set of helpers comes to.
+    """What each set of helpers comes to."""
 
-    Attributes:
-        forest: of the run's dataset.
-        sets: which helpers each has, the empty one first, (K, H).
-        levels: of decision points, the first step's first.
-    """
-
-    forest: Forest
-    sets: Bools
-    levels: tuple[Level, ...]
+    forest: Forest  # of the run's dataset
+    sets: Bools  # which helpers each has, the empty one first, (K, H)
+    levels: tuple[Level, ...]  # of decision points, the first step's first
 
     def backwards(self, choose: Choose) -> Iterator[tuple[Level, Floats, Floats, Ints]]:
         """Each level, the last first, with what its sets come to and which are chosen.

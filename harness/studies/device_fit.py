@@ -19,25 +19,16 @@ READOUT, WRITTEN = "readout", "written"
 
 @dataclass(frozen=True)
 class Fit:
-    """One answer of a model on a device, asked alone; NaN where a number of it is not known.
+    """One answer of a model on a device, asked alone; NaN where a number of it is not known."""
 
-    Attributes:
-        row: the model's.
-        answer: `readout`, which is one token, or how it is written.
-        prompt_tokens: read; of a run, the median.
-        output_tokens: written; of a run, the median.
-        seconds: that it takes; of a run, the median.
-        in_time: share of answers that are there within the window; of declared tokens 0 or 1, of one answer.
-        joules: that it takes; of a run, the mean.
-    """
-
-    row: DeviceRow
-    answer: str
-    prompt_tokens: float
-    output_tokens: float
-    seconds: float
+    row: DeviceRow  # the model's
+    answer: str  # `readout`, which is one token, or how it is written
+    prompt_tokens: float  # read; of a run, the median
+    output_tokens: float  # written; of a run, the median
+    seconds: float  # that it takes; of a run, the median
+    # share of answers that are there within the window; of declared tokens 0 or 1, of one answer
     in_time: Estimate
-    joules: Estimate
+    joules: Estimate  # that it takes; of a run, the mean
 
 
 def fits(device: Device, rows: Sequence[DeviceRow], told: "Told", window_s: float) -> list[Fit]:
@@ -47,19 +38,12 @@ def fits(device: Device, rows: Sequence[DeviceRow], told: "Told", window_s: floa
 
 @dataclass(frozen=True)
 class Told:
-    """Answers of which a fit is asked.
+    """Answers of which a fit is asked."""
 
-    Attributes:
-        prompt: tokens read, (n,).
-        output: tokens written by kind of answer, each (n,).
-        episodes: the episode of each, (n,); None for one declared answer.
-        who: the model that wrote them.
-    """
-
-    prompt: Floats
-    output: dict[str, Floats]
-    episodes: Ints | None = None
-    who: str = ""
+    prompt: Floats  # tokens read, (n,)
+    output: dict[str, Floats]  # tokens written by kind of answer, each (n,)
+    episodes: Ints | None = None  # the episode of each, (n,); None for one declared answer
+    who: str = ""  # the model that wrote them
 
 
 def declared(prompt_tokens: int, answer_tokens: int) -> Told:
@@ -100,19 +84,12 @@ def _fit(device: Device, row: DeviceRow, kind: str, told: Told, window_s: float)
 
 @dataclass(frozen=True)
 class Held:
-    """A figure of a run's answers that were asked alone, beside what a device profile says of it.
+    """A figure of a run's answers that were asked alone, beside what a device profile says of it."""
 
-    Attributes:
-        what: `seconds` of an answer, or a rate by its name in a profile.
-        role: whose answers.
-        measured: median with its 95 % interval over episodes; n is how many answers.
-        stated: what the profile says: of seconds the median over the same answers.
-    """
-
-    what: str
-    role: str
-    measured: Estimate
-    stated: float
+    what: str  # `seconds` of an answer, or a rate by its name in a profile
+    role: str  # whose answers
+    measured: Estimate  # median with its 95 % interval over episodes; n is how many answers
+    stated: float  # what the profile says: of seconds the median over the same answers
 
 
 def held(device: Device, row: DeviceRow, run: Run) -> list[Held]:

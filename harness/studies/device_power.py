@@ -16,21 +16,13 @@ WINDOWS = 5  # of asking; the intervals are over them
 
 @dataclass(frozen=True)
 class Drawn:
-    """What one meter says.
+    """What one meter says."""
 
-    Attributes:
-        meter: its name.
-        idle_watts: before, while nothing is asked.
-        watts: while answers are asked one by one.
-        answer_j: of an answer, all that the meter counts.
-        more_j: of that, what is above idling.
-    """
-
-    meter: str
-    idle_watts: float
-    watts: Estimate
-    answer_j: Estimate
-    more_j: Estimate
+    meter: str  # its name
+    idle_watts: float  # before, while nothing is asked
+    watts: Estimate  # while answers are asked one by one
+    answer_j: Estimate  # of an answer, all that the meter counts
+    more_j: Estimate  # of that, what is above idling
 
 
 def measure(

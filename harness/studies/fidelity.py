@@ -34,23 +34,17 @@ SHOWN = 20  # ways to disagree that the page lists
 
 @dataclass(frozen=True)
 class Fidelity:
-    """What the comparison says.
+    """What the comparison says."""
 
-    Attributes:
-        table: a row a model, prompt, answer mode and condition: `frozen`, `closed`, `difference` (frozen
-            minus closed, paired by episode) and `agreement` (share of episodes and seeds with the same
-            result), each with `_low` and `_high`, and `n` episodes; shares from 0 to 1.
-        episodes: a row an episode, condition and seed, with the result and the failure of both.
-        rank: Spearman's correlation of `frozen` and `closed` over the rows of `table`; conditions that make
-            no difference to a model count once. NaN for fewer than `LEAST_RANKED` rows, or where all are
-            alike.
-        ranked: how many rows that is over.
-    """
-
+    # a row a model, prompt, answer mode and condition: `frozen`, `closed`, `difference` (frozen minus closed,
+    # paired by episode) and `agreement` (share of episodes and seeds with the same result), each with `_low`
+    # and `_high`, and `n` episodes; shares from 0 to 1
     table: "pd.DataFrame"
-    episodes: "pd.DataFrame"
+    episodes: "pd.DataFrame"  # a row an episode, condition and seed, with the result and the failure of both
+    # Spearman's correlation of `frozen` and `closed` over the rows of `table`; conditions that make no
+    # difference to a model count once. NaN for fewer than `LEAST_RANKED` rows, or where all are alike
     rank: float
-    ranked: int
+    ranked: int  # how many rows that is over
 
 
 def fidelity(runs: Sequence[Path]) -> Fidelity:

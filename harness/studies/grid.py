@@ -43,17 +43,11 @@ HALVES = ("ego", "helper")
 
 @dataclass(frozen=True)
 class Factor:
-    """What one half of a swarm chooses.
+    """What one half of a swarm chooses."""
 
-    Attributes:
-        half: whose it is, `ego` or `helper`.
-        field: `model`, `prompt` or `answer`.
-        levels: what it may be, the base first.
-    """
-
-    half: str
-    field: str
-    levels: tuple[str, ...]
+    half: str  # whose it is, `ego` or `helper`
+    field: str  # `model`, `prompt` or `answer`
+    levels: tuple[str, ...]  # what it may be, the base first
 
     @property
     def name(self) -> str:
@@ -88,18 +82,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Effect:
-    """What a change of level is worth in success, averaged over all other factors.
+    """What a change of level is worth in success, averaged over all other factors."""
 
-    Attributes:
-        condition: the operating point.
-        what: the factor and its two levels; two of them for an interaction.
-        estimate: b - a of a main effect; of an interaction half the difference of two such differences.
-        p: of no effect, by Holm's method corrected for all effects of the grid; None without an interval.
-    """
-
-    condition: str
-    what: str
+    condition: str  # the operating point
+    what: str  # the factor and its two levels; two of them for an interaction
+    # b - a of a main effect; of an interaction half the difference of two such differences
     estimate: Estimate
+    # of no effect, by Holm's method corrected for all effects of the grid; None without an interval
     p: float | None
 
     @property
@@ -113,20 +102,13 @@ class Halves:
     """Shares of the variance of success between the cells that each half explains.
 
     What episodes by chance add is taken off, as a bootstrap over episodes says; so are intervals made.
-
-    Attributes:
-        condition: the operating point.
-        ego: which agent the ego has.
-        helpers: which the helpers have.
-        together: their interaction, the rest.
-        apart: `ego` - `helpers`.
     """
 
-    condition: str
-    ego: Estimate
-    helpers: Estimate
-    together: Estimate
-    apart: Estimate
+    condition: str  # the operating point
+    ego: Estimate  # which agent the ego has
+    helpers: Estimate  # which the helpers have
+    together: Estimate  # their interaction, the rest
+    apart: Estimate  # `ego` - `helpers`
 
 
 def level(agent: Agent, field: str) -> str:

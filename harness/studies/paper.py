@@ -24,17 +24,11 @@ VEHICLES = 4  # the ego and the cooperative neighbourhood of three
 
 @dataclass(frozen=True)
 class Panel:
-    """One panel of the study.
+    """One panel of the study."""
 
-    Attributes:
-        name: as in the paper's numbers.
-        settings: its grid points.
-        episodes: per seed.
-    """
-
-    name: str
-    settings: tuple[Setting, ...]
-    episodes: int
+    name: str  # as in the paper's numbers
+    settings: tuple[Setting, ...]  # its grid points
+    episodes: int  # per seed
 
 
 def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:

@@ -40,31 +40,20 @@ COLUMNS = ("latency_ms", "deadline_missed", "triggered", "messages", "effective_
 
 @dataclass(frozen=True)
 class WalkResult:
-    """What a walk at one operating point came to, for some seeds and episodes of each.
+    """What a walk at one operating point came to, for some seeds and episodes of each."""
 
-    Attributes:
-        episodes: their numbers, (E,).
-        ends: each of `ENDS`, (S, E); NaN where an episode was left out.
-        columns: numbers of the decisions (n,) by name, `COLUMNS`, which these metrics are of.
-        places: the episode of each decision, counted row by row in (S, E), (n,).
-    """
-
-    episodes: Ints
-    ends: Mapping[str, Floats]
+    episodes: Ints  # their numbers, (E,)
+    ends: Mapping[str, Floats]  # each of `ENDS`, (S, E); NaN where an episode was left out
+    # numbers of the decisions (n,) by name, `COLUMNS`, which these metrics are of
     columns: Mapping[str, Floats]
-    places: Ints
+    places: Ints  # the episode of each decision, counted row by row in (S, E), (n,)
 
 
 class Source(Protocol):
-    """Whose intents are coordinated: the calibrated proxy's, or a run's.
+    """Whose intents are coordinated: the calibrated proxy's, or a run's."""
 
-    Attributes:
-        name: what figures call it.
-        same_episodes: whether every seed plays the same episodes.
-    """
-
-    name: str
-    same_episodes: bool
+    name: str  # what figures call it
+    same_episodes: bool  # whether every seed plays the same episodes
 
     def manifest(self) -> dict[str, Any]:
         """What a reader needs to know of where the intents come from."""
@@ -102,16 +91,12 @@ def walk_through(
 
 @dataclass(frozen=True)
 class PanelResult:
-    """What a source came to at the grid points of a panel.
+    """What a source came to at the grid points of a panel."""
 
-    Attributes:
-        summary: a row a grid point, metric and interval: `source`, `panel`, the columns of `Setting.place`,
-            `metric`, `mean`, `ci_low`, `ci_high`, `n`, `interval`.
-        episodes: a row a grid point, seed and episode.
-    """
-
+    # a row a grid point, metric and interval: `source`, `panel`, the columns of `Setting.place`, `metric`,
+    # `mean`, `ci_low`, `ci_high`, `n`, `interval`
     summary: "pd.DataFrame"
-    episodes: "pd.DataFrame"
+    episodes: "pd.DataFrame"  # a row a grid point, seed and episode
 
 
 def play(

@@ -15,19 +15,12 @@ from harness.world.reference import drive_apart
 
 @dataclass(frozen=True)
 class Standing:
-    """One driver, frozen and live.
+    """One driver, frozen and live."""
 
-    Attributes:
-        frozen: success in the trees.
-        live: success in the simulator.
-        difference_points: frozen minus live, in percentage points, paired by episode.
-        agreement: share of episodes with the same result.
-    """
-
-    frozen: Estimate
-    live: Estimate
-    difference_points: Estimate
-    agreement: Estimate
+    frozen: Estimate  # success in the trees
+    live: Estimate  # success in the simulator
+    difference_points: Estimate  # frozen minus live, in percentage points, paired by episode
+    agreement: Estimate  # share of episodes with the same result
 
 
 def rank(dataset: Dataset, workers: Workers, progress: Callable[[int], None]) -> dict[str, Standing]:

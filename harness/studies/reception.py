@@ -31,18 +31,12 @@ RESAMPLES = 200
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a channel did to messages at one distance.
+    """What a channel did to messages at one distance."""
 
-    Attributes:
-        distance_m: between ego and helper.
-        crossing: share of single transmissions that succeed, over shadowing.
-        round_trip: share of requests that come back answered.
-        delay_s: mean seconds from the request to the end of the reply, for helpers that have their answer.
-    """
-
-    distance_m: float
-    crossing: Estimate
-    round_trip: Estimate
+    distance_m: float  # between ego and helper
+    crossing: Estimate  # share of single transmissions that succeed, over shadowing
+    round_trip: Estimate  # share of requests that come back answered
+    # mean seconds from the request to the end of the reply, for helpers that have their answer
     delay_s: float
 
 
@@ -78,19 +72,12 @@ def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0
 
 @dataclass(frozen=True)
 class Gap:
-    """How long a receiver waits from one of a vehicle's packets to the next that it gets, at one distance.
+    """How long a receiver waits from one of a vehicle's packets to the next that it gets, at one distance."""
 
-    Attributes:
-        distance_m: between the two.
-        mean_s: over trips.
-        p95_s: 95th percentile, with an interval over trips.
-        independent_s: the mean if each packet were lost by itself: 1 / (rate x reception).
-    """
-
-    distance_m: float
-    mean_s: Estimate
-    p95_s: Estimate
-    independent_s: float
+    distance_m: float  # between the two
+    mean_s: Estimate  # over trips
+    p95_s: Estimate  # 95th percentile, with an interval over trips
+    independent_s: float  # the mean if each packet were lost by itself: 1 / (rate x reception)
 
 
 def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Gap]:
@@ -132,19 +119,12 @@ def _p95(values: Floats, trips: Ints) -> Estimate:
 
 @dataclass(frozen=True)
 class Curve:
-    """Somebody else's curve.
+    """Somebody else's curve."""
 
-    Attributes:
-        configuration: settings of a channel that are theirs, as a condition has them.
-        source: whose it is; else the file.
-        distance_m: `(n,)`.
-        reception: `(n,)` shares.
-    """
-
-    configuration: str
-    source: str
-    distance_m: Floats
-    reception: Floats
+    configuration: str  # settings of a channel that are theirs, as a condition has them
+    source: str  # whose it is; else the file
+    distance_m: Floats  # `(n,)`
+    reception: Floats  # `(n,)` shares
 
 
 class _Row(msgspec.Struct, forbid_unknown_fields=True):
@@ -188,15 +168,10 @@ def _plain(cell: Any) -> Any:
 
 @dataclass(frozen=True)
 class Compared:
-    """A model held against a curve.
+    """A model held against a curve."""
 
-    Attributes:
-        curve: the curve.
-        reception: the model's at its distances, `(n,)`.
-    """
-
-    curve: Curve
-    reception: Floats
+    curve: Curve  # the curve
+    reception: Floats  # the model's at its distances, `(n,)`
 
     @property
     def mean_difference(self) -> float:

@@ -72,15 +72,10 @@ class Wavering(NamedTuple):
 
 @dataclass(frozen=True)
 class Repeats:
-    """Runs that differ in the draws of their answers alone.
+    """Runs that differ in the draws of their answers alone."""
 
-    Attributes:
-        path: the folder that theirs lie in.
-        runs: two or more.
-    """
-
-    path: Path
-    runs: tuple[Run, ...]
+    path: Path  # the folder that theirs lie in
+    runs: tuple[Run, ...]  # two or more
 
     def __post_init__(self) -> None:
         if len({(run.conditions, run.grid) for run in self.runs}) > 1:

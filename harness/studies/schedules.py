@@ -94,53 +94,33 @@ def settings(made: Choices, point: OperatingPoint, schedule: str) -> list[Settin
 
 @dataclass(frozen=True)
 class Chosen:
-    """A schedule at the setting chosen for it, and what it is worth.
+    """A schedule at the setting chosen for it, and what it is worth."""
 
-    Attributes:
-        play: its setting, and success and costs of every episode.
-        success: of episodes.
-        over_paper: success less that of the paper's schedule.
-        p: of no such difference, by Holm's method for all schedules of the run; None without an interval, and
-            for the paper's own and the oracle.
-        over_random: success less that of `random` with as many messages.
-        closed: share of the gap between the paper's schedule and the oracle that it closes.
-        messages: its messages as a share of the paper's.
-        area: success averaged over budgets from no message to those of `always`, at the settings of `front`.
-        area_j: the same over joules, from those of asking nobody; NaN where they are unknown.
-    """
-
-    play: Play
-    success: Estimate
-    over_paper: Estimate
+    play: Play  # its setting, and success and costs of every episode
+    success: Estimate  # of episodes
+    over_paper: Estimate  # success less that of the paper's schedule
+    # of no such difference, by Holm's method for all schedules of the run; None without an interval, and for
+    # the paper's own and the oracle
     p: float | None
-    over_random: Estimate
-    closed: Estimate
-    messages: Estimate
+    over_random: Estimate  # success less that of `random` with as many messages
+    closed: Estimate  # share of the gap between the paper's schedule and the oracle that it closes
+    messages: Estimate  # its messages as a share of the paper's
+    # success averaged over budgets from no message to those of `always`, at the settings of `front`
     area: Estimate
-    area_j: Estimate
+    area_j: Estimate  # the same over joules, from those of asking nobody; NaN where they are unknown
 
 
 @dataclass(frozen=True)
 class Compared:
-    """All schedules on one run.
+    """All schedules on one run."""
 
-    Attributes:
-        name: the run's model, prompt and answer mode.
-        point: the operating point.
-        names: of the schedules that are compared.
-        plays: of every setting, by schedule.
-        tune: the same on tune layouts; empty without.
-        oracle: the bound.
-        budget: share of the paper's messages within which settings are chosen.
-    """
-
-    name: str
-    point: OperatingPoint
-    names: tuple[str, ...]
-    plays: Mapping[str, Sequence[Play]]
-    tune: Mapping[str, Sequence[Play]]
-    oracle: Play
-    budget: float
+    name: str  # the run's model, prompt and answer mode
+    point: OperatingPoint  # the operating point
+    names: tuple[str, ...]  # of the schedules that are compared
+    plays: Mapping[str, Sequence[Play]]  # of every setting, by schedule
+    tune: Mapping[str, Sequence[Play]]  # the same on tune layouts; empty without
+    oracle: Play  # the bound
+    budget: float  # share of the paper's messages within which settings are chosen
 
     @property
     def paper(self) -> Play:

@@ -26,17 +26,12 @@ MOST_TOKENS = 1 << 16  # most tokens of a picture whose processor has no limit
 
 
 class Run(NamedTuple):
-    """Tokens that llama.cpp reads together.
+    """Tokens that llama.cpp reads together."""
 
-    Attributes:
-        inputs: token ids, (n,) int32, or embeddings, (n, width) float32.
-        places: positions relative to the first token, (1, n) int32; with M-RoPE a picture's are (4, n).
-        span: number of positions that they take; a picture may take fewer than it has tokens.
-    """
-
-    inputs: NDArray[Any]
+    inputs: NDArray[Any]  # token ids, (n,) int32, or embeddings, (n, width) float32
+    # positions relative to the first token, (1, n) int32; with M-RoPE a picture's are (4, n)
     places: NDArray[np.int32]
-    span: int
+    span: int  # number of positions that they take; a picture may take fewer than it has tokens
 
     def at(self, start: int) -> NDArray[np.int32]:
         """Return the tokens' positions from `start`; the fourth row is not a position and stays 0."""

@@ -27,27 +27,17 @@ BROKEN = 3  # failures in a row after which a server is set aside
 
 @dataclass(eq=False)
 class _ServerState:
-    """The state of one server.
-
-    Attributes:
-        busy: number of requests that it works on.
-        sent: number of requests that it has been sent so far.
-        failures: failed attempts since it last answered.
-        pauses: waits for it since it last answered.
-        unreached: vain attempts to reach it since it was set aside.
-        fault: its last failure.
-        aside: whether it is set aside: it gets no requests until it answers again.
-    """
+    """The state of one server."""
 
     url: str
     queue: "deque[_Pending]" = field(default_factory=deque)
-    busy: int = 0
-    sent: int = 0
-    failures: int = 0
-    pauses: int = 0
-    unreached: int = 0
-    fault: str = ""
-    aside: bool = False
+    busy: int = 0  # number of requests that it works on
+    sent: int = 0  # number of requests that it has been sent so far
+    failures: int = 0  # failed attempts since it last answered
+    pauses: int = 0  # waits for it since it last answered
+    unreached: int = 0  # vain attempts to reach it since it was set aside
+    fault: str = ""  # its last failure
+    aside: bool = False  # whether it is set aside: it gets no requests until it answers again
 
 
 @dataclass(eq=False)

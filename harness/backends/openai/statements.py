@@ -31,17 +31,13 @@ _WEIGHTS = ("digest", "n_params", "size")  # last names of facts that change if 
 
 
 class Model(NamedTuple):
-    """A server's statement about its model.
+    """A server's statement about its model."""
 
-    Attributes:
-        listed: the model's name, owner, root and length in the server's list; None without a list, or if the
-            model is not on it.
-        version: version of the server; None if it does not tell.
-        states: everything else that it states of the model, by dotted names; long texts as their digests.
-    """
-
+    # the model's name, owner, root and length in the server's list; None without a list, or if the model is
+    # not on it
     listed: dict[str, Any] | None = None
-    version: str | None = None
+    version: str | None = None  # version of the server; None if it does not tell
+    # everything else that it states of the model, by dotted names; long texts as their digests
     states: Mapping[str, Fact] = {}
 
     @property

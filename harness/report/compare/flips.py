@@ -13,22 +13,14 @@ LOST_BY = ("B", "A", None)  # in the order of the list: what B gave away comes f
 
 @dataclass(frozen=True)
 class DecisionFlip:
-    """A decision point at which the runs act otherwise.
+    """A decision point at which the runs act otherwise."""
 
-    Attributes:
-        scene: its id.
-        episode: its episode's number.
-        seeds: in which they do.
-        a: action of A.
-        b: action of B.
-        lost_by: the run whose action alone gave success away; None where neither, both or nobody knows.
-    """
-
-    scene: str
-    episode: int
-    seeds: tuple[int, ...]
-    a: str
-    b: str
+    scene: str  # its id
+    episode: int  # its episode's number
+    seeds: tuple[int, ...]  # in which they do
+    a: str  # action of A
+    b: str  # action of B
+    # the run whose action alone gave success away; None where neither, both or nobody knows
     lost_by: str | None
 
 

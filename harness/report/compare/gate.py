@@ -22,23 +22,14 @@ ENDS = ("low", "high")
 
 @dataclass(frozen=True)
 class Gate:
-    """A gate. It fails where the difference B - A, or an end of its interval, is so.
+    """A gate. It fails where the difference B - A, or an end of its interval, is so."""
 
-    Attributes:
-        text: as it was typed.
-        condition: the only one it looks at; None for all.
-        metric: its name.
-        end: `low` or `high` end of the interval; `value` for the difference itself.
-        op: one of `OPERATORS`.
-        number: in the metric's own unit, shares from 0 to 1.
-    """
-
-    text: str
-    condition: str | None
-    metric: str
-    end: str
-    op: str
-    number: float
+    text: str  # as it was typed
+    condition: str | None  # the only one it looks at; None for all
+    metric: str  # its name
+    end: str  # `low` or `high` end of the interval; `value` for the difference itself
+    op: str  # one of `OPERATORS`
+    number: float  # in the metric's own unit, shares from 0 to 1
 
 
 @dataclass(frozen=True)

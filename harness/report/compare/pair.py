@@ -47,17 +47,11 @@ def where(run: Run) -> str:
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two runs.
+    """One of the two runs."""
 
-    Attributes:
-        run: as it was read.
-        settings: those that may make a difference, by dotted name; None is left out.
-        values: of each metric, (C, S, E) by the run's grid; NaN where unknown.
-    """
-
-    run: Run
-    settings: Mapping[str, str]
-    values: Mapping[str, Floats]
+    run: Run  # as it was read
+    settings: Mapping[str, str]  # those that may make a difference, by dotted name; None is left out
+    values: Mapping[str, Floats]  # of each metric, (C, S, E) by the run's grid; NaN where unknown
 
     @cached_property
     def ends(self) -> Mapping[tuple[str, int, int], Episode]:
@@ -67,21 +61,13 @@ class Side:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two runs that can be compared.
+    """Two runs that can be compared."""
 
-    Attributes:
-        a: the one that is the base.
-        b: the one that is compared with it.
-        conditions: names that both have, in the order of `a`.
-        seeds: of the channel's draws, the same in both, ascending.
-        episodes: numbers of the episodes that both have, ascending.
-    """
-
-    a: Side
-    b: Side
-    conditions: tuple[str, ...]
-    seeds: tuple[int, ...]
-    episodes: tuple[int, ...]
+    a: Side  # the one that is the base
+    b: Side  # the one that is compared with it
+    conditions: tuple[str, ...]  # names that both have, in the order of `a`
+    seeds: tuple[int, ...]  # of the channel's draws, the same in both, ascending
+    episodes: tuple[int, ...]  # numbers of the episodes that both have, ascending
 
     def values(self, side: Side, metric: str, condition: str) -> Floats:
         """A metric of the episodes that both have, (E, S)."""

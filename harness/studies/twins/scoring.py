@@ -17,58 +17,34 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Pair:
-    """The answers to a question and to its twin.
+    """The answers to a question and to its twin."""
 
-    Attributes:
-        twin: name of the twin.
-        role: `ego`, `helper`, or `fusion` for the ego's fusion call.
-        episode: number of the episode.
-        scene: id of the decision point.
-        viewer: who was asked.
-        p: distribution of the question's answer over the actions; None where it failed.
-        q: the twin's, read back.
-        distance: total variation between both; None where one failed.
-        holds: whether what the twin declares holds; false where an answer failed.
-        said: both answers as they came.
-        status: of both answers, of the parser.
-        messages: the text of both questions.
-    """
-
-    twin: str
-    role: str
-    episode: int
-    scene: str
-    viewer: str
+    twin: str  # name of the twin
+    role: str  # `ego`, `helper`, or `fusion` for the ego's fusion call
+    episode: int  # number of the episode
+    scene: str  # id of the decision point
+    viewer: str  # who was asked
+    # distribution of the question's answer over the actions; None where it failed
     p: tuple[float, ...] | None
-    q: tuple[float, ...] | None
-    distance: float | None
-    holds: bool
-    said: tuple[str, str]
-    status: tuple[str, str]
-    messages: tuple[str, str]
+    q: tuple[float, ...] | None  # the twin's, read back
+    distance: float | None  # total variation between both; None where one failed
+    holds: bool  # whether what the twin declares holds; false where an answer failed
+    said: tuple[str, str]  # both answers as they came
+    status: tuple[str, str]  # of both answers, of the parser
+    messages: tuple[str, str]  # the text of both questions
 
 
 @dataclass(frozen=True)
 class Row:
-    """The result of one twin in one role.
+    """The result of one twin in one role."""
 
-    Attributes:
-        twin: the twin.
-        role: who was asked.
-        episodes: how many episodes the pairs are of.
-        invariance_rate: share of pairs that hold; n is the pairs.
-        tv_distance: mean total variation; n is the pairs whose two answers were parsed.
-        failed_rate: share of pairs in which an answer failed.
-        broken: pairs that do not hold, the farthest apart first, those that failed last.
-    """
-
-    twin: Twin
-    role: str
-    episodes: int
-    invariance_rate: Estimate
-    tv_distance: Estimate
-    failed_rate: Estimate
-    broken: tuple[Pair, ...]
+    twin: Twin  # the twin
+    role: str  # who was asked
+    episodes: int  # how many episodes the pairs are of
+    invariance_rate: Estimate  # share of pairs that hold; n is the pairs
+    tv_distance: Estimate  # mean total variation; n is the pairs whose two answers were parsed
+    failed_rate: Estimate  # share of pairs in which an answer failed
+    broken: tuple[Pair, ...]  # pairs that do not hold, the farthest apart first, those that failed last
 
 
 def distance(p: Sequence[float] | None, q: Sequence[float] | None) -> float | None:

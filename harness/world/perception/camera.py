@@ -126,21 +126,13 @@ _drawn = lru_cache(maxsize=KEPT)(frame)
 
 @dataclass(frozen=True)
 class Box:
-    """A vehicle or building as a box.
+    """A vehicle or building as a box."""
 
-    Attributes:
-        name: id.
-        corners: corners, (4, 2) m.
-        height_m: height above the road.
-        walls: paint on its walls, (4, ROWS, COLUMNS, 3).
-        lamps: which of that is a lamp that shines, (4, ROWS, COLUMNS).
-    """
-
-    name: str
-    corners: Floats
-    height_m: float
-    walls: Pixels
-    lamps: Lit
+    name: str  # id
+    corners: Floats  # corners, (4, 2) m
+    height_m: float  # height above the road
+    walls: Pixels  # paint on its walls, (4, ROWS, COLUMNS, 3)
+    lamps: Lit  # which of that is a lamp that shines, (4, ROWS, COLUMNS)
 
 
 def focal_px(width: int) -> float:

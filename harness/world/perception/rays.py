@@ -20,38 +20,23 @@ Look = tuple[WorldState, VehicleState]  # a state, and the vehicle that looks ar
 
 @dataclass(frozen=True)
 class Sweep:
-    """One full turn of rays from a vehicle's centre.
+    """One full turn of rays from a vehicle's centre."""
 
-    Attributes:
-        bearing_rad: direction of each ray in the world frame, (RAYS,).
-        range_m: distance to the first surface, (RAYS,); inf if there is none.
-        hits: indices of the rays that end on each vehicle or building, by id.
-    """
-
-    bearing_rad: Floats
-    range_m: Floats
-    hits: dict[str, NDArray[np.intp]]
+    bearing_rad: Floats  # direction of each ray in the world frame, (RAYS,)
+    range_m: Floats  # distance to the first surface, (RAYS,); inf if there is none
+    hits: dict[str, NDArray[np.intp]]  # indices of the rays that end on each vehicle or building, by id
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """What stops the rays of some viewers (v), viewer by viewer: other vehicles in their order, buildings.
+    """What stops the rays of some viewers (v), viewer by viewer: other vehicles in their order, buildings."""
 
-    Attributes:
-        origins_m: the viewers' centres, (v, 2).
-        ids: ids of each viewer's surfaces.
-        viewer: number of the viewer whose surface each is, (n,).
-        place: its place among that viewer's surfaces, (n,).
-        vehicle: whether it is a vehicle, (n,).
-        corners_m: its corners, (n, 4, 2).
-    """
-
-    origins_m: Floats
-    ids: tuple[tuple[str, ...], ...]
-    viewer: Ints
-    place: Ints
-    vehicle: Bools
-    corners_m: Floats
+    origins_m: Floats  # the viewers' centres, (v, 2)
+    ids: tuple[tuple[str, ...], ...]  # ids of each viewer's surfaces
+    viewer: Ints  # number of the viewer whose surface each is, (n,)
+    place: Ints  # its place among that viewer's surfaces, (n,)
+    vehicle: Bools  # whether it is a vehicle, (n,)
+    corners_m: Floats  # its corners, (n, 4, 2)
 
     def by_viewer(self, values: Any) -> Any:
         """Lay values of the surfaces (n,) out as (v, most surfaces of one); 0 or false without a surface."""
