@@ -23,8 +23,9 @@ from harness.evaluate.asking import requests
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.report.compare.gate import gate
-from harness.studies.twins import asking, declared, page, scoring
-from harness.studies.twins.asking import Study
+from harness.studies.twins import asking, declared, scoring
+from harness.studies.twins import study as twins_page
+from harness.studies.twins.asking import Questions
 from harness.studies.twins.declared import TWINS, changed
 from harness.studies.twins.scoring import METRICS, Pair
 from harness.world import scenarios
@@ -76,7 +77,7 @@ def twins_of(name: str, dataset: Dataset) -> Iterator[tuple[dict[str, Any], dict
 def asked(spec: Spec, out: Path, *names: str) -> list[scoring.Row]:
     """The rows of a study."""
     names = names or tuple(TWINS)
-    pairs, _ = asking.ask(Study(spec, names, 0), out, lambda done: None, None, 1)
+    pairs, _ = asking.ask(Questions(spec, names, 0), out, lambda done: None, None, 1)
     tidy(out)
     return scoring.rows(pairs, [TWINS[name] for name in names])
 
@@ -361,11 +362,11 @@ def test_what_always_gives_the_same_answer_holds_what_is_said_of_it(
 ) -> None:  # fmt: skip
     spec = spec_for(crossing, "swarm-tiny", answer=mode)
     answering(Reader(lambda r: [0.1, *[0.0] * (len(r.actions) - 2), 0.9]))
-    of, study = names or tuple(name for name in TWINS if name != "letters"), Study(spec, tuple(TWINS), 0)
+    of, study = names or tuple(name for name in TWINS if name != "letters"), Questions(spec, tuple(TWINS), 0)
     rows = asked(spec, tmp_path / "out", *of)
     for row in rows:
-        assert row.invariance_rate.value == page.of_constant(study, row.twin), row.twin.name
-    said = page.same_answer(study, rows)
+        assert row.invariance_rate.value == twins_page.of_constant(study, row.twin), row.twin.name
+    said = twins_page.same_answer(study, rows)
     assert ("letters, of which it holds 0 %" in said) == (mode == "readout")
 
 
@@ -386,7 +387,7 @@ def test_a_failed_answer_holds_nothing_and_has_no_distance(
     crossing: Dataset, tmp_path: Path, answering: Callable[[Any], None]
 ) -> None:
     spec = spec_for(crossing, "swarm-tiny")
-    study = Study(spec, ("ids",), 0)
+    study = Questions(spec, ("ids",), 0)
     scene = study.points()[0][0]
     answering(Scripted({f"{scene}~ids/v1": "I would rather not say"}))
     ego, helper = asked(spec, tmp_path / "out", "ids")
@@ -402,7 +403,7 @@ def test_what_a_helper_did_not_answer_is_left_out_and_counted(
     crossing: Dataset, tmp_path: Path, answering: Callable[[Any], None]
 ) -> None:
     spec = spec_for(crossing, "swarm-tiny")
-    study = Study(spec, ("ids",), 0)
+    study = Questions(spec, ("ids",), 0)
     lost = f"{study.points()[0][0]}~ids/v2"
     answering(Scripted({lost: failed(lost, "out of memory")}))
     pairs, said = asking.ask(study, tmp_path / "out", lambda done: None, None, 1)
@@ -453,7 +454,7 @@ def test_a_stopped_study_goes_on_and_asks_nothing_twice(
         n = sum(map(ord, request.messages[-1]["content"])) % 7
         return [n / 10, (10 - n) / 10, 0.0]
 
-    study = Study(spec_for(crossing, "swarm-tiny"), ("ids", "order", "message-order"), 0)
+    study = Questions(spec_for(crossing, "swarm-tiny"), ("ids", "order", "message-order"), 0)
     whole = Reader(rule)
     answering(whole)
     expected = asking.ask(study, tmp_path / "whole", lambda done: None, None, 1)
@@ -475,8 +476,8 @@ def test_a_stopped_study_goes_on_and_asks_nothing_twice(
 
 
 def test_points_are_one_a_step_and_the_same_for_any_selection(crossing: Dataset) -> None:
-    study = Study(spec_for(crossing), ("ids",), 0)
-    alone = Study(spec_for(crossing.of_episodes({1})), ("ids",), 0)
+    study = Questions(spec_for(crossing), ("ids",), 0)
+    alone = Questions(spec_for(crossing.of_episodes({1})), ("ids",), 0)
     assert alone.points() == {1: study.points()[1]}
     steps = crossing.forest.step
     for scenes in study.points().values():
@@ -555,8 +556,10 @@ def test_bad_input_is_one_line(
 
 
 def test_what_differs_is_marked_and_hostile_text_is_text() -> None:
-    [(minus, old), (plus, new)] = page.difference("same\nv3 <b>car</b> 12 m", "same\nv3 <b>car</b> 13 m")
+    [(minus, old), (plus, new)] = twins_page.difference(
+        "same\nv3 <b>car</b> 12 m", "same\nv3 <b>car</b> 13 m"
+    )
     assert (minus, plus) == ("-", "+")
     assert old == "v3 &lt;b&gt;car&lt;/b&gt; <mark>12</mark> m"
     assert new == "v3 &lt;b&gt;car&lt;/b&gt; <mark>13</mark> m"
-    assert list(page.difference("same", "same")) == []
+    assert list(twins_page.difference("same", "same")) == []

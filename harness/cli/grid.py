@@ -7,14 +7,13 @@ from pathlib import Path
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import console, table
 from harness.cli.progress import bar
 from harness.cli.run import file_name, first_folder
+from harness.cli.show import finish
 from harness.core import extras, resources
 from harness.core.errors import UserError, printable
 
 MOST_CELLS = 256
-MOST_EFFECTS = 8  # that are printed
 
 
 def command(
@@ -99,7 +98,7 @@ def command(
         ask="all",  # combinations share answers: whom one does not ask, another does
     )
     from harness.studies.grid import run_cells
-    from harness.studies.grid_page import in_a_sentence, ranked, strongest, tables, text, write_grid
+    from harness.studies.grid_study import grid_study
 
     names = "-".join(dict.fromkeys(file_name(agent.card.name) for agent in (*egos, *helpers)))
     folder = out or first_folder(
@@ -109,44 +108,10 @@ def command(
         raise UserError(
             f"--out {printable(folder)} already holds a finished grid; choose another or delete it"
         )
-    silent = as_json or quiet
-    with bar(f"{cells} combinations", quiet=silent, grows=True) as progress:
+    with bar(f"{cells} combinations", quiet=as_json or quiet, grows=True) as progress:
         cache = None if no_cache else default_file()
         grid = run_cells(spec, egos, helpers, folder, progress, progress.more, cache)
-    page = write_grid(grid, spec, folder)
-    if as_json:
-        cells_and_effects = tables(grid)
-        parts = ",\n".join(f'"{k}": {v.to_json(orient="records")}' for k, v in cells_and_effects.items())
-        typer.echo(f"{{{parts}}}")
-    if silent:
-        return
-    last, plain = grid.conditions[-1], console()
-    table(
-        (f"ego + helpers, {last}", "success % [95 % CI]", "latency ms", "tokens"),
-        [
-            (
-                f"{printable(grid.name(c.ego, 'ego'), 24)} + {printable(grid.name(c.helper, 'helper'), 24)}",
-                text("success_rate", c.estimate("success_rate", last)),
-                *(text(m, c.estimate(m, last)).partition(" ")[0] for m in ("latency_proxy_ms", "tokens")),
-            )
-            for c in ranked(grid, last)
-        ],
-    )
-    table(
-        (f"effect, {last}", "points [95 % CI]", "p"),
-        [
-            (printable(e.what, 90), text("success_rate", e.estimate), "–" if e.p is None else f"{e.p:.3f}")
-            for e in strongest(grid.effects, last, MOST_EFFECTS)
-        ],
-    )
-    for sentence in in_a_sentence(grid):
-        plain.print(sentence)
-    plain.print(
-        f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds, paired; p: corrected by "
-        f"Holm's method for all {len(grid.effects)} effects; the page has all {len(grid.conditions)} "
-        "conditions"
-    )
-    typer.echo(f"wrote {printable(page)}")
+    finish(grid_study(grid, spec, folder), folder, as_json, quiet)
 
 
 def _several(option: str, text: str) -> list[str]:

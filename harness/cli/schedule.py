@@ -7,11 +7,10 @@ from pathlib import Path
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import console, table
 from harness.cli.progress import bar
+from harness.cli.show import finish
 from harness.core import extras
 from harness.core.errors import UserError, printable, unknown
-from harness.core.figures import Unit, shown
 
 TrainRuns = typer.Argument(
     help="One or more folders of finished runs on train layouts (seeds 100000 to 199999).", metavar="RUN..."
@@ -93,6 +92,7 @@ def compare(
     from harness.coordination.schedules import SCHEDULES
     from harness.studies.learning import layouts
     from harness.studies.replayed_run import ReplayedRun
+    from harness.studies.schedule_study import schedule_study
     from harness.studies.schedules import compare as compared_on
     from harness.studies.study import refuse_other
     from harness.studies.sweep import point_of
@@ -110,8 +110,7 @@ def compare(
         raise UserError(
             f"--tune: {len(tune)} given for {len(runs)} runs; give one for each, in order, or none"
         )
-    silent = as_json or quiet
-    with bar("schedules", quiet=silent, grows=True) as progress:
+    with bar("schedules", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
         stored = [
             ReplayedRun(run, latency, progress.more, progress, models=own, say=progress.say)
@@ -134,35 +133,5 @@ def compare(
         ]
         for each in stored:
             each.settle()
-    from harness.studies.schedule_page import in_sentences, said, tables, write_schedules
-
-    page = write_schedules(found, [each.manifest() for each in stored], draws, where)
-    if as_json:
-        typer.echo(tables(found)["schedules"].to_json(orient="records"))
-    if silent:
-        return
-    text = console()
-    for run in found:
-        text.print(f"{printable(run.name, 40)} · {printable(run.point.name, 36)}")
-        joules = ("J",) if run.energy else ()
-        table(
-            ("schedule", "success %", "msgs", *joules, "over paper's", "gap closed %"),
-            [
-                (
-                    printable(said(row), 24), shown(row.success), f"{row.play.means['messages']:.1f}",
-                    *(f"{row.play.means['energy_j']:.0f}" for _ in joules),
-                    shown(row.over_paper), shown(row.closed, Unit("%", 0, 100.0)),
-                )
-                for row in run.rows
-            ],
-        )  # fmt: skip
-        for sentence in in_sentences(run):
-            text.print(printable(sentence, 400))
-    for source in stored:
-        if source.lost:
-            text.print(source.lost)
-    text.print(
-        "after a schedule's name: the most helpers it asks, and its threshold; 95 % intervals over episodes, "
-        "paired; the page also has costs, p, areas, and random with as many messages"
-    )
-    typer.echo(f"wrote {printable(page)}")
+    caveats = [source.lost for source in stored if source.lost]
+    finish(schedule_study(found, [each.manifest() for each in stored], draws, caveats), where, as_json, quiet)

@@ -1,24 +1,17 @@
 """`harness study twins`: metamorphic tests of a prompt."""
 
 from pathlib import Path
-from textwrap import fill
-from typing import TYPE_CHECKING
 
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import WIDTH, echo_json, table
 from harness.cli.progress import bar
 from harness.cli.run import free_folder
+from harness.cli.show import finish
 from harness.core import resources, work
 from harness.core.errors import printable, unknown
-from harness.core.figures import Unit, shown
-
-if TYPE_CHECKING:
-    from harness.studies.twins.scoring import Row
 
 EPISODES = 40  # that are drawn where nothing is said; with fewer, intervals near 90 % are too narrow
-HEADS = ("twin", "role", "holds", "invariant % [95 %]", "TV distance", "fail%", "n")
 
 
 def command(
@@ -68,9 +61,9 @@ def command(
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
     from harness.report.compare.gate import gate
-    from harness.report.compare.words import judged
-    from harness.studies.twins import asking, page, scoring
+    from harness.studies.twins import asking, scoring
     from harness.studies.twins.declared import TWINS
+    from harness.studies.twins.study import twins_study, write_pairs
 
     who = options.workers_of(workers)
     for name in twin or ():
@@ -95,41 +88,19 @@ def command(
         dtype=dtype,
         ask="all",  # every viewer has a twin
     )
-    study = asking.Study(spec, tuple(dict.fromkeys(twin or TWINS)), sample_seed)
-    able = [name for name in study.twins if asking.lack(spec, TWINS[name]) is None]
+    questions = asking.Questions(spec, tuple(dict.fromkeys(twin or TWINS)), sample_seed)
+    able = [name for name in questions.twins if asking.lack(spec, TWINS[name]) is None]
     for each in gates:
         if each.condition not in (None, *able):
             raise unknown(f"twin of --fail-if {printable(each.text)!r}", str(each.condition), able)
-    where = out or free_folder([spec], f"twins-{source.name}", study.goes_on)
+    where = out or free_folder([spec], f"twins-{source.name}", questions.goes_on)
     label = f"asking {printable(spec.ego.card.name, 30)}, episodes"
-    with bar(label, len(study.points()), as_json or quiet) as progress:
-        pairs, lost = asking.ask(study, where, progress, None if no_cache else default_file(), who)
+    with bar(label, len(questions.points()), as_json or quiet) as progress:
+        pairs, unanswered = asking.ask(questions, where, progress, None if no_cache else default_file(), who)
     with work.going_on(where):
-        rows = scoring.rows(pairs, [TWINS[name] for name in study.twins])
+        rows = scoring.rows(pairs, [TWINS[name] for name in questions.twins])
         verdicts = [scoring.judge(each, rows) for each in gates]
-        written = page.write(study, pairs, rows, verdicts, where, lost)
+        write_pairs(pairs, where)
+        finish(twins_study(questions, rows, verdicts, unanswered), where, as_json, quiet)
     work.tidy(where)
-    if as_json:
-        echo_json(page.mapping(study, rows, verdicts, lost))
-    elif not quiet:
-        typer.echo(f"{printable(spec.ego.name)} · {source.name}")
-        table(HEADS, map(_cells, rows))
-        typer.echo(
-            f"{page.decision_points(study)} decision points of {len(source.dataset.episodes)} episodes; "
-            "95 % intervals over episodes\n"
-            "n: questions that the twin changes; fail%: share with a failed answer, which\n"
-            "count as not holding"
-        )
-        gated = (judged(verdict, "-") for verdict in verdicts)
-        for said in (scoring.headline(rows), *page.notes(study, rows, lost), *gated):
-            typer.echo(fill(said, WIDTH))
-        typer.echo(f"wrote {printable(written)}")
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)
-
-
-def _cells(row: "Row") -> tuple[str, ...]:
-    return (
-        row.twin.name, row.role, row.twin.holds, shown(row.invariance_rate),
-        shown(row.tv_distance, Unit(decimals=2)),
-        f"{100 * row.failed_rate.value:.1f}", str(row.invariance_rate.n),
-    )  # fmt: skip

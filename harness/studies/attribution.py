@@ -20,7 +20,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable, unknown
-from harness.core.figures import Unit
+from harness.core.figures import PERCENT, Unit, as_mapping
 from harness.core.figures import shown as figure
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate, rate_interval
@@ -32,10 +32,12 @@ from harness.evaluate.walk import Decided, Memory, shown, walk
 from harness.prompts.versions import shown as listing
 from harness.runs.attribution import FILE, Attribution, LeftOut
 from harness.studies.replayed_run import ReplayedRun
+from harness.studies.study import Study, Table
 from harness.studies.twins.scoring import distance
 from harness.world.perception.graph import scene_graph
 
 HIDDEN, SEEN, OTHER = "hidden conflict vehicle", "seen conflict vehicle", "other object"
+SHIFT = Unit(decimals=2)
 SIGHT, NO_SIGHT = "helper with sight", "helper without sight"
 KINDS = (
     *(("ego", kind) for kind in (SEEN, OTHER)),
@@ -46,21 +48,13 @@ KINDS = (
 
 @dataclass(frozen=True)
 class Row:
-    """How much one kind of thing moves.
+    """How much one kind of thing moves."""
 
-    Attributes:
-        role: out of whose prompt it was left, or `fusion`.
-        kind: what it is.
-        shift: mean total variation.
-        flips: share whose likeliest action changed.
-        failed: share whose answer without it failed, which the other two leave out.
-    """
-
-    role: str
-    kind: str
-    shift: Estimate
-    flips: Estimate
-    failed: Estimate
+    role: str  # out of whose prompt it was left, or `fusion`
+    kind: str  # what it is
+    shift: Estimate  # mean total variation
+    flips: Estimate  # share whose likeliest action changed
+    failed: Estimate  # share whose answer without it failed, which the other two leave out
 
 
 def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> Attribution:
@@ -247,18 +241,45 @@ def headline(table: Sequence[Row]) -> str:
         "fusion": f"message of a {most.kind} of a {HIDDEN}",
     }[most.role]
     return (
-        f"The {what} moves answers most: without it, {figure(most.shift, Unit(decimals=2))} of the "
+        f"The {what} moves answers most: without it, {figure(most.shift, SHIFT)} of the "
         f"probability moves to other actions, and {figure(most.flips)} % of the most probable actions "
         f"change (n = {most.shift.n})."
     )
 
 
-def rule(found: Attribution) -> str:
-    """How the decision points were chosen."""
-    return (
-        f"{found.decision_points} of the {found.of} decision points of {found.condition}, drawn with sample "
-        f"seed {found.sample_seed}, each as likely as any other"
-    )
+def attribution_study(found: Attribution, run: ReplayedRun) -> Study:
+    """Declare the study of what was left out, of which `harness report` shows every decision."""
+    table, parts = rows(found), ("shift", "flips", "failed")
+    answer = {
+        "run": str(run.run.path), "condition": found.condition, "decision_points": found.decision_points,
+        "of": found.of, "sample_seed": found.sample_seed,
+        "rows": [
+            {"role": row.role, "kind": row.kind, **{n: as_mapping(getattr(row, n)) for n in parts}}
+            for row in table
+        ],
+    }  # fmt: skip
+    cells = [
+        (
+            r.kind, r.role, figure(r.shift, SHIFT), figure(r.flips), PERCENT.number(r.failed.value),
+            str(r.shift.n),
+        )
+        for r in table
+    ]  # fmt: skip
+    return Study(
+        "attribution", f"{run.name} · {run.run.source}", [headline(table)],
+        [
+            f"{found.decision_points} of the {found.of} decision points of {found.condition}, drawn with "
+            f"sample seed {found.sample_seed}, each as likely as any other; 95 % intervals are over "
+            "episodes. Of: the prompt that it is left out of; fusion: a message that came in time. Shift: "
+            "total variation distance of the answers or policies; flips: another action is most probable; "
+            "failed: the answer without it could not be read."
+        ],
+        [Table(
+            "What was left out", ("left out", "of", "shift [95 %]", "flips % [95 %]", "failed", "n"), cells,
+            terminal=range(6),
+        )],
+        {}, {}, answer, caveats=[run.lost] if run.lost else [],
+    )  # fmt: skip
 
 
 def write(found: Attribution, run: Path) -> Path:

@@ -30,23 +30,16 @@ SOURCE = ("name", "latency")  # of a source, what makes a study another one
 
 @dataclass(frozen=True)
 class Table:
-    """Text in columns, for a page and a terminal.
+    """Text in columns, for a page and a terminal."""
 
-    Attributes:
-        title: what stands above it.
-        heads: of the columns; the first column names the rows.
-        rows: the cells of each; `Markup` is shown as it is on the page, and as text in a terminal.
-        note: what stands below it on the page.
-        terminal: the columns that a terminal has room for; none where only the page shows the table.
-        most: how many rows a terminal shows; None for all.
-    """
-
-    title: str
-    heads: Sequence[str]
+    title: str  # what stands above it
+    heads: Sequence[str]  # of the columns; the first column names the rows
+    # the cells of each; `Markup` is shown as it is on the page, and as text in a terminal
     rows: Sequence[Sequence[str]]
-    note: str = ""
+    note: str = ""  # what stands below it on the page
+    # the columns that a terminal has room for; none where only the page shows the table
     terminal: Sequence[int] = ()
-    most: int | None = None
+    most: int | None = None  # how many rows a terminal shows; None for all
 
     @property
     def in_terminal(self) -> tuple[list[str], list[list[str]]]:
@@ -58,33 +51,20 @@ class Table:
 
 @dataclass(frozen=True)
 class Study:
-    """A finished study.
+    """A finished study."""
 
-    Attributes:
-        kind: names its manifest, `<kind>.json`.
-        title: what was played.
-        headline: the outcome in sentences, with n and intervals.
-        about: how it was made: n, what the intervals are over, and what the outcome is conditional on.
-        tables: for the page and the terminal.
-        data: the tables that are written as CSV and JSON Lines, by file name.
-        manifest: what it was made of.
-        answer: what `--json` prints, a data frame or plain values.
-        figures: by file name.
-        caveats: what a reader must know first.
-        more: what else the page shows, below the tables.
-    """
-
-    kind: str
-    title: str
-    headline: Sequence[str]
+    kind: str  # names its manifest, `<kind>.json`
+    title: str  # what was played
+    headline: Sequence[str]  # the outcome in sentences, with n and intervals
+    # how it was made: n, what the intervals are over, and what the outcome is conditional on
     about: Sequence[str]
-    tables: Sequence[Table]
-    data: "Mapping[str, pd.DataFrame]"
-    manifest: Mapping[str, Any]
-    answer: Any
-    figures: Mapping[str, Figure] = field(default_factory=dict)
-    caveats: Sequence[str] = ()
-    more: Markup = field(default_factory=Markup)
+    tables: Sequence[Table]  # for the page and the terminal
+    data: "Mapping[str, pd.DataFrame]"  # the tables that are written as CSV and JSON Lines, by file name
+    manifest: Mapping[str, Any]  # what it was made of
+    answer: Any  # what `--json` prints, a data frame or plain values
+    figures: Mapping[str, Figure] = field(default_factory=dict)  # by file name
+    caveats: Sequence[str] = ()  # what a reader must know first
+    more: Markup = field(default_factory=Markup)  # what else the page shows, below the tables
 
 
 def strong(text: str, when: bool = True) -> str:
@@ -99,11 +79,9 @@ def p_cell(p: float | None) -> str:
     return strong("< 0.001" if p < 0.001 else f"{p:.3f}", p <= LEVEL)
 
 
-def ends(
-    estimate: Estimate, name: str = "value", low: str = "ci_low", high: str = "ci_high"
-) -> dict[str, Any]:
-    """Return an estimate and its 95 % interval as three columns of a row."""
-    return {name: estimate.value, low: estimate.low, high: estimate.high}
+def ends(e: Estimate) -> dict[str, Any]:
+    """Return an estimate, its 95 % interval and its n as columns of a row."""
+    return {"value": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n}
 
 
 def percent(row: Any, value: str, low: str, high: str) -> str:

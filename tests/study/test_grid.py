@@ -22,7 +22,8 @@ from harness.evaluate.agent import Agent
 from harness.prompts import versions
 from harness.runs.metrics import LATENCY, SUCCESS
 from harness.studies.grid import Cell, Grid, run_cells
-from harness.studies.grid_page import front, in_a_sentence, write_grid
+from harness.studies.grid_study import front, grid_study, headline
+from harness.studies.study import write_study
 
 
 def agent(model: str = "proxy", prompt: str = "v2") -> Agent:
@@ -129,13 +130,13 @@ def test_the_half_that_matters_is_named() -> None:
     assert halves.ego.value + halves.helpers.value + halves.together.value == pytest.approx(1)
     assert halves.helpers.value > 0.9
     assert halves.apart.high < 0
-    [said] = in_a_sentence(made_up(of))
+    [said] = headline(made_up(of))
     assert said.startswith("Under 6g, the choice of the helpers matters more: the choice among 2 egos")
 
 
 def test_cells_that_do_not_differ_have_no_half_that_matters() -> None:
     of = {(ego, helper): [1.0, 0.0, 1.0] for ego in ("v1", "v2") for helper in ("v1", "v2")}
-    [said] = in_a_sentence(made_up(of))
+    [said] = headline(made_up(of))
     assert said == (
         "Under 6g, the 4 combinations succeed in 66.7 to 66.7 % of the episodes; 0 of 3 effects are more "
         "than chance explains (n = 3)."
@@ -159,7 +160,7 @@ def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset
     pytest.importorskip("matplotlib", reason="needs the report extra")
     out = grid.cells[0].run.path.parent.parent
     (out / "cells/1-2/report.html").write_text("what `harness report` wrote")
-    page = write_grid(grid, spec_of(small), out).read_text()
+    page = write_study(grid_study(grid, spec_of(small), out), out).read_text()
     cells, effects = pd.read_csv(out / "cells.csv"), pd.read_csv(out / "effects.csv")
     assert len(cells) == 4 * 3 * 3
     assert len(effects) == 3 * 3

@@ -34,7 +34,8 @@ from harness.studies.repeats import (
     run_repeats,
     stable,
 )
-from harness.studies.repeats_page import in_sentences, write_repeats
+from harness.studies.repeats_study import headline, repeats_study
+from harness.studies.study import write_study
 
 Said = tuple[int, str, str]
 # Episode 0 crashes in the first repeat; the others go on and decide otherwise at its second step.
@@ -153,7 +154,7 @@ def test_repeats_played_by_hand(small: Dataset, tmp_path: Path, wanderer: Wander
         ("00000-0", 0.666667, {"IDLE": 4, "FASTER": 2}),
         ("00000-1", 1.0, {"SLOWER": 2, "IDLE": 2}),
     ]
-    first, *others = in_sentences(of)
+    first, *others = headline(of)
     assert "at temperature 0.7, swarm-tiny · v2 · json decides differently in 55.6 [" in first
     assert [rate for rate in ("83.3 [", "50.0 [", "100.0 [") if rate not in first] == []
     assert others[-1].startswith(
@@ -226,9 +227,9 @@ def test_the_cache_keeps_repeats_apart(small: Dataset, tmp_path: Path, wanderer:
 
 def test_the_folder_has_a_page_and_all_figures(small: Dataset, tmp_path: Path, wanderer: Wanderer) -> None:
     of = repeated(hot(course(small, 2, OUTCOMES)), tmp_path / "repeats")
-    assert "<a href=" not in write_repeats(of).read_text()
+    assert "<a href=" not in write_study(repeats_study(of), of.path).read_text()
     (of.path / "repeat-2/report.html").write_text("what `harness report` wrote")
-    page = write_repeats(of).read_text()
+    page = write_study(repeats_study(of), of.path).read_text()
     assert '<a href="repeat-2/report.html">Report of repeat-2</a>' in page
     assert page.index("decides differently in 55.6 [") < page.index("<table")
     assert "pass^3" in page

@@ -24,12 +24,11 @@ from harness.studies.trust import (
     EXCLUDED,
     PEACE,
     Bench,
-    headline,
     names_of,
     run_bench,
     shares_of,
-    trust_study,
 )
+from harness.studies.trust_study import headline, trust_study
 
 ATTACKED = named_point("6g:attack=liar:share=1/3+spoof:share=1/3")
 RULES, ATTACKS, THIRD = ("linear", "trust", "linear:weight_cap=0.3"), ("liar+spoof", "stale"), 1 / 3

@@ -32,18 +32,12 @@ Asked = tuple[Twin, str, Request, Request]  # the role, the question and its twi
 
 
 @dataclass(frozen=True)
-class Study:
-    """What is asked.
+class Questions:
+    """What is asked."""
 
-    Attributes:
-        spec: who is asked, and how; its source has the drawn episodes.
-        twins: their names.
-        seed: of the draw of decision points.
-    """
-
-    spec: Spec
-    twins: tuple[str, ...]
-    seed: int
+    spec: Spec  # who is asked, and how; its source has the drawn episodes
+    twins: tuple[str, ...]  # their names
+    seed: int  # of the draw of decision points
 
     def __post_init__(self) -> None:
         ego = self.spec.ego
@@ -80,6 +74,10 @@ class Study:
             )
         return {episode: [of[step] for step in sorted(of)] for episode, of in sorted(drawn.items())}
 
+    def count(self) -> int:
+        """Return how many decision points were drawn."""
+        return sum(map(len, self.points().values()))
+
     def begin(self, identity: str) -> work.Begun:
         """What the work begins with; `identity` is the digest of the model's."""
         settings = {**self.spec.settings(), "twins": self.twins, "seed": self.seed, "identity": identity}
@@ -110,7 +108,7 @@ def lack(spec: Spec, twin: Twin) -> str | None:
 
 
 def ask(
-    study: Study, out: Path, progress: Callable[[int], None], cache: Path | None, workers: Workers
+    questions: Questions, out: Path, progress: Callable[[int], None], cache: Path | None, workers: Workers
 ) -> tuple[list[Pair], str]:
     """Ask about decision points and their twins; the same for any workers.
 
@@ -118,7 +116,7 @@ def ask(
     the result calls.
 
     Args:
-        study: what is asked.
+        questions: what is asked.
         out: folder of the result.
         progress: called with 1 for each episode that is done.
         cache: file of completions kept between runs; None for no cache.
@@ -138,36 +136,41 @@ def ask(
             f"--out {printable(out)} already holds finished twins; choose another folder or delete it"
         )
     [identity] = spread(
-        _identity, [study.spec], workers, lambda done: None, lambda of: f"the model {of.ego.card.name}", False
+        _identity,
+        [questions.spec],
+        workers,
+        lambda done: None,
+        lambda of: f"the model {of.ego.card.name}",
+        False,
     )
-    begun = study.begin(identity)
+    begun = questions.begin(identity)
     if left := work.begun(out, work.Begun):
         work.same(out, begun.settings, left.settings)
     with work.working(out, begun, RESULT) as place:
         points = [
-            (number, study.dataset.scenes(ids), read_kept(_answers_file(place, number)))
-            for number, ids in study.points().items()
+            (number, questions.dataset.scenes(ids), read_kept(_answers_file(place, number)))
+            for number, ids in questions.points().items()
         ]
         found: dict[int, list[Pair]] = {}
-        questions = Tally()
+        tally = Tally()
 
         def took(at: int, asked: tuple[list[Pair], list[Answer]]) -> None:
             found[at], answers = asked
-            questions.add(answers)
+            tally.add(answers)
             answered = [answer for answer in answers if answer.error is None]
             write_whole(_answers_file(place, points[at][0]), lines(answered))
             progress(1)
 
         # These are files of one machine.
         files = (cache, place) if isinstance(workers, int) else (None, None)
-        asked = partial(_asked, study, *files)
+        asked = partial(_asked, questions, *files)
         each(asked, points, workers, took, lambda point: f"episode {point[0]}", repeatable=False)
-        if questions.missing:
-            raise Unanswered(str(questions))
+        if tally.missing:
+            raise Unanswered(str(tally))
         pairs = [pair for at in range(len(points)) for pair in found[at]]
         if not pairs:
-            raise UserError(f"--twin: none applies to what was drawn: {study.lacks(study.twins)}")
-        return pairs, questions.counts()
+            raise UserError(f"--twin: none applies to what was drawn: {questions.lacks(questions.twins)}")
+        return pairs, tally.counts()
 
 
 def _identity(spec: Spec) -> str:
@@ -179,21 +182,21 @@ def _answers_file(place: Path, episode: int) -> Path:
 
 
 def _asked(
-    study: Study, cache: Path | None, place: Path | None,
+    questions: Questions, cache: Path | None, place: Path | None,
     episode: tuple[int, Sequence[Scene], Mapping[str, Answer]],
 ) -> tuple[list[Pair], list[Answer]]:  # fmt: skip
     """Ask about the decision points of an episode, then about their twins; return all answers as well."""
-    (number, scenes, kept), spec = episode, study.spec
+    (number, scenes, kept), spec = episode, questions.spec
 
     def backend() -> Backend:
         return cached(opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size), spec.ego.card, cache)
 
     asker = Asker(spec, backend, PAPER, place and _answers_file(place, number), kept)
-    twins = [twin for twin in map(TWINS.__getitem__, study.twins) if lack(spec, twin) is None]
-    questions = {scene.id: list(requests(spec, [scene])) for scene in scenes}
+    twins = [twin for twin in map(TWINS.__getitem__, questions.twins) if lack(spec, twin) is None]
+    asked_of = {scene.id: list(requests(spec, [scene])) for scene in scenes}
     # Fusion calls have the helpers' messages, which are there first.
     fused = any(twin.senders for twin in twins)
-    first = [request for of in questions.values() for request in of] if fused else []
+    first = [request for of in asked_of.values() for request in of] if fused else []
     asker.ask(first)
     asked = [
         each
@@ -202,7 +205,7 @@ def _asked(
         for each in (
             _fusion(spec, twin, scene, asker.answers)
             if twin.senders
-            else _twins(spec, twin, scene, questions[scene.id])
+            else _twins(spec, twin, scene, asked_of[scene.id])
         )
     ]
     known = {request.id for request in first}

@@ -38,35 +38,27 @@ LANES = {"LANE_LEFT": "LANE_RIGHT", "LANE_RIGHT": "LANE_LEFT"}
 
 @dataclass(frozen=True)
 class Twin:
-    """One way to put a question otherwise.
+    """One way to put a question otherwise."""
 
-    Attributes:
-        name: how commands call it.
-        says: what is other.
-        needs: what a question must have for it to apply.
-        within: greatest total-variation distance that it allows; None where the action must be the same.
-        graph: the twin's scene graph, `(spec, scene, graph)`.
-        text: the twin's request, `(spec, request)`, of a language model.
-        view: the same for who reads the graph and no text.
-        image: the twin's picture, where the graph is another; None where it is the same.
-        senders: whose messages a fusion call has, `(senders)`, in the place of these.
-        actions: the question's name for an action of the twin, where it is another.
-        modes: answer modes in which it applies.
-        constant: whether it holds of an ego that always gives the same answer, and so reads nothing; of a
-            read-out, where the letters are read once.
-    """
-
-    name: str
-    says: str
-    needs: str = "a graph or a text that it changes"
+    name: str  # how commands call it
+    says: str  # what is other
+    needs: str = "a graph or a text that it changes"  # what a question must have for it to apply
+    # greatest total-variation distance that it allows; None where the action must be the same
     within: float | None = None
+    # the twin's scene graph, `(spec, scene, graph)`
     graph: Callable[[Spec, Scene, Graph], Graph] | None = None
+    # the twin's request, `(spec, request)`, of a language model
     text: Callable[[Spec, Request], Request] | None = None
-    view: Callable[[Graph], Graph] | None = None
+    view: Callable[[Graph], Graph] | None = None  # the same for who reads the graph and no text
+    # the twin's picture, where the graph is another; None where it is the same
     image: Callable[[Image], Image] | None = None
+    # whose messages a fusion call has, `(senders)`, in the place of these
     senders: Callable[[Sequence[str]], Sequence[str]] | None = None
+    # the question's name for an action of the twin, where it is another
     actions: Mapping[str, str] | None = None
-    modes: tuple[str, ...] = get_args(AnswerMode)
+    modes: tuple[str, ...] = get_args(AnswerMode)  # answer modes in which it applies
+    # whether it holds of an ego that always gives the same answer, and so reads nothing; of a read-out, where
+    # the letters are read once
     constant: bool = True
 
     @property

@@ -1,0 +1,200 @@
+"""The study of twins: what holds of the answers, and the pairs that are farthest apart."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from difflib import SequenceMatcher
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from markupsafe import Markup, escape
+
+from harness.core.figures import PERCENT, Unit, as_mapping, shown
+from harness.core.files import write_whole
+from harness.core.versions import versions
+from harness.report.compare.gate import Verdict
+from harness.report.compare.words import judged
+from harness.report.page import visible
+from harness.studies.study import Study, Table
+from harness.studies.twins.asking import Questions, lack
+from harness.studies.twins.declared import TWINS, Twin
+from harness.studies.twins.scoring import METRICS, Pair, Row, headline
+
+EXAMPLES = 3  # of each row
+DISTANCE = Unit(decimals=2)
+HEADS = (
+    "twin", "role", "holds", "invariant %, 95 % CI", "TV distance", "failed %", "n", "constant answer %",
+    "episodes", "what is other", "examples",
+)  # fmt: skip
+
+
+def write_pairs(pairs: Sequence[Pair], out: Path) -> None:
+    """Write every pair of answers as a line of `pairs.jsonl`."""
+    lines = [{k: v for k, v in asdict(pair).items() if k != "messages"} for pair in pairs]
+    write_whole(out / "pairs.jsonl", b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
+
+
+def twins_study(
+    questions: Questions, rows: Sequence[Row], verdicts: Sequence[Verdict], unanswered: str = ""
+) -> Study:
+    """Declare the study of twins; `unanswered` says how many questions got no answer."""
+    answer, spec = mapping(questions, rows, verdicts, unanswered), questions.spec
+    return Study(
+        "twins", f"Twins: {spec.ego.name} on {spec.source.name}",
+        [headline(rows), *(judged(verdict, "-") for verdict in verdicts)],
+        [
+            "The model is asked each question twice: as it is, and as its twin, which puts the same "
+            "situation otherwise. So what must hold of both answers is known without knowing the right "
+            f"one. {questions.count()} decision points of {len(questions.dataset.episodes)} episodes; n is "
+            "the number of questions that the twin changes; 95 % intervals are over episodes. If either "
+            "answer could not be parsed (failed), nothing holds, and there is no distance."
+        ],
+        [Table(
+            "What holds", HEADS, [_cells(questions, row) for row in rows],
+            "A question is one viewer at one decision point. Invariant: the share of questions for which "
+            "what must hold does hold. same: both answers have the same most probable action (for a "
+            "mirrored twin, after swapping left and right back). TV <= x: the distributions are no "
+            "farther apart than x. TV: total variation distance, half the sum of the absolute "
+            "differences, 0 to 1. Constant answer: what an ego "
+            "holds that always gives the same answer, and so reads nothing.", terminal=range(7),
+        )],
+        {}, {**answer, "versions": versions()}, answer, caveats=notes(questions, rows, unanswered),
+        more=Markup("<h2>Worst examples</h2>\n{}").format(Markup("\n").join(
+            _example(spec.actions, row, n, pair)
+            for row in rows for n, pair in enumerate(row.broken[:EXAMPLES], 1)
+        ) or Markup("<p>None.</p>")),
+    )  # fmt: skip
+
+
+def _cells(questions: Questions, row: Row) -> list[str]:
+    name = f"{row.twin.name}-{row.role}"
+    links = [
+        Markup('<a href="#{}-{}">{}</a>').format(name, n, n) for n, _ in enumerate(row.broken[:EXAMPLES], 1)
+    ]
+    return [
+        Markup('<span id="{}">{}</span>').format(name, row.twin.name), row.role, row.twin.holds,
+        shown(row.invariance_rate), shown(row.tv_distance, DISTANCE), PERCENT.number(row.failed_rate.value),
+        str(row.invariance_rate.n), "100" if of_constant(questions, row.twin) else "0", str(row.episodes),
+        row.twin.says, Markup(" ").join(links) or "–",
+    ]  # fmt: skip
+
+
+def _example(actions: Sequence[str], row: Row, n: int, pair: Pair) -> Markup:
+    name, apart = f"{row.twin.name}-{row.role}", DISTANCE.number(pair.distance)
+    same = Markup("The text is the same; what differs is the scene graph.")
+    lines = [*difference(*pair.messages)] or [("", same)]
+    colour = {"-": "bad", "+": "good", "": ""}
+    text = Markup().join(
+        Markup('<span class="{}">{}</span><span>{}</span>').format(colour[sign], sign, words)
+        for sign, words in lines
+    )
+    heads = Markup().join(Markup('<th scope="col">{}</th>').format(visible(a)) for a in actions)
+    answers = Markup().join(
+        Markup('<tr><th scope="row">{}</th>{}<td>{}</td></tr>').format(
+            which,
+            Markup().join(
+                Markup("<td>{}</td>").format(DISTANCE.number(p)) for p in intent or [None] * len(actions)
+            ),
+            status,
+        )
+        for which, intent, status in zip(
+            ("as it is", "its twin, read back"), (pair.p, pair.q), pair.status, strict=True
+        )
+    )
+    whole = Markup("\n").join(
+        Markup("<pre>{}\n--- answer\n{}</pre>").format(visible(question), visible(said))
+        for question, said in zip(pair.messages, pair.said, strict=True)
+    )
+    return Markup(
+        '<section class="answer" id="{}-{}"><h3>{}, {}: {} in scene {}, TV {} <a href="#{}">back</a></h3>\n'
+        '<pre class="diff">{}</pre>\n<div class="scroll" tabindex="0" role="region" aria-label="Answers">'
+        '<table class="metrics"><thead><tr><th scope="col">answer</th>{}<th scope="col">parsed</th></tr>'
+        "</thead><tbody>{}</tbody></table></div>\n"
+        "<details><summary>Both questions and answers in full</summary>{}</details></section>"
+    ).format(
+        name, n, row.twin.name, row.role, visible(pair.viewer), visible(pair.scene), apart, name, text, heads,
+        answers, whole,
+    )  # fmt: skip
+
+
+def mapping(
+    questions: Questions, rows: Sequence[Row], verdicts: Sequence[Verdict], unanswered: str = ""
+) -> dict[str, Any]:
+    """Return the result as plain values; null where there is no number."""
+    table = [
+        {
+            "twin": row.twin.name, "role": row.role, "holds": row.twin.holds, "episodes": row.episodes,
+            "holds_of_constant": of_constant(questions, row.twin),
+            **{metric: as_mapping(getattr(row, metric)) for metric in METRICS},
+        }
+        for row in rows
+    ]  # fmt: skip
+    spec = questions.spec
+    plain: dict[str, Any] = msgspec.to_builtins({
+        **spec.ego.settings(), "world": spec.source.record(), "seed": questions.seed,
+        "decision_points": questions.count(), "rows": table, "left_out": missing(questions, rows),
+        **({"unanswered": unanswered} if unanswered else {}),
+        "gates": [{"gate": v.gate, "passed": not v.failed, "failed": dict(v.failed)} for v in verdicts],
+    })  # fmt: skip
+    return plain
+
+
+def missing(questions: Questions, rows: Sequence[Row]) -> dict[str, str]:
+    """Return the twins that no question has, and what they need."""
+    asked = {row.twin.name for row in rows}
+    return {n: lack(questions.spec, TWINS[n]) or TWINS[n].needs for n in questions.twins if n not in asked}
+
+
+def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> list[str]:
+    """Return what a reader must know besides the rows."""
+    by_need = dict[str, list[str]]()
+    for name, need in missing(questions, rows).items():
+        by_need.setdefault(need, []).append(name)
+    sentences = [same_answer(questions, rows)]
+    if not questions.spec.ego.can.language_model:
+        who = questions.spec.ego.card.name
+        sentences.insert(
+            0, f"{who} reads the scene graph and not the text, so this says nothing about the prompt."
+        )
+    for need, names in by_need.items():
+        sentences.append(f"Left out, since no question has it: {', '.join(names)} (needs {need}).")
+    if unanswered:
+        sentences.append(f"No answer to {unanswered}; their pairs are left out.")
+    return sentences
+
+
+def of_constant(questions: Questions, twin: Twin) -> bool:
+    """Whether a twin holds of an ego that always gives the same answer: every time, or never.
+
+    Over cyclic orders one letter is every action alike, which is the same for the twin.
+    """
+    return twin.constant or questions.spec.ego.letters == "cyclic"
+
+
+def same_answer(questions: Questions, rows: Sequence[Row]) -> str:
+    """Say what these twins would say of an ego that reads nothing."""
+    broken = list(dict.fromkeys(row.twin.name for row in rows if not of_constant(questions, row.twin)))
+    but = f" of every twin but {', '.join(broken)}, of which it holds 0 %" if broken else " of every twin"
+    return f"An ego that always gives the same answer holds 100 %{but}: to hold is not to read."
+
+
+def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
+    """The lines that two texts do not share, `-` of the first and `+` of the other, with words marked."""
+    old, new = a.splitlines(), b.splitlines()
+    for kind, i, j, k, n in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
+        if kind != "equal":
+            before, after = "\n".join(old[i:j]).split(" "), "\n".join(new[k:n]).split(" ")
+            changes = SequenceMatcher(None, before, after, autojunk=False).get_opcodes()
+            sides = (
+                ("-", before, [(kind, start, end) for kind, start, end, *_ in changes]),
+                ("+", after, [(kind, start, end) for kind, *_, start, end in changes]),
+            )
+            for sign, words, parts in sides:
+                if any(words):
+                    shown = (_word(words[start:end], kind) for kind, start, end in parts if start < end)
+                    yield sign, Markup(" ").join(shown)
+
+
+def _word(words: Sequence[str], kind: str) -> Markup:
+    shown = escape(visible(" ".join(words)))
+    return shown if kind == "equal" else Markup("<mark>{}</mark>").format(shown)
