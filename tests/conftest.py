@@ -24,6 +24,7 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 
 # A loaded machine is no failure, and what CI finds must be there to be found again.
 settings.register_profile("harness", deadline=None, derandomize="CI" in os.environ)
+settings.register_profile("quick", settings.get_profile("harness"), max_examples=20)
 settings.load_profile("harness")
 
 # Containers often set this: then every process that a test starts compiles the harness anew, and every worker
@@ -41,6 +42,12 @@ os.fsync = lambda fd: None
 
 # Collecting makes much and drops little: a search for cycles finds none, for a fifth of the time.
 gc.disable()
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files whose tests are all slow, with the engines that they import, where none is run."""
+    left_out = config.getoption("markexpr") == "not slow" and collection_path.suffix == ".py"
+    return True if left_out and "\npytestmark = pytest.mark.slow" in collection_path.read_text() else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -20,6 +20,7 @@ from harness import cli
 from harness.backends.base import Completion, Request
 from harness.backends.card import Card
 from harness.evaluate import lifecycle
+from harness.evaluate import run as evaluation
 from harness.studies import repeats, study
 
 RUN, DRIVEN, SEEDS = "run", "driven", ("--seeds", "0:4")
@@ -44,7 +45,7 @@ COMMANDS = {
     ),
     "paper": ("study", "paper", "--episodes", "10", "--sweep-episodes", "10", "--out", "out"),
     "closed-loop": (
-        "study", "closed-loop", "--model", "proxy", "--episodes", "17", "--seeds", "0", "--workers", "1",
+        "study", "closed-loop", "--model", "proxy", "--episodes", "2", "--seeds", "0", "--workers", "1",
         "--out", "out",
     ),
 }  # fmt: skip
@@ -125,7 +126,7 @@ def main(dataset: Path, folder: Path, names: Sequence[str]) -> None:
         return Wanderer() if card.name == "swarm-tiny" else backend(card, **options)
 
     for module, name, instead in (
-        (lifecycle, "datetime", Then), (repeats, "open_backend", opens),
+        (evaluation, "EPISODES_AT_ONCE", 1), (lifecycle, "datetime", Then), (repeats, "open_backend", opens),
         (study, "FORMATS", ("svg",)),  # the pictures of a study take longer than all else
     ):  # fmt: skip
         setattr(module, name, instead)

@@ -238,6 +238,7 @@ def test_a_faster_device_never_decides_later(
     assert latency_s(slow * np.array(shares)) <= latency_s(slow) + 1e-12
 
 
+@pytest.mark.slow
 def test_batches_change_no_row(small: Dataset, tmp_path: Path) -> None:
     """Who is in time follows from tokens, not from how fast this machine is at the moment."""
     spec = spec_of(
@@ -266,10 +267,11 @@ def test_a_read_out_writes_one_token(small: Dataset, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_workers_change_no_row(tmp_path: Path) -> None:
     """Each in a process of its own, as a user types it: a fork has none of an open engine's threads."""
-    drive = ("drive", "--model", "swarm-tiny", "--episodes", "17", "--seeds", "0", "--condition", "6g")
+    here = "from harness import cli; from harness.evaluate import run; run.EPISODES_AT_ONCE = 1; cli.main()"
+    drive = ("drive", "--model", "swarm-tiny", "--episodes", "3", "--seeds", "0", "--condition", "6g")
     on = ("--device-profile", "agx-orin", "--device-model", "qwen3-0.6b", "--quiet")
     for workers in "12":
-        typed = (sys.executable, "-m", "harness", *drive, *on, "--workers", workers, "--out", workers)
+        typed = (sys.executable, "-c", here, *drive, *on, "--workers", workers, "--out", workers)
         subprocess.run(typed, cwd=tmp_path, check=True)
     for name in ("decisions.parquet", "episodes.csv", "summary.csv"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()

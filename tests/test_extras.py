@@ -73,6 +73,7 @@ def test_a_frozen_evaluation_and_what_is_done_with_it_need_no_extra(tmp_path: Pa
     assert (tmp_path / "a/report.html").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "package", "extra"),
     [

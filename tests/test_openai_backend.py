@@ -317,6 +317,7 @@ json_values = st.recursive(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @given(json_values, st.sampled_from(["json", "readout"]))
 def test_whatever_json_comes_is_an_answer_or_an_error(payload: Any, answer: AnswerMode) -> None:
     choice = {"message": payload, "logprobs": payload}
@@ -777,6 +778,7 @@ def test_a_short_key_is_no_secret_and_changes_no_answer(monkeypatch: pytest.Monk
     assert ask_one(lambda asked: asked.reply(completion(GOOD))).text == GOOD
 
 
+@pytest.mark.slow
 def test_after_a_run_the_key_is_nowhere(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, small_path: Path
 ) -> None:
@@ -810,6 +812,7 @@ def test_after_a_run_the_key_is_nowhere(
     assert "MY_KEY" in (tmp_path / "run" / "run.json").read_text()
 
 
+@pytest.mark.slow
 def test_the_papers_cloud_comparator_is_a_card_with_its_round_trip_declared(
     harness: Callable[..., tuple[int, str, str]],
     small_path: Path,

@@ -234,6 +234,7 @@ json_values = st.recursive(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @given(st.lists(json_values | st.binary().map(lambda data: b"data: " + data + b"\n")))
 def test_whatever_comes_is_an_answer_or_a_fault(sent: list[Any]) -> None:
     for wrapped in (sent, [p if isinstance(p, bytes) else {"choices": [{"delta": p}]} for p in sent]):

@@ -88,6 +88,7 @@ def by_hand(backend: Any, request: Request) -> list[float]:
     return list(weights / weights.sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["llama-cpp", "transformers"])
 def test_an_engine_averages_what_it_says_of_each_order_alone_or_in_a_batch(engine: str) -> None:
     pytest.importorskip({"llama-cpp": "llama_cpp", "transformers": "torch"}[engine])

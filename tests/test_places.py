@@ -62,6 +62,7 @@ def spoil(run: Path) -> None:
     (run / "run.json").write_text(json.dumps(manifest))
 
 
+@pytest.mark.slow
 def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     here = Path.cwd()
     data = here / "datasets/mine"
@@ -94,6 +95,7 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     assert places == ["reports/one/report.html", None, "report.html"], "pages of one project are linked"
 
 
+@pytest.mark.slow
 def test_no_page_of_studies_names_a_folder(typed: Callable[..., str]) -> None:
     here = Path.cwd()
     run = here / "reports/one"

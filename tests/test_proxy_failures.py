@@ -97,6 +97,7 @@ def test_never_is_never_and_always_is_always(share: float) -> None:
     assert {drawn(failures, name) for name in made_up(2000)} == {expected}
 
 
+@pytest.mark.slow
 def test_the_intervals_cover_the_declared_rate_as_often_as_they_say() -> None:
     """The failed rate of 400 runs of 150 answers each, by the interval of the summary: 95 % of them."""
     truth = sum(share for how, share in FAULTY.texts.items() if how in FAILED)
@@ -141,6 +142,7 @@ def test_a_slow_answer_is_late_by_what_was_declared(small: Dataset, tmp_path: Pa
     assert min(arrivals) < 400 < max(arrivals), "a slow helper is heard late"
 
 
+@pytest.mark.slow
 def test_neither_batches_nor_a_replay_nor_company_change_a_failure(small: Dataset, tmp_path: Path) -> None:
     run(spec_of(small, "proxy-faulty"), tmp_path / "run")
     run(spec_of(small, "proxy-faulty", batch_size=1), tmp_path / "single")

@@ -38,6 +38,7 @@ def snapshot(home: Path, repository: str) -> Path:
     return home / "hub" / f"models--{repository.replace('/', '--')}" / "snapshots" / COMMIT
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_fetched_once_without_what_nobody_loads(tmp_path: Path) -> None:
     with serving({"some/model": CHECKPOINT}) as hub:
         for _ in range(2):
@@ -49,6 +50,7 @@ def test_a_checkpoint_is_fetched_once_without_what_nobody_loads(tmp_path: Path) 
     assert fetched.read_bytes() == CHECKPOINT["model.safetensors"]
 
 
+@pytest.mark.slow
 def test_with_the_hub_gone_what_was_fetched_is_found(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
     pytest.importorskip("transformers", reason="needs the transformers extra")
@@ -58,6 +60,7 @@ def test_with_the_hub_gone_what_was_fetched_is_found(tmp_path: Path) -> None:
     assert "does not load" in again.stderr, "these weights are none; but they are found"
 
 
+@pytest.mark.slow
 def test_of_a_repository_of_gguf_files_the_cards_one_is_fetched_and_held_to_its_digest(
     tmp_path: Path,
 ) -> None:
@@ -95,6 +98,7 @@ def test_a_file_that_is_not_what_its_card_says_is_refused(tmp_path: Path) -> Non
         held_to_digest(card, file)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("repositories", "said"),
     [

@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner
 
 from harness.backends import cards
@@ -28,6 +29,7 @@ def test_twelve_questions_of_twelve_tune_layouts_each_with_one_conflict() -> Non
         assert len({str(request.messages) for request in requests}) == 12
 
 
+@pytest.mark.slow
 def test_a_question_is_as_the_dataset_freezes_it(tmp_path: Path) -> None:
     built = ["dataset", "build", questions.SCENARIO, "--episodes", "1", "--seed", "1000", "--no-audit"]
     assert CliRunner().invoke(app, [*built, "--out", str(tmp_path / "tune")]).exit_code == 0

@@ -182,6 +182,7 @@ def test_no_reader_of_a_run_waits_for_what_is_no_file(
         assert [one.state for one in runs_in(tmp_path)] in (["broken"], ["finished"])
 
 
+@pytest.mark.slow
 def test_a_table_of_few_bytes_and_a_thousand_million_rows_is_refused(tmp_path: Path) -> None:
     run = made_up(tmp_path / "run")
     file = run / "decisions.parquet"
@@ -252,6 +253,7 @@ def is_path(value: ast.expr) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_nothing_reads_a_file_but_through_the_reader() -> None:
     reads = {
         source.relative_to(SOURCES).as_posix(): found

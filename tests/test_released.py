@@ -15,6 +15,7 @@ ROOT = Path(__file__).parent.parent
 DATASETS = tomllib.loads((ROOT / "datasets/released.toml").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [p.parent.name for p in (ROOT / "datasets").glob("*/manifest.json")])
 def test_a_shipped_dataset_is_sound_and_has_the_digest_it_was_released_with(name: str) -> None:
     assert sha256_file(ROOT / "datasets" / name / "manifest.json") == DATASETS[name]

@@ -301,6 +301,7 @@ def test_tables_have_both_turns(small: Dataset, tmp_path: Path) -> None:
                                              "intent_FASTER,message")  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_table_of_a_run_says_it_in_a_line_each(harness: Harness, small_path: Path) -> None:
     harness("init", "project")
     os.chdir("project")
@@ -343,6 +344,7 @@ def test_a_replay_tells_the_turns_apart(small: Dataset, tmp_path: Path) -> None:
     assert first.slow_s + second.slow_s == stored.slow_s
 
 
+@pytest.mark.slow
 def test_batches_and_a_kill_change_nothing(small: Dataset, tmp_path: Path) -> None:
     whole = run(faulty(small), tmp_path / "whole")
     single = run(faulty(small, batch_size=1), tmp_path / "single")

@@ -197,6 +197,7 @@ def over(name: str, **settings: Any) -> OperatingPoint:
     return replace(named_point(name), **settings)
 
 
+@pytest.mark.slow
 @given(radios, cases(), delays)
 def test_a_relay_loses_and_delays_nothing_that_came_directly(name, case, delay_s):
     direct, relayed = (
@@ -217,6 +218,7 @@ def test_settings_of_a_unit_that_is_not_there_change_nothing(name, case):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
 
 
+@pytest.mark.slow
 @given(radios, cases(), delays, st.sampled_from(["relay", "fusion"]), st.booleans())
 def test_a_single_decision_over_a_unit_is_a_row_of_the_batch(name, case, delay_s, edge, on_demand):
     beside = over(name, edge=edge, edge_delay_s=delay_s, on_demand=on_demand, window_s=0.3)

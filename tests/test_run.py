@@ -71,6 +71,7 @@ def test_the_batch_size_changes_no_byte_of_the_proxys_run(
     assert same_files(tmp_path / "run", proxy_run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trees", "walks", "workers"), [(1, 99, 1), (3, 99, 1), (1, 99, 2), (9, 1, 1), (1, 1, 2)]
 )
@@ -118,6 +119,7 @@ def tiny_spec(tiny: Path, data: Dataset, **options: Any) -> Spec:
     )
 
 
+@pytest.mark.slow
 def test_the_batch_size_changes_no_answer_of_a_language_model(
     tiny: Path, small_path: Path, tmp_path: Path
 ) -> None:
@@ -133,6 +135,7 @@ def test_the_batch_size_changes_no_answer_of_a_language_model(
     assert len({a.raw for a in runs[1]}) > 5, "answers that are all alike would show no order"
 
 
+@pytest.mark.slow
 def test_prompts_that_are_too_long_for_the_model_got_no_answer(
     tiny: Path, small_path: Path, tmp_path: Path
 ) -> None:

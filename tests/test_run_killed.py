@@ -36,6 +36,7 @@ def killed(small_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(
     killed: Path, small: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -48,6 +49,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(
     _all_become_whole(outs, killed, small)
 
 
+@pytest.mark.slow
 def test_killed_at_any_time_and_resumed_it_is_the_same_run(
     killed: Path, small: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,6 +228,7 @@ def test_a_run_is_written_by_one_process_at_a_time(answers: bytes, small: Datase
     run(spec_of(small), out)
 
 
+@pytest.mark.slow
 def test_a_read_out_over_cyclic_orders_goes_on_where_it_was_killed(small: Dataset, tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
     card = cards.resolve("swarm-tiny", "transformers")

@@ -178,6 +178,7 @@ def test_a_server_is_sent_temperature_and_seed() -> None:
 # -- a run --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_is_drawn_by_its_sampling_seed(small: Dataset, tiny: Path, tmp_path: Path) -> None:
     spec = spec_of(small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, limit=2)
     one, again = (run(replace(spec, batch_size=n), tmp_path / str(n)) for n in (8, 3))
@@ -205,6 +206,7 @@ def agent_of(model: Path, answer: AnswerMode = "json") -> Agent:
     return Agent(resolve(str(model)), versions.load("v2"), answer)
 
 
+@pytest.mark.slow
 def test_a_replay_asks_on_as_the_run_was_asked(
     small: Dataset, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

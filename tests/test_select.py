@@ -44,6 +44,7 @@ def test_a_seed_draws_what_another_does_not(shipped: Dataset) -> None:
     assert len(drawn) == 5
 
 
+@pytest.mark.slow
 def test_a_run_says_which_and_its_command_selects_them_again(harness: Callable[..., Any]) -> None:
     words = ("--danger", "left", "--sample", "2", "--sample-seed", "7", "--condition", "6g", "--seeds", "3:4")
     code, out, _ = harness("eval", *words, "--out", "a")

@@ -255,6 +255,7 @@ json_values = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.text(), json_values), st.sampled_from([*SERVERS]))
 def test_whatever_is_stated_is_a_short_identity(facts: dict[str, Any], kind: Kind) -> None:
     import asyncio

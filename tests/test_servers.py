@@ -108,6 +108,7 @@ def test_a_server_without_work_of_its_own_takes_from_the_other() -> None:
     assert {(c.batch_size, c.seconds, c.retries) for c in done} == {(2, None, 0)}
 
 
+@pytest.mark.slow
 def test_connections_stay_open_between_calls_and_are_closed_with_the_backend() -> None:
     ports = set()
 
@@ -415,6 +416,7 @@ def lines(run: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (run / servers.FILE).read_bytes().splitlines()]
 
 
+@pytest.mark.slow
 def test_which_server_gave_each_answer_stands_beside_the_tables(
     whole: Path, small: Dataset, tmp_path: Path
 ) -> None:
@@ -461,6 +463,7 @@ def test_the_shards_lines_are_put_together_and_a_torn_one_is_left_out(tmp_path: 
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_an_answer_of_one_server_is_kept_for_all(small: Dataset, whole: Path, tmp_path: Path) -> None:
     """The second run has other servers, of which none is asked anything."""
     for answers in (None, 0):
@@ -471,6 +474,7 @@ def test_an_answer_of_one_server_is_kept_for_all(small: Dataset, whole: Path, tm
     assert same_decisions(done.out, whole)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_ends_at_once_and_goes_on(small_path: Path, project: Path) -> None:
     """Each answer takes a minute."""
 
@@ -511,6 +515,7 @@ def project(tmp_path: Path) -> Path:
 Typed = Callable[..., tuple[int, str, str]]
 
 
+@pytest.mark.slow
 def test_servers_are_named_on_the_command_line(harness: Typed, project: Path, small_path: Path) -> None:
     with served() as one, served() as other:
         options = ("--model", "mine", "--server", one, "--server", other + "/", "--no-cache")

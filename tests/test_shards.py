@@ -98,6 +98,7 @@ def copied(split: Path, to: Path, *names: str) -> list[Path]:
     return [to / name for name in names]
 
 
+@pytest.mark.slow
 def test_merged_shards_are_the_run_that_was_not_split(split: Path, harness: Typed, tmp_path: Path) -> None:
     shards = copied(split, tmp_path, "2", "3", "1")
     assert harness("run", "merge", *shards, "--out", "merged", "--quiet") == (0, "", "")
@@ -147,6 +148,7 @@ def test_gaps_are_refused(split: Path, harness: Typed, tmp_path: Path) -> None:
     assert re.search(r"/2, shard 2/3, lacks episodes 16 to 31 and 0 parts more; type its command again", said)
 
 
+@pytest.mark.slow
 def test_the_same_shard_twice_is_taken_where_its_bytes_agree(
     split: Path, harness: Typed, tmp_path: Path
 ) -> None:
@@ -205,6 +207,7 @@ def test_what_no_shard_can_be(options: tuple[str, ...], said: str, harness: Type
     assert not Path("shard").exists()
 
 
+@pytest.mark.slow
 def test_a_dataset_of_shards_is_the_one_that_was_not_split(harness: Typed, tmp_path: Path) -> None:
     assert harness(*BUILD, "--out", "whole/small")[0] == 0
     for n in ("1", "2"):

@@ -74,6 +74,7 @@ def test_near_and_alone_only_half_duplex_and_the_curve_s_floor_remain():
     assert QUIET.reception(np.array([2000.0]))[0] < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance_m", [100.0, 250.0])
 def test_collisions_are_those_of_the_equations(distance_m):
     """(14) to (18), with every interferer's shadowing drawn instead of integrated."""
@@ -103,9 +104,9 @@ def test_collisions_are_those_of_the_equations(distance_m):
 def test_loss_averaged_over_shadowing_is_the_curve(radio, sight):
     distances_m = np.array([20.0, 55, 100, 160, 250, 333, 450])
     shadows = norm.ppf((np.arange(4000) + 0.5) / 4000)
-    site = place(distances_m, sight)
-    received = [1 - radio.loss(site, np.full(len(distances_m), z), 1520.0) for z in shadows]
-    np.testing.assert_allclose(np.mean(received, axis=0), radio.reception(distances_m, sight), atol=2e-3)
+    site = links(place(distances_m, sight), len(shadows), len(distances_m)).where
+    lost = radio.loss(site, np.tile(shadows[:, None], len(distances_m)), 1520.0)
+    np.testing.assert_allclose(np.mean(1 - lost, axis=0), radio.reception(distances_m, sight), atol=2e-3)
 
 
 def test_what_stands_between_and_the_corner_cost_reception():
@@ -120,6 +121,7 @@ def test_what_stands_between_and_the_corner_cost_reception():
     assert QUIET.loss(place([50 * np.sqrt(2)], BUILDING, 50.0), z, 800.0)[0] == 1.0
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=25)
 @given(
     density=st.floats(0, 400),
@@ -146,6 +148,7 @@ def test_alone_more_power_never_hurts():
     assert np.all(np.diff(received, axis=0) >= -1e-9)
 
 
+@pytest.mark.slow
 def test_a_message_waits_for_a_slot_and_takes_one_a_block():
     n = 20_000
     given_draws = draws(n, 1)
@@ -277,6 +280,7 @@ def test_twice_the_bandwidth_in_half_as_long_slots_is_half_as_busy():
     assert fine.busy_ratio() == pytest.approx(coarse.busy_ratio() / 2, rel=0.05)
 
 
+@pytest.mark.slow
 def test_where_a_real_radio_is_what_the_paper_declares():
     """8 % and 25 ms: Mode 4 at 150 to 250 m beside 200 vehicles a km. 1.2 % and 5 ms: Mode 2 at 50 m."""
     v2x = replace(BUSY, t2_slots=50)
@@ -304,6 +308,7 @@ def test_who_knows_nothing_of_each_other_meets_by_chance(threshold):
     np.testing.assert_allclose(nobody.same_by_exclusion(np.array([10.0, 900])), 1 / 100)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spacing_m", "vehicles"), [(10.0, 200), (20.0, 100)])
 def test_the_closed_forms_agree_with_100_000_slots_of_simulated_scheduling(spacing_m, vehicles):
     """A ring of vehicles that sense all within 300 m, 2 sub-channels, 10 Hz, counters of 5 to 15."""

@@ -49,6 +49,7 @@ def trips(seeds: int, steps: int = 6) -> Trips:
     return Trips(seed, np.full(seeds, 7), np.zeros(seeds, dtype=int), steps)
 
 
+@pytest.mark.slow
 def test_shadowing_is_normal_and_forgets_with_the_distance_moved():
     n, decorrelation_m = 20_000, 10.0
     here = np.broadcast_to([[0.0, 0.0], [50.0, 10.0]], (n, 2, 2))

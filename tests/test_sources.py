@@ -83,6 +83,7 @@ def prompts_shown(page: Path) -> list[str]:
     return [m["content"] for detail in every for sent in detail["prompts"] for m in sent]
 
 
+@pytest.mark.slow
 def test_a_run_keeps_each_file_that_made_it_once(project: Path, harness: Typed) -> None:
     files, manifest = kept(project / "reports/run"), read(project / "reports/run").manifest
     assert sorted(files) == [
@@ -101,6 +102,7 @@ def test_a_run_keeps_each_file_that_made_it_once(project: Path, harness: Typed) 
     assert kept(Path("again")) == files
 
 
+@pytest.mark.slow
 def test_a_mixed_swarm_keeps_the_prompts_of_all(project: Path, harness: Typed) -> None:
     prompt("theirs", "Look: ")
     typed = (*EVAL, "--dataset", "own/scenes", "--condition", "6g", "--out", "mixed")

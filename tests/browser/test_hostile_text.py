@@ -75,6 +75,7 @@ def attacked(request, small, tmp_path_factory):
     return base / "report.html", text
 
 
+@pytest.mark.slow
 def test_nothing_in_the_file_is_markup_that_the_report_did_not_write(attacked):
     _, text = attacked
     page = Page(text)
@@ -84,6 +85,7 @@ def test_nothing_in_the_file_is_markup_that_the_report_did_not_write(attacked):
     assert all(href.startswith("#") for href in page.values("href"))
 
 
+@pytest.mark.slow
 def test_every_payload_is_shown_as_the_text_it_is(attacked):
     _, text = attacked
     shown = Page(text).text

@@ -70,6 +70,7 @@ def test_weights_lie_beside_its_card(harness: Harness, project: Path) -> None:
     assert missing()["my-model"] is None
 
 
+@pytest.mark.slow
 def test_a_name_that_ships_is_refused(harness: Harness, project: Path) -> None:
     (project / "prompts/mine").rename(project / "prompts/v2")
     assert harness("eval", "--prompt", "v2") == (

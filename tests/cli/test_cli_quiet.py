@@ -13,6 +13,7 @@ Said = tuple[int, str, str]
 DRIVE = ("--episodes", "1", "--seeds", "0", "--workers", "1")
 
 
+@pytest.mark.slow
 def test_quiet_prints_nothing_and_writes_the_same(harness: Callable[..., Said], small_path: Path) -> None:
     once = ("eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--out")
     sweep = ("study", "sweep", "run", "--over", "tau", "--grid", "0.2,0.9", "--out")
@@ -44,6 +45,7 @@ def test_the_closed_loop_campaign_is_quiet(harness: Callable[..., Said]) -> None
     assert Path("closed/closed-loop.json").is_file()
 
 
+@pytest.mark.slow
 def test_quiet_says_errors_and_what_json_asks_for(harness: Callable[..., Said], small_path: Path) -> None:
     code, out, err = harness("eval", "--model", "proxi", "--quiet")
     assert (code, out) == (2, "")

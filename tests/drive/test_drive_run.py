@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from driving import spec
 from evaluating import FILES
+from killed_drive import EPISODES, EPISODES_AT_ONCE
 
 from harness.backends.driver import DriverBackend
 from harness.core.errors import UserError
@@ -71,6 +72,7 @@ def test_a_summary_agrees_with_its_episodes(whole):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("workers", "batch_size"), [(2, 8), (1, 1), (1, 100), (2, 3)])
 def test_workers_and_batches_change_no_byte(whole, tmp_path, monkeypatch, workers, batch_size):
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 4)  # so that both workers have some
@@ -79,8 +81,9 @@ def test_workers_and_batches_change_no_byte(whole, tmp_path, monkeypatch, worker
 
 
 @pytest.mark.slow
-def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp_path):
-    cruise = spec("cruise", seeds=(0,), episodes=33)  # three chunks
+def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp_path, monkeypatch):
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", EPISODES_AT_ONCE)
+    cruise = spec("cruise", seeds=(0,), episodes=EPISODES)
     expected = folder_of(cruise, tmp_path / "whole")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(HERE.parent)])}
     # Before the settings are kept, in chunks, before a table, tidying up.
@@ -92,7 +95,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
         out = tmp_path / f"at-{n}"
         if (out / ".work" / "config.json").is_file() and not (out / "run.json").is_file():
             with pytest.raises(UserError, match="begun with another seeds"):
-                evaluate(spec("cruise", seeds=(1,), episodes=33), out, lambda done: None)
+                evaluate(spec("cruise", seeds=(1,), episodes=EPISODES), out, lambda done: None)
             resumed += 1
         if not (out / "run.json").exists() or (out / ".work").exists():
             assert folder_of(cruise, out) == expected
@@ -100,27 +103,29 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
     assert resumed == 3
 
 
+@pytest.mark.slow
 def test_a_chunk_that_kills_its_worker_is_named_and_the_same_command_goes_on(harness, tmp_path, monkeypatch):
     """A worker is forked with the world in which it dies."""
 
     class Deadly(LiveWorld):
         def __init__(self, scenario, first_seed, numbers, *others):
-            if 17 in numbers:
+            if 3 in numbers:
                 os._exit(9)
             super().__init__(scenario, first_seed, numbers, *others)
 
-    line = ("drive", "--model", "cruise", "--episodes", "33", "--seeds", "0", "--quiet", "--out", "run")
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 2)
+    line = ("drive", "--model", "cruise", "--episodes", "5", "--seeds", "0", "--quiet", "--out", "run")
     with monkeypatch.context() as patched:
         patched.setattr(live_world, "LiveWorld", Deadly)
         code, out, said = harness(*line)
     assert (code, out) == (2, "")
     assert said == (
-        "harness: episodes 16 to 31: the worker was killed 3 times, perhaps because memory ran out; try "
+        "harness: episodes 2 to 3: the worker was killed 3 times, perhaps because memory ran out; try "
         "fewer --workers; the other 2 are done; run keeps what is done; type the same command to continue: "
         f"harness {' '.join(line)}\n"
     )
     kept = {part.name for part in (tmp_path / "run/.work").glob("episodes-*")}
-    assert kept == {"episodes-000000-000015", "episodes-000032-000032"}
+    assert kept == {"episodes-000000-000001", "episodes-000004-000004"}
     assert harness(*line) == (0, "", "")
     assert harness(*line[:-1], "whole", "--workers", "1") == (0, "", "")
     assert all((tmp_path / "run" / n).read_bytes() == (tmp_path / "whole" / n).read_bytes() for n in FILES)

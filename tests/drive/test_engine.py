@@ -161,6 +161,7 @@ def test_episodes_are_in_one_world_until_one_acts_otherwise():
                     ]
 
 
+@pytest.mark.slow
 def test_sharing_a_world_changes_nothing():
     together = driven(spec(), (0, 1, 6))
     alone = [driven(spec(points=(point,), seeds=(seed,)), (e,)) for point in POINTS.values()
@@ -174,6 +175,7 @@ def test_sharing_a_world_changes_nothing():
     assert sorted(map(repr, together.decisions.table.to_pylist())) == sorted(map(repr, apart))
 
 
+@pytest.mark.slow
 def test_who_is_driven_beside_changes_nothing():
     together = driven(spec("proxy-faulty"), range(5))
     apart = [driven(spec("proxy-faulty"), (e,)) for e in range(5)]

@@ -50,18 +50,21 @@ def page(text):
     return Page(text)
 
 
+@pytest.mark.slow
 def test_every_moment_played_again_is_the_moment_that_was_asked(driven):
     found = read(driven)
     assert found.decisions.scenes
     assert all(scene_of(found, scene).id == scene for scene in found.decisions.scenes)
 
 
+@pytest.mark.slow
 def test_workers_change_no_byte_of_a_page(driven, tmp_path, monkeypatch):
     one, two = by_workers(gather([driven]), tmp_path, monkeypatch)
     assert len(details(one)) > 8
     assert two == one
 
 
+@pytest.mark.slow
 def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
     spec = live_spec_of(episodes=1, first_seed=FROM_LEFT)
     name = "occluded-intersection:perfect_knowledge=true"
@@ -93,6 +96,7 @@ def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
         scene_of(read(gone), scene)
 
 
+@pytest.mark.slow
 def test_the_cameras_of_a_run_see_by_the_light_that_it_was_driven_in(tmp_path):
     spec = live_spec_of(episodes=1, first_seed=FROM_LEFT)
     name = "occluded-intersection:ambient=night"
@@ -207,6 +211,7 @@ def test_the_prompt_of_a_second_answer_has_the_messages_that_were_heard(tmp_path
     assert all("MESSAGES" in found[key][-1]["content"] for key in heard)
 
 
+@pytest.mark.slow
 def test_a_driver_beside_a_model_takes_no_helper_out_of_the_picture(driven, tmp_path):
     run(live_spec_of("cruise", episodes=3, first_seed=FROM_LEFT), tmp_path / "cruise")
     every = details(render(gather([tmp_path / "cruise", driven])))
@@ -226,6 +231,7 @@ def edited(driven, tmp_path, name, edit):
     return copy
 
 
+@pytest.mark.slow
 def test_a_prompt_with_another_digest_than_was_asked_is_not_shown(driven, tmp_path):
     def answer(a):
         if a["viewer"] == "v2":
@@ -238,6 +244,7 @@ def test_a_prompt_with_another_digest_than_was_asked_is_not_shown(driven, tmp_pa
     assert all(sent for (_, viewer), sent in found.items() if viewer != "v2")
 
 
+@pytest.mark.slow
 def test_a_moment_that_cannot_be_played_again_has_neither_picture_nor_prompt(driven, tmp_path):
     other = edited(
         driven, tmp_path, "run.json", lambda text: text.replace('"first_seed": 6', '"first_seed": 600')

@@ -229,6 +229,7 @@ def test_an_area_has_the_best_rank_and_not_the_best_luck():
 # -- the commands ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_schedules_are_compared_from_the_command_line(
     stored: ReplayedRun, harness: Callable[..., Any], tmp_path: Path
 ):

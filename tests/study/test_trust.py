@@ -160,6 +160,7 @@ def test_frozen_and_driven_trust_alike(small: Dataset, tmp_path: Path) -> None:
     assert np.nanmean(trust[attackers]) < 0.5 < np.nanmean(trust[~attackers])
 
 
+@pytest.mark.slow
 def test_nobody_looks_at_claims_unless_a_rule_or_an_attack_does(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -174,6 +175,7 @@ def test_nobody_looks_at_claims_unless_a_rule_or_an_attack_does(
         assert bool(looked) == looks, text
 
 
+@pytest.mark.slow
 def test_of_a_model_a_run_is_made_first_and_not_twice(
     harness: Callable[..., Any], small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
