@@ -15,13 +15,19 @@ from pathlib import Path
 
 from evaluating import run, spec_of
 
-from harness.dataset.load import load
+from harness.coordination.operating_point import POINTS
+from harness.dataset.load import Dataset, load
 from harness.evaluate import run as evaluation
 from harness.evaluate.spec import Spec
 
 CHANGES = ("fsync", "mkdir", "replace", "rmdir", "unlink")
-TREES_AT_ONCE = 2  # so that some die between two parts of a run
+TREES_AT_ONCE = 1  # so that some die between two parts of a run
 WALKS_AT_ONCE = 1  # and some between the walks of two seeds
+
+
+def spec_to_kill(dataset: Dataset) -> Spec:
+    """Two layouts, alone and together."""
+    return spec_of(dataset, limit=2, points=(POINTS["single-local"], POINTS["6g"]))
 
 
 def die_before(n: int) -> None:
@@ -58,7 +64,7 @@ def forked(spec: Spec, out: Path, before: int = 0) -> int:
 
 
 def main(dataset: Path, folder: Path) -> None:
-    spec = spec_of(load(dataset))
+    spec = spec_to_kill(load(dataset))
     run(spec, folder / "whole")
     evaluation.TREES_AT_ONCE, evaluation.WALKS_AT_ONCE = TREES_AT_ONCE, WALKS_AT_ONCE
     began = time.monotonic()

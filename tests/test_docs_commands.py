@@ -30,7 +30,7 @@ READER_HAS = {
 
 # Added to what is typed, where it would take minutes; of an option given twice the last one counts. A whole
 # line has its own, or its command's.
-SHARD = "--episodes 17 --seeds 0 --workers 1"  # the fewest of which there are two
+SHARD = "--episodes 2 --seeds 0 --workers 1"
 CUT = {
     "harness drive --model proxy --shard 1/2 --out reports/split/1": SHARD,
     "harness drive --model proxy --shard 2/2 --out reports/split/2": SHARD,
@@ -38,6 +38,11 @@ CUT = {
     "harness eval --model ./my-checkpoint --prompt v2": "--limit 1",
     "harness eval --model my-model": "--limit 1",
     **{line: "--limit 1" for line in TYPED if "--dataset suite:" in line},  # of each of six families
+    **{
+        line: "--limit 1"
+        for line in TYPED
+        if re.match(r"harness eval --model swarm-tiny (?!.*--(prompt|no-cache))", line)
+    },
     "harness eval": "--limit 2",  # of 240 episodes; one has no interval to gate on
     "harness study grid": "--limit 1 --seeds 0:1",  # of 200 episodes
     "harness drive": "--episodes 1 --seeds 0 --workers 1",  # of 240 with 5 seeds
@@ -111,6 +116,7 @@ def parsed(args: list[str]) -> tuple[str, list[str]]:
 def test_a_page_can_be_followed(
     page: Path, harness: Callable[..., Any], small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that two episodes are two shards
     for file, stands_for in {**READER_HAS, "few": small_path}.items():
         (tmp_path / file).symlink_to(stands_for)
     known: dict[str, Any] = {}

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from evaluating import FILES, run, same_files, spec_of, walked, with_ego
-from killed_run import TREES_AT_ONCE, WALKS_AT_ONCE
+from killed_run import TREES_AT_ONCE, WALKS_AT_ONCE, spec_to_kill
 from run_on_disk import answers_of
 
 from harness.backends import cards
@@ -59,7 +59,7 @@ def test_killed_at_any_time_and_resumed_it_is_the_same_run(
 
 
 def _all_become_whole(outs: list[Path], killed: Path, small: Dataset) -> None:
-    spec = spec_of(small)
+    spec = spec_to_kill(small)
     for out in outs:
         if not (out / "run.json").exists() or (out / ".work").exists():
             assert run(spec, out).manifest.seeds == (0, 1)

@@ -521,7 +521,9 @@ def test_servers_are_named_on_the_command_line(harness: Typed, project: Path, sm
         options = ("--model", "mine", "--server", one, "--server", other + "/", "--no-cache")
         code, _, err = harness("eval", *options, "--dataset", small_path, "--limit", "2", "--out", "run")
         assert (code, err) == (0, "")
-        code, _, err = harness("drive", *options, "--episodes", "1", "--seeds", "0:1", "--out", "driven")
+        code, _, err = harness(
+            "drive", *options, "--episodes", "1", "--seeds", "0:1", "--condition", "6g", "--out", "driven"
+        )
         assert (code, err) == (0, "")
     manifest = json.loads((project / "run/run.json").read_text())
     assert manifest["model"]["server"]["base_url"] == "http://127.0.0.1:9/v1", "the card's own"

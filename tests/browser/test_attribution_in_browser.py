@@ -16,6 +16,8 @@ from harness.runs import folder
 from harness.studies.attribution import attribute, write
 from harness.studies.replayed_run import ReplayedRun
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def made(small, tmp_path_factory):

@@ -17,6 +17,8 @@ from harness.core import places
 from harness.report.page import render, visible
 from harness.report.runs import gather
 
+pytestmark = pytest.mark.slow
+
 WRITTEN = """
   html head meta title style body nav a button noscript main section h1 h2 h3 p strong code span small br
   table thead tbody tr th td dl dt dd details summary div figure figcaption pre script
@@ -75,7 +77,6 @@ def attacked(request, small, tmp_path_factory):
     return base / "report.html", text
 
 
-@pytest.mark.slow
 def test_nothing_in_the_file_is_markup_that_the_report_did_not_write(attacked):
     _, text = attacked
     page = Page(text)
@@ -85,7 +86,6 @@ def test_nothing_in_the_file_is_markup_that_the_report_did_not_write(attacked):
     assert all(href.startswith("#") for href in page.values("href"))
 
 
-@pytest.mark.slow
 def test_every_payload_is_shown_as_the_text_it_is(attacked):
     _, text = attacked
     shown = Page(text).text
@@ -103,7 +103,6 @@ def gathered(text):
     return json.loads(packed(text, "index"))["runs"]
 
 
-@pytest.mark.slow
 def test_nothing_runs_in_the_overview_nor_in_any_decision(browser, attacked):
     file, text = attacked
     context = browser.new_context(offline=True)

@@ -17,6 +17,8 @@ from reading import packed
 
 from harness import cli
 
+pytestmark = pytest.mark.slow
+
 SIZE = """async (shown) => {
   const image = new Image();
   image.src = shown.querySelector("image").getAttribute("href");
@@ -340,7 +342,6 @@ def test_it_prints_light_and_without_controls(opened, report):
     assert page.evaluate("document.documentElement.scrollWidth") <= 718
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("where", ["", "#scene"])
 def test_it_can_be_read_by_who_does_not_see_it(opened, report, index, where):
     page = opened(report, where and f"#scene={index['scenes'][0][0]}")

@@ -19,6 +19,8 @@ from harness.coordination.operating_point import POINTS
 from harness.report.page import write_report
 from harness.report.runs import gather
 
+pytestmark = pytest.mark.slow
+
 SPY = """<title>not told</title><script>
 fetch("/").then(() => { document.title = "read" }, () => { document.title = "refused at " + self.origin })
 </script>"""

@@ -32,20 +32,6 @@ def test_quiet_prints_nothing_and_writes_the_same(harness: Callable[..., Said], 
 
 
 @pytest.mark.slow
-def test_the_papers_campaign_is_quiet(harness: Callable[..., Said]) -> None:
-    paper = ("study", "paper", "--episodes", "10", "--sweep-episodes", "10", "--out", "paper", "--quiet")
-    assert harness(*paper) == (0, "", "")
-    assert Path("paper/index.html").is_file()
-
-
-@pytest.mark.slow
-def test_the_closed_loop_campaign_is_quiet(harness: Callable[..., Said]) -> None:
-    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
-    assert harness("study", "closed-loop", *DRIVE, "--out", "closed", "--quiet") == (0, "", "")
-    assert Path("closed/closed-loop.json").is_file()
-
-
-@pytest.mark.slow
 def test_quiet_says_errors_and_what_json_asks_for(harness: Callable[..., Said], small_path: Path) -> None:
     code, out, err = harness("eval", "--model", "proxi", "--quiet")
     assert (code, out) == (2, "")

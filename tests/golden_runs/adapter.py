@@ -8,6 +8,8 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import redirect_stdout
+from io import StringIO
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -28,14 +30,15 @@ SETTINGS = (
 )  # fmt: skip
 
 
-def typed(*arguments: str | Path) -> None:
-    """The command as typed, in the current folder. Raises AssertionError unless it ends well."""
+def typed(*arguments: str | Path) -> str:
+    """What the command prints, typed in the current folder. Raises AssertionError unless it ends well."""
     command = ["harness", *map(str, arguments)]
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as printed:
         patch.setattr(sys, "argv", command)
         with pytest.raises(SystemExit) as ended:
             main()
     assert not ended.value.code, f"`{' '.join(command)}` ended with {ended.value.code}"
+    return printed.getvalue()
 
 
 def tables_of(run: Path) -> dict[str, Table]:

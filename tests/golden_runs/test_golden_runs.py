@@ -112,7 +112,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
             command = [run(part[1:-1]) if part[0] == "{" else part for part in RUNS[name]]
             missing.clear()
             quiet = [] if command[1] == "fidelity" else ["--quiet"]  # which has no such option
-            adapter.typed(*command, *quiet, "--out", folder / name)
+            printed = adapter.typed(*command, *quiet, "--out", folder / name)
+            assert not (quiet and printed)
             assert not missing, f"{name} asks what no completion is stored for, first:\n{missing[0]}"
         return folder / name
 
