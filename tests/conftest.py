@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from evaluating import run, spec_of
 from hypothesis import settings
 
 from harness import cli
@@ -121,27 +122,31 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     return report
 
 
+@pytest.fixture(scope="session")
+def workers_folder(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """The folder of all workers."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if hasattr(request.config, "workerinput") else base
+
+
 @pytest.fixture(scope="session", autouse=True)
-def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+def _own_cache(workers_folder: Path) -> None:
     """No test reads or writes the completions that whoever runs the tests keeps."""
-    os.environ["SWARMDRIVE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+    os.environ["SWARMDRIVE_CACHE"] = str(workers_folder / "cache")
 
 
 @pytest.fixture(scope="session")
-def once(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Once:
+def once(workers_folder: Path) -> Once:
     """A folder by name, filled once, by whoever of several workers comes first; tests leave it as it is."""
-    base = tmp_path_factory.getbasetemp()
-    if hasattr(request.config, "workerinput"):
-        base = base.parent
 
     def filled(name: str, fill: Callable[[Path], object]) -> Path:
-        done = base / f"{name}.done"
-        with (base / f"{name}.lock").open("w") as lock:
+        done = workers_folder / f"{name}.done"
+        with (workers_folder / f"{name}.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not done.exists():
-                fill(base / name)
+                fill(workers_folder / name)
                 done.touch()
-        return base / name
+        return workers_folder / name
 
     return filled
 
@@ -155,6 +160,12 @@ def small_path(once: Once) -> Path:
 @pytest.fixture(scope="session")
 def small(small_path: Path) -> Dataset:
     return load(small_path)
+
+
+@pytest.fixture(scope="session")
+def proxy_run(once: Once, small: Dataset) -> Path:
+    """Folder of a run of the proxy on every episode of `small`."""
+    return once("proxy-run", lambda out: run(spec_of(small), out))
 
 
 @pytest.fixture

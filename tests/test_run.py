@@ -48,13 +48,6 @@ from harness.world.drivers import DRIVERS
 ALL = tuple(POINTS)
 
 
-@pytest.fixture(scope="module")
-def proxy_run(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("runs") / "proxy"
-    run(spec_of(small), out)
-    return out
-
-
 def without_company(answers: list[Answer]) -> list[Answer]:
     """Answers less what may differ with the batch: its size, and the seconds of an answer asked alone."""
     return [msgspec.structs.replace(answer, batch_size=0, **UNTIMED) for answer in answers]

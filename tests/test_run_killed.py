@@ -90,19 +90,13 @@ def answers(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return kept.read_bytes()
 
 
-@pytest.fixture(scope="module")
-def whole(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run that nobody killed."""
-    return run(spec_of(small), tmp_path_factory.mktemp("whole") / "run").out
-
-
 @pytest.mark.parametrize("torn", [1, 5, 300, 20_000])
 def test_a_torn_last_line_is_dropped_and_asked_again(
-    torn: int, whole: Path, answers: bytes, small: Dataset, tmp_path: Path
+    torn: int, proxy_run: Path, answers: bytes, small: Dataset, tmp_path: Path
 ) -> None:
     out = unfinished(spec_of(small), tmp_path / "torn", answers[:-torn])
     run(spec_of(small), out)
-    assert same_files(out, whole)
+    assert same_files(out, proxy_run)
 
 
 def test_what_follows_a_torn_line_can_be_read_again(answers: bytes, small: Dataset, tmp_path: Path) -> None:
@@ -176,11 +170,11 @@ def test_damaged_answers_are_one_line(line: bytes, answers: bytes, small: Datase
 )
 @pytest.mark.parametrize("finished", [True, False])
 def test_other_settings_are_refused_by_name_and_change_nothing(
-    finished: bool, other, named: str, whole: Path, answers: bytes, small: Dataset, tmp_path: Path
+    finished: bool, other, named: str, proxy_run: Path, answers: bytes, small: Dataset, tmp_path: Path
 ) -> None:
     out = tmp_path / "run"
     if finished:
-        shutil.copytree(whole, out)
+        shutil.copytree(proxy_run, out)
         (out / ".work").mkdir()
     else:
         unfinished(spec_of(small), out, answers[:5000])
