@@ -98,6 +98,12 @@ OTHER_PROGRAMS = {
 }
 
 
+def lines_of(page: Path) -> list[str]:
+    """What a page has a reader type."""
+    shell = [block for language, block in blocks(page) if language != "python"]
+    return [shlex.join(shlex.split(line, comments=True)) for block in shell for line, _ in typed(block)]
+
+
 def name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
@@ -112,7 +118,7 @@ def parsed(args: list[str]) -> tuple[str, list[str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in pages() if blocks(page)], ids=name)
+@pytest.mark.parametrize("page", [page for page in pages() if blocks(page) and page != PAGE], ids=name)
 def test_a_page_can_be_followed(
     page: Path, harness: Callable[..., Any], small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,8 +173,10 @@ def test_commands_named_in_a_sentence_exist_with_their_options(page: Path) -> No
             assert {word for word in words if word.startswith("--")} <= options, mention
 
 
-def test_the_reference_is_the_program() -> None:
+def test_the_reference_is_the_program_and_other_pages_type_its_examples() -> None:
     assert PAGE.read_text() == reference(), "run `python docs/reference.py`"
+    elsewhere = {line for page in pages() if page != PAGE for line in lines_of(page)}
+    assert set(lines_of(PAGE)) <= elsewhere
 
 
 def test_console_is_the_one_form_of_a_shell_block() -> None:
