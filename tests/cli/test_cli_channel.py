@@ -52,6 +52,7 @@ def test_show_says_where_settings_leave_what_the_source_tried(harness: Callable[
     assert "outside" not in harness("radio", "show", "mode4")[1]
 
 
+@pytest.mark.slow
 def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: Callable[..., Said]) -> None:
     rows = '10,0.97,"power_dbm=20,rate_hz=20",they\n100,0.5,"power_dbm=20,rate_hz=20",they\n10,0.9,,they\n'
     Path("theirs.csv").write_text(f"distance_m,reception,configuration,source\n{rows}")
@@ -70,6 +71,7 @@ def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: 
         assert point["round_trip"]["value"] <= point["crossing"]["value"]
 
 
+@pytest.mark.slow
 def test_check_says_how_long_a_receiver_waits_for_the_next_packet(harness: Callable[..., Said]) -> None:
     """The mean wait is about 1 / (rate x reception); less where little arrives, as shadowing has spells."""
     for name in PHYSICAL:
@@ -144,12 +146,14 @@ def test_a_sweep_over_a_radios_setting_gives_what_a_run_at_it_gives(
     assert at[at.metric == "success_rate"]["mean"].tolist() == pytest.approx(of_run.tolist())
 
 
+@pytest.mark.slow
 def test_a_run_warns_of_a_radio_that_its_source_never_tried(harness: Callable[..., Said], done: Path) -> None:
     said = "mode4:density_per_km=1000: density_per_km = 1000 is outside what its model was held against"
     assert harness("report", done, "--out", "page.html")[0] == 0
     assert said in Path("page.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_sweep_refuses_a_run_whose_radio_has_changed_since(
     harness: Callable[..., Said], small: Dataset, tmp_path: Path
 ) -> None:

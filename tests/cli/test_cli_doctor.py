@@ -57,12 +57,14 @@ def test_what_is_not_installed_is_named_with_the_command_that_installs_it() -> N
     assert {engine for engine, lack in told["engines"].items() if lack} == {"transformers", "llama-cpp"}
 
 
+@pytest.mark.slow
 def test_no_gpu_is_no_error() -> None:
     alone = "import os; os.environ['PATH'] = os.environ['CUDA_VISIBLE_DEVICES'] = ''"
     assert json.loads(apart(alone, "--json"))["gpu"] == []
     assert json.loads(apart(alone, "--json", "--gpu"))["gpu"] == []
 
 
+@pytest.mark.slow
 def test_a_gpu_is_what_nvidia_smi_says_and_one_that_fails_says_nothing(tmp_path: Path) -> None:
     program = tmp_path / "nvidia-smi"
     alone = f"import os; os.environ['PATH'] = {str(tmp_path)!r}"

@@ -137,6 +137,7 @@ def test_a_picture_counts_in_every_prompt(
         assert {(n["least"], n["most"]) for n in told["prompt_tokens"].values()} == {(counted, counted)}
 
 
+@pytest.mark.slow
 def test_a_processor_that_is_here_is_asked_and_a_difference_ends_with_one(
     harness: Harness, small_path: Path, tmp_path: Path
 ) -> None:

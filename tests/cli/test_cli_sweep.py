@@ -20,6 +20,7 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return evaluate(spec_of(small), tmp_path_factory.mktemp("sweep") / "run").out
 
 
+@pytest.mark.slow
 def test_without_an_axis_it_draws_the_papers_panels_beside_the_proxys(
     harness: Callable[..., Said], done: Path
 ) -> None:
@@ -79,6 +80,7 @@ def test_what_cannot_be_is_one_line_and_nothing_is_written(
     assert not Path("swept").exists()
 
 
+@pytest.mark.slow
 def test_the_papers_study_ends_with_how_many_numbers_it_met(harness: Callable[..., Said]) -> None:
     code, out, err = harness("study", "paper", "--episodes", "20", "--sweep-episodes", "20", "--out", "p")
     assert (code, err) == (0, "")

@@ -21,6 +21,7 @@ def started(here: Path, command: tuple[str, ...], **out: Any) -> "subprocess.Pop
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", SPEAK, ids=" ".join)
 def test_nobody_reads(command: tuple[str, ...], tmp_path: Path) -> None:
     process = started(tmp_path, command, stdout=subprocess.PIPE)

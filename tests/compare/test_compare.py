@@ -280,6 +280,7 @@ def test_one_episode_has_differences_and_no_interval(small_path: Path, tmp_path:
             assert d.change.low != d.change.low
 
 
+@pytest.mark.slow
 def test_live_runs_are_compared_with_live_runs(
     runs: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -307,6 +308,7 @@ def test_live_runs_are_compared_with_live_runs(
             pair(Path("cruise"), other)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compared_is_refused(
     runs: tuple[Path, Path], small: Dataset, tmp_path: Path, harness: Callable[..., Said]
 ) -> None:

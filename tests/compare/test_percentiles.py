@@ -1,6 +1,7 @@
 """Percentiles of resampled episodes: each is what it would be of the decisions written out."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,6 +19,7 @@ def laid(made: list[tuple[int, float]]) -> Decided:
     return np.array([place for place, _ in made], dtype=np.int64), np.array([v for _, v in made], dtype=float)
 
 
+@pytest.mark.slow
 @given(st.data(), SEEDS)
 def test_the_difference_is_that_of_all_decisions_of_episodes_that_both_know(
     data: st.DataObject, n: int
@@ -42,6 +44,7 @@ def test_the_difference_is_that_of_all_decisions_of_episodes_that_both_know(
         assert len(met) > 1 or np.isnan(change.low)
 
 
+@pytest.mark.slow
 def test_the_interval_has_the_width_that_theory_gives_a_median() -> None:
     """The median of n normal values has a standard error of 1.2533 sigma / sqrt(n); mean of 30 widths."""
     rng, place, widths = np.random.default_rng(7), np.arange(400), []

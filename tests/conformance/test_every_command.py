@@ -274,6 +274,7 @@ def mine(theirs: Server) -> Iterator[Server]:
         yield server
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "command"), commands(), ids=[words for words, _ in commands()])
 def test_a_hostile_copy_causes_nothing(
     words: str, command: Any, harness: Callable[..., Said], base: Path, theirs: Server, mine: Server,

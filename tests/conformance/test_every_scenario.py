@@ -108,11 +108,13 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(scenario: Scenario)
             assert thawed.outcome.result == world.outcome.result
 
 
+@pytest.mark.slow
 def test_a_driver_who_sees_everything_reaches_the_goal_and_one_who_waits_does_not(scenario: Scenario) -> None:
     assert {drive(scenario, "full-view", seed).result for seed in SEEDS} == {"cleared"}
     assert {drive(scenario, "brake", seed).result for seed in SEEDS} - {"cleared"}
 
 
+@pytest.mark.slow
 def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenario) -> None:
     """All that could speak against a helper is what it claims: everybody is undecided."""
     rule = Trust()
@@ -138,6 +140,7 @@ def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenar
             state = fused.state
 
 
+@pytest.mark.slow
 def test_many_viewers_see_together_what_each_sees_alone(scenario: Scenario) -> None:
     states = []
     for seed in SEEDS:

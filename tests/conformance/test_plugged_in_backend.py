@@ -54,6 +54,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_card_names_it_and_it_is_listed_and_run(
     project: Path, small_path: Path, harness: Callable[..., tuple[int, str, str]]
 ) -> None:

@@ -7,6 +7,7 @@ import pytest
 from harness.runs import folder
 
 
+@pytest.mark.slow
 def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     options = ("--condition", "all", "--episodes", 2, "--first-seed", 5, "--seeds", "0:2", "--workers", 1)
     code, out, err = harness("drive", "--model", "local-view", *options, "--out", tmp_path / "run")
@@ -26,6 +27,7 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     assert success in (0.0, 0.5, 1.0)
 
 
+@pytest.mark.slow
 def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(harness, tmp_path, small_path):
     draw = ("--sample", 2, "--sample-seed", 3, "--seeds", "0:1")
     layouts = json.loads((small_path / "manifest.json").read_text())

@@ -35,6 +35,7 @@ def test_every_grid_point_is_a_condition_that_its_name_tells() -> None:
     assert found["tau"][0].point.name == "6g:tau_nats=0.3"
 
 
+@pytest.mark.slow
 def test_the_study_is_a_live_run_and_figures_of_it(harness: Callable[..., Said]) -> None:
     code, out, err = harness(*OPTIONS)
     assert (code, err) == (0, "")
@@ -56,6 +57,7 @@ def test_the_study_is_a_live_run_and_figures_of_it(harness: Callable[..., Said])
     assert {p: p.read_bytes() for p in written} == written
 
 
+@pytest.mark.slow
 def test_a_folder_of_another_study_is_refused(harness: Callable[..., Said]) -> None:
     assert harness(*OPTIONS, "--json")[0] == 0
     told = json.loads(Path("study/closed-loop.json").read_text())

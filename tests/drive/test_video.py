@@ -26,6 +26,7 @@ def out(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_an_episode_played_again_ends_as_it_did(out):
     row: Any
     for row in pd.read_csv(out / "episodes.csv", keep_default_na=False).itertuples():
@@ -71,6 +72,7 @@ def test_an_episode_is_drawn_as_a_gif_in_which_things_move(out, drawn):
     assert sum(a != b for a, b in pairwise(frames)) == len(frames) - 1
 
 
+@pytest.mark.slow
 def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(out, tmp_path, monkeypatch, capsys):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     film = tmp_path / "episode.mp4"
@@ -82,6 +84,7 @@ def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(out, tmp_path, monkeyp
     assert [p.name for p in tmp_path.iterdir()] == ["episode.mp4"]
 
 
+@pytest.mark.slow
 def test_the_same_episode_gives_the_same_gif(out, drawn, tmp_path):
     write_video(find(out, 0, None, None), tmp_path / "again.gif", lambda done: None)
     assert (tmp_path / "again.gif").read_bytes() == drawn[0].read_bytes()
@@ -106,6 +109,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
     assert [p.name for p in tmp_path.iterdir()] == ["folder.gif"]
 
 
+@pytest.mark.slow
 def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, capsys):
     pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     words = ("--model", "cruise", "--condition", "single-local", "--seeds", "0,1", "--workers", 1)

@@ -29,6 +29,7 @@ def pixels(address):
     return np.asarray(image.open(BytesIO(base64.b64decode(content))))
 
 
+@pytest.mark.slow
 def test_each_viewer_has_its_picture_and_boxes_around_what_its_sensors_list(run, dataset):
     opened = details(render(gather([run])))
     boxes = 0
@@ -47,6 +48,7 @@ def test_each_viewer_has_its_picture_and_boxes_around_what_its_sensors_list(run,
     assert boxes > len(opened)
 
 
+@pytest.mark.slow
 def test_where_an_episode_was_lost_comes_first_if_a_page_cannot_have_all(run, monkeypatch):
     lost, every = choose.lost(read(run)), list(read(run).decisions.scenes)
     assert 1 < len(lost) < len(every) - 1
@@ -58,6 +60,7 @@ def test_where_an_episode_was_lost_comes_first_if_a_page_cannot_have_all(run, mo
         assert with_pictures < set(lost) if room < len(lost) else set(lost) < with_pictures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["own", "blank", "another"])
 def test_an_answer_says_which_picture_its_prompt_had(run, tmp_path, mode):
     """By what the run recorded: here of the ego alone."""
@@ -73,6 +76,7 @@ def test_an_answer_says_which_picture_its_prompt_had(run, tmp_path, mode):
         assert {(a["role"], a.get("picture")) for a in of["answers"]} == {("ego", mode), ("helper", None)}
 
 
+@pytest.mark.slow
 def test_pictures_of_a_report_of_the_default_dataset_take_less_than_one_and_a_half_megabytes():
     dataset = load(folder("datasets") / "occluded-intersection-v2", limit=30)
     drawn = [scenes.cameras(dataset.scenario, scene) for scene in dataset.scenes(dataset.courses()[::20])]

@@ -38,6 +38,7 @@ def test_one_scene_gives_one_picture_byte_for_byte(dataset, tmp_path, format):
     assert (tmp_path / "scene").read_bytes() == picture(scenes_of(dataset)[3], format)
 
 
+@pytest.mark.slow
 def test_every_vehicle_is_labelled_with_id_and_kind_and_the_file_stays_light(dataset):
     for scene in scenes_of(dataset)[::3]:
         for viewer in scene.viewers:
@@ -108,6 +109,7 @@ def placed(points):
     return np.array(boxes), axes.get_window_extent().get_points()
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60)
 @given(st.lists(st.tuples(*[st.floats(-79, 79)] * 2), min_size=2, max_size=7))
 @example([(19.0, 56.0), (40.0, 77.0), (70.0, 74.0), (71.0, 71.0)])  # a corner with little room

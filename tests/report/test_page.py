@@ -157,6 +157,7 @@ def prompts_in(opened):
     return [m["content"] for d in opened.values() for sent in d["prompts"] for m in sent]
 
 
+@pytest.mark.slow
 def test_prompts_are_those_given_and_none_where_none_are(run, opened):
     assert "I am v3." in prompts_in(opened)
     # The sample's prompt is nobody's, and it was asked with another than this greeting.
@@ -165,6 +166,7 @@ def test_prompts_are_those_given_and_none_where_none_are(run, opened):
         assert all(a["prompt"] is None for d in bare.values() for a in d["runs"][0]["answers"])
 
 
+@pytest.mark.slow
 def test_a_page_names_the_answer_mode_and_has_the_prompt_of_a_read_out(dataset, tmp_path):
     said = {"label_mass": 0.25, "retries": 2, "cached": True}
 
@@ -232,10 +234,12 @@ def test_a_page_is_written_where_python_writes_no_package_metadata_as_text(monke
     assert re.search(r"Vega 5[\d.]+, Vega Lite 5[\d.]+, Vega Embed 6[\d.]+, which lie", library.licence())
 
 
+@pytest.mark.slow
 def test_the_same_runs_give_the_same_page(run):
     assert written(run) == written(run)
 
 
+@pytest.mark.slow
 def test_workers_change_no_byte_of_a_page(run, dataset, tmp_path, monkeypatch):
     other = write_run(tmp_path / "other", dataset, model="other")
     change(other, decision=lambda row: row.update(triggered=False))
@@ -244,6 +248,7 @@ def test_workers_change_no_byte_of_a_page(run, dataset, tmp_path, monkeypatch):
     assert two == one
 
 
+@pytest.mark.slow
 def test_several_runs_stand_side_by_side_and_each_is_named(run, dataset, tmp_path):
     brave = write_run(
         tmp_path / "brave", dataset, model="brave",
@@ -261,6 +266,7 @@ def test_several_runs_stand_side_by_side_and_each_is_named(run, dataset, tmp_pat
         assert [told is not None for told in detail["runs"]] == [scene in of for of in came]
 
 
+@pytest.mark.slow
 def test_sweeps_in_a_runs_folder_are_in_its_page_unless_a_link_leads_out(run, tmp_path):
     swept = copied(run, tmp_path)
     (tmp_path / "secret.svg").write_text("<svg>secret</svg>")
@@ -521,6 +527,7 @@ def test_a_run_on_another_dataset_than_lies_there_is_refused(run, tmp_path):
         gather([other])
 
 
+@pytest.mark.slow
 def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_path):
     app = typer.Typer()
     app.command()(command)
@@ -538,6 +545,7 @@ def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_pat
             CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
 
 
+@pytest.mark.slow
 def test_a_page_of_a_frozen_run_waits_for_no_painter_no_simulator_and_no_pandas(run, tmp_path):
     program = (
         "import sys; from pathlib import Path; from harness.cli.report import write;"
@@ -548,6 +556,7 @@ def test_a_page_of_a_frozen_run_waits_for_no_painter_no_simulator_and_no_pandas(
     assert said.stdout == "[]\n"
 
 
+@pytest.mark.slow
 def test_an_answer_of_somebody_who_is_not_in_the_scene_is_one_line(dataset, tmp_path):
     run = write_run(tmp_path / "run", dataset)
     answers = (run / "answers.jsonl").read_text().splitlines()

@@ -107,6 +107,7 @@ def test_names_of_near_lines_stand_together() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_command_shows_both_beside_the_model(small_path: Path, harness: Any) -> None:
     code, out, _ = harness("eval", "--dataset", small_path, "--seeds", "0:1", "--condition", "single-local")
     assert code == 0

@@ -95,6 +95,7 @@ def test_each_vehicle_begins_at_a_time_of_its_own_and_all_have_been_heard_at_the
     assert len(phases) >= 5
 
 
+@pytest.mark.slow
 def test_losses_make_what_is_known_older():
     """Without losses the mean age is some 70 ms; each loss adds 100 ms, .08 + .08² + … of them on average."""
     seeds = range(60)
@@ -119,6 +120,7 @@ def test_a_beacon_says_the_same_to_all_and_its_errors_are_those_declared():
 DIALS = ("beacon_loss=0", "beacon_loss=0.08", "beacon_loss=0.7", "beacon_rule=cam,beacon_loss=0.7", RADIO)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.integers(1, 120), max_size=6), st.sampled_from(DIALS))
 def test_beacons_do_not_depend_on_how_time_is_cut(frames, dials):
@@ -305,6 +307,7 @@ def heard(dials, seeds=range(5)):
     return found
 
 
+@pytest.mark.slow
 def test_on_a_strong_radio_beacons_get_through_and_on_a_feeble_one_only_the_first_does():
     strong = heard("beacon_channel=its-g5+density_per_km=0+power_dbm=60")
     feeble = heard("beacon_channel=its-g5+power_dbm=-60")
@@ -312,6 +315,7 @@ def test_on_a_strong_radio_beacons_get_through_and_on_a_feeble_one_only_the_firs
     assert all(time_s < -0.8 for time_s in feeble.values())
 
 
+@pytest.mark.slow
 def test_a_busier_channel_never_makes_anybody_hear_more():
     """The draws are shared, and so is the shadowing."""
     quiet, busy = (heard(f"beacon_channel=its-g5+density_per_km={density}") for density in (10, 150))

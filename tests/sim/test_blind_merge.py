@@ -53,6 +53,7 @@ def test_it_lets_go_first_who_is_on_its_lane_and_minds_nobody_on_the_other():
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(replace(COMES, x_m=-150.0)))) == "IDLE"
 
 
+@pytest.mark.slow
 def test_who_sees_everything_clears_and_who_cruises_meets_a_danger_or_nobody():
     dangerous = [seed for seed, found in LAYOUTS.items() if found.danger]
     free = [seed for seed, found in LAYOUTS.items() if not found.danger]
@@ -76,6 +77,7 @@ def test_cars_come_when_they_are_drawn_to_and_at_one_band_of_speeds():
                 assert P.main_mps[0] <= spawn.speed_mps <= P.main_mps[1]
 
 
+@pytest.mark.slow
 def test_nobody_but_the_ego_touches_anybody():
     for seed in range(15):
         world = World.start(SCENARIO, seed)

@@ -58,6 +58,7 @@ def test_a_scenario_check_states_rates_intervals_and_n(harness):
     assert max(map(len, out.splitlines())) <= 80
 
 
+@pytest.mark.slow
 def test_a_dataset_is_built_checked_and_ranked(harness, tmp_path):
     out_folder = tmp_path / "two-v1"
     code, out, _ = harness(

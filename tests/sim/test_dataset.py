@@ -35,6 +35,7 @@ def contents(folder):
 # Building.
 
 
+@pytest.mark.slow
 def test_a_build_killed_half_way_and_continued_by_two_workers_has_the_bytes_of_an_undisturbed_one(
     small_folder, tmp_path
 ):
@@ -146,6 +147,7 @@ def test_poses_are_kept_to_the_micrometre_so_that_other_machines_write_the_same(
                 assert number == round(number, 6)
 
 
+@pytest.mark.slow
 def test_an_edge_leads_where_the_thawed_world_goes(small):
     """Thawed to the micrometre, so positions agree to a millimetre, and ends to the frame."""
     forest = small.forest
@@ -166,6 +168,7 @@ def test_an_edge_leads_where_the_thawed_world_goes(small):
                 assert mine.speed_mps == pytest.approx(its.speed_mps, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_what_becomes_of_an_action_with_the_full_view_driver_is_what_it_drives(small):
     forest = small.forest
     for n in forest.visited(forest.drivers["cruise"]).tolist()[::5]:
@@ -190,6 +193,7 @@ def test_the_first_episodes_can_be_loaded_alone(small_folder):
     assert {name[:5] for name in few.forest.ids} == {"00000"}
 
 
+@pytest.mark.slow
 def test_another_lag_is_another_dataset_and_everybody_has_it(small, tmp_path):
     p = replace(SCENARIO.parameters, decision_lag_s=0.0)
     at_once = replace(SCENARIO, parameters=p)

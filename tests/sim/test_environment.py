@@ -75,6 +75,7 @@ def test_a_vehicle_without_a_lane_is_named(kind, tmp_path):
         build(scenario, tmp_path / "set", 1, 0, 1, lambda done: None)
 
 
+@pytest.mark.slow
 def test_an_ego_that_begins_in_a_collision_is_said_by_the_check_and_by_runs(tmp_path, harness):
     scenario = scenarios.get("env:crashed-v0:decisions=1")
     build(scenario, tmp_path / "set", 2, 0, 1, lambda done: None)
@@ -132,6 +133,7 @@ def test_its_frames_are_those_of_its_own_step(env):
         assert (ours.env.steps, ours.env.time) == (theirs.steps, theirs.time)
 
 
+@pytest.mark.slow
 def test_traffic_that_it_spawns_enters():
     scenario = scenarios.get(named("intersection-v1", SPEED_ONLY))
     assert (scenario.actions, scenario.parameters.decisions) == (CAREFUL_FIRST[:3], 6)
@@ -268,11 +270,13 @@ def test_its_dataset_is_sound_and_pins_its_configuration(folder):
         load(changed)
 
 
+@pytest.mark.slow
 def test_equal_builds_are_equal_bytes(folder, tmp_path):
     build(scenarios.get(f"{OWN}:decisions=2,helpers=2"), tmp_path / "breakdown", 2, 0, 1, lambda done: None)
     assert (tmp_path / "breakdown/manifest.json").read_bytes() == (folder / "manifest.json").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "config"), [("merge-v0", None), ("roundabout-v0", None), ("intersection-v1", SPEED_ONLY)]
 )
@@ -291,6 +295,7 @@ def test_stock_environments_freeze_as_they_drive_and_are_drawn(env, config, tmp_
     assert picture.getvalue().startswith(b"<?xml")
 
 
+@pytest.mark.slow
 def test_the_commands_take_it_from_end_to_end(harness, folder):
     assert harness("dataset", "show", folder, "00000-0", "--out", "scene.png")[0] == 0
     for model in ("proxy", "swarm-tiny"):

@@ -80,6 +80,7 @@ def test_every_frozen_record_and_tree_fits(small: Dataset):
     assert all(fits(msgspec.to_builtins(tree), Tree) for tree in small.trees)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data())
 def test_a_changed_record_fits_where_the_published_schema_says_so(small: Dataset, data: st.DataObject):
@@ -90,6 +91,7 @@ def test_a_changed_record_fits_where_the_published_schema_says_so(small: Dataset
     assert fits(record, record_type(small.scenario)) == valid
 
 
+@pytest.mark.slow
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data())
 def test_a_changed_tree_fits_where_the_published_schema_says_so(small: Dataset, data: st.DataObject):
@@ -102,6 +104,7 @@ def test_a_changed_tree_fits_where_the_published_schema_says_so(small: Dataset, 
     assert fits(tree, Tree) == valid
 
 
+@pytest.mark.slow
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data())
 def test_a_changed_manifest_fits_where_the_published_schema_says_so(

@@ -1,5 +1,7 @@
 """Reference drivers in the simulator."""
 
+import pytest
+
 from harness.world.drivers import DRIVERS
 from harness.world.outcome import Outcome
 from harness.world.reference import check, drive_all, summary
@@ -19,6 +21,7 @@ def test_who_clears_too_long_after_the_full_view_driver_is_late():
     assert outcomes["local-view"].time_s - outcomes["full-view"].time_s > 1.01
 
 
+@pytest.mark.slow
 def test_a_check_counts_every_episode_once_for_any_number_of_workers():
     done = []
     alone = check(SCENARIO, 4, 5, 1, done.append)

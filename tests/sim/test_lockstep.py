@@ -48,6 +48,7 @@ def everything(world):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", EVERY, ids=lambda s: s.name)
 def test_together_is_as_alone(scenario, form):
     """Whatever each decides, and whenever: none is in step with another, and they end one by one."""
@@ -92,6 +93,7 @@ def test_wrecks_stay_where_they_are_and_their_worlds_go_on(form):
     assert {world.outcome.other_crashes > 0 for world in worlds} == {True, False}
 
 
+@pytest.mark.slow
 def test_environments_are_simulated_by_highway_env():
     scenario = scenarios.get("env:highway-v0")
     worlds = [World.start(scenario, seed) for seed in range(3)]

@@ -134,6 +134,7 @@ def spread(values):
     return float(np.std(np.array(values)))
 
 
+@pytest.mark.slow
 def test_lidar_noise_is_what_is_stated():
     found = draws(70.0, 90.0)
     truth = ahead(70.0, 90.0)
@@ -145,6 +146,7 @@ def test_lidar_noise_is_what_is_stated():
     assert np.mean([d.speed_mps for d in found]) == pytest.approx(10.0, abs=0.06)
 
 
+@pytest.mark.slow
 def test_radar_noise_is_what_is_stated():
     found = draws(100.0)
     assert spread([d.y_m for d in found]) == pytest.approx(0.4, rel=0.06)  # range, straight ahead
@@ -256,6 +258,7 @@ def without(state, vehicle):
     return replace(state, vehicles=tuple(v for v in state.vehicles if v.id != vehicle))
 
 
+@pytest.mark.slow
 def test_a_graph_does_not_change_when_what_it_does_not_list_is_taken_away():
     hidden = 0
     for seed in range(24):
@@ -281,6 +284,7 @@ def test_a_graph_does_not_change_when_what_it_does_not_list_is_taken_away():
     assert hidden > 300
 
 
+@pytest.mark.slow
 def test_an_episode_without_its_danger_looks_the_same_for_as_long_as_the_ego_does_not_see_it():
     hidden_steps = 0
     for seed in range(24):
@@ -315,6 +319,7 @@ def test_a_graph_names_only_its_viewer_the_ego_what_it_lists_and_buildings():
             world.act("IDLE")
 
 
+@pytest.mark.slow
 def test_most_dangers_are_hidden_from_the_ego_and_seen_by_a_helper_two_decisions_before():
     dangers = hidden = helped = 0
     for seed in range(40):

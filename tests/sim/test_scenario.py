@@ -92,6 +92,7 @@ def test_a_harmless_car_is_like_a_dangerous_one_but_late(layouts):
         assert bands[0] == pytest.approx(bands[1], abs=0.25)
 
 
+@pytest.mark.slow
 def test_nobody_touches_anybody_before_the_ego_does():
     for seed in range(60):
         world = World.start(SCENARIO, seed)

@@ -4,6 +4,7 @@ import json
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,6 +25,7 @@ states = st.builds(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @given(states)
 def test_a_state_survives_json_exactly(state):
     assert WorldState.from_dict(json.loads(canonical_json(state.to_dict()))) == state

@@ -88,6 +88,7 @@ def test_an_unhindered_cruise_clears_when_the_distance_is_covered():
     assert (outcome.result, outcome.time_s) == ("cleared", pytest.approx(frames / P.simulation_hz))
 
 
+@pytest.mark.slow
 def test_the_same_seed_is_the_same_episode_whatever_ran_before_in_the_process():
     defaults = (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
     try:
@@ -252,6 +253,7 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(seed):
         world.act(behaviour)
 
 
+@pytest.mark.slow
 def test_many_seeds_thaw_at_every_step_to_the_same_next_second():
     for seed in range(20, 32):
         world = World.start(SCENARIO, seed)

@@ -40,6 +40,7 @@ def grid(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Grid:
     return played(small, tmp_path_factory.mktemp("grid"))
 
 
+@pytest.mark.slow
 def test_a_cell_is_the_run_of_its_mix(grid: Grid, small: Dataset, tmp_path: Path) -> None:
     for cell in grid.cells:
         alone = replace(spec_of(small), ego=cell.ego, helpers=(cell.helper,))
@@ -48,6 +49,7 @@ def test_a_cell_is_the_run_of_its_mix(grid: Grid, small: Dataset, tmp_path: Path
         assert sorted(a.id for a in answers_of(out)) == sorted(a.id for a in cell.run.answers)
 
 
+@pytest.mark.slow
 def test_an_agent_is_asked_once_in_a_role_about_a_decision_point(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -63,6 +65,7 @@ def test_an_agent_is_asked_once_in_a_role_about_a_decision_point(
     assert len(asked) == len(set(asked)) > 100
 
 
+@pytest.mark.slow
 def test_a_stopped_grid_goes_on_and_asks_only_what_is_missing(small: Dataset, tmp_path: Path) -> None:
     whole, again = played(small, tmp_path / "grid"), list[int]()
     played(small, tmp_path / "grid", again.append)
@@ -156,6 +159,7 @@ def test_the_front_is_what_none_beats_without_taking_longer() -> None:
     assert names == [("v1", "v1"), ("v1", "v2")]
 
 
+@pytest.mark.slow
 def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset) -> None:
     pytest.importorskip("matplotlib", reason="needs the report extra")
     out = grid.cells[0].run.path.parent.parent
@@ -173,6 +177,7 @@ def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset
     assert page.count("<a href=") == page.count('<a href="cells/1-2/report.html">cells/1-2</a>') == 3
 
 
+@pytest.mark.slow
 def test_letters_are_those_of_the_agents_that_read_out(
     harness: Callable[..., Any], small_path: Path, tmp_path: Path
 ) -> None:

@@ -49,11 +49,13 @@ def run(harness: Callable[..., Said], small_path: Path, monkeypatch: pytest.Monk
         yield server
 
 
+@pytest.mark.slow
 def test_a_study_asks_the_server_of_the_users_card(run: Server, harness: Callable[..., Said]) -> None:
     assert harness(*STUDY)[0] == 0
     assert run.asked
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", [True, False])
 def test_a_study_names_the_prompt_that_its_run_keeps(
     changed: bool, run: Server, small_path: Path, harness: Callable[..., Said]
@@ -75,6 +77,7 @@ def test_a_study_names_the_prompt_that_its_run_keeps(
     assert harness(*study)[0] == 0
 
 
+@pytest.mark.slow
 def test_what_the_run_says_of_a_server_changes_nothing(run: Server, harness: Callable[..., Said]) -> None:
     """Its card may have moved: the identity of what is opened is compared."""
     with serving(lambda asked: asked.reply(completion(GOOD))) as theirs:
@@ -83,6 +86,7 @@ def test_what_the_run_says_of_a_server_changes_nothing(run: Server, harness: Cal
         assert (len(theirs.asked), bool(run.asked)) == (0, True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "said"),
     [
@@ -102,6 +106,7 @@ def test_a_card_that_asks_otherwise_is_refused(
     assert said in err
 
 
+@pytest.mark.slow
 def test_another_identity_is_refused_before_a_question(run: Server, harness: Callable[..., Said]) -> None:
     with serving(lambda asked: asked.reply(completion(GOOD))) as other:
         Path("models/mine.toml").write_text(CARD.format(url=other.url, more=""))
@@ -110,6 +115,7 @@ def test_another_identity_is_refused_before_a_question(run: Server, harness: Cal
     assert "the model is not what it was (base_url); run again" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "study",
     [
