@@ -54,6 +54,7 @@ def n_answers(folder: Path) -> int:
     return len(read(folder).answers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", [frozen(), LiveSource(1_000_000, 4)], ids=["frozen", "closed loop"])
 def test_decisions_are_those_of_asking_all(source: Source, tmp_path: Path) -> None:
     names = POINTS if source.kind == "closed-loop" else (*POINTS, "v2x:messages=shuffled")
@@ -69,6 +70,7 @@ def test_nobody_asks_so_no_helper_answers(name: str, tmp_path: Path) -> None:
     assert {answer.role for answer in read(tmp_path / "run").answers} == {"ego"}
 
 
+@pytest.mark.slow
 def test_workers_change_no_byte(tmp_path: Path) -> None:
     source = LiveSource(1_000_000, 18)
     for workers in (1, 2):
@@ -82,6 +84,7 @@ class Stops(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_a_stopped_run_asks_the_same_in_the_same_batches(tmp_path: Path) -> None:
     batches: dict[str, list[tuple[str, ...]]] = {}
 
@@ -121,6 +124,7 @@ def test_the_command_that_repeats_a_run_asks_alike(ask: str) -> None:
 STUDIED = [Setting(name, named_point(name), 4) for name in ("v2x", "v2x:tau_nats=0.2", "6g:attack=stale")]
 
 
+@pytest.mark.slow
 def test_a_study_of_a_run_that_asked_few_is_that_of_one_that_asked_all(tmp_path: Path) -> None:
     for ask in ("all", "used"):
         evaluate(spec(frozen(4), ask, ("single-local",)), tmp_path / ask, lambda done: None)
@@ -160,6 +164,7 @@ def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
     assert f"one of {len(source.left_out)} decision points" in source.leaves_out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ask", ["used", "all"])
 def test_how_much_is_asked_is_said_once_and_first(ask: str, tmp_path: Path) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")

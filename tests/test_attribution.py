@@ -99,6 +99,7 @@ def made(small: Dataset, tmp_path: Path, judging: Judging) -> Callable[..., Path
     return make
 
 
+@pytest.mark.slow
 def test_a_graph_without_an_object_is_one_that_no_sensor_reported(small: Dataset) -> None:
     """Its line and its conflict go, what it hid is seen, and nothing else changes."""
     opened = 0
@@ -166,6 +167,7 @@ def of_decisions(path: Path, name: str, found: Attribution) -> Iterator[Any]:
             yield each, made[each.scene, each.seed], own
 
 
+@pytest.mark.slow
 def test_a_message_left_out_of_a_pool_is_exact_and_asks_nobody(
     made: Callable[..., Path], judging: Judging
 ) -> None:
@@ -183,6 +185,7 @@ def test_a_message_left_out_of_a_pool_is_exact_and_asks_nobody(
     assert moved["helper with sight"] > moved["helper without sight"]
 
 
+@pytest.mark.slow
 def test_helpers_that_were_never_asked_are_asked_first(made: Callable[..., Path], judging: Judging) -> None:
     point = named_point("v2x:max_helpers=1")
     everybody = attribute(ReplayedRun(made(point)), point.name, 12, 0)
@@ -195,6 +198,7 @@ def test_helpers_that_were_never_asked_are_asked_first(made: Callable[..., Path]
     assert [f"is asked {len(judging.asked)} questions now" in text for text in told] == [True]
 
 
+@pytest.mark.slow
 def test_a_rule_with_memory_keeps_it(made: Callable[..., Path]) -> None:
     """It is the mean of now and of what it remembers, so half of what moves now moves it after step 0."""
     plain, smooth = SIXG, named_point("6g:loss=0,consensus=smooth")
@@ -211,6 +215,7 @@ def test_a_rule_with_memory_keeps_it(made: Callable[..., Path]) -> None:
     assert len(steps) > 2
 
 
+@pytest.mark.slow
 def test_a_fusion_call_is_made_again_without_the_message(made: Callable[..., Path], judging: Judging) -> None:
     """With v3's message it says SLOWER, else FASTER; with nobody's, the ego's own IDLE."""
     fusion = named_point("6g:loss=0,consensus=ego-prompt")
@@ -243,6 +248,7 @@ def test_the_draw_is_no_choice_and_a_larger_one_has_the_smaller(made: Callable[.
     assert len(draw(source, SIXG.name, 10**6, 0)[0]) == of
 
 
+@pytest.mark.slow
 def test_a_killed_one_goes_on_and_asks_nothing_twice(made: Callable[..., Path], judging: Judging) -> None:
     class Killed(BaseException):
         pass
@@ -276,6 +282,7 @@ def test_an_answer_that_fails_is_counted_and_moves_nothing(
     assert headline(rows(found)).startswith("The message of a helper with")
 
 
+@pytest.mark.slow
 def test_the_decisions_view_has_what_was_left_out_there_alone(made: Callable[..., Path]) -> None:
     path = made()
     bare = [detail["runs"][0] for detail in unpacked(Decisions(gather([path])))]
@@ -314,6 +321,7 @@ def test_what_cannot_be_asked_otherwise_is_refused(small: Dataset, tmp_path: Pat
         attribute(ReplayedRun(proxy), "6g", 5, 0)
 
 
+@pytest.mark.slow
 def test_no_object_can_be_left_out_of_a_picture(small: Dataset, tmp_path: Path, judging: Judging) -> None:
     points, card = (named_point("single-local"),), cards.load("smolvlm-256m")
     spec = spec_of(small, "swarm-tiny", "v4", points=points, seeds=(0,), latency="paper")
@@ -325,6 +333,7 @@ def test_no_object_can_be_left_out_of_a_picture(small: Dataset, tmp_path: Path, 
     assert attribute(ReplayedRun(text), "single-local", 2, 0).left_out
 
 
+@pytest.mark.slow
 def test_typed_it_says_what_moves_most_in_eighty_columns(
     harness: Callable[..., Said], small: Dataset, tmp_path: Path
 ) -> None:

@@ -221,6 +221,7 @@ class Fusing(Prior):
         return Completion(request.id, text, None, None, "stop", None, 1)
 
 
+@pytest.mark.slow
 def test_a_fusion_call_has_the_blind_helpers_messages(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

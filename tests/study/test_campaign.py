@@ -54,6 +54,7 @@ def test_a_verdict_looks_at_the_interval() -> None:
     assert verdict(88.5, 88.2, 88.8, 89.0, 91.0) == "misses"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [100, 105, 110])
 def test_on_any_seeds_28_rows_hold_at_the_papers_own_sizes(first: int) -> None:
     """Sets that the table of docs/studies.md does not have."""
@@ -81,6 +82,7 @@ def test_five_seeds_that_round_alike_are_not_taken_for_exact() -> None:
     assert verdict(30.0, np.nan, np.nan, 89.0, 91.0) == "unclear"
 
 
+@pytest.mark.slow
 def test_seeds_are_the_studys_own() -> None:
     one, again, other = (run_paper(panels(10, 10), seeds, lambda done: None) for seeds in ((7,), (7,), (3,)))
     assert one.data["ledger"].equals(again.data["ledger"])

@@ -123,6 +123,7 @@ def test_variance_lies_between_episodes_or_within() -> None:
         assert math.isnan(between_share(nothing).value)
 
 
+@pytest.mark.slow
 def test_the_share_between_episodes_is_found_again() -> None:
     """Of 4000 episodes whose variance is 3 parts of 4 between them."""
     rng = np.random.default_rng(5)
@@ -182,6 +183,7 @@ def test_a_repeat_is_a_run_with_its_own_sampling_seed(
     assert all("--temperature 0.7 --sampling-seed" in run.manifest.command for run in of.runs)
 
 
+@pytest.mark.slow
 def test_a_stopped_one_goes_on_as_if_it_had_not_been(
     small: Dataset, tmp_path: Path, wanderer: Wanderer
 ) -> None:
@@ -207,6 +209,7 @@ def test_a_stopped_one_goes_on_as_if_it_had_not_been(
         repeated(hot(small, temperature=0.8), tmp_path / "stopped")
 
 
+@pytest.mark.slow
 def test_the_cache_keeps_repeats_apart(small: Dataset, tmp_path: Path, wanderer: Wanderer) -> None:
     kept = tmp_path / "completions.sqlite"
     first = repeated(hot(small), tmp_path / "first", cache=kept)
@@ -241,6 +244,7 @@ def test_the_folder_has_a_page_and_all_figures(small: Dataset, tmp_path: Path, w
     assert found["repeats/repeat-2"] == ("eval", "finished")
 
 
+@pytest.mark.slow
 def test_the_command_prints_tables_and_json(
     harness: Callable[..., Said], small_path: Path, wanderer: Wanderer
 ) -> None:
@@ -269,6 +273,7 @@ def test_the_command_prints_tables_and_json(
     assert {f["metric"] for f in made["figures"]} >= {"flip_rate", "pass^2", "any@2", "stated_entropy_nats"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -52,6 +52,7 @@ def test_at_the_runs_own_point_a_sweep_says_what_the_run_said(
         assert value(summary, 0.7, metric) == pytest.approx(figure(done, "6g", metric).value)
 
 
+@pytest.mark.slow
 def test_without_others_or_trigger_a_vehicle_is_alone(
     done: Evaluated, source: ReplayedRun, tmp_path: Path
 ) -> None:
@@ -61,6 +62,7 @@ def test_without_others_or_trigger_a_vehicle_is_alone(
     assert value(swept(source, tmp_path / "c", "loss", "1"), 1, "success_rate") == pytest.approx(alone)
 
 
+@pytest.mark.slow
 def test_every_axis_gives_its_panels(source: ReplayedRun, tmp_path: Path) -> None:
     panels = {name: settings([source], [axis], [grid(axis)], ["6g"]) for name, axis in AXES.items()}
     study = run_sweep([source], panels, source.seeds, tmp_path, lambda n: None)
@@ -100,6 +102,7 @@ TOGETHER = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asks", [True, False])
 def test_points_that_are_walked_together_are_each_as_alone(
     small: Dataset, asks: bool, tmp_path: Path
@@ -123,6 +126,7 @@ def test_points_that_are_walked_together_are_each_as_alone(
         assert np.array_equal(walked.places, expected.places)
 
 
+@pytest.mark.slow
 def test_many_points_are_walked_in_parts(
     source: ReplayedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,6 +135,7 @@ def test_many_points_are_walked_in_parts(
     assert swept(source, tmp_path / "parts", "tau").equals(whole)
 
 
+@pytest.mark.slow
 def test_runs_are_paired(source: ReplayedRun, small: Dataset, tmp_path: Path) -> None:
     """The same answers under another prompt's name see the same luck."""
     other = ReplayedRun(run(spec_of(small, prompt="v1"), tmp_path / "v1").out)
@@ -190,6 +195,7 @@ def test_a_setting_that_one_value_frees_is_drawn(source: ReplayedRun) -> None:
     assert len(settings([source], [axis], [("never", "entropy")], ["6g:schedule=never"])) == 2
 
 
+@pytest.mark.slow
 def test_another_sweep_is_not_overwritten_and_the_same_one_is_made_again(
     source: ReplayedRun, tmp_path: Path
 ) -> None:
