@@ -15,7 +15,7 @@ from test_gguf_chat import Words
 from harness.backends import cards
 from harness.backends.base import Request
 from harness.backends.chat import Chat
-from harness.backends.chat_template import needs_first_user, unsaid, with_system
+from harness.backends.chat_template import lost_message, needs_first_user, with_system
 from harness.backends.openai.shapes import body
 from harness.core.errors import UserError
 from harness.core.resources import find
@@ -46,7 +46,7 @@ def test_all_is_said_whatever_white_space_is_around_it() -> None:
     chat = Chat("good", Words(TURNS + OPENING))
     prompt = chat.render(CHAT, thinking=False)
     assert prompt.endswith("a lorry ahead.<|im_end|>\n<|im_start|>assistant\n")
-    assert unsaid(CHAT, prompt) is None
+    assert lost_message(CHAT, prompt) is None
 
 
 def test_a_thought_of_an_earlier_turn_may_be_left_out() -> None:

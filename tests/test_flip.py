@@ -12,7 +12,7 @@ from run_on_disk import answers_of
 
 from harness.backends import cards
 from harness.backends.base import Completion, Letters, Request
-from harness.backends.orders import averaged
+from harness.backends.orders import average_orders
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
@@ -63,7 +63,7 @@ class Taking:
         if self.of_actions:
             return readout.stated(request.actions, [self.of_actions[a] for a in request.actions])
         if request.orders:
-            return averaged(request.actions, [self.of_letters] * (1 + len(request.orders))).text
+            return average_orders(request.actions, [self.of_letters] * (1 + len(request.orders))).text
         return readout.stated(request.actions, self.of_letters)
 
 

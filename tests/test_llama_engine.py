@@ -188,13 +188,13 @@ def test_a_beginning_kept_from_before_changes_nothing_and_is_not_computed_again(
 ) -> None:
     engine = engine_of(tiny / "F32.gguf")
     computed: list[int] = []
-    call = engine._context._call
+    call = engine.context._call
 
     def counted(token: Any, *rest: Any) -> int:
         computed.append(len(token))
         return call(token, *rest)
 
-    monkeypatch.setattr(engine._context, "_call", counted)
+    monkeypatch.setattr(engine.context, "_call", counted)
     system, helper = list(range(3, 103)), list(range(200, 300))
     for asked, tokens in [
         ([[*system, 5, 6], [*system, 7]], 100 + 3),
@@ -211,19 +211,19 @@ def test_a_beginning_kept_from_before_changes_nothing_and_is_not_computed_again(
         np.testing.assert_allclose(next_of(session), naive(theirs, asked), atol=1e-4)
         session.close()
         assert sum(computed) == tokens
-    assert len(engine._context.tokens) == 2, "two beginnings are kept, and no sequence"
+    assert len(engine.context.tokens) == 2, "two beginnings are kept, and no sequence"
 
 
 def test_memory_grows_with_the_sequences_and_nothing_is_lost(tiny: Path, theirs: Any) -> None:
     engine = engine_of(tiny / "F32.gguf")
     sequences = [[*range(3, 103), i] for i in range(8)]
     session, other = engine.begin(sequences[:7]), engine.begin(sequences[7:])
-    room = engine._context._room
+    room = engine.context._room
     for step in range(18):
         chunks = [[(step * 31 + i * 7 + j) % VOCABULARY for j in range(25)] for i in range(7)]
         session.advance(chunks)
         sequences[:7] = [old + new for old, new in zip(sequences, chunks, strict=False)]
-    assert engine._context._room > room
+    assert engine.context._room > room
     np.testing.assert_allclose(next_of(session), naive(theirs, sequences[:7]), atol=1e-4)
     other.advance([[5]])
     np.testing.assert_allclose(next_of(other), naive(theirs, [[*sequences[7], 5]]), atol=1e-4)

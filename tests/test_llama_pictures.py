@@ -221,13 +221,13 @@ def test_who_reads_pictures_with_which_projector_is_part_of_a_backends_identity(
 def read(engine: LlamaEngine, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many tokens each call of llama.cpp reads."""
     counts: list[int] = []
-    call = engine._context._call
+    call = engine.context._call
 
     def counted(inputs: Any, *rest: Any) -> int:
         counts.append(len(inputs))
         return call(inputs, *rest)
 
-    monkeypatch.setattr(engine._context, "_call", counted)
+    monkeypatch.setattr(engine.context, "_call", counted)
     return counts
 
 
@@ -276,23 +276,23 @@ def test_a_picture_is_encoded_once_unless_its_prompt_alone_is_asked_again(
 def test_memory_grows_with_pictures_in_it_and_nothing_is_lost(engine: LlamaEngine, theirs: Any) -> None:
     prompts = [prompt(image, 80) for image in (A, B, C)]
     session = begin(engine, *prompts)
-    room = engine._context._room
+    room = engine.context._room
     for step in range(20):
         chunks = [[(step * 31 + i * 7 + j) % 300 + 10 for j in range(25)] for i in range(3)]
         session.advance(chunks)
         prompts = [[*p, *chunk] for p, chunk in zip(prompts, chunks, strict=True)]
-    assert engine._context._room > room
+    assert engine.context._room > room
     np.testing.assert_allclose(session.log_probs(), naive(theirs, prompts), atol=ROUNDED)
 
 
 def test_a_beginning_whose_picture_nobody_has_any_more_is_left_behind(engine: LlamaEngine) -> None:
     begin(engine, prompt(Image(A.pixels.copy()), 80)).close()
-    assert len(engine._context.tokens) == 1
+    assert len(engine.context.tokens) == 1
     engine._projector._encoded.clear()
     session = begin(engine, prompt(B, *range(100, 300)))
     session.advance([list(range(10, 310))])  # beyond the room there is
     lost, kept = engine.look(A)[0], engine.look(B)[0]
-    held = list(engine._context.tokens.values())
+    held = list(engine.context.tokens.values())
     assert (sum(lost in each for each in held), sum(kept in each for each in held)) == (0, 2)
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from harness.backends import cards
 from harness.backends.base import Completion, Request
-from harness.backends.orders import averaged
+from harness.backends.orders import average_orders
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.evaluate import questions
@@ -38,7 +38,7 @@ def letters_p(of_action: list[float], of_letter: list[float]) -> list[list[float
 
 @given(SHARES, SHARES)
 def test_a_preference_for_letters_cancels(of_action: list[float], of_letter: list[float]) -> None:
-    read = averaged(ACTIONS, letters_p(of_action, of_letter))
+    read = average_orders(ACTIONS, letters_p(of_action, of_letter))
     assert shares(read.text) == pytest.approx([p / sum(of_action) for p in of_action], abs=2e-6)
     assert read.label_mass == pytest.approx(0.5)
     spread = [float(np.var(np.log(p))) for p in (of_letter, of_action)]
@@ -47,16 +47,16 @@ def test_a_preference_for_letters_cancels(of_action: list[float], of_letter: lis
 
 
 def test_what_follows_the_letter_and_what_follows_the_action() -> None:
-    letter = averaged(ACTIONS, letters_p([1.0, 1.0, 1.0], [0.7, 0.2, 0.1]))
+    letter = average_orders(ACTIONS, letters_p([1.0, 1.0, 1.0], [0.7, 0.2, 0.1]))
     assert (letter.letter_share, letter.follows_letter) == (1.0, True)
-    action = averaged(ACTIONS, letters_p([0.7, 0.2, 0.1], [1.0, 1.0, 1.0]))
+    action = average_orders(ACTIONS, letters_p([0.7, 0.2, 0.1], [1.0, 1.0, 1.0]))
     assert (action.letter_share, action.follows_letter) == (0.0, False)
-    nothing = averaged(ACTIONS, [[0.1, 0.1, 0.1]] * 3)
+    nothing = average_orders(ACTIONS, [[0.1, 0.1, 0.1]] * 3)
     assert (nothing.letter_share, shares(nothing.text)) == (0.0, pytest.approx([1 / 3] * 3, abs=1e-6))
 
 
 def test_a_letter_that_a_server_leaves_nothing_still_has_a_logarithm() -> None:
-    assert all(p > 0 for p in shares(averaged(ACTIONS, [[0.9, 0.1, 0.0]] * 3).text))
+    assert all(p > 0 for p in shares(average_orders(ACTIONS, [[0.9, 0.1, 0.0]] * 3).text))
 
 
 def agent(engine: str, letters: Any = "cyclic") -> Agent:

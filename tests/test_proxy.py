@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from harness.backends.base import Request
-from harness.backends.proxy import answer, distribution
+from harness.backends.proxy import answers, distribution
 from harness.coordination.trigger import entropy_nats
 from harness.dataset.load import Dataset
 from harness.parsing.parse import parse
@@ -86,7 +86,7 @@ def test_every_answer_is_what_its_prompt_asks_for(graph: dict[str, Any], data: s
     """A prompt that asks for a distribution has JSON alone; one that asks for reasons has them first."""
     form = data.draw(st.sampled_from(FORMS[graph["role"]]))
     asked = request(graph, form)
-    parsed = parse(answer(asked), **asked.shape._asdict())
+    parsed = parse(answers([asked])[0], **asked.shape._asdict())
     assert parsed.verdict == ("strict" if form == "distribution" else "recovered"), parsed.detail
     assert [str(r) for r in parsed.repairs] == ([] if form == "distribution" else ["prose_around"])
     assert (parsed.message is None) == (graph["role"] == "ego")
@@ -134,12 +134,12 @@ def test_a_car_that_arrives_with_the_ego_makes_it_brake_and_say_so() -> None:
         "nodes": [], "conflicts": [crossing],
         "sectors": [{"sector": "left", "seen_share": 0.2, "occluded": True, "by": ["b1"]}],
     }  # fmt: skip
-    assert json.loads(answer(request(graph))) == {
+    assert json.loads(answers([request(graph)])[0]) == {
         "evidence": "v7 from left 28 m before the ego's path.",
         "risk": "high",
         "action_distribution": {"SLOWER": 0.9, "IDLE": 0.05, "FASTER": 0.05},
     }
-    free = json.loads(answer(request({**graph, "conflicts": []})))
+    free = json.loads(answers([request({**graph, "conflicts": []})])[0])
     assert free["evidence"] == "Nothing on the ego's path; hidden: left."
     assert free["action_distribution"]["SLOWER"] < 0.5
 
@@ -156,12 +156,12 @@ def test_it_reads_its_own_view_and_neither_messages_nor_truth(small: Dataset) ->
                 truth=truth_graph(SCENARIO, scene.state),
                 thinking=True,
             )
-            assert answer(bare) == answer(full)
+            assert answers([bare]) == answers([full])
 
 
 def test_without_a_view_it_has_nothing_to_say() -> None:
     with pytest.raises(ValueError, match="has no view"):
-        answer(Request("s/v1", "ego", (), ACTIONS, 64))
+        answers([Request("s/v1", "ego", (), ACTIONS, 64)])
 
 
 def test_a_quarter_of_a_sector_hidden_leaves_it_just_sure_enough() -> None:

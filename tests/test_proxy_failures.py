@@ -12,8 +12,8 @@ from scipy.stats import binom
 
 from harness.backends import cards
 from harness.backends.base import Request
-from harness.backends.failures import Failures, drawn, spoilt
-from harness.backends.proxy import answer
+from harness.backends.failures import Failures, draw_failure, spoil
+from harness.backends.proxy import answers
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.core.statistics import rate_interval
@@ -60,7 +60,7 @@ def test_every_failure_has_its_status_whatever_was_answered(how: str, form: str,
     asked = questions(small, form)
     assert {request.role for request in asked} == {"ego", "helper"}
     for request in asked:
-        text, finish_reason = spoilt(answer(request), how, request.actions)
+        text, finish_reason = spoil(answers([request])[0], how, request.actions)
         parsed = parse(text, role=request.role, actions=request.actions, finish_reason=finish_reason)
         assert parsed.status == STATUS[how], text
 
@@ -68,13 +68,13 @@ def test_every_failure_has_its_status_whatever_was_answered(how: str, form: str,
 def test_there_is_a_status_for_every_failure_and_no_other_way_to_spoil() -> None:
     assert {how for how in STATUS if how} == set(FAULTY.texts)
     with pytest.raises(ValueError, match="no failure 'shrug'"):
-        spoilt("{}", "shrug", ())
+        spoil("{}", "shrug", ())
 
 
 def test_failures_come_as_often_as_declared() -> None:
     """10,000 answers: each count within the range that holds 99.99 % of such counts."""
     n = 10_000
-    found = [drawn(FAULTY, name) for name in made_up(n)]
+    found = [draw_failure(FAULTY, name) for name in made_up(n)]
     counts = Counter(how for how, _ in found)
     slow = sum(slow_s == FAULTY.slow_s for _, slow_s in found)
     assert {slow_s for _, slow_s in found} == {0.0, FAULTY.slow_s}
@@ -94,7 +94,7 @@ def test_failures_come_as_often_as_declared() -> None:
 def test_never_is_never_and_always_is_always(share: float) -> None:
     failures = Failures(nan=share, slow_tail=share, slow_s=0.4 * share)
     expected = ("nan", 0.4) if share else (None, 0.0)
-    assert {drawn(failures, name) for name in made_up(2000)} == {expected}
+    assert {draw_failure(failures, name) for name in made_up(2000)} == {expected}
 
 
 @pytest.mark.slow
@@ -103,7 +103,7 @@ def test_the_intervals_cover_the_declared_rate_as_often_as_they_say() -> None:
     truth = sum(share for how, share in FAULTY.texts.items() if how in FAILED)
     covered = 0
     for start in range(0, 400 * 150, 150):
-        failed = np.array([float(drawn(FAULTY, name)[0] in FAILED) for name in made_up(150, start)])
+        failed = np.array([float(draw_failure(FAULTY, name)[0] in FAILED) for name in made_up(150, start)])
         interval = rate_interval(failed)
         covered += interval.low <= truth <= interval.high
     assert 0.92 <= covered / 400 <= 0.99
@@ -113,7 +113,7 @@ def test_a_run_counts_what_was_drawn_exactly(small: Dataset, tmp_path: Path) -> 
     done = run(spec_of(small, "proxy-faulty"), tmp_path / "run")
     verdicts: dict[str, list[str]] = {"ego": [], "helper": []}
     for given in answers_of(tmp_path / "run"):
-        how, slow_s = drawn(FAULTY, given.id)
+        how, slow_s = draw_failure(FAULTY, given.id)
         assert (given.status, given.slow_s) == (STATUS[how], slow_s)
         verdicts[given.role].append("failed" if how in FAILED else STATUS[how])
     for role, each in verdicts.items():
@@ -133,7 +133,7 @@ def test_a_slow_answer_is_late_by_what_was_declared(small: Dataset, tmp_path: Pa
     asks = OperatingPoint("asks", "6g", tau_nats=0.0)  # at every step
     run(spec_of(small, "proxy-faulty", points=(POINTS["single-local"], asks)), tmp_path / "run")
     alone = decisions(tmp_path / "run", "single-local")
-    expected = [145.0 + 1000 * drawn(FAULTY, f"{d.scene}/v1")[1] for d in alone]
+    expected = [145.0 + 1000 * draw_failure(FAULTY, f"{d.scene}/v1")[1] for d in alone]
     found = [d.latency_ms for d in alone]
     assert found == pytest.approx(expected)
     assert set(found) <= {145.0, 545.0}

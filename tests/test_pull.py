@@ -11,7 +11,7 @@ import pytest
 from small_hub import COMMIT, serving
 
 from harness.backends.cards import Card, Latency
-from harness.backends.weights import held_to_digest
+from harness.backends.weights import check_digest
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes
 
@@ -92,10 +92,10 @@ def test_a_file_that_is_not_what_its_card_says_is_refused(tmp_path: Path) -> Non
     file.write_bytes(b"GGUF")
     latency = Latency("paper", None, "b")
     card = Card("mine", "llama-cpp", "d", latency, weights=str(file), sha256=sha256_bytes(b"GGUF"))
-    assert held_to_digest(card, file) == file
+    assert check_digest(card, file) == file
     file.write_bytes(b"GGUX")
     with pytest.raises(UserError, match=r"is not what its card says: sha256 [0-9a-f]{64}, and the card has"):
-        held_to_digest(card, file)
+        check_digest(card, file)
 
 
 @pytest.mark.slow

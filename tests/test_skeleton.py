@@ -59,10 +59,10 @@ def chat(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 def parts(shape: Shape) -> list[str | tuple[str, ...]]:
     """The fixed texts of an answer without lists or texts, and between them what is chosen from."""
     found: list[str | tuple[str, ...]] = []
-    way = start(shape).ways[0]
+    way = start(shape).branches[0]
     while way.then:
         found += [way.text, way.then.options]
-        way = way.then.ways[0]
+        way = way.then.branches[0]
     return [*found, way.text]
 
 

@@ -15,10 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from transformers import Gemma3ForCausalLM, Gemma3TextConfig, Qwen3Config, Qwen3ForCausalLM
 
-from harness.backends.transformers import prefixes
+from harness.backends.engine import common_beginning
+from harness.backends.transformers import memory
 from harness.backends.transformers import session as reading
-from harness.backends.transformers.memory import PAGE
-from harness.backends.transformers.prefixes import LEAST_TOKENS, Prefix, Prefixes, common
+from harness.backends.transformers.memory import LEAST_TOKENS, PAGE, Prefix, Prefixes
 from harness.backends.transformers.session import Reader
 
 SHAPE: dict[str, Any] = {
@@ -331,7 +331,7 @@ def read(ids: Sequence[int]) -> Prefix:
 
 
 def test_the_oldest_beginnings_leave_and_one_in_use_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(prefixes, "MOST_TOKENS", 100)
+    monkeypatch.setattr(memory, "MOST_TOKENS", 100)
     kept = Prefixes()
     first, second, third = ([n] * 40 for n in (1, 2, 3))
     kept.keep(read(first))
@@ -353,7 +353,7 @@ def test_only_the_part_in_common_is_given_back() -> None:
 
 @given(st.lists(st.lists(st.integers(0, 1), max_size=6), min_size=1, max_size=5))
 def test_common_is_the_longest_beginning_of_all(sequences: list[list[int]]) -> None:
-    found = common(sequences)
+    found = common_beginning(sequences)
     assert all(ids[: len(found)] == found for ids in sequences)
     longer = {tuple(ids[: len(found) + 1]) for ids in sequences}
     assert len(longer) > 1 or len(min(longer)) == len(found)

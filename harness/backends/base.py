@@ -105,7 +105,7 @@ class Request:
         return self.image.sha256 if self.image else None
 
 
-def by_scenario(requests: Sequence[Request]) -> list[list[Request]]:
+def split_by_scenario(requests: Sequence[Request]) -> list[list[Request]]:
     """Split requests into parts of one scenario each, in their order; those of a run are one part."""
     return [list(part) for _, part in groupby(requests, key=lambda request: id(request.scenario))]
 
@@ -187,12 +187,12 @@ def same_model(stored: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
 
 def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
     """Return an identity without what servers state, if the stored one lacks that; the helpers' as well."""
-    made = {key: value for key, value in now.items() if key != "states" or key in stored}
-    helpers, others = made.get("helpers"), stored.get("helpers")
+    identity = {key: value for key, value in now.items() if key != "states" or key in stored}
+    helpers, others = identity.get("helpers"), stored.get("helpers")
     if isinstance(helpers, list | tuple) and isinstance(others, list | tuple) and len(helpers) == len(others):
         pairs = zip(helpers, others, strict=True)
-        made["helpers"] = [_as_stored(h, o) if isinstance(o, Mapping) else h for h, o in pairs]
-    return made
+        identity["helpers"] = [_as_stored(h, o) if isinstance(o, Mapping) else h for h, o in pairs]
+    return identity
 
 
 class Rendering(Backend, Protocol):
@@ -240,5 +240,5 @@ class Timed(Backend, Protocol):
     """A backend whose answers were timed earlier, so that they are not timed again."""
 
     def latency(self) -> "Latency":
-        """Return the latency with which the decisions of the replayed run were made."""
+        """Return the latency with which the decisions of the replayed run were identity."""
         ...

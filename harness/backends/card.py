@@ -10,6 +10,7 @@ from harness.backends.failures import Failures
 from harness.backends.servers import Server
 from harness.backends.vision import Vision
 from harness.core.config import Count, Seconds
+from harness.core.errors import printable
 
 Dtype = Literal["float32", "bfloat16", "auto"]
 Thinking = Literal["none", "switch", "always"]
@@ -92,6 +93,11 @@ class Card:
     projector: str | None = None
     system: System | None = None
     letters: Letters | None = None
+
+    @property
+    def shown(self) -> str:
+        """How messages name it."""
+        return f"model {printable(self.name)!r}"
 
     def at(self, urls: tuple[str, ...]) -> "Card":
         """Return the card of a served model with other servers; the card itself if `urls` is empty.

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 from harness.backends.card import Thinking
-from harness.backends.chat_template import FIRST_USER, ChatTemplate, Refused, unsaid, with_system
+from harness.backends.chat_template import FIRST_USER, ChatTemplate, Refused, lost_message, with_system
 from harness.core.errors import UserError, printable
 from harness.prompts.readout import spelt
 
@@ -143,7 +143,7 @@ class Chat:
             prompt = self._apply(shown, thinking=thinking)
         except Refused as error:
             raise UserError(f"{error}; {self._way_out(messages, thinking)}") from None
-        if (lacking := unsaid(shown, prompt)) is not None:
+        if (lacking := lost_message(shown, prompt)) is not None:
             turn = next(n for n, message in enumerate(shown, 1) if message is lacking)
             raise UserError(
                 f"model {printable(self.name)!r}: its chat template leaves out or changes the text of "
@@ -157,7 +157,7 @@ class Chat:
         joined = self._shown(with_system(messages, FIRST_USER))
         if len(joined) < len(messages) and not self.system:
             with suppress(UserError):
-                if unsaid(joined, self._apply(joined, thinking=thinking)) is None:
+                if lost_message(joined, self._apply(joined, thinking=thinking)) is None:
                     return (
                         f'a card with system = "{FIRST_USER}" puts the system text into the first user turn'
                     )

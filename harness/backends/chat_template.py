@@ -67,7 +67,7 @@ def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any],
     return ({**first, "content": f"{system['content']}\n\n{first['content']}"}, *others)
 
 
-def unsaid(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
+def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
     """Return the first message whose text does not stand in a prompt, after those before it; None if all do.
 
     White space around a text does not matter, and thoughts of earlier turns may be left out.
@@ -75,13 +75,13 @@ def unsaid(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
     at = 0
     for message in messages:
         text = _text(message["content"]).strip()
-        found = prompt.find(text, at)
-        if found < 0 and message["role"] == "assistant":
+        place = prompt.find(text, at)
+        if place < 0 and message["role"] == "assistant":
             text = text.rpartition(_THOUGHT_ENDS)[2].strip()
-            found = prompt.find(text, at)
-        if found < 0:
+            place = prompt.find(text, at)
+        if place < 0:
             return message
-        at = found + len(text)
+        at = place + len(text)
     return None
 
 
@@ -92,7 +92,7 @@ def needs_first_user(text: str) -> bool:
     try:
         template = ChatTemplate("", text)
         joined = with_system(asked, FIRST_USER)
-        takes = unsaid(joined, template.render(joined, **empty)) is None
+        takes = lost_message(joined, template.render(joined, **empty)) is None
     except UserError:
         return False
     try:

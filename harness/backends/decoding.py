@@ -14,7 +14,7 @@ from typing import Any
 from harness.backends.base import Completion, FinishReason, Request, per_token_s
 from harness.backends.drafts import Drafts
 from harness.backends.engine import Engine, Session, common_length
-from harness.backends.orders import averaged
+from harness.backends.orders import average_orders
 from harness.backends.sampling import Choice
 from harness.backends.skeleton import Filled, Skeleton, filled, tokens_after
 from harness.core.errors import UserError, printable
@@ -206,7 +206,8 @@ def _completion_of_letters(
     """Return a read-out, from the log-probabilities of each letter's tokens in each order."""
     if len(log_p) > 1:
         p = [[math.fsum(map(math.exp, own)) for own in letters_log_p] for letters_log_p in log_p]
-        return _completion(request, tokens=1, batch_size=batch_size, **asdict(averaged(request.actions, p)))
+        average = asdict(average_orders(request.actions, p))
+        return _completion(request, tokens=1, batch_size=batch_size, **average)
     largest = max(map(max, log_p[0]))
     weights = [math.fsum(math.exp(x - largest) for x in own) for own in log_p[0]]
     mass = min(1.0, math.exp(largest) * sum(weights))

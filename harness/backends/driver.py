@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from harness import __version__
-from harness.backends.base import Completion, Request, by_scenario
+from harness.backends.base import Completion, Request, split_by_scenario
 from harness.backends.card import Card
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, sha256_file
@@ -27,7 +27,7 @@ class DriverBackend:
         self.driver = driver
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        return [completion for part in by_scenario(requests) for completion in self._complete(part)]
+        return [completion for part in split_by_scenario(requests) for completion in self._complete(part)]
 
     def _complete(self, requests: Sequence[Request]) -> list[Completion]:
         """Answer requests of one scenario."""

@@ -4,7 +4,8 @@ The answer modes are implemented once, on top of it; an engine knows nothing of 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any, Protocol
 
 from harness.backends.chat import Chat
@@ -39,7 +40,8 @@ class Session(Protocol):
         A chunk is not empty, a guess may be. Returns how many tokens of each guess were appended; an engine
         that checks none appends none.
         """
-        ...
+        self.advance(chunks)
+        return [0] * len(guesses)
 
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
         """Return the log-probabilities of some tokens after each of some chunks of each sequence.
@@ -85,6 +87,7 @@ class Engine(Protocol):
         ...
 
 
+LEAST_SAVED = 64  # fewer tokens saved are cheaper to read than a group of prompts of its own
 _PLACE_BITS, _DIGITS = 16, 10  # a picture's token: hex digits of its digest, then bits of the token's place
 
 
@@ -94,7 +97,7 @@ def picture_tokens(image: Image, count: int) -> list[int]:
     return [-1 - (first | place) for place in range(count)]
 
 
-def picture_of(token: int) -> tuple[int, int]:
+def locate_picture(token: int) -> tuple[int, int]:
     """Return the number of the picture that a token belongs to, and the token's place in it."""
     return divmod(-1 - token, 1 << _PLACE_BITS)
 
@@ -111,3 +114,34 @@ def common_length(sequences: Sequence[list[int]]) -> int:
     """Return the length of the common beginning of one or more sequences."""
     first, last = min(sequences), max(sequences)  # all that sort between these two begin as both do
     return next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
+
+
+def common_beginning(sequences: Sequence[list[int]]) -> list[int]:
+    """Return the common beginning of one or more sequences."""
+    return sequences[0][: common_length(sequences)]
+
+
+def group_by_beginning(sequences: Sequence[list[int]]) -> Iterator[list[int]]:
+    """Split sequences into groups with longer common beginnings, where that saves tokens.
+
+    Yields:
+        The places of each group's sequences.
+    """
+    order = sorted(range(len(sequences)), key=sequences.__getitem__)
+    shared = [common_length([sequences[a], sequences[b]]) for a, b in pairwise(order)]
+    yield from _split(order, shared)
+
+
+def _split(order: list[int], shared: list[int]) -> Iterator[list[int]]:
+    """Split sorted sequences, of which neighbours share a beginning of some length."""
+    least = min(shared, default=0)
+    cuts = [-1, *(i for i, length in enumerate(shared) if length == least), len(shared)]
+    rest = []
+    for start, end in pairwise(cuts):
+        part, inside = order[start + 1 : end + 1], shared[start + 1 : end]
+        if inside and (len(part) - 1) * (min(inside) - least) >= LEAST_SAVED:
+            yield from _split(part, inside)
+        else:
+            rest += part
+    if rest:
+        yield rest

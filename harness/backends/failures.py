@@ -41,7 +41,7 @@ class Failures:
         return {name: rate for name, rate in asdict(self).items() if not name.startswith("slow_")}
 
 
-def drawn(failures: Failures, request_id: str) -> tuple[str | None, float]:
+def draw_failure(failures: Failures, request_id: str) -> tuple[str | None, float]:
     """Draw how a request's text fails (None if it does not), and by how many seconds its answer is slow.
 
     The draw depends on the id only, so batch, order, prompt and condition do not change it.
@@ -57,7 +57,7 @@ def drawn(failures: Failures, request_id: str) -> tuple[str | None, float]:
     return None, slow_s
 
 
-def spoilt(text: str, how: str, actions: Sequence[str]) -> tuple[str, FinishReason]:
+def spoil(text: str, how: str, actions: Sequence[str]) -> tuple[str, FinishReason]:
     """Spoil a good answer, which ends in compact JSON, in one of the ways of `Failures`."""
     match how:
         case "fence":

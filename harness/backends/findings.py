@@ -54,8 +54,8 @@ class Findings(Struct, frozen=True):
     def sentences(self, letters: bool = True) -> Iterator[str]:
         """Yield what a reader of the model's runs has to know; `letters` says whether they are read out."""
         if not self.reads_scene:
-            moved = sum(pair.moved for pair in self.pairs if pair.fact in ("conflict", "gap"))
-            n = sum(pair.n for pair in self.pairs if pair.fact in ("conflict", "gap"))
+            scene = [pair for pair in self.pairs if pair.fact in ("conflict", "gap")]
+            moved, n = sum(pair.moved for pair in scene), sum(pair.n for pair in scene)
             yield (
                 "it does not read the scene: a conflict put in or taken out, or a gap of 0.2 or 5 s, moved "
                 f"its answer in {moved} of {n} pairs (model check, prompt {self.prompt})."

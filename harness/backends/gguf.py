@@ -29,7 +29,7 @@ class ModelFacts:
 def facts(file: Path) -> ModelFacts:
     """Read what a file states of its model; nothing if it is no GGUF. Raises OSError if it does not open."""
     try:
-        values = metadata(file)
+        values = read_metadata(file)
     except ValueError:
         return ModelFacts()
 
@@ -43,7 +43,7 @@ def facts(file: Path) -> ModelFacts:
     return ModelFacts(text("general.name"), text("general.license"), context_tokens, template)
 
 
-def metadata(file: Path, arrays: bool = False) -> Mapping[str, Any]:
+def read_metadata(file: Path, arrays: bool = False) -> Mapping[str, Any]:
     """Read the keys and values of a GGUF file; arrays are skipped unless they are asked for.
 
     Raises OSError if it cannot be opened, and ValueError if it is no GGUF or they are longer than `LONGEST`.

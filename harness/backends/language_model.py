@@ -10,7 +10,7 @@ from harness.backends.base import Completion, Request
 from harness.backends.decoding import Decoding
 from harness.backends.engine import Engine, common_length
 from harness.core.arrays import Floats
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, one_line, printable
 
 
 class _Prompt(NamedTuple):
@@ -120,7 +120,7 @@ class LanguageModel:
                 [p.request for p in batch], [p.ids for p in batch], [p.further for p in batch]
             )
         except Exception as error:  # an engine may fail in any way; its message is data
-            return f"{type(error).__name__}: {printable(' '.join(str(error).split()), 200)}"
+            return f"{type(error).__name__}: {one_line(error)}"
         return [replace(answer, prompt_tokens=p.read) for p, answer in zip(batch, answers, strict=True)]
 
 

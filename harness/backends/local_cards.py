@@ -10,7 +10,7 @@ from typing import Any
 from harness.backends.base import Letters
 from harness.backends.card import Card, Latency, System, Thinking
 from harness.backends.gguf import facts
-from harness.backends.vision import Vision, vision_of
+from harness.backends.vision import Vision, read_vision
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import bytes_of, text_of
@@ -138,7 +138,7 @@ def _vision(text: str, checkpoint: Path) -> Vision | None:
             json.loads(text_of(file, "record")) if file.is_file() else {}
             for file in (checkpoint / "config.json", checkpoint / "preprocessor_config.json")
         )
-        return vision_of(config, processor)
+        return read_vision(config, processor)
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise UserError(
             f"model directory {printable(text)!r}: its config does not say how it takes pictures "

@@ -17,8 +17,8 @@ LEAST_P = 1e-9  # a letter to which a server's list leaves nothing
 
 
 @dataclass(frozen=True)
-class Averaged:
-    """A read-out over all orders."""
+class AveragedReadOut:
+    """A read-out over all orders.
 
     text: str  # the answer
     label_mass: float  # total probability of the letters, the mean over the orders
@@ -28,7 +28,7 @@ class Averaged:
     follows_letter: bool  # whether one letter is the likeliest in every order
 
 
-def averaged(actions: Sequence[str], letters_p: Sequence[Sequence[float]]) -> Averaged:
+def average_orders(actions: Sequence[str], letters_p: Sequence[Sequence[float]]) -> AveragedReadOut:
     """Average a read-out.
 
     `letters_p` has the letters' probabilities in each cyclic order of the actions
@@ -44,7 +44,7 @@ def averaged(actions: Sequence[str], letters_p: Sequence[Sequence[float]]) -> Av
     within = log_p - log_p.mean(axis=1, keepdims=True)
     total = float((within**2).sum())
     of_letter = len(p) * float((within.mean(axis=0) ** 2).sum())
-    return Averaged(
+    return AveragedReadOut(
         text=stated(actions, weights.tolist()),
         label_mass=min(1.0, float(mass.mean())),
         letter_share=round(min(1.0, of_letter / total), 6) if total > 0 else 0.0,

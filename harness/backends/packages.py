@@ -48,7 +48,7 @@ class Packaged:
         return f"model {printable(self.model)!r}: package {self.package} {self.version}"
 
 
-def packaged(card: Card) -> Packaged | None:
+def find_packaged(card: Card) -> Packaged | None:
     """Return where in a wheel a card's weights lie; None if they lie elsewhere.
 
     Raises UserError if the card names no package, file, version or digest that can be fetched.
@@ -57,7 +57,7 @@ def packaged(card: Card) -> Packaged | None:
     if not weights.startswith(PREFIX):
         return None
     package, _, file = weights.removeprefix(PREFIX).partition("/")
-    shown = f"model {printable(card.name)!r}: weights = {printable(weights)!r}"
+    shown = f"{card.shown}: weights = {printable(weights)!r}"
     parts = file.split("/")
     odd = "\\" in file or not file.isprintable() or any(part in ("", ".", "..") for part in parts)
     if not _NAME.fullmatch(package) or odd or not file.endswith(".gguf"):

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from harness.backends.base import Completion, FinishReason, Request, by_scenario
+from harness.backends.base import Completion, FinishReason, Request, split_by_scenario
 from harness.backends.card import Card
-from harness.backends.failures import Failures, drawn, spoilt
+from harness.backends.failures import Failures, draw_failure, spoil
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded
 from harness.prompts.answer_schema import plainest
@@ -40,16 +40,16 @@ class Proxy:
         self._failures = failures
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        return [self._completion(*each) for each in zip(requests, answers(requests), strict=True)]
-
-    def _completion(self, request: Request, text: str) -> Completion:
-        finish_reason: FinishReason = "stop"
-        slow_s = 0.0
-        if self._failures:
-            how, slow_s = drawn(self._failures, request.id)
+        completions = []
+        for request, text in zip(requests, answers(requests), strict=True):
+            finish_reason: FinishReason = "stop"
+            how, slow_s = draw_failure(self._failures, request.id) if self._failures else (None, 0.0)
             if how:
-                text, finish_reason = spoilt(text, how, request.actions)
-        return Completion(request.id, text, None, None, finish_reason, None, 1, slow_s=slow_s)
+                text, finish_reason = spoil(text, how, request.actions)
+            completions.append(
+                Completion(request.id, text, None, None, finish_reason, None, 1, slow_s=slow_s)
+            )
+        return completions
 
     def identity(self) -> dict[str, Any]:
         """Return the proxy's version and failures."""
@@ -61,15 +61,9 @@ class Proxy:
         }
 
 
-def answer(request: Request) -> str:
-    """Return the text of the answer to a request."""
-    [text] = answers([request])
-    return text
-
-
 def answers(requests: Sequence[Request]) -> list[str]:
     """Return the texts of the answers to some requests."""
-    return [text for part in by_scenario(requests) for text in _answers(part)]
+    return [text for part in split_by_scenario(requests) for text in _answers(part)]
 
 
 def _answers(requests: Sequence[Request]) -> list[str]:
@@ -81,12 +75,12 @@ def _answers(requests: Sequence[Request]) -> list[str]:
         views.append(request.view)
     assert scenario is not None
     return [
-        _told(request, view, _hedged(scenario.actions, planned, view))
+        _text(request, view, _hedged(scenario.actions, planned, view))
         for request, view, planned in zip(requests, views, plans(scenario, views), strict=True)
     ]
 
 
-def _told(request: Request, view: Mapping[str, Any], intent: dict[str, float]) -> str:
+def _text(request: Request, view: Mapping[str, Any], intent: dict[str, float]) -> str:
     """Return the text of an answer."""
     best = max(intent, key=intent.__getitem__)
     body = {name: plainest(schema) for name, schema in request.shape.further.items()}

@@ -15,7 +15,7 @@ from typing import Any, Literal
 from harness.backends.base import AnswerMode, Backend
 from harness.backends.card import Card
 from harness.core import extras
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import UserError, unknown
 from harness.core.plugins import Plugins
 
 
@@ -158,9 +158,7 @@ def open_backend(
     """
     engine = registration(card.engine)
     if package := missing_package(card.engine):
-        raise UserError(
-            f"model {printable(card.name)!r} needs {package}, which is not installed; run `{engine.install}`"
-        )
+        raise UserError(f"{card.shown} needs {package}, which is not installed; run `{engine.install}`")
     if batch_size < 1:
         raise UserError(f"batch size {batch_size}; allowed: 1 or more")
     backend: Backend = resolve(engine.opens)(card, device=device, dtype=dtype, batch_size=batch_size)

@@ -31,8 +31,8 @@ def open(card: Card, **_: Any) -> "Replay":
             f"{printable(run.path)} is a run of a driver; "
             f"run it again with --model {printable(run.manifest.model['name'])}"
         )
-    if said := why(run.path):
-        raise UserError(f"{printable(run.path)} lacks answers, so nothing replays it: {said}; run it again")
+    if reason := why(run.path):
+        raise UserError(f"{printable(run.path)} lacks answers, so nothing replays it: {reason}; run it again")
     return Replay(run)
 
 
@@ -57,8 +57,8 @@ class Replay:
                 missing.setdefault(request.role, []).append(self._as_run(request))
         new = {
             completion.request_id: completion
-            for role, of_role in missing.items()
-            for completion in self._model(role, of_role).complete(of_role)
+            for role, asked in missing.items()
+            for completion in self._model(role, asked).complete(asked)
         }
         return [
             new[request.id] if answer is None else self._completion(request, answer)
@@ -90,20 +90,16 @@ class Replay:
             self._check(request, agent)
         if role not in self._models:
             stated = convert(agent["model"], Card, f"{shown}: its model")
-            card = own(
-                stated, (), f"{shown} holds no answer for {requests[0].id}",
-                "write one of that name, or make the run again",
-            )  # fmt: skip
+            lacking = f"{shown} holds no answer for {requests[0].id}"
+            card = own(stated, (), lacking, "write one of that name, or make the run again")
             model = open_backend(card, dtype=manifest.dtype, batch_size=manifest.batch_size)
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":
                 helpers = manifest.identity.get("helpers")
                 stored = helpers[0] if isinstance(helpers, list) and helpers else {}
             if not same_model(stored, model.identity()):
-                raise UserError(
-                    f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} has "
-                    "changed since that run; make the run again"
-                )
+                changed = f"{printable(card.name)} has changed since that run"
+                raise UserError(f"{lacking}, and {changed}; make the run again")
             self._models[role] = cached(model, card, default_file())
         return self._models[role]
 
@@ -163,9 +159,10 @@ def _turn(whole: Completion, first: FirstTurn, again: bool) -> Completion:
     """Return one of an answer's two turns: the repair turn if `again`, else the first."""
     costs: dict[str, Any] = {}
     for name in ("prompt_tokens", "completion_tokens", "seconds", "slow_s"):
-        both, of_first = getattr(whole, name), getattr(first, name)
-        of_second = None if both is None or of_first is None else both - of_first
-        costs[name] = of_second if again else of_first
+        both, one_turn = getattr(whole, name), getattr(first, name)
+        if again:
+            one_turn = None if both is None or one_turn is None else both - one_turn
+        costs[name] = one_turn
     if again:
         return replace(whole, **costs)
     reason: Any = first.finish_reason

@@ -24,7 +24,7 @@ LONGEST_PIECE = 16  # most characters of a token in a text that the model writes
 UNIT = (0, 1)  # bounds of a number that is `0.` and two digits
 
 
-class Way(NamedTuple):
+class Branch(NamedTuple):
     """Fixed text that may follow a point, and the point behind it; None at the end."""
 
     text: str
@@ -33,70 +33,74 @@ class Way(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A place where the model decides, and then goes on in one of several ways."""
+    """A place where the model decides, and then goes on in one of several branches.
 
-    options: tuple[str, ...]  # texts to choose from; one empty text where only the way is chosen
-    most: int  # most characters of a text that the model writes instead of a choice; 0 for a choice
-    ways: tuple[Way, ...]  # what may follow
-    instead: tuple[Way, ...] = ()  # what may stand here instead: the end of a list that has no numbers
+    Attributes:
+        options: texts to choose from; one empty text where only the branch is chosen.
+        most: most characters of a text that the model writes instead of a choice; 0 for a choice.
+        branches: what may follow.
+        instead: what may stand here instead: the end of a list that has no numbers.
+    """
+
+    options: tuple[str, ...]
+    most: int
+    branches: tuple[Branch, ...]
+    instead: tuple[Branch, ...] = ()
 
 
-def ways_of(schema: Mapping[str, Any], ways: Sequence[Way]) -> list[Way]:
-    """Return the ways to write a value of a schema and go on in one of some ways.
+def expand(schema: Mapping[str, Any], branches: Sequence[Branch]) -> list[Branch]:
+    """Return the branches that write a value of a schema and go on in one of some branches.
 
     Fixed texts begin and end only beside letters and digits, where tokenizers split as well.
     """
     if "enum" in schema:
         options = [canonical_json(choice) for choice in schema["enum"]]
         if len(options) == 1:
-            return _after(options[0], ways)
-        return _quoted(Point(tuple(option[1:-1] for option in options), 0, tuple(_after('"', ways))))
+            return _after(options[0], branches)
+        texts = tuple(option[1:-1] for option in options)
+        return [Branch('"', Point(texts, 0, tuple(_after('"', branches))))]
     match schema["type"]:
         case "string":
-            return _quoted(Point(("",), schema["maxLength"], tuple(_after('"', ways))))
+            return [Branch('"', Point(("",), schema["maxLength"], tuple(_after('"', branches))))]
         case "boolean":
-            return [Way("", Point(("false", "true"), 0, tuple(ways)))]
+            return [Branch("", Point(("false", "true"), 0, tuple(branches)))]
         case "object":
             members = [*schema["properties"].items()]
-            ways = _after("}", ways)
+            branches = _after("}", branches)
             for place, (name, member) in reversed([*enumerate(members)]):
-                ways = _after(f"{',' if place else '{'}{canonical_json(name)}:", ways_of(member, ways))
-            return ways
+                branches = _after(f"{',' if place else '{'}{canonical_json(name)}:", expand(member, branches))
+            return branches
         case "array":
-            ends = further = _after("]", ways)
+            ends = further = _after("]", branches)
             for place in reversed(range(schema["maxItems"])):
-                item = ways_of(schema["items"], further)
+                item = expand(schema["items"], further)
                 enough = place and place >= schema["minItems"]
                 further = _after("," if place else "[", item) + (ends if enough else [])
             if schema["minItems"]:
                 return further
             if further[0].text == "[" and (point := further[0].then):  # no fixed text to choose by
-                return [Way("[", replace(point, instead=tuple(ends)))]
+                return [Branch("[", replace(point, instead=tuple(ends)))]
             return further + _after("[", ends)
     if (schema["minimum"], schema["maximum"]) == UNIT and schema["type"] == "number":
-        return [Way("0.", Point(TWO_DIGITS, 0, tuple(ways)))]
-    return [Way("", Point(number_texts(schema), 0, tuple(ways)))]
+        return [Branch("0.", Point(TWO_DIGITS, 0, tuple(branches)))]
+    return [Branch("", Point(number_texts(schema), 0, tuple(branches)))]
 
 
-def _after(text: str, ways: Sequence[Way]) -> list[Way]:
-    return [Way(text + way.text, way.then) for way in ways]
-
-
-def _quoted(point: Point) -> list[Way]:
-    return [Way('"', point)]
+def _after(text: str, branches: Sequence[Branch]) -> list[Branch]:
+    return [Branch(text + branch.text, branch.then) for branch in branches]
 
 
 def start(shape: Shape) -> Point:
     """Return the point at which an answer begins."""
-    return Point(("",), 0, tuple(ways_of(constrained_schema(shape), [Way("", None)])))
+    return Point(("",), 0, tuple(expand(constrained_schema(shape), [Branch("", None)])))
 
 
 def filled(shape: Shape, place: int) -> str:
-    """Return the answer with the option and the way at this place everywhere, and no text."""
-    text, point = "", Way("", start(shape)).then
+    """Return the answer with the option and the branch at this place everywhere, and no text."""
+    text, point = "", Branch("", start(shape)).then
     while point:
-        way = point.ways[place]
-        text, point = text + point.options[place] + way.text, way.then
+        branch = point.branches[place]
+        text, point = text + point.options[place] + branch.text, branch.then
     return text
 
 
@@ -124,11 +128,11 @@ class Filled(NamedTuple):
 
 
 class Leg(NamedTuple):
-    """An option and the way behind it: their text, its tokens, and the point that follows."""
+    """An option and the branch behind it: their text, its tokens, and the point that follows."""
 
     text: str
     tokens: tuple[int, ...]
-    way: Way
+    branch: Branch
 
 
 class Skeleton:
@@ -149,15 +153,16 @@ class Skeleton:
     def _legs_of(self, point: Point, before: str) -> list[Leg]:
         """Return what may be chosen at a point that follows a fixed text."""
         if (point, before) not in self._legs:
-            # Only the first option stands before a way: those of one kind end alike.
-            ends = [self._tokens(point.options[0] or before, way.text) for way in point.ways]
+            # Only the first option stands before a branch: those of one kind end alike.
+            ends = [self._tokens(point.options[0] or before, branch.text) for branch in point.branches]
             self._legs[point, before] = legs = [
-                Leg(option + way.text, self._tokens(before, option) + end, way)
-                for option in point.options for way, end in zip(point.ways, ends, strict=True)
+                Leg(option + branch.text, self._tokens(before, option) + end, branch)
+                for option in point.options for branch, end in zip(point.branches, ends, strict=True)
             ]  # fmt: skip
-            legs += [Leg(way.text, self._tokens(before, way.text), way) for way in point.instead]
+            legs += [Leg(branch.text, self._tokens(before, branch.text), branch) for branch in point.instead]
             # One option may be a prefix of another (SLOW, SLOWER), so the tokens after it decide.
-            if any(b.tokens[: len(a.tokens)] == a.tokens for a, b in pairwise(sorted(legs, key=_by_tokens))):
+            by_tokens = sorted(leg.tokens for leg in legs)
+            if any(longer[: len(tokens)] == tokens for tokens, longer in pairwise(by_tokens)):
                 raise UserError(
                     f"model {printable(self._chat.name)!r}: its tokenizer cannot tell the choices of a "
                     "constrained answer apart; use --answer json"
@@ -166,16 +171,16 @@ class Skeleton:
 
     def _most(self) -> int:
         longest: dict[Point | None, int] = {None: 0}
-        pending = [Way("\n", self._start)]
+        pending = [Branch("\n", self._start)]
         while pending:
             before, point = pending[-1]
             if point is None or point in longest:
                 pending.pop()
-            elif later := [way for way in point.ways + point.instead if way.then not in longest]:
+            elif later := [branch for branch in point.branches + point.instead if branch.then not in longest]:
                 pending += later
             else:
                 legs = self._legs_of(point, before)
-                longest[point] = point.most + max(len(leg.tokens) + longest[leg.way.then] for leg in legs)
+                longest[point] = point.most + max(len(leg.tokens) + longest[leg.branch.then] for leg in legs)
         return longest[self._start]
 
     def walk(self) -> Generator[Ask, int, Filled]:
@@ -199,7 +204,8 @@ class Skeleton:
                     depth += 1
             [leg] = legs
             forced += leg.tokens[depth:]
-            text, count, before, point = text + leg.text, count + len(leg.tokens), leg.way.text, leg.way.then
+            text, count = text + leg.text, count + len(leg.tokens)
+            before, point = leg.branch
         return Filled(text, count)
 
     def _write(
@@ -233,10 +239,6 @@ class Skeleton:
         if key not in self._allowed:
             self._allowed[key] = sorted(ends.union(i for i, size in self._sizes if size <= key[0]))
         return self._allowed[key]
-
-
-def _by_tokens(leg: Leg) -> tuple[int, ...]:
-    return leg.tokens
 
 
 def _is_plain(text: str) -> bool:

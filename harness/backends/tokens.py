@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.backends.card import Card
-from harness.backends.gguf import metadata
+from harness.backends.gguf import read_metadata
 from harness.core.errors import UserError, printable
 from harness.core.extras import OPTIONAL, without
 from harness.core.files import text_of
@@ -70,7 +70,7 @@ def _from_gguf(file: Path) -> Any:
     """Build the tokenizer of a GGUF file: a byte-level one of its vocabulary, another by transformers."""
     from tokenizers import AddedToken, models
 
-    values = metadata(file, arrays=True)
+    values = read_metadata(file, arrays=True)
     pre = str(values.get("tokenizer.ggml.pre"))
     if values["tokenizer.ggml.model"] != "gpt2" or pre not in _SPLITS:
         return _converted(file, values["tokenizer.ggml.model"], pre)

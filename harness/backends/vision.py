@@ -67,7 +67,7 @@ class Vision:
         return width, height
 
 
-def vision_of(config: Mapping[str, Any], processor: Mapping[str, Any]) -> Vision | None:
+def read_vision(config: Mapping[str, Any], processor: Mapping[str, Any]) -> Vision | None:
     """Return what a checkpoint's config.json and preprocessor_config.json state; None without vision.
 
     Its pictures have `WIDE` x `HIGH` tokens, unless it scales them to a size of its own.

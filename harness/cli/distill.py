@@ -74,7 +74,7 @@ def command(
     # A stage has a batch at least, and that of messages takes a scene for four sequences of each prompt.
     counts = _counts(samples, max(batch, 4 * sum(map(len, learnt.values()))))
 
-    from harness.backends.transformers.engine import device_of
+    from harness.backends.transformers.engine import choose_device
     from harness.training.distill import Curriculum
     from harness.training.distill import distill as run
     from harness.training.train import STAGES, Plan
@@ -90,7 +90,7 @@ def command(
             progress(drawn + sum(counts[: STAGES.index(stage)]) + seen - progress.done)
 
         facts = run(
-            Curriculum(learnt, layouts, first_seed, base), plan, out, progress, show, device_of(device),
+            Curriculum(learnt, layouts, first_seed, base), plan, out, progress, show, choose_device(device),
             threads, options.workers_of(workers),
         )  # fmt: skip
     for apart in facts["held_out"]:

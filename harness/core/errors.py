@@ -43,6 +43,11 @@ def printable(text: object, limit: int = 120) -> str:
     return escaped if len(escaped) <= limit else escaped[: limit - 1] + "…"
 
 
+def one_line(error: Exception, limit: int = 200) -> str:
+    """Return an error's message on one line, made safe to show."""
+    return printable(" ".join(str(error).split()), limit)
+
+
 def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserError:
     """Build the `UserError` for a name that does not exist; it suggests the nearest name and lists all."""
     names = sorted(known)

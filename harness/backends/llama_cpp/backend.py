@@ -8,7 +8,7 @@ from harness.backends.base import Request
 from harness.backends.card import Card
 from harness.backends.chat import Chat
 from harness.backends.llama_cpp.child import Child
-from harness.backends.weights import find_gguf, held_to_digest
+from harness.backends.weights import check_digest, find_gguf
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 
@@ -22,7 +22,7 @@ def open(
     """
     if dtype not in (None, "auto"):
         raise UserError(f"dtype {printable(dtype)!r}; a GGUF file has its own: leave it out, or give auto")
-    return LlamaBackend(card, held_to_digest(card, find_gguf(card)), device, batch_size)
+    return LlamaBackend(card, check_digest(card, find_gguf(card)), device, batch_size)
 
 
 class LlamaBackend(Child):

@@ -201,13 +201,12 @@ class LlamaContext:
 
     def _call(self, inputs: NDArray[Any], place: Ints, owner: Ints, wanted: NDArray[np.int8]) -> int:
         """Call llama_decode on arrays of one length, without a copy."""
-        one = np.ones_like(owner)
         # One address for each token, since it belongs to one sequence.
         owners = owner.ctypes.data + owner.itemsize * np.arange(len(owner), dtype=np.uintp)
         arrays: dict[str, NDArray[Any]] = {
             "token" if inputs.ndim == 1 else "embd": inputs,
             "pos": place,
-            "n_seq_id": one,
+            "n_seq_id": np.ones_like(owner),
             "seq_id": owners,
             "logits": wanted,
         }

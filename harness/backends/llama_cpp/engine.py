@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from harness.backends.beginnings import alike
 from harness.backends.card import Card
 from harness.backends.chat import Chat
-from harness.backends.engine import check_logits, common_length
+from harness.backends.engine import Session, check_logits, common_beginning, common_length, group_by_beginning
 from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp.context import LlamaContext, Logits
 from harness.backends.llama_cpp.model import LlamaModel, build, most_sequences
@@ -69,20 +68,20 @@ class LlamaEngine:
     ) -> None:
         shown = [text for text in _PICTURES if projector and text in model.template]
         if projector and not shown:
-            raise UserError(f"model {card.name!r}: its chat template has none of {_PICTURES} for a picture")
+            raise UserError(f"{card.shown}: its chat template has none of {_PICTURES} for a picture")
         self.chat = Chat(card.name, model, shown[0] if shown else None, card.system)
         self.context_tokens = card.context_tokens or model.trained_tokens
         self.stops: Sequence[int] = sorted({*model.stops, *self.chat.ends})
         self._card, self._file, self._model = card, file, model
         self._projector = projector
-        self._context = LlamaContext(model, batch_size + BEGINNINGS, projector)
+        self.context = LlamaContext(model, batch_size + BEGINNINGS, projector)
         self._free = list(range(batch_size))
         # The least recently used comes first.
         self._beginnings = list(range(batch_size, batch_size + BEGINNINGS))
 
     def look(self, image: Image) -> list[int]:
         if self._projector is None:
-            raise ValueError(f"model {self._card.name!r} takes no pictures")
+            raise ValueError(f"{self._card.shown} takes no pictures")
         return self._projector.tokens(image)
 
     def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> "LlamaSession":
@@ -102,43 +101,39 @@ class LlamaEngine:
 
     def _read(self, prompts: dict[int, list[int]]) -> Logits:
         places = list(prompts)
-        self._context.reserve(max(map(len, prompts.values())) + _ANSWER)
+        self.context.reserve(max(map(len, prompts.values())) + _ANSWER)
         # The last token of each prompt is always read, for its logits.
         heads = [[] if self._model.whole_state else prompt[:-1] for prompt in prompts.values()]
-        groups = [
-            self._group([places[i] for i in group], [heads[i] for i in group]) for group in alike(heads)
-        ]
+        groups = []
+        for members in group_by_beginning(heads):
+            shared = common_beginning([heads[i] for i in members])
+            nearest, known = self._nearest(shared)
+            groups.append(_Group([places[i] for i in members], shared, nearest, known, known))
         if len(prompts) == 1:
             groups = [self._read_again(groups[0])]
         for group in groups:
-            self._context.fork(group.nearest, group.places[0], group.known)
+            self.context.fork(group.nearest, group.places[0], group.known)
         firsts = {g.places[0]: g.shared[g.known :] for g in groups if len(g.places) > 1}
         if unread := {place: tokens for place, tokens in firsts.items() if tokens}:
-            self._context.extend(unread)
+            self.context.extend(unread)
         for group in groups:
             for place in group.places[1:]:
-                self._context.fork(group.places[0], place, len(group.shared))
-        logits = self._context.extend({p: ids[len(self._context.tokens[p]) :] for p, ids in prompts.items()})
+                self.context.fork(group.places[0], place, len(group.shared))
+        logits = self.context.extend({p: ids[len(self.context.tokens[p]) :] for p, ids in prompts.items()})
         for group in groups:
             if group.known:
                 self._used(group.nearest)
         for group in groups:
             if len(group.shared) > 2 * group.kept and (len(group.places) > 1 or len(prompts) == 1):
                 oldest = self._beginnings[0]
-                self._context.drop(oldest)
-                self._context.fork(group.places[0], oldest, len(group.shared))
+                self.context.drop(oldest)
+                self.context.fork(group.places[0], oldest, len(group.shared))
                 self._used(oldest)
         return logits
 
-    def _group(self, places: list[int], heads: list[list[int]]) -> _Group:
-        """Find the longest kept part of what some prompts begin with."""
-        shared = heads[0][: common_length(heads)]
-        nearest, known = self._nearest(shared)
-        return _Group(places, shared, nearest, known, known)
-
     def _nearest(self, shared: list[int], but: int | None = None) -> tuple[int, int]:
         """Return the kept beginning with most of some tokens, and how many: not `but` of them."""
-        kept = {b: common_length([self._context.tokens.get(b, []), shared]) for b in self._beginnings}
+        kept = {b: common_length([self.context.tokens.get(b, []), shared]) for b in self._beginnings}
         kept = {b: 0 if n == but else n for b, n in kept.items()}
         nearest = max(self._beginnings, key=kept.__getitem__)
         return nearest, kept[nearest]
@@ -154,22 +149,18 @@ class LlamaEngine:
         self._beginnings.remove(beginning)
         self._beginnings.append(beginning)
 
-    def extend(self, chunks: dict[int, Sequence[int]]) -> Logits:
-        """Append tokens to sequences by place; return the logits after each, (len(chunks), vocabulary)."""
-        return self._context.extend(chunks)
-
     def peek(self, chunks: dict[int, Sequence[int]]) -> Logits:
         """Return the logits after some tokens more of sequences by place, which stay as they are."""
-        lengths = {place: len(self._context.tokens[place]) for place in chunks}
-        logits = self._context.extend(chunks)
+        lengths = {place: len(self.context.tokens[place]) for place in chunks}
+        logits = self.context.extend(chunks)
         for place, length in lengths.items():
-            self._context.cut(place, length)
+            self.context.cut(place, length)
         return logits
 
     def release(self, places: Sequence[int]) -> None:
         """Drop the sequences at some places, which are free afterwards."""
         for place in places:
-            self._context.drop(place)
+            self.context.drop(place)
         self._free += places
 
     def identity(self) -> dict[str, Any]:
@@ -184,28 +175,25 @@ class LlamaEngine:
             "file_sha256": None if commit else self._sha256,
             **self._projector_identity,
             "dtype": self._model.dtype,
-            "kv_cache": self._context.cache_type,
+            "kv_cache": self.context.cache_type,
             "device": self._model.device,
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
             **({"system": self.chat.system} if self.chat.system else {}),
         }
 
     @cached_property
-    def _projector_identity(self) -> dict[str, Any]:
-        if not (self._projector and self._card.projector):
-            return {}
-        return {
-            "projector": self._card.projector,
-            "projector_sha256": sha256_file(self._file.with_name(self._card.projector)),
-        }
-
-    @cached_property
     def _sha256(self) -> str:
         return sha256_file(self._file)
 
+    @cached_property
+    def _projector_identity(self) -> dict[str, Any]:
+        name = self._projector and self._card.projector
+        digest = name and sha256_file(self._file.with_name(name))
+        return {"projector": name, "projector_sha256": digest} if name else {}
 
-class LlamaSession:
-    """Sequences that advance together; `harness.backends.engine.Session` documents the methods."""
+
+class LlamaSession(Session):
+    """Sequences that advance together."""
 
     def __init__(self, engine: LlamaEngine, places: list[int], logits: Logits) -> None:
         self._engine = engine
@@ -233,11 +221,7 @@ class LlamaSession:
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
         rows = [row for row, chunk in enumerate(chunks) if chunk]
         if rows:
-            self._logits[rows] = self._engine.extend({self._places[row]: chunks[row] for row in rows})
-
-    def follow(self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]) -> list[int]:
-        self.advance(chunks)  # guesses are not checked
-        return [0] * len(guesses)
+            self._logits[rows] = self._engine.context.extend({self._places[row]: chunks[row] for row in rows})
 
     def keep(self, places: Sequence[int]) -> None:
         kept = [self._places[place] for place in places]

@@ -14,7 +14,7 @@ import llama_cpp as c
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.backends.engine import picture_of, picture_tokens
+from harness.backends.engine import locate_picture, picture_tokens
 from harness.backends.llama_cpp.model import LlamaModel, keep_errors, last_error
 from harness.backends.vision import Vision
 from harness.core.cores import threads
@@ -105,13 +105,13 @@ class Projector:
         """Return the tokens that stand for a picture; the `Image` must stay alive until they are read."""
         layout = self._layout(image.pixels.shape[:2])
         numbers = picture_tokens(image, sum(part for part in layout if isinstance(part, int)))
-        self._images[picture_of(numbers[0])[0]] = image
+        self._images[locate_picture(numbers[0])[0]] = image
         remaining = iter(numbers)
         return [t for part in layout for t in (islice(remaining, part) if isinstance(part, int) else part)]
 
     def run(self, token: int) -> Run:
         """Return the part of a picture that begins with a token. Raises LookupError if it is gone."""
-        key, place = picture_of(token)
+        key, place = locate_picture(token)
         if key not in self._encoded:
             if (image := self._images.get(key)) is None:
                 raise LookupError("a picture is gone that a prompt's tokens stand for; look at it again")
@@ -123,7 +123,7 @@ class Projector:
 
     def forget(self, tokens: Sequence[int]) -> None:
         """Drop the encodings of the pictures among some tokens, so that they are encoded again."""
-        for key in {picture_of(token)[0] for token in tokens if token < 0}:
+        for key in {locate_picture(token)[0] for token in tokens if token < 0}:
             self._encoded.pop(key, None)
 
     def _layout(self, shape: tuple[int, ...]) -> list[Sequence[int] | int]:

@@ -17,9 +17,9 @@ from harness.backends.card import Card
 from harness.backends.openai.http import Client, Reply
 from harness.backends.openai.pool import ServerPool
 from harness.backends.openai.prompt_check import PromptCheck
-from harness.backends.openai.shapes import body, digest_url, failed, model_of, read
+from harness.backends.openai.shapes import answering_model, body, digest_url, failed, read
 from harness.backends.openai.stream import ASKED, BROKE_OFF
-from harness.backends.orders import averaged
+from harness.backends.orders import average_orders
 from harness.backends.servers import Fields, Server
 from harness.core.errors import printable
 from harness.core.files import canonical_json
@@ -98,7 +98,7 @@ class OpenAIBackend:
         if self._pool.model.tells_weights:
             return None
         return (
-            f"model {printable(self._card.name)!r}: some answers come from the completion cache, and its "
+            f"{self._card.shown}: some answers come from the completion cache, and its "
             "server does not say which weights it has; if these have changed since, use --no-cache"
         )
 
@@ -155,7 +155,7 @@ class OpenAIBackend:
 
     def _note(self, request: Request, reply: Reply, answer: Completion) -> None:
         """Keep which server gave an answer; say once if it names another model than it was asked for."""
-        model, asked = model_of(reply.payload), self._card.weights
+        model, asked = answering_model(reply.payload), self._card.weights
         if model not in (None, asked, f"{asked}:latest", (self._pool.model.listed or {}).get("id")):
             model, url = printable(model), printable(reply.url)
             if not self._named_other:
@@ -215,7 +215,7 @@ def _over_orders(request: Request, completions: Sequence[Completion]) -> Complet
     return replace(
         first, prompt_tokens=total(completion.prompt_tokens for completion in completions),
         seconds=seconds, first_token_s=seconds, retries=retries,
-        **asdict(averaged(request.actions, letters_p)),
+        **asdict(average_orders(request.actions, letters_p)),
     )  # fmt: skip
 
 

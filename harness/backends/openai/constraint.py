@@ -151,13 +151,13 @@ class _Reader:
             self.value(items)
 
     def _string(self, most: int) -> None:
-        found = _STRING.match(self._text, self.at)
-        if not found:
+        match = _STRING.match(self._text, self.at)
+        if not match:
             ended = self.at == len(self._text) or _STRING_BEGUN.fullmatch(self._text, self.at)
             raise EOFError if ended else ValueError
-        if len(json.loads(found[0])) > most or (self._compact and "\\" in found[0]):
+        if len(json.loads(match[0])) > most or (self._compact and "\\" in match[0]):
             raise ValueError
-        self.at = found.end()
+        self.at = match.end()
 
     def _one_of(self, options: Sequence[str]) -> str:
         """Read one of some texts, none of which begins another; a str is one of its characters."""
@@ -173,10 +173,10 @@ class _Reader:
 
     def _number(self, least: float, most: float, whole: bool) -> None:
         number, begun = (_DECIMALS, _DECIMALS_BEGUN) if self._compact else (_NUMBER, _NUMBER_BEGUN)
-        found = number.match(self._text, self.at)
-        open_ended = not found or not self._compact  # more digits or an exponent may follow
+        match = number.match(self._text, self.at)
+        open_ended = not match or not self._compact  # more digits or an exponent may follow
         if open_ended and begun.fullmatch(self._text, self.at):
             raise EOFError
-        if not found or not least <= (value := float(found[0])) <= most or (whole and not value.is_integer()):
+        if not match or not least <= (value := float(match[0])) <= most or (whole and not value.is_integer()):
             raise ValueError
-        self.at = found.end()
+        self.at = match.end()

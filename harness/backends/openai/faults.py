@@ -24,7 +24,7 @@ def may_pass(status: int) -> bool:
     return status == 429 or status >= 500
 
 
-def words_of(payload: Any) -> str:
+def error_words(payload: Any) -> str:
     """Return an error's words, which servers put at `error`, `error.message`, `message` or `detail`."""
     reason = None
     try:
@@ -52,9 +52,9 @@ def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
     first = choices[0] if isinstance(choices, list) and choices else None
     for stated in (payload, first):
         if isinstance(stated, dict) and (error := stated.get("error")):
-            return Fault(words_of({"error": error}), _code(error) or _code(payload))
+            return Fault(error_words({"error": error}), _code(error) or _code(payload))
     if of_chat and not choices and any(isinstance(payload.get(name), str | list) for name in _WORDS[1:]):
-        return Fault(words_of(payload), _code(payload))
+        return Fault(error_words(payload), _code(payload))
     return None
 
 

@@ -16,7 +16,7 @@ from urllib.request import getproxies, proxy_bypass
 import aiohttp
 from yarl import URL
 
-from harness.backends.openai.faults import fault_in, may_pass, plain_text, words_of
+from harness.backends.openai.faults import error_words, fault_in, may_pass, plain_text
 from harness.backends.openai.stream import Stream
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable
@@ -85,27 +85,21 @@ class Client:
         """Send JSON to a server."""
         return await self._once("POST", base, base + path, content, self._server.timeout_s)
 
-    async def _once(
-        self, method: str, base: str, url: str, content: bytes | None, within_s: float
-    ) -> Reply:  # fmt: skip
+    async def _once(self, method: str, base: str, url: str, content: bytes | None, within_s: float) -> Reply:
         try:
             async with asyncio.timeout(within_s):  # for the whole attempt: a server may send bytes for ever
                 return await self._read(method, base, url, content)
         except (aiohttp.ClientError, UnicodeError) as error:
-            fault = self._shown(_described(error))
+            kind, text = type(error).__name__, str(error)
+            fault = self._shown(f"{kind}: {text}" if text else kind)
             return Reply(fault=fault, unreached=isinstance(error, _UNREACHED), again=True)
         except TimeoutError:
             return Reply(fault=f"no whole answer within {within_s:g} s", again=True)
 
     async def _read(self, method: str, base: str, url: str, content: bytes | None) -> Reply:
         data, stream = bytearray(), Stream()
-        async with self._session.request(
-            method,
-            URL(url, encoded=True),
-            data=content,
-            proxy=self._proxies[base],
-            allow_redirects=False,
-        ) as response:
+        options: dict[str, Any] = {"data": content, "proxy": self._proxies[base], "allow_redirects": False}
+        async with self._session.request(method, URL(url, encoded=True), **options) as response:
             streamed = response.content_type == "text/event-stream"
             async for chunk in response.content.iter_any():
                 data += chunk
@@ -114,37 +108,30 @@ class Client:
                 if streamed:
                     stream.take(chunk, time.perf_counter())
         status, after_s = response.status, _after_s(response.headers.get("retry-after"))
+
+        def fault(words: str, status: int = status, again: bool = False) -> Reply:
+            return Reply(fault=words, status=status, again=again, after_s=after_s)
+
         if streamed and status == 200:
             if stream.fault:
-                status = stream.code if stream.again and stream.code else status
-                return Reply(
-                    fault=self._shown(stream.fault), status=status, again=stream.again, after_s=after_s
-                )
+                code = stream.code if stream.again and stream.code else status
+                return fault(self._shown(stream.fault), code, stream.again)
             # Put together before the key is looked for, since pieces may cut through it.
             payload, _ = self._payload(json.dumps(stream.payload()).encode())
             return Reply(payload, status=status, first_at_s=stream.first_at_s)
         payload, readable = self._payload(bytes(data))
         if status == 200:
-            fault = fault_in(payload if readable else plain_text(data), of_chat=url.endswith(COMPLETIONS))
-            if fault is None:
+            error = fault_in(payload if readable else plain_text(data), of_chat=url.endswith(COMPLETIONS))
+            if error is None:
                 return Reply(payload, fault=None if readable else "the answer is no JSON", status=status)
-            words = self._shown(fault.words)
-            if fault.code is None:
-                return Reply(fault=f"an error with HTTP 200: {words}", status=status)
-            again = may_pass(fault.code)
-            return Reply(
-                fault=f"error {fault.code} with HTTP 200: {words}", status=fault.code, again=again,
-                after_s=after_s,
-            )  # fmt: skip
+            words = f"with HTTP 200: {self._shown(error.words)}"
+            if error.code is None:
+                return fault(f"an error {words}")
+            return fault(f"error {error.code} {words}", error.code, may_pass(error.code))
         if 300 <= status < 400:
-            return Reply(fault=f"HTTP {status}: a redirect, which is not followed", status=status)
-        message = words_of(payload) if readable else bytes(data).decode("utf-8", "replace")
-        return Reply(
-            fault=f"HTTP {status}: {self._shown(message)}",
-            status=status,
-            again=may_pass(status),
-            after_s=after_s,
-        )
+            return fault(f"HTTP {status}: a redirect, which is not followed")
+        message = error_words(payload) if readable else bytes(data).decode("utf-8", "replace")
+        return fault(f"HTTP {status}: {self._shown(message)}", again=may_pass(status))
 
     def _payload(self, data: bytes) -> tuple[Any, bool]:
         """Parse JSON and remove the key from it, however it is escaped. Returns the value and the success."""
@@ -180,10 +167,6 @@ def _proxy(url: str) -> str | None:
     if proxy_bypass(parts.hostname or ""):
         return None
     return proxies.get(parts.scheme) or proxies.get("all")
-
-
-def _described(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 def _after_s(text: str | None) -> float | None:

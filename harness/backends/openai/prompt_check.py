@@ -7,7 +7,7 @@ from typing import Any
 
 from harness.backends.base import Request
 from harness.backends.card import Card
-from harness.backends.chat_template import FIRST_USER, Messages, unsaid
+from harness.backends.chat_template import FIRST_USER, Messages, lost_message
 from harness.backends.openai.http import Client
 from harness.backends.openai.shapes import body, digest_url
 from harness.backends.servers import Server
@@ -64,7 +64,7 @@ class PromptCheck:
         messages: Messages = asked["messages"]
         if self._server.kind == "llama-server":
             prompt = await self._field(base, "/apply-template", "prompt", asked)
-            lacking = unsaid(messages, prompt) if isinstance(prompt, str) else None
+            lacking = lost_message(messages, prompt) if isinstance(prompt, str) else None
         else:
             counts = [
                 await self._field(base, "/tokenize", "count", {**asked, "messages": some})
@@ -75,7 +75,7 @@ class PromptCheck:
         if lacking is not None:
             way = "" if self._card.system else f'; or give its card system = "{FIRST_USER}"'
             raise UserError(
-                f"model {printable(self._card.name)!r}: the chat template at {printable(base)} leaves out or "
+                f"{self._card.shown}: the chat template at {printable(base)} leaves out or "
                 f"changes the {printable(lacking['role'])}'s text, so the model would not read what it is "
                 f"asked; start the server with the template that the model was trained with{way}"
             )

@@ -14,7 +14,7 @@ from harness.backends.chat import in_parts
 from harness.backends.chat_template import with_system
 from harness.backends.openai.constraint import broken, constraint
 from harness.backends.servers import MOST_LOGPROBS, Kind, Server
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.prompts.readout import letters, spelt, stated
 
@@ -79,7 +79,7 @@ def body(
         return json_body
     if request.temperature and server.fields.temperature is False:
         raise UserError(
-            f"model {printable(card.name)!r}: its card sends no temperature, and {request.temperature:g} is "
+            f"{card.shown}: its card sends no temperature, and {request.temperature:g} is "
             "asked for; leave --temperature out"
         )
     return server.fields.applied(json_body)
@@ -168,7 +168,7 @@ def _read_out(
     return Completion(request.id, text, *tokens, "stop", None, 1, label_mass=min(1.0, mass))
 
 
-def model_of(payload: Any) -> str | None:
+def answering_model(payload: Any) -> str | None:
     """Return the model that a server says has answered; None if it says none."""
     model = payload.get("model") if isinstance(payload, dict) else None
     return model if isinstance(model, str) else None

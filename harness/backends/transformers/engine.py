@@ -12,9 +12,9 @@ from harness.backends.card import Card, Dtype
 from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.engine import Session
 from harness.backends.language_model import LanguageModel
-from harness.backends.weights import fetching, find_checkpoint, find_gguf, held_to_digest, hub_commit, is_gguf
+from harness.backends.weights import check_digest, fetching, find_checkpoint, find_gguf, hub_commit, is_gguf
 from harness.core.cores import threads
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, one_line, printable
 from harness.core.files import digest, sha256_bytes, sha256_file, text_of
 from harness.core.image import Image
 
@@ -34,7 +34,7 @@ def open(
         raise UserError(f"dtype {printable(dtype)!r}; allowed: {', '.join(get_args(Dtype))}")
     import torch
 
-    where, device = checkpoint(card), device_of(device)
+    where, device = checkpoint(card), choose_device(device)
     torch.set_num_threads(min(threads(), torch.get_num_threads()))  # fewer may have been asked for
     tokenizer, model = load(card, where, dtype=dtype, device=device)
     return LanguageModel(TransformersEngine(card, where, tokenizer, model), batch_size)
@@ -47,15 +47,13 @@ def checkpoint(card: Card) -> Path:
     """
     if not is_gguf(card):
         where = find_checkpoint(card)
-        held_to_digest(card, where / "model.safetensors")
+        check_digest(card, where / "model.safetensors")
         return where
-    from harness.backends.transformers.unpack import unpacked
+    from harness.backends.transformers.unpack import unpack_checkpoint
 
     if card.vision:
-        raise UserError(
-            f"model {printable(card.name)!r}: a GGUF file takes no pictures on transformers; use llama-cpp"
-        )
-    return unpacked(card, held_to_digest(card, find_gguf(card)))
+        raise UserError(f"{card.shown}: a GGUF file takes no pictures on transformers; use llama-cpp")
+    return unpack_checkpoint(card, check_digest(card, find_gguf(card)))
 
 
 def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]:
@@ -68,6 +66,7 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     _refuse_kernels(card, where)
+    shown = f"{card.shown} in {where}"
     # trust_remote_code=False: otherwise a checkpoint with its own code asks at the terminal.
     options = {"local_files_only": True, "trust_remote_code": False}
     try:
@@ -79,34 +78,25 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
                 where, dtype=dtype, output_loading_info=True, use_safetensors=True, **options
             )
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
-        reason = printable(" ".join(str(error).split()), 200)
-        raise UserError(
-            f"model {card.name!r} in {where} does not load: {reason}; {fetching(card)}"
-        ) from error
+        raise UserError(f"{shown} does not load: {one_line(error)}; {fetching(card)}") from error
     try:
         model = model.to(device).eval()
     except RuntimeError as error:
-        reason = printable(" ".join(str(error).split()), 200)
-        raise UserError(
-            f"model {card.name!r} does not fit on {device}: {reason}; give another device or dtype"
-        ) from error
-    if report["missing_keys"]:
-        # transformers fills missing weights with random numbers.
-        absent = sorted(report["missing_keys"])
-        raise UserError(
-            f"model {card.name!r} in {where} lacks {len(absent)} of its weights "
-            f"({printable(absent[0])}); {fetching(card)}"
-        )
+        fault = f"{card.shown} does not fit on {device}: {one_line(error)}"
+        raise UserError(f"{fault}; give another device or dtype") from error
+    if absent := sorted(report["missing_keys"]):  # transformers fills them with random numbers
+        fault = f"lacks {len(absent)} of its weights ({printable(absent[0])})"
+        raise UserError(f"{shown} {fault}; {fetching(card)}")
     rows = model.get_input_embeddings().num_embeddings
     if len(tokenizer) > rows:
         raise UserError(
-            f"model {card.name!r} in {where}: its tokenizer has {len(tokenizer)} tokens and the model "
-            f"only {rows}; give both from one checkpoint"
+            f"{shown}: its tokenizer has {len(tokenizer)} tokens and the model only {rows}; give both from "
+            "one checkpoint"
         )
     if not tokenizer.chat_template:
         raise UserError(
-            f"model {card.name!r} in {where} has no chat template; use its instruct version, "
-            "or put a chat_template.jinja beside its config.json"
+            f"{shown} has no chat template; use its instruct version, or put a chat_template.jinja beside "
+            "its config.json"
         )
     return tokenizer, model
 
@@ -129,12 +119,12 @@ def _refuse_kernels(card: Card, where: Path) -> None:
             for key in ("attn_implementation", "_attn_implementation"):
                 if "/" in str(value.get(key, "")):
                     raise UserError(
-                        f"model {printable(card.name)!r} in {printable(where)}: {key} in its config.json "
+                        f"{card.shown} in {printable(where)}: {key} in its config.json "
                         "names code of the hub, which is never run; take it out of the file"
                     )
 
 
-def device_of(asked: str | None) -> str:
+def choose_device(asked: str | None) -> str:
     """Return the device that a user names; None means CUDA if there is any. Raises UserError if missing."""
     import torch
 
@@ -164,24 +154,18 @@ class TransformersEngine:
         from harness.backends.transformers.eyes import Eyes
         from harness.backends.transformers.session import Reader
 
-        self.card = card
-        self.where = where
+        self.card, self.where, self.model = card, where, model
         self.eyes = Eyes(card.name, where, card.vision, tokenizer, model) if card.vision else None
         image_token = self.eyes.image_token if self.eyes else None
         self.chat = Chat(card.name, HubTokenizer(tokenizer), image_token, card.system)
-        self.model = model
         self.context_tokens: int = (
-            card.context_tokens or self.model.config.get_text_config().max_position_embeddings
+            card.context_tokens or model.config.get_text_config().max_position_embeddings
         )
-        listed = self.model.generation_config.eos_token_id or []
+        listed = model.generation_config.eos_token_id or []
         # A chat model's turn may end with a token that its generation config does not list: the template's.
-        ends = {
-            *(listed if isinstance(listed, list) else [listed]),
-            tokenizer.eos_token_id,
-            *self.chat.ends,
-        }
+        ends = {*(listed if isinstance(listed, list) else [listed]), tokenizer.eos_token_id, *self.chat.ends}
         self.stops: Sequence[int] = sorted(ends - {None})
-        self._reader = Reader(self.model, self.eyes)
+        self._reader = Reader(model, self.eyes)
 
     def look(self, image: Image) -> list[int]:
         if self.eyes is None:

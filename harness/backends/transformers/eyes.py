@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 
 import torch
 
-from harness.backends.engine import picture_of, picture_tokens
+from harness.backends.engine import locate_picture, picture_tokens
 from harness.backends.transformers.processor import Processor
 from harness.backends.vision import Vision
 from harness.core.errors import UserError
@@ -40,7 +40,7 @@ class Eyes:
     def look(self, image: Image) -> list[int]:
         """Return the tokens that stand for a picture; the `Image` must stay alive until they are read."""
         tokens = picture_tokens(image, self._processor.measured(image.pixels)[0])
-        self._images[picture_of(tokens[0])[0]] = image
+        self._images[locate_picture(tokens[0])[0]] = image
         return [*self._before, *tokens, *self._after]
 
     def forget(self, prompt: Sequence[int]) -> None:
@@ -102,7 +102,7 @@ class Eyes:
 
 def _pictures(tokens: Iterable[int]) -> list[int]:
     """Return the pictures whose first token is among these, in order."""
-    pictures = (picture_of(token) for token in tokens if token < 0)
+    pictures = (locate_picture(token) for token in tokens if token < 0)
     return [key for key, place in pictures if place == 0]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from harness.backends.card import Card
 from harness.backends.vision import Vision
 from harness.backends.weights import find_checkpoint
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, one_line
 from harness.core.image import Pixels
 
 if TYPE_CHECKING:
@@ -39,9 +39,8 @@ class Processor:
             self._processor = AutoImageProcessor.from_pretrained(where, backend="pil", **files)
             self._config = AutoConfig.from_pretrained(where, **files)
         except Exception as error:  # a broken file surfaces as any of a dozen exception types
-            reason = printable(" ".join(str(error).split()), 200)
             raise UserError(
-                f"model {name!r} in {where} has no image processor ({reason}); copy its "
+                f"model {name!r} in {where} has no image processor ({one_line(error)}); copy its "
                 "preprocessor_config.json there, or leave [vision] out of its card"
             ) from error
         self._of_size = dict[tuple[int, ...], tuple[int, Any]]()

@@ -21,11 +21,9 @@ import torch
 from torch.nn.functional import linear, pad
 from transformers.cache_utils import Cache, DynamicCache, DynamicLayer
 
-from harness.backends.beginnings import alike
-from harness.backends.engine import Session, check_logits
+from harness.backends.engine import Session, check_logits, common_beginning, group_by_beginning
 from harness.backends.transformers.eyes import Eyes
-from harness.backends.transformers.memory import PagedLayer, joined
-from harness.backends.transformers.prefixes import LEAST_TOKENS, NOTHING, Prefix, Prefixes, common
+from harness.backends.transformers.memory import LEAST_TOKENS, NOTHING, PagedLayer, Prefix, Prefixes, joined
 from harness.core.arrays import Floats
 
 CPU_TOKENS = 1024  # most tokens that a CPU reads together: what more of them need does not stay in its cache
@@ -79,7 +77,7 @@ class Reader:
         if self._eyes:
             self._eyes.encode(token for prompt in prompts for token in prompt)
         parts = []
-        for group in alike(beginnings):
+        for group in group_by_beginning(beginnings):
             prefix = self._prefix([beginnings[place] for place in group])
             for piece in self._pieces(group, [len(prompt) - len(prefix.ids) for prompt in prompts]):
                 at = positions and [positions[place] for place in piece]
@@ -98,7 +96,7 @@ class Reader:
 
     def _prefix(self, beginnings: list[list[int]]) -> Prefix:
         """Return what some prompts begin with; what is read of it is kept, unless half of it was."""
-        shared = common(beginnings)
+        shared = common_beginning(beginnings)
         prefix = self._prefixes.longest(shared)
         known = len(prefix.ids)
         if len(beginnings) > 1 and len(shared) - known >= LEAST_TOKENS:
@@ -233,11 +231,11 @@ class Rows:
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
         # All ways of a sequence stand side by side in its row, and a token sees those of its own way alone:
         # the sequence's keys and values are neither copied nor read again.
-        n, ways, width = len(chunks), len(chunks[0]), max(len(way) for of in chunks for way in of)
+        n, ways, width = len(chunks), len(chunks[0]), max(len(way) for each in chunks for way in each)
         ids = torch.zeros(n, ways, width, dtype=torch.long)
         own = torch.zeros(n, ways, width, dtype=torch.bool)
-        for row, of in enumerate(chunks):
-            for turn, way in enumerate(of):
+        for row, each in enumerate(chunks):
+            for turn, way in enumerate(each):
                 ids[row, turn, width - len(way) :] = torch.tensor(way)
                 own[row, turn, width - len(way) :] = True
         same = torch.eye(ways, dtype=torch.bool)[:, None, :, None]
@@ -325,8 +323,8 @@ def _log_probs(logits: Any, tokens: Sequence[int] | None) -> Floats:
     return log_p
 
 
-class Apart:
-    """A `Session` of sequences that are each read on their own."""
+class Apart(Session):
+    """Sequences that are each read on their own: what a window or a recurrent state reads stays read."""
 
     def __init__(self, sessions: Sequence[Rows]) -> None:
         self._sessions = sessions
@@ -341,18 +339,14 @@ class Apart:
         for session, chunk in zip(self._sessions, chunks, strict=True):
             session.advance([chunk])
 
-    def follow(self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]) -> list[int]:
-        self.advance(chunks)  # what a window or a recurrent state has read cannot be taken back
-        return [0] * len(guesses)
-
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
-        found = []
+        rows = []
         for session, ways in zip(self._sessions, chunks, strict=True):
-            forks = [session.copy() for _ in ways]  # what they read cannot be taken back
+            forks = [session.copy() for _ in ways]
             for fork, chunk in zip(forks, ways, strict=True):
                 fork.advance([chunk])
-            found.append(np.concatenate([fork.log_probs(tokens) for fork in forks]))
-        return np.stack(found)
+            rows.append(np.concatenate([fork.log_probs(tokens) for fork in forks]))
+        return np.stack(rows)
 
     def keep(self, places: Sequence[int]) -> None:
         self._sessions = [self._sessions[place] for place in places]

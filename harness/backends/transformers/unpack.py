@@ -15,17 +15,17 @@ from typing import Any
 from warnings import catch_warnings, simplefilter
 
 from harness.backends.card import Card
-from harness.backends.gguf import metadata
+from harness.backends.gguf import read_metadata
 from harness.backends.tokens import tokenizer
 from harness.core import kept
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, one_line, printable
 from harness.core.files import alone, digest, sha256_file, write_whole
 
 _PATIENCE_S = 3600.0  # for another process that unpacks the same file
 _SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
 
 
-def unpacked(card: Card, file: Path) -> Path:
+def unpack_checkpoint(card: Card, file: Path) -> Path:
     """Return the checkpoint of a GGUF file, which is made if it is not kept.
 
     Raises UserError if the file has no tokenizer or chat template, transformers does not know its
@@ -35,7 +35,7 @@ def unpacked(card: Card, file: Path) -> Path:
 
     made_by = [__version__, kept.code_sha256("backends/transformers/unpack.py", "backends/tokens.py")]
     to = kept.folder() / "checkpoints" / digest([sha256_file(file), *made_by])[:16]
-    shown = f"model {printable(card.name)!r} in {printable(file)}"
+    shown = f"{card.shown} in {printable(file)}"
     try:
         to.parent.mkdir(parents=True, exist_ok=True)
         with alone(to.with_name(f".{to.name}.lock"), _PATIENCE_S):
@@ -60,7 +60,7 @@ def _unpack(file: Path, to: Path, shown: str) -> None:
     import transformers
 
     try:
-        values = metadata(file, arrays=True)
+        values = read_metadata(file, arrays=True)
     except ValueError as error:
         raise UserError(f"{shown} does not load: {error}; copy or download the file again") from None
     if not isinstance(values.get("tokenizer.chat_template"), str):
@@ -76,12 +76,11 @@ def _unpack(file: Path, to: Path, shown: str) -> None:
                 file.parent, gguf_file=file.name, dtype=torch.float32, output_loading_info=True,
                 local_files_only=True, trust_remote_code=False,
             )  # fmt: skip
-    except OSError as error:
-        if error.errno is not None:  # the disk; others are transformers' own words
-            raise
-        raise _unloadable(shown, error) from error
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
-        raise _unloadable(shown, error) from error
+        if isinstance(error, OSError) and error.errno is not None:  # the disk, and not transformers' words
+            raise
+        fault = f"{shown} does not load with transformers: {one_line(error)}"
+        raise UserError(f"{fault}; run it on llama-cpp") from error
     if report["missing_keys"]:
         absent = sorted(report["missing_keys"])
         raise UserError(
@@ -103,8 +102,3 @@ def _specials(values: Mapping[str, Any]) -> dict[str, str]:
     ids = {name: values.get(f"tokenizer.ggml.{key}_token_id") for name, key in _SPECIALS.items()}
     tokens = values["tokenizer.ggml.tokens"]
     return {f"{name}_token": tokens[number] for name, number in ids.items() if number is not None}
-
-
-def _unloadable(shown: str, error: Exception) -> UserError:
-    reason = printable(" ".join(str(error).split()), 200)
-    return UserError(f"{shown} does not load with transformers: {reason}; run it on llama-cpp")
