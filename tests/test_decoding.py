@@ -290,7 +290,7 @@ def test_a_letter_counts_in_all_of_its_spellings() -> None:
     session = Said({1: 1 / 4, 11: 1 / 4, 2: 1 / 8, 3: 1 / 16, 13: 1 / 32, 23: 1 / 32})
     chat = SimpleNamespace(name="spelt", encode=ids.__getitem__, spellings=lambda letters: spellings)
     engine: Any = SimpleNamespace(chat=chat, begin=lambda prompts, exact: session)
-    [answer] = Decoding(engine).answer([ask(0, "readout")], [[5, 6]])
+    [answer] = Decoding(engine).answer([ask(0, "readout")], [[[5, 6]]])
     assert json.loads(answer.text)["action_distribution"] == pytest.approx(
         dict(zip(ACTIONS, (4 / 6, 1 / 6, 1 / 6), strict=True)), abs=1e-6
     )
@@ -305,7 +305,7 @@ def test_one_spelling_alone_is_read_out_to_the_last_bit_as_ever() -> None:
         spellings=lambda letters: {x: [] for x in letters},
     )  # fmt: skip
     engine: Any = SimpleNamespace(chat=chat, begin=lambda prompts, exact: Said(p))
-    [answer] = Decoding(engine).answer([ask(0, "readout")], [[5, 6]])
+    [answer] = Decoding(engine).answer([ask(0, "readout")], [[[5, 6]]])
     log_p = [math.log(x) for x in p.values()]
     weights = [math.exp(x - max(log_p)) for x in log_p]
     assert answer.text == readout.stated(ACTIONS, weights)

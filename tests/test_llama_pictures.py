@@ -288,7 +288,7 @@ def test_memory_grows_with_pictures_in_it_and_nothing_is_lost(engine: LlamaEngin
 def test_a_beginning_whose_picture_nobody_has_any_more_is_left_behind(engine: LlamaEngine) -> None:
     begin(engine, prompt(Image(A.pixels.copy()), 80)).close()
     assert len(engine.context.tokens) == 1
-    engine._projector._encoded.clear()
+    engine._projector._pictures._encoded.clear()
     session = begin(engine, prompt(B, *range(100, 300)))
     session.advance([list(range(10, 310))])  # beyond the room there is
     lost, kept = engine.look(A)[0], engine.look(B)[0]

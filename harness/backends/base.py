@@ -101,7 +101,6 @@ class Request:
 
     @property
     def image_sha256(self) -> str | None:
-        """Digest of the picture's pixels; None without a picture."""
         return self.image.sha256 if self.image else None
 
 
@@ -240,5 +239,5 @@ class Timed(Backend, Protocol):
     """A backend whose answers were timed earlier, so that they are not timed again."""
 
     def latency(self) -> "Latency":
-        """Return the latency with which the decisions of the replayed run were identity."""
+        """Return the latency with which the decisions of the replayed run were made."""
         ...

@@ -135,7 +135,6 @@ class Cached:
         self._doubt = doubt(backend)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """Return one completion per request, in order; the backend answers those that are not cached."""
         prompts = self.backend.rendered(requests)
         keys = [key(self._identity, p, r, self._batch_size) for p, r in zip(prompts, requests, strict=True)]
         known = self._try(lambda file: file.find(keys)) or {}

@@ -96,7 +96,6 @@ class Card:
 
     @property
     def shown(self) -> str:
-        """How messages name it."""
         return f"model {printable(self.name)!r}"
 
     def at(self, urls: tuple[str, ...]) -> "Card":

@@ -85,11 +85,9 @@ def argument(card: Card) -> str:
 def own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card:
     """Return the user's own card of the model that a run names. What the run says of it opens nothing.
 
-    Args:
-        stated: the card that the run states. Only its name is looked up; the rest is compared.
-        given: cards that the user gave, which come before the card files.
-        where: name of the run, in messages.
-        hint: what the user can do if there is no such card, which is a UserError, as is a card that differs.
+    Only the name of the card that the run states is looked up; the rest is compared. Cards that the user gave
+    come before the card files. Raises UserError, with `where` and `hint`, if there is no such card or it
+    differs.
     """
     name = printable(stated.name)
     card = next((card for card in given if card.name == stated.name), None)
@@ -189,5 +187,4 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
 
 
 def _engines_with(key: str) -> list[str]:
-    """Return the engines that understand a key."""
     return [engine for engine, registered in ENGINES.usable().items() if key in registered.allowed_keys]

@@ -130,7 +130,6 @@ class Chat:
 
     @property
     def ends(self) -> tuple[int, ...]:
-        """Ids of the tokens that end a turn by the template: one at most."""
         return () if self.turn_end is None else (self.turn_end,)
 
     def render(self, messages: Sequence[Mapping[str, str]], *, thinking: bool) -> str:

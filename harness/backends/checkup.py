@@ -69,9 +69,11 @@ class Checkup:
 
 
 def check(
-    backend: Rendering, asked: Sequence[Request], shown: Sequence[Pictured] = (),
+    backend: Rendering,
+    asked: Sequence[Request],
+    shown: Sequence[Pictured] = (),
     progress: Callable[[int], None] = lambda done: None,
-) -> Checkup:  # fmt: skip
+) -> Checkup:
     """Check a model with some questions, one in each answer mode.
 
     For a model with vision, `shown` has questions of an image prompt. `progress` is called with 1 after each.
@@ -98,7 +100,6 @@ def check(
 
 
 def _leading(ids: Sequence[int], token: int | None) -> int:
-    """Return how often a token stands at the beginning."""
     return next((n for n, other in enumerate(ids) if other != token), len(ids))
 
 

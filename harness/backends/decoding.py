@@ -43,24 +43,22 @@ class Decoding:
             return 1
         return request.max_tokens
 
-    def answer(
-        self, requests: Sequence[Request], prompts: Sequence[Sequence[int]],
-        further: Sequence[Sequence[list[int]]] = (),
-    ) -> list[Completion]:  # fmt: skip
+    def answer(self, requests: Sequence[Request], orders: Sequence[Sequence[list[int]]]) -> list[Completion]:
         """Answer requests of one answer mode, for each of which there is `room`.
 
         Args:
             requests: the requests.
-            prompts: their rendered messages, in tokens.
-            further: of a read-out over several orders, those of each request's other orders, equally many.
+            orders: of each request its rendered messages, in tokens; of a read-out over several orders the
+                messages with each, equally many.
 
         Returns:
             Completions in order, without prompt tokens. A read-out's first token comes when it is complete.
         """
         start_s = time.perf_counter()
+        prompts = [prompt for prompt, *_ in orders]
         choice = Choice(requests, prompts)
         if requests[0].answer == "readout":
-            answers = self._read_out(requests, prompts, further)
+            answers = self._read_out(requests, orders)
         else:
             mode = self._free if requests[0].answer == "json" else self._constrained
             with closing(self._engine.begin(prompts)) as session:
@@ -120,9 +118,7 @@ class Decoding:
     def _over(self, tokens: list[int], request: Request) -> bool:
         return tokens[-1] in self._engine.stops or len(tokens) == request.max_tokens
 
-    def _constrained(
-        self, session: Session, requests: Sequence[Request], choice: Choice
-    ) -> list[Completion]:  # fmt: skip
+    def _constrained(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Completion]:
         walks = [self._skeleton(request).walk() for request in requests]
         asks = [next(walk) for walk in walks]
         done: dict[int, Filled] = {}
@@ -151,17 +147,14 @@ class Decoding:
         return skeleton
 
     def _read_out(
-        self, requests: Sequence[Request], prompts: Sequence[Sequence[int]],
-        further: Sequence[Sequence[list[int]]],
-    ) -> list[Completion]:  # fmt: skip
+        self, requests: Sequence[Request], orders: Sequence[Sequence[list[int]]]
+    ) -> list[Completion]:
         # Requests may have different numbers of actions: each column stands for one letter's token.
         spellings = {r.actions: self._letter_tokens(r.actions) for r in requests}
         tokens = sorted({t for per_letter in spellings.values() for own in per_letter for t in own})
         column = {token: j for j, token in enumerate(tokens)}
-        others = further or [()] * len(prompts)
-        orders = [[list(prompt), *rest] for prompt, rest in zip(prompts, others, strict=True)]
         if len(orders[0]) == 1:
-            with closing(self._engine.begin(prompts, tokens)) as session:
+            with closing(self._engine.begin([prompt for [prompt] in orders], tokens)) as session:
                 readings = session.log_probs(tokens)[:, None]
         else:  # what all orders of a question begin with is read once, and then the rest of each
             shared = [common_length(each) for each in orders]
@@ -169,13 +162,12 @@ class Decoding:
             rests = [[ids[length:] for ids in each] for each, length in zip(orders, shared, strict=True)]
             with closing(self._engine.begin(heads, tokens)) as session:
                 readings = session.ends(rests, tokens)
-        return [
-            _completion_of_letters(request, len(requests), [
-                [[float(row[column[token]]) for token in own] for own in spellings[request.actions]]
-                for row in rows
-            ])
-            for request, rows in zip(requests, readings, strict=True)
-        ]  # fmt: skip
+        completions = []
+        for request, rows in zip(requests, readings, strict=True):
+            columns = [[column[token] for token in own] for own in spellings[request.actions]]
+            log_p = [[row[own].tolist() for own in columns] for row in rows]
+            completions.append(_completion_of_letters(request, len(requests), log_p))
+        return completions
 
     def _letter_tokens(self, actions: tuple[str, ...]) -> list[list[int]]:
         """Return the tokens of each letter, in all its spellings: with a blank before it, and without."""

@@ -39,16 +39,13 @@ def load(name: str) -> Device:
 
 
 def _with_sources(value: Any, sources: dict[str, str]) -> Any:
-    """Replace the name of each source by its text."""
     if isinstance(value, list):
         return [_with_sources(item, sources) for item in value]
     if not isinstance(value, dict):
         return value
-    return {
-        key: sources.get(inner, inner) if key == "source" and isinstance(inner, str)
-        else _with_sources(inner, sources)
-        for key, inner in value.items()
-    }  # fmt: skip
+    source = value.get("source")
+    named = {"source": sources.get(source, source)} if isinstance(source, str) else {}
+    return {key: _with_sources(inner, sources) for key, inner in value.items()} | named
 
 
 def row_of(device: Device, model: str) -> DeviceRow:
@@ -78,11 +75,11 @@ def _scaled(device: Device, billions: float) -> DeviceRow:
         source = f"{near.model} times {factor:.3g}, by the number of weights"
         return constant and Constant(constant.value * factor, "modelled", source)
 
+    factors = {**dict.fromkeys(RATES, 1 / ratio), **dict.fromkeys(JOULES, ratio)}
+    values = {name: scaled(getattr(near, name), factor) for name, factor in factors.items()}
     return msgspec.structs.replace(
-        near, model=f"{billions:g}b from {near.model}", billions=billions,
-        **{name: scaled(getattr(near, name), 1 / ratio) for name in RATES},
-        **{name: scaled(getattr(near, name), ratio) for name in JOULES},
-    )  # fmt: skip
+        near, model=f"{billions:g}b from {near.model}", billions=billions, **values
+    )
 
 
 def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | None]]:

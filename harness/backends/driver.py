@@ -30,7 +30,6 @@ class DriverBackend:
         return [completion for part in split_by_scenario(requests) for completion in self._complete(part)]
 
     def _complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """Answer requests of one scenario."""
         scenario = requests[0].scenario
         if scenario is None:
             raise ValueError(f"request {requests[0].id} has no scenario; a driver needs its road")

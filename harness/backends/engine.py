@@ -55,9 +55,7 @@ class Session(Protocol):
         """Keep these sequences only, in this order: n becomes len(places)."""
         ...
 
-    def close(self) -> None:
-        """Free the memory."""
-        ...
+    def close(self) -> None: ...
 
 
 class Engine(Protocol):
@@ -82,24 +80,10 @@ class Engine(Protocol):
         """
         ...
 
-    def identity(self) -> dict[str, Any]:
-        """Return what decides the answers, as JSON: engine, versions, weights, settings."""
-        ...
+    def identity(self) -> dict[str, Any]: ...
 
 
 LEAST_SAVED = 64  # fewer tokens saved are cheaper to read than a group of prompts of its own
-_PLACE_BITS, _DIGITS = 16, 10  # a picture's token: hex digits of its digest, then bits of the token's place
-
-
-def picture_tokens(image: Image, count: int) -> list[int]:
-    """Return the negative numbers that stand for a picture of `count` tokens, in every engine and process."""
-    first = int(image.sha256[:_DIGITS], 16) << _PLACE_BITS
-    return [-1 - (first | place) for place in range(count)]
-
-
-def locate_picture(token: int) -> tuple[int, int]:
-    """Return the number of the picture that a token belongs to, and the token's place in it."""
-    return divmod(-1 - token, 1 << _PLACE_BITS)
 
 
 def check_logits(largest: Sequence[float]) -> None:

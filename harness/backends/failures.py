@@ -37,7 +37,7 @@ class Failures:
 
     @property
     def texts(self) -> dict[str, float]:
-        """The shares of the spoilt texts by name, in order."""
+        """The shares of the spoilt texts by name."""
         return {name: rate for name, rate in asdict(self).items() if not name.startswith("slow_")}
 
 

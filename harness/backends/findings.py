@@ -31,20 +31,28 @@ class Moved(Struct, frozen=True):
 
     @property
     def read(self) -> bool:
-        """Whether most pairs moved."""
         return 2 * self.moved > self.n
 
 
 class Findings(Struct, frozen=True):
     """What fixed questions showed of a model."""
 
-    prompt: str  # the prompt version that they were asked with
-    letters: str  # how the letters of the pairs were read, `raw` or `cyclic`
-    n: int  # number of questions that were read over cyclic orders
-    letter_share: float  # mean share of the variance that followed the letter
-    follows_letter: int  # in how many questions one letter was the likeliest in every order
-    label_mass: float  # mean probability of the letters
-    pairs: tuple[Moved, ...]  # the pairs, by kind of fact
+    Attributes:
+        prompt: the prompt version that they were asked with.
+        letters: how the letters of the pairs were read, `raw` or `cyclic`.
+        n: number of questions that were read over cyclic orders.
+        letter_share: mean share of the variance that followed the letter.
+        follows_letter: in how many questions one letter was the likeliest in every order.
+        label_mass: mean probability of the letters.
+    """
+
+    prompt: str
+    letters: str
+    n: int
+    letter_share: float
+    follows_letter: int
+    label_mass: float
+    pairs: tuple[Moved, ...]
 
     @property
     def reads_scene(self) -> bool:

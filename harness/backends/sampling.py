@@ -36,13 +36,7 @@ class Choice:
     def next(
         self, session: Session, places: Sequence[int], among: Sequence[Sequence[int] | None]
     ) -> list[int]:
-        """Choose the next token of each sequence of a session.
-
-        Args:
-            session: session with the sequences of `places`, the places of their requests, in order.
-            places: see `session`.
-            among: allowed tokens of each sequence; None allows all.
-        """
+        """Choose the next token of the request at each place, in a session, among some tokens (None: all)."""
         chosen = session.argmax(among)
         if self._drawn:
             log_p = session.log_probs()

@@ -57,11 +57,10 @@ class Fields:
 
     @property
     def changed(self) -> Mapping[str, str | bool]:
-        """The fields that are left out or renamed."""
         return {name: other for name, other in vars(self).items() if other is not True}
 
     def applied(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a request with the fields left out and renamed, in their order."""
+        """Return a request with the fields left out and renamed."""
         sent = {name: vars(self).get(name, True) for name in body}
         return {
             name if other is True else other: body[name] for name, other in sent.items() if other is not False
@@ -126,7 +125,6 @@ class Server:
 
     @property
     def urls(self) -> tuple[str, ...]:
-        """The base URL of each server, without a trailing slash."""
         urls = (self.base_url,) if isinstance(self.base_url, str) else self.base_url
         return tuple(url.rstrip("/") for url in urls)
 
@@ -137,7 +135,6 @@ class Server:
 
     @property
     def tells_thinking(self) -> bool:
-        """Whether a request can turn thinking on and off."""
         return self.kind in ("vllm", "llama-server")
 
 
@@ -152,7 +149,6 @@ def readable(variable: str) -> bool:
 
 
 def _fault(url: str) -> str | None:
-    """Return what is wrong with a base URL; None if nothing is."""
     try:
         parts = urlsplit(url)
         host = bool(parts.hostname) and parts.port != 0  # raises if the port is not a number

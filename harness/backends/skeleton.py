@@ -157,8 +157,9 @@ class Skeleton:
             ends = [self._tokens(point.options[0] or before, branch.text) for branch in point.branches]
             self._legs[point, before] = legs = [
                 Leg(option + branch.text, self._tokens(before, option) + end, branch)
-                for option in point.options for branch, end in zip(point.branches, ends, strict=True)
-            ]  # fmt: skip
+                for option in point.options
+                for branch, end in zip(point.branches, ends, strict=True)
+            ]
             legs += [Leg(branch.text, self._tokens(before, branch.text), branch) for branch in point.instead]
             # One option may be a prefix of another (SLOW, SLOWER), so the tokens after it decide.
             by_tokens = sorted(leg.tokens for leg in legs)

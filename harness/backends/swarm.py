@@ -28,7 +28,6 @@ class Swarm:
         return [completions[place] for place in range(len(requests))]
 
     def identity(self) -> dict[str, Any]:
-        """Return the identity of the ego's model, with those of the helpers."""
         ego, *helpers = (backend.identity() for backend in self._backends)
         return {**ego, "helpers": helpers}
 

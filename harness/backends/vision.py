@@ -36,7 +36,6 @@ class Vision:
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height of the pictures that the model is shown."""
         return self.width_px, self.height_px
 
     @property

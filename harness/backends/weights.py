@@ -221,7 +221,7 @@ def _hub_cache() -> Path:
 
 
 def _snapshot(card: Card) -> Path | None:
-    """Return the folder in the hub's cache of a card's repository at its revision; None if there is none."""
+    """Return the folder of a card's repository at its revision in the hub's cache; None if there is none."""
     repository = _hub_cache() / f"models--{(card.weights or '').replace('/', '--')}"
     revision = card.revision or "main"
     reference = repository / "refs" / revision

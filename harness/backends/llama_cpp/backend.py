@@ -36,14 +36,11 @@ class LlamaBackend(Child):
         self.chat = Chat(card.name, _RemoteTokenizer(self), self.call("chat.image_token"), card.system)
 
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
-        """Return what `LanguageModel.next_log_probs` does."""
         log_p: Floats = self.call("next_log_probs", requests, vocabulary)
         return log_p
 
 
 class _RemoteTokenizer:
-    """The `Tokenizer` of the model in a child process."""
-
     def __init__(self, child: Child) -> None:
         self._child = child
         stated = (

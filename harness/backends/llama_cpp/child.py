@@ -76,7 +76,6 @@ class Child:
         raise UserError(f"model {printable(self._name)!r}: {last} of {attribute}; see `harness model check`")
 
     def close(self) -> None:
-        """Kill the process, if there is one."""
         if self._running:
             process, pipe = self._running
             self._running = None
@@ -175,7 +174,6 @@ def _get(backend: Any, attribute: str, arguments: tuple[Any, ...], options: dict
 
 
 def _attempt(work: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None]:
-    """Return the result of some work, or the exception that it raises."""
     try:
         return work(*arguments), None
     except UserError as error:

@@ -51,7 +51,6 @@ class LlamaContext:
             lists[copy] = lists[source][:length] if length else []
 
     def drop(self, sequence: int) -> None:
-        """Remove a sequence, if it exists."""
         if self.tokens.pop(sequence, None) is not None and self._context:
             c.llama_memory_seq_rm(self._memory(), sequence, -1, -1)
 
@@ -91,7 +90,6 @@ class LlamaContext:
         return logits
 
     def free(self) -> None:
-        """Free all memory; all sequences are lost."""
         if self._context:
             c.llama_free(self._context)
         self._context, self.tokens, self._ends = None, {}, {}
@@ -158,7 +156,6 @@ class LlamaContext:
         return logits
 
     def _runs(self, chunk: Sequence[int]) -> list[Run]:
-        """Split a chunk into texts and pictures."""
         if self._projector is None or min(chunk) >= 0:
             return [text_run(chunk)]
         runs, start = [], 0

@@ -158,7 +158,6 @@ class LlamaEngine:
         return logits
 
     def release(self, places: Sequence[int]) -> None:
-        """Drop the sequences at some places, which are free afterwards."""
         for place in places:
             self.context.drop(place)
         self._free += places
@@ -234,7 +233,6 @@ class LlamaSession(Session):
 
 
 def _log_probs(logits: Logits, tokens: Sequence[int] | None) -> Floats:
-    """Return the log-probabilities of some or all tokens, from logits (n, vocabulary)."""
     largest = logits.max(axis=1, keepdims=True).astype(np.float64)
     check_logits(largest.ravel().tolist())
     reduced = logits - largest

@@ -1,27 +1,24 @@
 """The projector of a model with vision: a second GGUF file, with which llama.cpp's mtmd encodes pictures."""
 
 import ctypes
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
-from weakref import WeakValueDictionary
 
 import llama_cpp as c
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.backends.engine import locate_picture, picture_tokens
 from harness.backends.llama_cpp.model import LlamaModel, keep_errors, last_error
+from harness.backends.pictures import Pictures, locate_picture
 from harness.backends.vision import Vision
 from harness.core.cores import threads
 from harness.core.errors import UserError, printable
 from harness.core.image import Image
 
-KEPT = 64  # pictures whose embeddings are kept: those of a chunk of requests, for a repair turn
 MOST_TOKENS = 1 << 16  # most tokens of a picture whose processor has no limit
 
 
@@ -57,11 +54,7 @@ class Projector:
     """
 
     def __init__(self, name: str, file: Path, model: LlamaModel, vision: Vision) -> None:
-        """Load a projector.
-
-        Raises UserError if llama-cpp-python has no mtmd, the file is not a projector of this model, or a
-        picture does not have as many tokens as the card says.
-        """
+        """Load a projector. Raises UserError if it is none, not of this model, or not what the card says."""
         shown = f"model {name!r} with projector {printable(file)}"
         try:
             m = import_module("llama_cpp.mtmd_cpp")
@@ -91,9 +84,9 @@ class Projector:
         if m.mtmd_decode_use_non_causal(self._context, None):
             raise UserError(f"{shown}: its pictures' tokens see those behind them, which is not done here")
         self._mrope: bool = m.mtmd_decode_use_mrope(self._context)
-        self._images: WeakValueDictionary[int, Image] = WeakValueDictionary()
+        self._pictures = Pictures(lambda images: [self._encode(image) for image in images])
+        self.forget = self._pictures.forget
         self._layouts: dict[tuple[int, ...], list[Sequence[int] | int]] = {}
-        self._encoded: OrderedDict[int, dict[int, Run]] = OrderedDict()
         count = sum(n for n in self._layout((vision.height_px, vision.width_px)) if isinstance(n, int))
         if count != vision.tokens:
             raise UserError(
@@ -104,27 +97,15 @@ class Projector:
     def tokens(self, image: Image) -> list[int]:
         """Return the tokens that stand for a picture; the `Image` must stay alive until they are read."""
         layout = self._layout(image.pixels.shape[:2])
-        numbers = picture_tokens(image, sum(part for part in layout if isinstance(part, int)))
-        self._images[locate_picture(numbers[0])[0]] = image
-        remaining = iter(numbers)
+        tokens = self._pictures.add(image, sum(part for part in layout if isinstance(part, int)))
+        remaining = iter(tokens)
         return [t for part in layout for t in (islice(remaining, part) if isinstance(part, int) else part)]
 
     def run(self, token: int) -> Run:
         """Return the part of a picture that begins with a token. Raises LookupError if it is gone."""
-        key, place = locate_picture(token)
-        if key not in self._encoded:
-            if (image := self._images.get(key)) is None:
-                raise LookupError("a picture is gone that a prompt's tokens stand for; look at it again")
-            self._encoded[key] = self._encode(image)
-            if len(self._encoded) > KEPT:
-                self._encoded.popitem(last=False)
-        self._encoded.move_to_end(key)
-        return self._encoded[key][place]
-
-    def forget(self, tokens: Sequence[int]) -> None:
-        """Drop the encodings of the pictures among some tokens, so that they are encoded again."""
-        for key in {locate_picture(token)[0] for token in tokens if token < 0}:
-            self._encoded.pop(key, None)
+        number, place = locate_picture(token)
+        [runs] = self._pictures.encodings([number])
+        return runs[place]
 
     def _layout(self, shape: tuple[int, ...]) -> list[Sequence[int] | int]:
         """Return the token ids of each marker and the token count of each picture part, in order.

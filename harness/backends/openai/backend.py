@@ -42,11 +42,8 @@ def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
 class OpenAIBackend:
     """A model behind one or several servers.
 
-    Requests are sent concurrently, each by itself, so `complete` may be called during another call.
-    Connections stay open between calls.
-
-    Attributes:
-        window: most requests that are sent at once.
+    Requests are sent concurrently, at most `window` at once and each by itself, so `complete` may be called
+    during another call. Connections stay open between calls.
     """
 
     def __init__(self, card: Card, server: Server, batch_size: int) -> None:
@@ -196,7 +193,6 @@ class OpenAIBackend:
 
 def _over_orders(request: Request, completions: Sequence[Completion]) -> Completion:
     """Return the completion of a read-out over several orders; if one failed, that one."""
-    first = completions[0]
     retries = sum(completion.retries for completion in completions)
     if broken := next((completion for completion in completions if completion.error), None):
         return replace(broken, request_id=request.id, retries=retries)
@@ -212,11 +208,10 @@ def _over_orders(request: Request, completions: Sequence[Completion]) -> Complet
         for completion, share in zip(completions, shares, strict=True)
     ]
     seconds = total(completion.seconds for completion in completions)
-    return replace(
-        first, prompt_tokens=total(completion.prompt_tokens for completion in completions),
-        seconds=seconds, first_token_s=seconds, retries=retries,
-        **asdict(average_orders(request.actions, letters_p)),
-    )  # fmt: skip
+    costs = {"seconds": seconds, "first_token_s": seconds, "retries": retries}
+    prompt_tokens = total(completion.prompt_tokens for completion in completions)
+    average = asdict(average_orders(request.actions, letters_p))
+    return replace(completions[0], prompt_tokens=prompt_tokens, **costs, **average)
 
 
 class _Loop:
@@ -230,7 +225,6 @@ class _Loop:
         self.run(client.__aenter__())
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """Run a coroutine in the loop and return its result; an interrupt cancels it."""
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result()

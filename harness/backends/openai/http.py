@@ -35,9 +35,21 @@ _UNREACHED = (aiohttp.ClientConnectorError, aiohttp.ConnectionTimeoutError, aioh
 class Reply:
     """Result of one request."""
 
-    payload: Any = None  # the JSON value; None on a fault
-    fault: str | None = None  # why there is no payload; printable and of limited length
-    # HTTP status, or that of an error inside an answer with 200; None without a response
+    Attributes:
+        payload: the JSON value; None on a fault.
+        fault: why there is no payload; printable and of limited length.
+        status: HTTP status, or that of an error inside an answer with 200; None without a response.
+        unreached: whether there was no connection at all.
+        again: whether another attempt may succeed.
+        after_s: seconds that the server asks to wait before another attempt.
+        first_at_s: when the first text of a stream came, by `time.perf_counter`; None if it is not known.
+        retries: earlier failed attempts at the server that gave this reply.
+        begun_s: when the first attempt began, by `time.perf_counter`.
+        alone: whether the server had no other request of this program at the time.
+    """
+
+    payload: Any = None
+    fault: str | None = None
     status: int | None = None
     unreached: bool = False  # whether there was no connection at all
     again: bool = False  # whether another attempt may succeed
@@ -51,10 +63,7 @@ class Reply:
 
 
 class Client:
-    """Sends requests to servers with one key. Redirects are not followed, since they would carry the key.
-
-    Inside `async with` connections stay open; their number is not limited.
-    """
+    """Sends requests to servers with one key. Redirects are not followed, since they would carry the key."""
 
     def __init__(self, server: Server) -> None:
         self._server = server
@@ -82,7 +91,6 @@ class Client:
         return await self._once(method, base, url, content, min(CONNECT_S, self._server.timeout_s))
 
     async def post(self, base: str, path: str, content: bytes) -> Reply:
-        """Send JSON to a server."""
         return await self._once("POST", base, base + path, content, self._server.timeout_s)
 
     async def _once(self, method: str, base: str, url: str, content: bytes | None, within_s: float) -> Reply:
@@ -162,7 +170,6 @@ def _key(server: Server) -> str | None:
 
 
 def _proxy(url: str) -> str | None:
-    """Return the HTTP proxy that the environment names for a URL, if any."""
     parts, proxies = urlsplit(url), getproxies()
     if proxy_bypass(parts.hostname or ""):
         return None

@@ -63,15 +63,7 @@ class ServerPool:
     """
 
     def __init__(self, client: Client, settings: Server, name: str, weights: str, at_once: int) -> None:
-        """Prepare a pool, which `open` connects.
-
-        Args:
-            client: sends single requests.
-            settings: the servers' URLs and the number of retries.
-            name: name of the card, for messages.
-            weights: the servers' name of the model.
-            at_once: most requests that one server gets at once.
-        """
+        """Prepare a pool, which `open` connects. One server gets `at_once` requests at most."""
         self._client, self._settings, self._name, self._weights = client, settings, printable(name), weights
         self._at_once = at_once
         self._servers = [_ServerState(url) for url in settings.urls]
@@ -122,7 +114,6 @@ class ServerPool:
     # -- who is asked ---------------------------------------------------------------------------------------
 
     def _rank(self, key: str) -> list[_ServerState]:
-        """Return the servers in the order of a key."""
         if len(self._servers) == 1:
             return self._servers
         weights = {s: blake2b(f"{s.url} {key}".encode(), digest_size=8).digest() for s in self._servers}
@@ -149,7 +140,6 @@ class ServerPool:
                     self._run(self._work(server, pending))
 
     def _next(self, server: _ServerState) -> _Pending | None:
-        """Take the next request from a server's own queue."""
         while server.queue:
             if not (pending := server.queue.popleft()).reply.done():  # its caller may have been cancelled
                 return pending
@@ -165,7 +155,6 @@ class ServerPool:
         return queue.pop() if queue and not queue[-1].failed[server] else None
 
     async def _work(self, server: _ServerState, pending: _Pending | None) -> None:
-        """Send a server one request after another until none is left for it."""
         while pending:
             try:
                 await self._ask(server, pending)
@@ -261,7 +250,6 @@ class ServerPool:
         return "; ".join(f"{printable(server.url)} ({server.fault})" for server in self._servers)
 
     def say(self, line: str) -> None:
-        """Print a line about the model on stderr."""
         print(f"harness: model {self._name!r}: {line}", file=sys.stderr)
 
     # -- what they have -------------------------------------------------------------------------------------

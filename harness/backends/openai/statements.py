@@ -48,9 +48,8 @@ class Model(NamedTuple):
     def covers(self, earlier: "Model") -> bool:
         """Whether it states all that an earlier statement did; a server that is loading states less."""
         lists = earlier.listed is None or self.listed is not None
-        return lists and (earlier.version is None or self.version is not None) and all(
-            name in self.states for name in earlier.states
-        )  # fmt: skip
+        tells_version = earlier.version is None or self.version is not None
+        return lists and tells_version and earlier.states.keys() <= self.states.keys()
 
 
 async def stated(kind: Kind, weights: str, models: Any, ask: Ask) -> Model:

@@ -22,7 +22,7 @@ class Stream:
     Attributes:
         fault: why it is no completion, with text of the server of any length; None once it is one.
         again: whether another attempt may succeed.
-        code: the HTTP status that an error in it would have had; None if there is none, or it states none.
+        code: the HTTP status that an error in it would have had; None if it states none.
     """
 
     def __init__(self) -> None:

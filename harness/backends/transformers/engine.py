@@ -194,7 +194,6 @@ class TransformersEngine:
 
     @cached_property
     def _files_sha256(self) -> str:
-        """Digest of the files that decide the answers, by name and content."""
         files = sorted(p for p in self.where.iterdir() if p.is_file() and p.suffix in _HASHED)
         return digest({path.name: sha256_file(path) for path in files})
 

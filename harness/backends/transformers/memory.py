@@ -59,12 +59,10 @@ class PagedLayer(DynamicLayer):  # type: ignore[misc]  # transformers is untyped
             memory[index, :, : states.shape[-2]] = states
 
     def reset(self) -> None:
-        """Let go of everything."""
         self._memory = []
         super().reset()
 
     def batch_select_indices(self, indices: Any) -> None:
-        """Keep these rows, in this order."""
         end = self.keys.shape[-2]
         held = [memory[indices] for memory in self._memory or (self.keys, self.values)]
         self._memory = held if self._memory else []
@@ -133,7 +131,6 @@ class Prefixes:
         return Prefix(nearest.ids[:most], layers)
 
     def holds(self, ids: list[int]) -> bool:
-        """Whether a whole prompt is kept."""
         return any(kept.ids == ids for kept in self._kept)
 
     def keep(self, prefix: Prefix) -> None:
@@ -143,5 +140,4 @@ class Prefixes:
             del self._kept[0]
 
     def clear(self) -> None:
-        """Drop all beginnings."""
         self._kept.clear()

@@ -48,7 +48,6 @@ class Processor:
         self.tokens = self.measured(blank)[0]
 
     def __call__(self, pictures: list[Pixels]) -> "Mapping[str, torch.Tensor]":
-        """Return the inputs of the model's vision encoder."""
         # A model that scales to one size takes one list of pictures for each row.
         images = [[pixels] for pixels in pictures] if "max_image_size" in self._options else pictures
         inputs: Mapping[str, torch.Tensor] = self._processor(

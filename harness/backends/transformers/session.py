@@ -119,7 +119,6 @@ class Reader:
         return [sorted(piece) for piece in pieces]
 
     def cache(self) -> Cache:
-        """Return an empty cache of the model's layers."""
         cache = DynamicCache(config=self._model.config)
         if self.together:
             cache.layers = [PagedLayer() for _ in cache.layers]
@@ -315,7 +314,6 @@ class Rows:
 
 
 def _log_probs(logits: Any, tokens: Sequence[int] | None) -> Floats:
-    """Return the log-probabilities of some or all tokens, from logits (n, vocabulary)."""
     logits = logits.float()
     check_logits(logits.amax(-1).tolist())
     selected = logits if tokens is None else logits[:, list(tokens)]

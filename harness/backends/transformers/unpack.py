@@ -98,7 +98,6 @@ def _unpack(file: Path, to: Path, shown: str) -> None:
 
 
 def _specials(values: Mapping[str, Any]) -> dict[str, str]:
-    """Return the texts of special tokens, such as `bos_token`."""
     ids = {name: values.get(f"tokenizer.ggml.{key}_token_id") for name, key in _SPECIALS.items()}
     tokens = values["tokenizer.ggml.tokens"]
     return {f"{name}_token": tokens[number] for name, number in ids.items() if number is not None}

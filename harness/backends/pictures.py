@@ -1,0 +1,64 @@
+"""The pictures that tokens of prompts stand for, and the encodings of those that were used last.
+
+A picture's tokens are negative numbers, the same in every engine and process: digits of its digest, then bits
+of the token's place in it. It is encoded when they are first read, as part of an answer's time.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from typing import Generic, TypeVar
+from weakref import WeakValueDictionary
+
+from harness.core.image import Image
+
+T = TypeVar("T")
+KEPT = 64  # encodings that are kept: those of a chunk of requests, for repair turns and fusion calls
+_PLACE_BITS, _DIGITS = 16, 10
+
+
+def locate_picture(token: int) -> tuple[int, int]:
+    """Return the number of the picture that a token belongs to, and the token's place in it."""
+    return divmod(-1 - token, 1 << _PLACE_BITS)
+
+
+def pictures_in(tokens: Iterable[int]) -> list[int]:
+    """Return the numbers of the pictures whose first token is among these, in order."""
+    located = (locate_picture(token) for token in tokens if token < 0)
+    return [number for number, place in located if place == 0]
+
+
+class Pictures(Generic[T]):
+    """Pictures by number, with what an engine's `encode` makes of each."""
+
+    def __init__(self, encode: Callable[[list[Image]], list[T]]) -> None:
+        self._encode = encode
+        self._images: WeakValueDictionary[int, Image] = WeakValueDictionary()
+        self._encoded: OrderedDict[int, T] = OrderedDict()  # the least recently used come first
+
+    def add(self, image: Image, count: int) -> list[int]:
+        """Return a picture's `count` tokens; the `Image` must stay alive until they are read."""
+        number = int(image.sha256[:_DIGITS], 16)
+        self._images[number] = image
+        return [-1 - ((number << _PLACE_BITS) | place) for place in range(count)]
+
+    def image(self, number: int) -> Image:
+        """Return a picture. Raises LookupError if it is not alive."""
+        if (image := self._images.get(number)) is None:
+            raise LookupError("a picture is gone that a prompt's tokens stand for; look at it again")
+        return image
+
+    def encodings(self, numbers: Sequence[int]) -> list[T]:
+        """Return the encodings of some pictures; those that are not kept are encoded together."""
+        if new := [number for number in dict.fromkeys(numbers) if number not in self._encoded]:
+            self._encoded |= zip(new, self._encode([self.image(number) for number in new]), strict=True)
+        for number in numbers:
+            self._encoded.move_to_end(number)
+        encodings = [self._encoded[number] for number in numbers]
+        while len(self._encoded) > KEPT:
+            self._encoded.popitem(last=False)
+        return encodings
+
+    def forget(self, tokens: Iterable[int]) -> None:
+        """Drop the encodings of the pictures among some tokens, so that they are encoded again."""
+        for number in {locate_picture(token)[0] for token in tokens if token < 0}:
+            self._encoded.pop(number, None)
