@@ -1,6 +1,6 @@
 """A GGUF's chat template, rendered without transformers as transformers renders it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ class Words:
     """What a GGUF file says of text, its bytes as tokens."""
 
     template: str
-    specials: dict[str, str] = field(default_factory=lambda: {"eos_token": "<|im_end|>"})
+    specials: Mapping[str, str] = field(default_factory=lambda: {"eos_token": "<|im_end|>"})
     bos: int | None = None
     vocabulary: int = 256
 

@@ -26,60 +26,44 @@ AGAIN = "#2"  # suffix of the id of a repair turn's request
 
 @dataclass(frozen=True)
 class Request:
-    """One question to a small language model.
+    """One question to a small language model."""
 
-    Attributes:
-        id: unique in a run, `<scene>/<viewer>`; a repair turn has the suffix `AGAIN`.
-        role: which prompt of the version was rendered, and which schema the answer has.
-        messages: chat messages, `{"role": "system" | "user" | "assistant", "content": text}`.
-        orders: of a read-out over cyclic orders, the chat with each further order of the actions behind the
-            letters; empty if the letters are read once.
-        flips: of a read-out, its chats with the list of actions reversed, `messages` and `orders`, which are
-            asked as a request of their own (`harness.evaluate.flip`); empty if that is not asked.
-        actions: meta-action names, in the environment's order.
-        max_tokens: most tokens the answer may have.
-        form: what the prompt asks for (`Prompt.form`).
-        answer: how the model answers. `json`: it writes freely. `constrained`: it fills in numbers and
-            choices of a fixed text. `readout`: the messages ask for one letter (`harness.prompts.readout`),
-            and the letters' probabilities are the answer.
-        extension: further members of its answer (`Shape.extension`).
-        sums: whether probabilities of `json` that sum to other than 1 fail the answer, or are divided by
-            their
-            sum.
-        thinking: whether the model is asked to think first (if its template can switch that).
-        reasons_first: whether the prompt asks for reasons before the answer.
-        temperature: 0 takes the likeliest token; above, tokens are drawn from softmax(logits / temperature).
-        sample: number of the answer among several to one question, which seeds its draws; 0 if there is one.
-        timed: whether the answer's time is measured; a server then streams it, which shows the first token.
-        agent: which of the run's agents is asked: 0 is the ego's.
-        image: the picture before the text of the last user message; None if there is none.
-        view: the viewer's own scene graph, for backends without a language model; it holds nothing that the
-            prompt's author could not see.
-        truth: scene graph with everything in view; None unless the card is `privileged`.
-        scenario: scenario of the view; only backends that read the view read it.
-    """
-
-    id: str
-    role: Role
+    id: str  # unique in a run, `<scene>/<viewer>`; a repair turn has the suffix `AGAIN`
+    role: Role  # which prompt of the version was rendered, and which schema the answer has
+    # chat messages, `{"role": "system" | "user" | "assistant", "content": text}`
     messages: tuple[Mapping[str, str], ...]
-    actions: tuple[str, ...]
-    max_tokens: int
-    form: str = "distribution"
+    actions: tuple[str, ...]  # meta-action names, in the environment's order
+    max_tokens: int  # most tokens the answer may have
+    form: str = "distribution"  # what the prompt asks for (`Prompt.form`)
+    # how the model answers. `json`: it writes freely. `constrained`: it fills in numbers and choices of a
+    # fixed text. `readout`: the messages ask for one letter (`harness.prompts.readout`), and the letters'
+    # probabilities are the answer.
     answer: AnswerMode = "json"
+    # of a read-out over cyclic orders, the chat with each further order of the actions behind the letters;
+    # empty if the letters are read once
     orders: tuple[tuple[Mapping[str, str], ...], ...] = ()
+    # of a read-out, its chats with the list of actions reversed, `messages` and `orders`, which are asked as
+    # a request of their own (`harness.evaluate.flip`); empty if that is not asked
     flips: tuple[tuple[Mapping[str, str], ...], ...] = ()
-    extension: str = ""
+    extension: str = ""  # further members of its answer (`Shape.extension`)
+    # whether probabilities of `json` that sum to other than 1 fail the answer, or are divided by their sum
     sums: Sums = "refuse"
-    thinking: bool = False
-    reasons_first: bool = False
+    thinking: bool = False  # whether the model is asked to think first (if its template can switch that)
+    reasons_first: bool = False  # whether the prompt asks for reasons before the answer
+    # 0 takes the likeliest token; above, tokens are drawn from softmax(logits / temperature)
     temperature: float = 0.0
+    # number of the answer among several to one question, which seeds its draws; 0 if there is one
     sample: int = 0
+    # whether the answer's time is measured; a server then streams it, which shows the first token
     timed: bool = False
-    agent: int = 0
-    image: Image | None = None
+    agent: int = 0  # which of the run's agents is asked: 0 is the ego's
+    image: Image | None = None  # the picture before the text of the last user message; None if there is none
+    # the viewer's own scene graph, for backends without a language model; it holds nothing that the prompt's
+    # author could not see
     view: Mapping[str, Any] | None = None
+    # scene graph with everything in view; None unless the card is `privileged`
     truth: Mapping[str, Any] | None = None
-    scenario: "Scenario | None" = None
+    scenario: "Scenario | None" = None  # scenario of the view; only backends that read the view read it
 
     @property
     def shape(self) -> Shape:
@@ -111,47 +95,35 @@ def split_by_scenario(requests: Sequence[Request]) -> list[list[Request]]:
 
 @dataclass(frozen=True)
 class Completion:
-    """One answer to a request.
-
-    Attributes:
-        text: the model's text, unchanged; empty on an error.
-        prompt_tokens: tokens of the prompt; None if the engine has no tokenizer. Of several orders, what they
-            begin with counts once in process, and as often as a server counts it.
-        completion_tokens: tokens of the answer; None if the engine has no tokenizer.
-        finish_reason: `stop`, `length` (cut off by max_tokens) or `error`.
-        seconds: time of this answer if its request ran alone (batch_size 1), else None: the wall time of a
-            batch is not the latency of an answer.
-        batch_size: number of requests that went through the engine together.
-        error: the engine's message if finish_reason is `error`.
-        label_mass: total probability of the letters in a `readout`; None otherwise.
-        retries: failed attempts before this one; their time is in `seconds`.
-        cached: whether it comes from the cache, in which case it has no seconds.
-        slow_s: declared seconds of this answer beyond its card's latency (the slow tail of a proxy).
-        first_token_s: time to first token (TTFT), prefill included; None if it is not known.
-        token_s: time per output token (TPOT, see `per_token_s`); None if there is only one token.
-        letter_share: how much of a read-out over several orders follows the letter, 0 to 1
-            (`harness.backends.orders`); None otherwise, like the next.
-        follows_letter: whether one letter is the likeliest in every order.
-        flipped: of a replayed read-out, whether its likeliest action changed in the reversed list; None where
-            that is not known.
-    """
+    """One answer to a request."""
 
     request_id: str
-    text: str
+    text: str  # the model's text, unchanged; empty on an error
+    # tokens of the prompt; None if the engine has no tokenizer. Of several orders, what they begin with
+    # counts once in process, and as often as a server counts it.
     prompt_tokens: int | None
-    completion_tokens: int | None
-    finish_reason: FinishReason
+    completion_tokens: int | None  # tokens of the answer; None if the engine has no tokenizer
+    finish_reason: FinishReason  # `stop`, `length` (cut off by max_tokens) or `error`
+    # time of this answer if its request ran alone (batch_size 1), else None: the wall time of a batch is not
+    # the latency of an answer
     seconds: float | None
-    batch_size: int
-    error: str | None = None
-    label_mass: float | None = None
-    retries: int = 0
-    cached: bool = False
+    batch_size: int  # number of requests that went through the engine together
+    error: str | None = None  # the engine's message if finish_reason is `error`
+    label_mass: float | None = None  # total probability of the letters in a `readout`; None otherwise
+    retries: int = 0  # failed attempts before this one; their time is in `seconds`
+    cached: bool = False  # whether it comes from the cache, in which case it has no seconds
+    # declared seconds of this answer beyond its card's latency (the slow tail of a proxy)
     slow_s: float = 0.0
+    # time to first token (TTFT), prefill included; None if it is not known
     first_token_s: float | None = None
+    # time per output token (TPOT, see `per_token_s`); None if there is only one token
     token_s: float | None = None
+    # how much of a read-out over several orders follows the letter, 0 to 1 (`harness.backends.orders`); None
+    # otherwise, like the next
     letter_share: float | None = None
-    follows_letter: bool | None = None
+    follows_letter: bool | None = None  # whether one letter is the likeliest in every order
+    # of a replayed read-out, whether its likeliest action changed in the reversed list; None where that is
+    # not known
     flipped: bool | None = None
 
 

@@ -21,17 +21,12 @@ Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z", description="64 digits 
 
 @dataclass(frozen=True)
 class Latency:
-    """Declared time of one answer.
+    """Declared time of one answer."""
 
-    Attributes:
-        source: `card` means `inference_s`; `paper`, for a card that declares no time, the paper's 145 ms.
-        inference_s: declared seconds of one answer; None for the paper's.
-        basis: where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date".
-    """
-
+    # `card` means `inference_s`; `paper`, for a card that declares no time, the paper's 145 ms
     source: LatencySource
-    inference_s: Seconds | None
-    basis: str
+    inference_s: Seconds | None  # declared seconds of one answer; None for the paper's
+    basis: str  # where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date"
 
     def __post_init__(self) -> None:
         if (self.source == "card") != (self.inference_s is not None):
@@ -40,58 +35,45 @@ class Latency:
 
 @dataclass(frozen=True)
 class Card:
-    """One model on one engine.
+    """One model on one engine."""
 
-    Attributes:
-        name: file stem of the card, `<stem>:<engine>`, name of the directory or GGUF file, hub id, or
-            `replay:<run>`.
-        description: one line for people.
-        weights: directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for
-            `replay`; the server's name of the model for `openai`; None without a model.
-        file: name of the GGUF file in `weights`; None if `weights` is the file itself, or no file is needed.
-        revision: branch, tag or commit on the hub; None means its default branch.
-        sha256: digest of the GGUF file, or of a checkpoint's model.safetensors, checked on loading.
-        gated: whether the hub gives the weights only to those who have accepted their licence there.
-        dtype: number format of a checkpoint's weights; `auto` is the checkpoint's own.
-        quantisation: number format of a GGUF file's weights, for people only; the file decides.
-        context_tokens: most tokens of prompt and answer together; None means the checkpoint's own limit.
-        thinking: `switch` if its chat template can turn thinking on and off, `always` if it cannot be off.
-        privileged: whether it sees the truth behind the occlusion: an upper reference, never a contestant.
-        licence: SPDX id of the weights' licence, or its name if it has no id.
-        max_new_tokens: most tokens of an answer, if the model needs another limit than its prompt's.
-        thinking_tokens: most tokens of a thought, in addition to the answer's, if asked to think.
-        server: the server of an `openai` model.
-        failures: how often the proxy fails on purpose.
-        vision: how the model takes pictures; None if it only reads text.
-        projector: name of the GGUF file beside `file` that turns pictures into tokens.
-        letters: `raw` for a model that was trained to answer by the letters in one order; None, or `cyclic`,
-            averages a read-out over their orders, unless `--letters` says otherwise.
-        system: `first-user` puts the system text at the beginning of the first user turn, for a chat template
-            that has no place for it; None gives it a message of its own.
-    """
-
+    # file stem of the card, `<stem>:<engine>`, name of the directory or GGUF file, hub id, or `replay:<run>`
     name: str
     engine: str
-    description: str
+    description: str  # one line for people
     latency: Latency
+    # directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for `replay`;
+    # the server's name of the model for `openai`; None without a model
     weights: str | None = None
+    # name of the GGUF file in `weights`; None if `weights` is the file itself, or no file is needed
     file: str | None = None
-    revision: str | None = None
+    revision: str | None = None  # branch, tag or commit on the hub; None means its default branch
+    # digest of the GGUF file, or of a checkpoint's model.safetensors, checked on loading
     sha256: Sha256 | None = None
+    # whether the hub gives the weights only to those who have accepted their licence there
     gated: bool = False
-    dtype: Dtype = "auto"
+    dtype: Dtype = "auto"  # number format of a checkpoint's weights; `auto` is the checkpoint's own
+    # number format of a GGUF file's weights, for people only; the file decides
     quantisation: str | None = None
+    # most tokens of prompt and answer together; None means the checkpoint's own limit
     context_tokens: Count | None = None
+    # `switch` if its chat template can turn thinking on and off, `always` if it cannot be off
     thinking: Thinking = "none"
+    # whether it sees the truth behind the occlusion: an upper reference, never a contestant
     privileged: bool = False
-    licence: str | None = None
+    licence: str | None = None  # SPDX id of the weights' licence, or its name if it has no id
+    # most tokens of an answer, if the model needs another limit than its prompt's
     max_new_tokens: Count | None = None
-    thinking_tokens: Count = 2048
-    server: Server | None = None
-    failures: Failures | None = None
-    vision: Vision | None = None
-    projector: str | None = None
+    thinking_tokens: Count = 2048  # most tokens of a thought, in addition to the answer's, if asked to think
+    server: Server | None = None  # the server of an `openai` model
+    failures: Failures | None = None  # how often the proxy fails on purpose
+    vision: Vision | None = None  # how the model takes pictures; None if it only reads text
+    projector: str | None = None  # name of the GGUF file beside `file` that turns pictures into tokens
+    # `first-user` puts the system text at the beginning of the first user turn, for a chat template that has
+    # no place for it; None gives it a message of its own
     system: System | None = None
+    # `raw` for a model that was trained to answer by the letters in one order; None, or `cyclic`, averages a
+    # read-out over their orders, unless `--letters` says otherwise
     letters: Letters | None = None
 
     @property

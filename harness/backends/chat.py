@@ -19,23 +19,12 @@ _TURN = ({"role": "user", "content": "?"}, {"role": "assistant", "content": _ANS
 
 
 class Tokenizer(Protocol):
-    """A model's tokenizer, which comes with a chat template.
+    """A model's tokenizer, which comes with a chat template."""
 
-    Attributes:
-        template: the template's Jinja text.
-        specials: texts of special tokens by their name in a chat template, such as `bos_token`.
-        bos: id of the token that begins a sequence; None if there is none.
-        vocabulary: number of tokens.
-    """
-
-    @property
-    def template(self) -> str: ...
-    @property
-    def specials(self) -> Mapping[str, str]: ...
-    @property
-    def bos(self) -> int | None: ...
-    @property
-    def vocabulary(self) -> int: ...
+    template: str  # the template's Jinja text
+    specials: Mapping[str, str]  # texts of special tokens by their name in a template, such as `bos_token`
+    bos: int | None  # id of the token that begins a sequence; None if there is none
+    vocabulary: int  # number of tokens
 
     def encode(self, text: str) -> list[int]:
         """Return the token ids of a rendered prompt, in which the template has already written any BOS."""
@@ -89,11 +78,8 @@ class HubTokenizer:
 class Chat:
     """A tokenizer with its chat template; `encode`, `decode` and `pieces` are the tokenizer's.
 
-    Attributes:
-        name: name of the model.
-        tokenizer: its tokenizer.
-        image_token: token that the template writes for a picture; None if the model takes none.
-        system: where the system text stands: `first-user`, or None for a message of its own.
+    The template writes `image_token` for a picture; None if the model takes none. The system text stands in
+    the first user turn (`system` is `first-user`), or in a message of its own (None).
     """
 
     def __init__(

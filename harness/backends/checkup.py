@@ -55,7 +55,7 @@ class Checkup:
     # its token ids, each with its text; None if only a server knows them
     tokens: list[tuple[int, str]] | None
     # number of BOS tokens that it begins with; more than one harms most models. Further on, BOS may be the
-    # mark of a turn
+    # mark of a turn.
     bos_tokens: int | None
     # text of the token with which its chat template ends an answer; None if there is no such token, and for a
     # server's

@@ -44,15 +44,10 @@ class Decoding:
         return request.max_tokens
 
     def answer(self, requests: Sequence[Request], orders: Sequence[Sequence[list[int]]]) -> list[Completion]:
-        """Answer requests of one answer mode, for each of which there is `room`.
+        """Answer requests of one answer mode, for each of which there is `room`; count no prompt tokens.
 
-        Args:
-            requests: the requests.
-            orders: of each request its rendered messages, in tokens; of a read-out over several orders the
-                messages with each, equally many.
-
-        Returns:
-            Completions in order, without prompt tokens. A read-out's first token comes when it is complete.
+        `orders` has each request's rendered messages, in tokens; of a read-out over several orders the
+        messages with each, equally many. The first token of a read-out comes when it is complete.
         """
         start_s = time.perf_counter()
         prompts = [prompt for prompt, *_ in orders]

@@ -17,17 +17,11 @@ class Session(Protocol):
     """n sequences that advance together, each with a distribution over its next token."""
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
-        """Return the most likely next token of each sequence, among the tokens listed for it (None: all).
-
-        The lowest id wins a tie.
-        """
+        """Return the most likely next token of each sequence among some (None: all); the lowest of equals."""
         ...
 
     def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
-        """Return the natural log-probabilities of some or all tokens as the next one.
-
-        They are normalised over the whole vocabulary. Shape (n, len(tokens)), or (n, vocabulary).
-        """
+        """Return log-probabilities over the vocabulary of some next tokens (None: all), (n, tokens)."""
         ...
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:

@@ -20,12 +20,12 @@ class Failures:
     A text is spoilt in one way at most; any answer may be slow as well.
     """
 
-    fence: Share = 0.0  # the answer is in a code fence. Recovered
-    prose: Share = 0.0  # the answer is between sentences. Recovered
-    truncation: Share = 0.0  # the answer is cut off inside its JSON. Failed, `truncated_json`
-    nan: Share = 0.0  # one probability is NaN. Failed, `non_finite`
-    unknown_action: Share = 0.0  # no action's name is one of the scenario's. Failed, `unknown_action`
-    unclosed_think: Share = 0.0  # the answer is in a thought that never ends. Failed, `truncated_reasoning`
+    fence: Share = 0.0  # the answer is in a code fence. Recovered.
+    prose: Share = 0.0  # the answer is between sentences. Recovered.
+    truncation: Share = 0.0  # the answer is cut off inside its JSON. Failed, `truncated_json`.
+    nan: Share = 0.0  # one probability is NaN. Failed, `non_finite`.
+    unknown_action: Share = 0.0  # no action's name is one of the scenario's. Failed, `unknown_action`.
+    unclosed_think: Share = 0.0  # the answer is in a thought that never ends. Failed, `truncated_reasoning`.
     slow_tail: Share = 0.0  # the answer takes `slow_s` seconds longer than the card's latency
     slow_s: Seconds = 0.0
 

@@ -37,21 +37,12 @@ class Moved(Struct, frozen=True):
 class Findings(Struct, frozen=True):
     """What fixed questions showed of a model."""
 
-    Attributes:
-        prompt: the prompt version that they were asked with.
-        letters: how the letters of the pairs were read, `raw` or `cyclic`.
-        n: number of questions that were read over cyclic orders.
-        letter_share: mean share of the variance that followed the letter.
-        follows_letter: in how many questions one letter was the likeliest in every order.
-        label_mass: mean probability of the letters.
-    """
-
-    prompt: str
-    letters: str
-    n: int
-    letter_share: float
-    follows_letter: int
-    label_mass: float
+    prompt: str  # the prompt version that they were asked with
+    letters: str  # how the letters of the pairs were read, `raw` or `cyclic`
+    n: int  # number of questions that were read over cyclic orders
+    letter_share: float  # mean share of the variance that followed the letter
+    follows_letter: int  # in how many questions one letter was the likeliest in every order
+    label_mass: float  # mean probability of the letters
     pairs: tuple[Moved, ...]
 
     @property

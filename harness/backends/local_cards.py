@@ -23,10 +23,9 @@ _SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
 
 
 def local_card(text: str, engine: str | None) -> Card | None:
-    """Return the card of `replay:RUN_DIR`, a path or a hub id; None of another text.
+    """Return the card of `replay:RUN_DIR`, a path or a hub id, on `engine` if there is a choice, or None.
 
-    It runs on `engine`, if there is a choice. Raises UserError if there is no such file or run, or it does
-    not say how to open it.
+    Raises UserError if there is no such file or run, or it does not say how to open it.
     """
     kind, _, rest = text.partition(":")
     if kind == "replay":

@@ -18,7 +18,7 @@ LEAST_P = 1e-9  # a letter to which a server's list leaves nothing
 
 @dataclass(frozen=True)
 class AveragedReadOut:
-    """A read-out over all orders.
+    """A read-out over all orders."""
 
     text: str  # the answer
     label_mass: float  # total probability of the letters, the mean over the orders

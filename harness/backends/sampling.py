@@ -15,23 +15,17 @@ from harness.core.arrays import Floats
 
 
 class Choice:
-    """Chooses the tokens of some answers; each sampled token takes one uniform draw.
-
-    Attributes:
-        first_at_s: when the first token was chosen, by `time.perf_counter`; None before.
-        rounds: number of calls of `next`; for an answer that is asked alone, its number of chosen tokens.
-        draws: whether any token is drawn and not just the likeliest.
-    """
+    """Chooses the tokens of some answers; each sampled token takes one uniform draw."""
 
     def __init__(self, requests: Sequence[Request], prompts: Sequence[Sequence[int]]) -> None:
-        self.first_at_s: float | None = None
-        self.rounds = 0
+        self.first_at_s: float | None = None  # when the first token was chosen, by `time.perf_counter`
+        self.rounds = 0  # calls of `next`: the number of chosen tokens of an answer that is asked alone
         self._drawn = {
             place: (request.temperature, noise.generator("answer", tuple(ids), request.sample))
             for place, (request, ids) in enumerate(zip(requests, prompts, strict=True))
             if request.temperature
         }
-        self.draws = bool(self._drawn)
+        self.draws = bool(self._drawn)  # whether any token is drawn and not just the likeliest
 
     def next(
         self, session: Session, places: Sequence[int], among: Sequence[Sequence[int] | None]

@@ -40,7 +40,7 @@ class Fields:
     """
 
     max_tokens: _Sent = True  # most tokens of the answer
-    # 0, or that of `--temperature`. Left out, the server draws its answers as it likes
+    # 0, or that of `--temperature`. Left out, the server draws its answers as it likes.
     temperature: _Sent = True
     seed: _Sent = True  # number of the answer among several to one question
     top_p: _Sent = True  # 1, if answers are drawn
@@ -81,11 +81,11 @@ class Server:
     """A server that speaks OpenAI's chat completions."""
 
     # URL up to and with `/v1`; http or https, without credentials, query or fragment. With a list of servers,
-    # any of them may answer, and each must list the model
+    # any of them may answer, and each must list the model.
     base_url: str | tuple[str, ...]
     kind: Kind = "generic"  # decides how a constrained answer is asked for; `generic` is OpenAI's own way
     # environment variable with the key; it need not be set for a server without one. Its name tells that it
-    # is a key of models (`readable`), or the user lists it in SWARMDRIVE_KEYS
+    # is a key of models (`readable`), or the user lists it in SWARMDRIVE_KEYS.
     key_env: str = "OPENAI_API_KEY"
     # longest time of one attempt, from connecting to the last byte, in seconds
     timeout_s: Annotated[float, Meta(gt=0, le=float_info.max, description="seconds, more than 0")] = 120.0

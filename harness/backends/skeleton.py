@@ -33,19 +33,12 @@ class Branch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A place where the model decides, and then goes on in one of several branches.
+    """A place where the model decides, and then goes on in one of several branches."""
 
-    Attributes:
-        options: texts to choose from; one empty text where only the branch is chosen.
-        most: most characters of a text that the model writes instead of a choice; 0 for a choice.
-        branches: what may follow.
-        instead: what may stand here instead: the end of a list that has no numbers.
-    """
-
-    options: tuple[str, ...]
-    most: int
-    branches: tuple[Branch, ...]
-    instead: tuple[Branch, ...] = ()
+    options: tuple[str, ...]  # texts to choose from; one empty text where only the branch is chosen
+    most: int  # most characters of a text that the model writes instead of a choice; 0 for a choice
+    branches: tuple[Branch, ...]  # what may follow
+    instead: tuple[Branch, ...] = ()  # what may stand here instead: the end of a list that has no numbers
 
 
 def expand(schema: Mapping[str, Any], branches: Sequence[Branch]) -> list[Branch]:

@@ -22,9 +22,9 @@ class Vision:
     height_px: Count  # their height; even, since one camera's picture is above the other's
     patch_px: Count  # side of a patch
     merge: Count  # number of patches along a side of a token's square
-    # least area of a picture; a smaller one is enlarged. None if there is no limit
+    # least area of a picture; a smaller one is enlarged. None if there is no limit.
     least_px: Count | None = None
-    most_px: Count | None = None  # greatest area; a larger one is scaled down. None if there is no limit
+    most_px: Count | None = None  # greatest area; a larger one is scaled down. None if there is no limit.
     # width and height that every picture is scaled to; None if pictures keep their size
     scaled_to_px: tuple[Count, Count] | None = None
 
@@ -69,10 +69,8 @@ class Vision:
 def read_vision(config: Mapping[str, Any], processor: Mapping[str, Any]) -> Vision | None:
     """Return what a checkpoint's config.json and preprocessor_config.json state; None without vision.
 
-    Its pictures have `WIDE` x `HIGH` tokens, unless it scales them to a size of its own.
-
-    Raises:
-        LookupError, TypeError: the model is neither Qwen's nor Idefics3's kind, or a file is malformed.
+    Its pictures have `WIDE` x `HIGH` tokens, unless it scales them to a size of its own. Raises LookupError
+    or TypeError if the model is neither Qwen's nor Idefics3's kind, or a file is malformed.
     """
     vision = config.get("vision_config")
     if vision is None:

@@ -27,10 +27,7 @@ _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 
 
 def find_checkpoint(card: Card) -> Path:
-    """Find the directory of a card's checkpoint: as given, beside the cards, or in the hub's cache.
-
-    Raises UserError if it is not found, or lacks its config, weights or tokenizer.
-    """
+    """Find the directory of a card's checkpoint: as given, beside the cards, or in the hub's cache."""
     local = find("models", card.weights or "")
     where = local if local.is_dir() else _snapshot(card)
     if where is None:
@@ -61,10 +58,7 @@ def _check_files(card: Card, checkpoint: Path) -> None:
 
 
 def find_gguf(card: Card) -> Path:
-    """Find the GGUF file of a card: as given, beside the cards, out of a package, or in the hub's cache.
-
-    Raises UserError if the file is not found, or its projector is not beside it.
-    """
+    """Find the GGUF file of a card: as given, beside the cards, out of a package, or in the hub's cache."""
     if wanted := packages.find_packaged(card):
         if not wanted.place.is_file():
             raise UserError(
@@ -94,7 +88,7 @@ def is_gguf(card: Card) -> bool:
 
 
 def find_weights(card: Card) -> Path:
-    """Find the checkpoint's directory or the GGUF file of a card. Raises what finding either raises."""
+    """Find the checkpoint's directory or the GGUF file of a card. Raises UserError if it is not whole."""
     return find_gguf(card) if is_gguf(card) else find_checkpoint(card)
 
 

@@ -16,10 +16,7 @@ from harness.core.errors import UserError, printable
 def open(
     card: Card, *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> "LlamaBackend":
-    """Find and load a card's weights.
-
-    Raises UserError if the file is missing, an option is wrong, or llama.cpp refuses the file.
-    """
+    """Find and load a card's weights."""
     if dtype not in (None, "auto"):
         raise UserError(f"dtype {printable(dtype)!r}; a GGUF file has its own: leave it out, or give auto")
     return LlamaBackend(card, check_digest(card, find_gguf(card)), device, batch_size)

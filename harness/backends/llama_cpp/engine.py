@@ -27,10 +27,7 @@ _PICTURES = ("<|image_pad|>", "<image>")  # tokens that chat templates write for
 
 
 def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
-    """Load a GGUF file in this process, which llama.cpp may abort.
-
-    Raises UserError if llama.cpp refuses the file, its projector, the device or the batch size.
-    """
+    """Load a GGUF file in this process, which llama.cpp may abort."""
     os.environ.setdefault("GGML_NO_BACKTRACE", "1")  # a backtrace would start a debugger if there is one
     most = most_sequences() - BEGINNINGS
     if batch_size > most:
@@ -43,21 +40,13 @@ def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> La
 
 
 class _Group(NamedTuple):
-    """Prompts of a call that begin alike.
+    """Prompts of a call that begin alike."""
 
-    Attributes:
-        places: places of their sequences.
-        shared: what they begin with.
-        nearest: the kept beginning that the first is forked from.
-        known: number of tokens of it.
-        kept: most tokens of `shared` in any kept beginning.
-    """
-
-    places: list[int]
-    shared: list[int]
-    nearest: int
-    known: int
-    kept: int
+    places: list[int]  # places of their sequences
+    shared: list[int]  # what they begin with
+    nearest: int  # the kept beginning that the first is forked from
+    known: int  # number of tokens of it
+    kept: int  # most tokens of `shared` in any kept beginning
 
 
 class LlamaEngine:

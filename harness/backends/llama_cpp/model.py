@@ -1,7 +1,7 @@
 """Load a GGUF file with llama.cpp, in a child process since llama.cpp may abort its process."""
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,17 +30,7 @@ def last_error() -> str:
 
 
 class LlamaModel:
-    """A loaded model, and the `harness.backends.chat.Tokenizer` in its file.
-
-    Attributes:
-        pointer: llama.cpp's model.
-        vocabulary: number of tokens, with rows that have no token.
-        trained_tokens: length of the context that it was trained for.
-        dtype: number format of the weights, as llama.cpp names it.
-        stops: token ids that end an answer, sorted.
-        whole_state: whether a sequence's state cannot be cut (recurrent layers), so no beginning is shared.
-        device: `cpu` or `gpu`.
-    """
+    """A loaded model, and the `harness.backends.chat.Tokenizer` in its file."""
 
     def __init__(self, name: str, file: Path, device: str | None) -> None:
         c.llama_log_set(keep_errors, ctypes.c_void_p(0))
@@ -65,17 +55,19 @@ class LlamaModel:
         if not template:
             raise UserError(f"{shown} has no chat template; give the GGUF file of its instruct version")
         self.template: str = template.decode(errors="replace")
-        self.trained_tokens: int = c.llama_model_n_ctx_train(self.pointer)
+        self.trained_tokens: int = c.llama_model_n_ctx_train(self.pointer)  # length of its context
+        # Number format of the weights, as llama.cpp names it.
         self.dtype = self._described().split(" ", 2)[-1].removeprefix("all ")
         self.stops = [t for t in range(self.vocabulary) if c.llama_vocab_is_eog(self._vocab, t)]
         bos, eos = c.llama_vocab_bos(self._vocab), c.llama_vocab_eos(self._vocab)
         named = {"bos_token": bos, "eos_token": eos, "pad_token": c.llama_vocab_pad(self._vocab)}
-        self.specials = {
+        self.specials: Mapping[str, str] = {
             key: c.llama_vocab_get_text(self._vocab, token).decode(errors="replace")
             for key, token in named.items()
             if token >= 0
         }
         self.bos: int | None = bos if bos >= 0 else None
+        # Whether a sequence's state cannot be cut (recurrent layers), so that no beginning is shared.
         self.whole_state: bool = c.llama_model_is_recurrent(self.pointer) or c.llama_model_is_hybrid(
             self.pointer
         )

@@ -30,10 +30,7 @@ _CLOSED_S = 5.0  # longest wait for connections to close
 
 
 def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
-    """Connect to a card's servers.
-
-    Raises UserError if no server answers, one refuses the key, the key is malformed, or models differ.
-    """
+    """Connect to a card's servers. Raises UserError if none answers or takes the key, or models differ."""
     if card.server is None:
         raise ValueError(f"card {card.name} has no server")
     return OpenAIBackend(card, card.server, batch_size)

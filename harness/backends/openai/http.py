@@ -35,21 +35,9 @@ _UNREACHED = (aiohttp.ClientConnectorError, aiohttp.ConnectionTimeoutError, aioh
 class Reply:
     """Result of one request."""
 
-    Attributes:
-        payload: the JSON value; None on a fault.
-        fault: why there is no payload; printable and of limited length.
-        status: HTTP status, or that of an error inside an answer with 200; None without a response.
-        unreached: whether there was no connection at all.
-        again: whether another attempt may succeed.
-        after_s: seconds that the server asks to wait before another attempt.
-        first_at_s: when the first text of a stream came, by `time.perf_counter`; None if it is not known.
-        retries: earlier failed attempts at the server that gave this reply.
-        begun_s: when the first attempt began, by `time.perf_counter`.
-        alone: whether the server had no other request of this program at the time.
-    """
-
-    payload: Any = None
-    fault: str | None = None
+    payload: Any = None  # the JSON value; None on a fault
+    fault: str | None = None  # why there is no payload; printable and of limited length
+    # HTTP status, or that of an error inside an answer with 200; None without a response
     status: int | None = None
     unreached: bool = False  # whether there was no connection at all
     again: bool = False  # whether another attempt may succeed
@@ -59,7 +47,7 @@ class Reply:
     retries: int = 0  # earlier failed attempts at the server that gave this reply
     begun_s: float = 0.0  # when the first attempt began, by `time.perf_counter`
     alone: bool = False  # whether the server had no other request of this program at the time
-    url: str = ""  # base URL of the server
+    url: str = ""
 
 
 class Client:

@@ -255,10 +255,7 @@ class ServerPool:
     # -- what they have -------------------------------------------------------------------------------------
 
     async def _look(self, server: _ServerState) -> Model | None:
-        """Ask a server for its statement about the model; None if it does not answer.
-
-        Raises Unanswered if it refuses the key.
-        """
+        """Ask a server for its statement about the model; None if it does not answer."""
         reply = await self._client.get(server.url, server.url + "/models")
         server.fault = reply.fault or ""
         if reply.unreached or (reply.again and self._settings.any_may_answer):

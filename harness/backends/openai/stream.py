@@ -17,18 +17,13 @@ _CUT_OFF = "the stream ends before the answer does"
 
 
 class Stream:
-    """The received part of one completion.
-
-    Attributes:
-        fault: why it is no completion, with text of the server of any length; None once it is one.
-        again: whether another attempt may succeed.
-        code: the HTTP status that an error in it would have had; None if it states none.
-    """
+    """The received part of one completion."""
 
     def __init__(self) -> None:
+        # Why it is no completion, with text of the server of any length; None once it is one.
         self.fault: str | None = _CUT_OFF
-        self.again = True
-        self.code: int | None = None
+        self.again = True  # whether another attempt may succeed
+        self.code: int | None = None  # the HTTP status that an error in it would have had, if it states one
         self._rest = b""
         self._kind = b""  # of the event
         self._model: str | None = None

@@ -25,10 +25,7 @@ _HASHED = {".bin", ".jinja", ".json", ".model", ".safetensors", ".txt"}
 def open(
     card: Card, *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> LanguageModel:
-    """Find and load a card's weights.
-
-    Raises UserError if the device, the weights or the chat template is missing, or files do not load.
-    """
+    """Find and load a card's weights."""
     dtype = dtype or card.dtype
     if dtype not in get_args(Dtype):
         raise UserError(f"dtype {printable(dtype)!r}; allowed: {', '.join(get_args(Dtype))}")
@@ -41,10 +38,7 @@ def open(
 
 
 def checkpoint(card: Card) -> Path:
-    """Return the directory of a card's checkpoint, held to the card's digest; a GGUF file is unpacked.
-
-    Raises UserError if the weights are not found, are not what the card says, or cannot be unpacked.
-    """
+    """Return the directory of a card's checkpoint, held to the card's digest; a GGUF file is unpacked."""
     if not is_gguf(card):
         where = find_checkpoint(card)
         check_digest(card, where / "model.safetensors")
@@ -57,10 +51,7 @@ def checkpoint(card: Card) -> Path:
 
 
 def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]:
-    """Load the tokenizer and the model of a checkpoint.
-
-    Raises UserError if files do not load, weights do not fill the model, or there is no chat template.
-    """
+    """Load the tokenizer and the model of a checkpoint. Raises UserError if they do not go together."""
     import transformers
 
     transformers.utils.logging.set_verbosity_error()

@@ -70,10 +70,7 @@ class Processor:
 
 
 def tokens(card: Card) -> int:
-    """Return the number of tokens that a card's processor makes of a picture of the card's size.
-
-    Raises UserError if the checkpoint or its processor is missing.
-    """
+    """Return the number of tokens that a card's processor makes of a picture of the card's size."""
     if card.vision is None:
         raise ValueError(f"card {card.name} takes no pictures")
     return Processor(card.name, find_checkpoint(card), card.vision).tokens

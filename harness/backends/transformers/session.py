@@ -165,14 +165,10 @@ class Rows:
     def __init__(
         self, reader: Reader, parts: list[tuple[Sequence[int], Cache]], mask: Any, logits: Any, places: Any
     ) -> None:
-        """Hold sequences that were read.
+        """Hold what was read: caches with the places of their sequences, and the logits after each sequence.
 
-        Args:
-            reader: what reads.
-            parts: caches, each with the places of its sequences.
-            mask: 1 for a token and 0 for a pad, (n, columns), on the CPU.
-            logits: after each sequence, (n, vocabulary); None if nothing was read.
-            places: positions of each prompt's tokens; None if they are consecutive.
+        The mask is 1 for a token and 0 for a pad, (n, columns), on the CPU. `places` has the positions of
+        each prompt's tokens; None if they are consecutive.
         """
         self._reader, self._parts, self._mask, self._logits = reader, parts, mask, logits
         self._places = places

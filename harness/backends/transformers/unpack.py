@@ -26,11 +26,7 @@ _SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
 
 
 def unpack_checkpoint(card: Card, file: Path) -> Path:
-    """Return the checkpoint of a GGUF file, which is made if it is not kept.
-
-    Raises UserError if the file has no tokenizer or chat template, transformers does not know its
-    architecture, or the checkpoint cannot be written.
-    """
+    """Return the checkpoint of a GGUF file, made if it is not kept. Raises UserError if it cannot be."""
     from transformers import __version__
 
     made_by = [__version__, kept.code_sha256("backends/transformers/unpack.py", "backends/tokens.py")]
