@@ -146,6 +146,7 @@ def test_a_study_of_a_run_that_asked_few_is_that_of_one_that_asked_all(tmp_path:
     assert not (tmp_path / "alone" / replayed_run.MORE).exists()
 
 
+@pytest.mark.slow
 def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

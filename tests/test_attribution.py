@@ -120,6 +120,7 @@ def test_a_graph_without_an_object_is_one_that_no_sensor_reported(small: Dataset
     assert opened > 10
 
 
+@pytest.mark.slow
 def test_each_listed_object_moves_what_a_viewer_says_of_conflicts(
     made: Callable[..., Path], small: Dataset
 ) -> None:
@@ -308,6 +309,7 @@ def test_a_driver_is_asked_for_the_ego_alone(small: Dataset, tmp_path: Path) -> 
     assert "seen conflict vehicle in the ego's prompt" in headline(rows(found))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_asked_otherwise_is_refused(small: Dataset, tmp_path: Path) -> None:
     points = (named_point("single-local"),)
     proxy = run(spec_of(small, points=points, seeds=(0,)), tmp_path / "proxy").out

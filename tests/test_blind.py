@@ -156,6 +156,7 @@ def test_killed_among_the_blind_it_goes_on(
     assert answers_of(tmp_path / "run") == answers_of(done.out)
 
 
+@pytest.mark.slow
 def test_a_replay_has_its_blind_answers_and_asks_the_model_for_others(
     done: Evaluated, small: Dataset, tmp_path: Path
 ) -> None:

@@ -228,6 +228,7 @@ def _write(path: str, first: int) -> None:
         cached.complete([replace(BASE, sample=i), replace(BASE, sample=i + 20)])
 
 
+@pytest.mark.slow
 def test_processes_that_write_at_once_lose_nothing(file: Path, capfd: pytest.CaptureFixture[str]) -> None:
     context = multiprocessing.get_context("fork")
     writers = [context.Process(target=_write, args=(str(file), 20 * n)) for n in range(4)]
@@ -274,6 +275,7 @@ def tiny_run(tiny: Path, data: Dataset, out: Path, cache: Path | None, **options
     return evaluate(spec, out, lambda done: None, cache)
 
 
+@pytest.mark.slow
 def test_a_run_from_the_cache_is_the_run_that_was_asked(
     tiny: Path, small_path: Path, tmp_path: Path, file: Path
 ) -> None:

@@ -50,6 +50,7 @@ def moments(dataset: Dataset) -> list[tuple[WorldState, str]]:
     return [(scene.state, viewer) for scene in scenes for viewer in scene.viewers]
 
 
+@pytest.mark.slow
 def test_a_hidden_vehicle_changes_no_pixel(dataset: Dataset):
     hidden = 0
     for state, viewer in moments(dataset):
@@ -63,6 +64,7 @@ def test_a_hidden_vehicle_changes_no_pixel(dataset: Dataset):
     assert hidden
 
 
+@pytest.mark.slow
 def test_a_vehicle_in_sight_and_in_the_field_owns_pixels(dataset: Dataset):
     owners = 0
     for state, viewer in moments(dataset):

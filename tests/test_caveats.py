@@ -101,6 +101,7 @@ def test_an_engine_that_is_not_here_is_not_judged(done: Evaluated) -> None:
     assert caveats(with_engine(done, "elsewhere"), done.scores) == []
 
 
+@pytest.mark.slow
 def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     small_path: Path, harness: Callable[..., Said]
 ) -> None:

@@ -137,6 +137,7 @@ def with_template(folder: Path, template: str) -> Path:
     return made
 
 
+@pytest.mark.slow
 def test_a_gguf_file_without_a_system_role_is_run_and_said_to_be(
     harness: Harness, small: Dataset, small_path: Path, tmp_path: Path
 ) -> None:
@@ -158,6 +159,7 @@ def test_a_gguf_file_without_a_system_role_is_run_and_said_to_be(
     assert (code, out.count("--- v1 "), out.count("--- v1 user")) == (0, 1, 1), err
 
 
+@pytest.mark.slow
 def test_a_gguf_file_that_drops_the_system_text_is_refused(
     harness: Harness, small_path: Path, tmp_path: Path
 ) -> None:
@@ -169,6 +171,7 @@ def test_a_gguf_file_that_drops_the_system_text_is_refused(
     assert "message 1 of 2, the system's" in err
 
 
+@pytest.mark.slow
 def test_a_checkpoint_whose_end_is_another_token_ends_where_its_template_says(
     harness: Harness, tmp_path: Path
 ) -> None:

@@ -57,6 +57,7 @@ def test_answers_come_from_another_process_with_its_seconds_and_identity(tmp_pat
     child.close()
 
 
+@pytest.mark.slow
 def test_who_kills_the_engine_time_after_time_is_an_error_and_the_others_are_answered(tmp_path: Path) -> None:
     child = mortal(tmp_path)
     first, killer, last = child.complete([ask("first", "a"), ask("die", "b"), ask("last", "c")])
@@ -70,6 +71,7 @@ def test_who_kills_the_engine_time_after_time_is_an_error_and_the_others_are_ans
     child.close()
 
 
+@pytest.mark.slow
 def test_a_death_by_company_costs_nobody_an_answer(tmp_path: Path) -> None:
     child = mortal(tmp_path)
     answers = child.complete([ask("hello"), ask("die in company")])
@@ -77,6 +79,7 @@ def test_a_death_by_company_costs_nobody_an_answer(tmp_path: Path) -> None:
     child.close()
 
 
+@pytest.mark.slow
 def test_an_exit_is_a_death_too(tmp_path: Path) -> None:
     child = mortal(tmp_path)
     assert [c.error for c in child.complete([ask("exit")])] == ["engine died: exit code 3"]
@@ -93,6 +96,7 @@ def test_an_engine_killed_while_idle_is_started_again(tmp_path: Path) -> None:
     child.close()
 
 
+@pytest.mark.slow
 def test_an_engine_that_somebody_stops_is_ended_and_its_question_asked_of_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,6 +125,7 @@ def test_an_engine_that_is_stopped_for_a_moment_goes_on(
     child.close()
 
 
+@pytest.mark.slow
 def test_deaths_while_loading_are_tried_again_and_then_said(tmp_path: Path) -> None:
     child = mortal(tmp_path, deaths=LOADS - 1)
     assert born(tmp_path) == LOADS
@@ -184,6 +189,7 @@ def interruptible() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("blow", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_whatever_ends_the_run_ends_the_engine(tmp_path: Path, blow: signal.Signals) -> None:
@@ -210,6 +216,7 @@ def test_whatever_ends_the_run_ends_the_engine(tmp_path: Path, blow: signal.Sign
     until_dead(pid)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_in_an_answer_leaves_a_child_that_answers_the_next_question(tmp_path: Path) -> None:
     child = mortal(tmp_path)

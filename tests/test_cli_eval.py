@@ -15,6 +15,7 @@ from harness.dataset import load
 Said = tuple[int, str, str]
 
 
+@pytest.mark.slow
 def test_it_prints_a_table_and_where_the_report_is(harness: Callable[..., Said], small_path: Path) -> None:
     code, out, err = harness("eval", "--dataset", small_path, "--limit", "2", "--seeds", "0:2")
     folder = Path("reports/proxy-v2-small")
@@ -33,6 +34,7 @@ def test_it_prints_a_table_and_where_the_report_is(harness: Callable[..., Said],
     }
 
 
+@pytest.mark.slow
 def test_json_is_the_manifest_and_the_summary(harness: Callable[..., Said], small_path: Path) -> None:
     code, out, err = harness("eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--json")
     told = json.loads(out, parse_constant=pytest.fail)
@@ -44,6 +46,7 @@ def test_json_is_the_manifest_and_the_summary(harness: Callable[..., Said], smal
     assert rows["6g", "success_rate", "episodes"]["n"] == 1
 
 
+@pytest.mark.slow
 def test_the_same_again_is_refused_and_goes_on_where_it_was_stopped(
     harness: Callable[..., Said], small_path: Path
 ) -> None:
@@ -64,6 +67,7 @@ def test_the_same_again_is_refused_and_goes_on_where_it_was_stopped(
     assert not Path("run/.work").exists()
 
 
+@pytest.mark.slow
 def test_a_number_behind_the_usual_name_is_said(harness: Callable[..., Said], small_path: Path) -> None:
     typed = ("eval", "--model", "brake", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--quiet")
     assert harness(*typed, "--condition", "single-local")[2] == ""
@@ -89,6 +93,7 @@ def test_a_dataset_in_the_command_has_its_name_or_a_path_from_here(
     assert load.argument(shipped) == str(shipped), "that name now means the folder here"
 
 
+@pytest.mark.slow
 def test_the_command_in_the_manifest_runs_it_again(
     harness: Callable[..., Said], small_path: Path, tmp_path: Path
 ) -> None:
@@ -102,6 +107,7 @@ def test_the_command_in_the_manifest_runs_it_again(
     assert same_files(tmp_path / "a b", tmp_path / "first")
 
 
+@pytest.mark.slow
 def test_a_limit_beyond_the_dataset_is_said(harness: Callable[..., Said], small_path: Path) -> None:
     code, out, err = harness("eval", "--dataset", small_path, "--limit", "9999", "--seeds", "0:1")
     assert (code, err) == (0, "--limit 9999: small has 4 episodes, all of which are used\n")

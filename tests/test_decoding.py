@@ -86,6 +86,7 @@ def best(backend: LanguageModel, ids: Sequence[int], texts: Sequence[str]) -> st
 # -- json ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> None:
     from transformers import GenerationConfig
 
@@ -107,6 +108,7 @@ def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> Non
     assert len(lengths) > 2, "answers of one length would not show that rows leave their batch"
 
 
+@pytest.mark.slow
 def test_what_is_guessed_saves_forwards_and_changes_no_answer(small: Dataset) -> None:
     """On the model that ships, whose texts have a shape that can be guessed."""
     opened = open_backend(resolve("swarm-tiny", "transformers"), batch_size=16, device="cpu")
@@ -369,6 +371,7 @@ REQUESTS = st.builds(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.lists(REQUESTS, max_size=7))
 def test_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:

@@ -72,6 +72,7 @@ def few(once_drawn: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory
         ]
 
 
+@pytest.mark.slow
 def test_of_each_level_as_many_are_learnt_from_as_a_whole_tree_has():
     forest = load(folder("datasets") / "occluded-intersection-v2", 10).forest
     chosen = forest.drivers[lessons.TEACHER]
@@ -145,6 +146,7 @@ def test_the_teacher_wants_what_turned_out_safe_and_least_late() -> None:
     assert danger.tolist() == [1.0, 0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(few: list[Lessons]) -> None:
     """Played again in the simulator, action by action, from the start."""
     for each in few:

@@ -74,6 +74,7 @@ def die(graves: Path, number: int) -> None:
     os._exit(number)
 
 
+@pytest.mark.slow
 def test_where_every_item_kills_its_worker_not_all_are_tried(tmp_path: Path) -> None:
     with pytest.raises(Unfinished, match="the other 0 are done"):
         spread(partial(die, tmp_path), range(50), 2, lambda done: None)

@@ -129,6 +129,7 @@ def llama(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_llama.build(tmp_path_factory.mktemp("llama") / "tiny.gguf", "Q8_0", context=4096)
 
 
+@pytest.mark.slow
 def test_another_architecture_is_compared_but_for_its_export(
     llama: Path, small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,6 +153,7 @@ def test_another_architecture_is_compared_but_for_its_export(
     assert 0 < measured["GGUF: largest difference of a logit"] < 0.1  # llama.cpp rounds what it multiplies
 
 
+@pytest.mark.slow
 def test_read_outs_alone_need_no_text_and_what_was_left_out_is_said(
     llama: Path, small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -114,6 +114,7 @@ def test_reasons_that_were_asked_for_change_nothing_of_a_verdict(reasons: str, v
     assert (asked.verdict == "failed") == (unasked.verdict == "failed") == (bare.verdict == "failed")
 
 
+@pytest.mark.slow
 @unhurried
 @given(ANSWERS, SHAPES, st.data())
 def test_the_quick_reading_is_the_slow_one_or_none(value: Any, shape: Shape, data: st.DataObject) -> None:

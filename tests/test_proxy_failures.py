@@ -54,6 +54,7 @@ def questions(dataset: Dataset, form: str) -> list[Request]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["distribution", "recommendation"])
 @pytest.mark.parametrize("how", [how for how in STATUS if how])
 def test_every_failure_has_its_status_whatever_was_answered(how: str, form: str, small: Dataset) -> None:
@@ -71,6 +72,7 @@ def test_there_is_a_status_for_every_failure_and_no_other_way_to_spoil() -> None
         spoil("{}", "shrug", ())
 
 
+@pytest.mark.slow
 def test_failures_come_as_often_as_declared() -> None:
     """10,000 answers: each count within the range that holds 99.99 % of such counts."""
     n = 10_000

@@ -73,6 +73,7 @@ def test_of_a_repository_of_gguf_files_the_cards_one_is_fetched_and_held_to_its_
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_projector_is_fetched_with_the_file_that_it_belongs_to(tmp_path: Path) -> None:
     (tmp_path / "models").mkdir()
     (tmp_path / "swarmdrive.toml").touch()
@@ -123,6 +124,7 @@ def test_what_a_hub_refuses_is_one_line(
     assert not (snapshot(tmp_path, "some/model") / "model.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_a_hub_that_is_not_reached_is_one_line_and_nothing_is_written(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # nobody listens, and nobody else can

@@ -10,6 +10,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from harness.parsing.parse import Parsed, Status, parse
 
 FILE = Path(__file__).parent / "golden" / "real-answers.jsonl.xz"
@@ -27,6 +29,7 @@ def parsed(record: dict[str, Any], divides: bool = False) -> Parsed:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_each_answer_is_parsed_as_it_was() -> None:
     records = corpus()
     found = [

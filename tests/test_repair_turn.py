@@ -321,6 +321,7 @@ def test_a_table_of_a_run_says_it_in_a_line_each(harness: Harness, small_path: P
 # -- it is the same however it is asked -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_replay_has_both_turns_again(small: Dataset, tmp_path: Path) -> None:
     spec = faulty(small)
     done = run(spec, tmp_path / "run")
@@ -328,6 +329,7 @@ def test_a_replay_has_both_turns_again(small: Dataset, tmp_path: Path) -> None:
     assert (done.out / "answers.jsonl").read_bytes() == (again.out / "answers.jsonl").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_replay_tells_the_turns_apart(small: Dataset, tmp_path: Path) -> None:
     """A parser that reads the first turn is shown what that took, and asks no second one."""
     done = run(faulty(small), tmp_path / "run")
@@ -380,6 +382,7 @@ def test_a_difference_says_that_there_is_a_repair_turn() -> None:
     assert change.texts["ego.j2"].added > 0
 
 
+@pytest.mark.slow
 def test_check_counts_the_longest_repair_turn(harness: Harness, small_path: Path, tmp_path: Path) -> None:
     harness("init", "project")
     os.chdir("project")

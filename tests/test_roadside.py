@@ -210,6 +210,7 @@ def test_a_relay_loses_and_delays_nothing_that_came_directly(name, case, delay_s
     assert np.all((relayed.airtime_s >= direct.airtime_s) | np.isnan(direct.airtime_s))
 
 
+@pytest.mark.slow
 @given(radios, cases())
 def test_settings_of_a_unit_that_is_not_there_change_nothing(name, case):
     there = over(name, edge_delay_s=0.5, edge_x_m=9.0, edge_antenna_m=9.0)

@@ -80,6 +80,7 @@ def test_how_many_walks_are_taken_at_once_and_by_whom_changes_no_byte(
     assert sum(answered) == sum(owed) == len(answers_of(proxy_run))
 
 
+@pytest.mark.slow
 def test_decisions_in_row_groups_are_the_same_rows(
     proxy_run: Path, small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,6 +149,7 @@ def test_prompts_that_are_too_long_for_the_model_got_no_answer(
 # -- replay ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prompt", ["v1", "v2"])
 def test_a_replay_makes_the_tables_of_the_run_it_replays(prompt: str, small: Dataset, tmp_path: Path) -> None:
     first = run(spec_of(small, prompt=prompt), tmp_path / "run")
@@ -371,6 +373,7 @@ def test_a_blocked_link_stays_blocked_for_its_episode_and_for_no_other(
         assert any(len(set(states)) == 2 for states in along)
 
 
+@pytest.mark.slow
 def test_the_luck_is_the_same_for_every_prompt_and_model(small: Dataset, tmp_path: Path) -> None:
     """Asked by a proxy with v1 or v2, a helper's link is up or down alike."""
     data = course(small)  # whatever is decided, both come to the same scenes

@@ -108,6 +108,7 @@ def test_what_follows_a_torn_line_can_be_read_again(answers: bytes, small: Datas
     assert read_kept(kept) == read_kept(tmp_path / "whole.jsonl")
 
 
+@pytest.mark.slow
 def test_a_torn_chunk_is_asked_again_as_a_whole(answers: bytes, small: Dataset, tmp_path: Path) -> None:
     """Wherever it is torn, also between two lines: its batches must hold the same questions again."""
     spec, kept = spec_of(small), tmp_path / "answers.jsonl"

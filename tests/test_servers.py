@@ -383,6 +383,7 @@ def whole(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
         return evaluated(served_spec(small, url), tmp_path_factory.mktemp("served") / "whole")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answers", [0, 1, 40])
 def test_a_server_killed_in_mid_run_loses_nothing(
     whole: Path, small: Dataset, tmp_path: Path, answers: int, capfd: pytest.CaptureFixture[str]
@@ -399,6 +400,7 @@ def test_a_server_killed_in_mid_run_loses_nothing(
     assert f"--server {one} --server {other}" in manifest.command
 
 
+@pytest.mark.slow
 def test_with_no_server_left_the_run_stops_and_goes_on_at_others(
     whole: Path, small: Dataset, tmp_path: Path
 ) -> None:
@@ -434,6 +436,7 @@ def test_which_server_gave_each_answer_stands_beside_the_tables(
     assert not any(one.encode() in (out / name).read_bytes() for name in FILES)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_stopped_and_goes_on_still_says_who_answered(small: Dataset, tmp_path: Path) -> None:
     with served(70) as one, pytest.raises(UserError):
         evaluated(served_spec(small, one), tmp_path / "run")

@@ -133,6 +133,7 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return evaluate(spec_of(small, points=points), tmp_path_factory.mktemp("radios") / "run").out
 
 
+@pytest.mark.slow
 def test_a_sweep_over_a_radios_setting_gives_what_a_run_at_it_gives(
     harness: Callable[..., Said], done: Path
 ) -> None:
@@ -173,6 +174,7 @@ def test_a_sweep_refuses_a_run_whose_radio_has_changed_since(
     assert "channel profile mine has changed since; restore it or run again" in err
 
 
+@pytest.mark.slow
 def test_no_messages_is_a_control_of_a_physical_radio_too(harness: Callable[..., Said], done: Path) -> None:
     code, out, _ = harness(
         "study", "sweep", done, "--over", "loss", "--grid", "1", "--condition", "its-g5", "--json"

@@ -50,6 +50,7 @@ def completed(line: str) -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.slow
 def test_a_shell_completes_commands_and_options() -> None:
     assert sorted(completed("harness d")) == ["dataset", "drive"]
     assert completed("harness eval --qu") == ["--quiet"]

@@ -44,6 +44,7 @@ def test_without_an_axis_it_draws_the_papers_panels_beside_the_proxys(
     assert all(s["density_coupled"] for s in sizes)
 
 
+@pytest.mark.slow
 def test_conditions_stand_side_by_side_and_times_may_be_the_papers(
     harness: Callable[..., Said], done: Path
 ) -> None:

@@ -58,6 +58,7 @@ def test_a_stopped_trust_study_says_what_it_keeps(
     assert said.splitlines()[-1] == f"harness: terminated; study keeps what is done; {how}"
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     """No file may grow beyond 1000 bytes, which ends a write as a full disk does."""
     process = started(

@@ -28,6 +28,7 @@ from harness.world.world import World
 IDLE, SLOWER, FASTER, UNSURE = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.4, 0.3)
 
 
+@pytest.mark.slow
 def test_an_episode_played_by_hand():
     """Nobody is dangerous. At 1 s the ego is unsure: alone it goes on, over 6G its helpers make it brake.
 
@@ -128,6 +129,7 @@ def test_an_episode_that_ends_while_a_decision_is_open_records_it_and_never_acts
     assert (episode.partner is not None, episode.fault, episode.least_gap_m) == (True, "ego", 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("seed", [NO_DANGER, FROM_LEFT, ONCOMING])
 def test_a_driver_that_takes_the_lag_drives_as_the_reference_does(driver, seed):

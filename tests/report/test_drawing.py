@@ -47,6 +47,7 @@ def test_every_vehicle_is_labelled_with_id_and_kind_and_the_file_stays_light(dat
             assert {f"{v.id} {v.kind}" for v in scene.state.vehicles} <= set(texts(svg))
 
 
+@pytest.mark.slow
 def test_what_the_viewer_does_not_see_is_labelled_hidden(dataset):
     scene = scenes_of(dataset)[2]
     for viewer in scene.viewers:
@@ -66,6 +67,7 @@ def test_conflict_points_say_when_the_ego_and_the_other_are_there(dataset):
     assert f"v1 in {ego:.1f} s, {conflict['with']} in {other:.1f} s" in texts(picture(scene))
 
 
+@pytest.mark.slow
 def test_the_ego_from_the_south_is_in_the_lower_half_because_north_is_up(dataset):
     pixels = imread(io.BytesIO(picture(scenes_of(dataset)[0], "png")))[..., :3]
     height = len(pixels)

@@ -117,6 +117,7 @@ def test_the_command_shows_both_beside_the_model(small_path: Path, harness: Any)
     assert "constant: always the action that did best in the scenario's tune layouts" in out
 
 
+@pytest.mark.slow
 def test_a_scenario_without_a_constant_is_refused_in_one_line(harness: Any, tmp_path: Path) -> None:
     typed = ("drive", "--env", "merge-v0", "--model", "constant", "--episodes", "1", "--seeds", "0:1")
     code, _, said = harness(*typed, "--out", tmp_path / "run")

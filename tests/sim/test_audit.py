@@ -69,6 +69,7 @@ def known():
     return rng.normal(size=(200, 8)), rng.choice(["left", "right", "", ""], 200)
 
 
+@pytest.mark.slow
 def test_noise_tells_nothing(known):
     auc, told_by = judge(moments(*known), ("left", "right"))
     assert set(auc) == {"danger", "left", "right"}
@@ -76,6 +77,7 @@ def test_noise_tells_nothing(known):
     assert told_by == {}
 
 
+@pytest.mark.slow
 def test_a_number_that_tells_is_found_and_named(known):
     table, danger = known
     table[:, 5] += 4.0 * (danger == "left")
@@ -85,6 +87,7 @@ def test_a_number_that_tells_is_found_and_named(known):
     assert next(iter(told_by)) == "number 5"
 
 
+@pytest.mark.slow
 def test_what_is_known_only_where_there_is_danger_tells_too(known):
     table, danger = known
     table[danger == "", 2] = np.nan

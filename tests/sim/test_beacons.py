@@ -106,6 +106,7 @@ def test_losses_make_what_is_known_older():
     assert all(more >= less - 1e-9 for more, less in zip(most, usual, strict=True)), "the draws are shared"
 
 
+@pytest.mark.slow
 def test_a_beacon_says_the_same_to_all_and_its_errors_are_those_declared():
     errors = []
     for seed in range(150):
@@ -344,6 +345,7 @@ def test_the_loss_of_a_beacon_is_that_of_its_link_when_it_was_sent():
     assert came / n == pytest.approx(0.7, abs=0.04)
 
 
+@pytest.mark.slow
 def test_times_between_beacons_that_get_through_are_geometric():
     """Mean T / p; the share q is reached after ceil(log(1 - q) / log(1 - p)) periods: 3 at .95 and p = .7."""
     p, gaps = replace(SCENARIO.parameters, beacon_loss=0.3), []

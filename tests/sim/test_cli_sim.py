@@ -39,6 +39,7 @@ def test_the_answer_schemas_of_a_scenario_are_shown_and_hold(harness):
         jsonschema.validate(one, schemas["helper"])
 
 
+@pytest.mark.slow
 def test_a_scenario_check_states_rates_intervals_and_n(harness):
     code, out, err = harness(
         "dataset", "scenario", "drive", NAME, "--episodes", 3, "--seed", 178, "--workers", 1, "--json"
@@ -164,6 +165,7 @@ def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
     assert sorted(small_folder.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_a_scene_is_drawn_whole(harness, small_folder, tmp_path):
     pytest.importorskip("harness.report.drawing")
     for suffix, start in {"svg": b"<?xml", "png": b"\x89PNG"}.items():

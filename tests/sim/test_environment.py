@@ -197,6 +197,7 @@ def test_the_state_says_who_is_where_and_helpers_are_the_nearest():
     assert {v.route for v in state.vehicles} == {"to b lane 1", "to b lane 2"}
 
 
+@pytest.mark.slow
 def test_other_controlled_vehicles_help_first_and_keep_to_their_course():
     several = {
         "controlled_vehicles": 2,
@@ -389,6 +390,7 @@ def test_what_an_environment_lacks_is_said_in_a_line(env, config, said):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_road_of_another_seed_is_refused():
     scenario = scenarios.get("env:rebuilt-v0")
     lanes = reset(scenario.name, 0).config["lanes_count"]

@@ -237,6 +237,7 @@ def alike(one, other):
     return close(one.state().to_dict(), other.state().to_dict())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [FROM_RIGHT, FROM_LEFT, ONCOMING])
 def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(seed):
     world = World.start(SCENARIO, seed)

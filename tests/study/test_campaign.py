@@ -103,6 +103,7 @@ def test_what_equation_2_does_is_measured(study: Path) -> None:
     assert f"{100 * without:.1f} [" in page
 
 
+@pytest.mark.slow
 def test_the_papers_values_are_drawn_in_every_panel(study: Path) -> None:
     numbers = pd.read_csv(study / "ledger.csv")
     numbers["value"] = numbers["value"].fillna("")

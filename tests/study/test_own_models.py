@@ -138,6 +138,7 @@ def test_a_model_that_is_no_card_is_not_asked_and_the_line_says_what_to_type(
     assert code == 2 or study[1] in ("trust", "schedule")
 
 
+@pytest.mark.slow
 def test_a_replay_asks_no_server_that_its_run_names(
     run: Server, harness: Callable[..., Said], small_path: Path
 ) -> None:
@@ -157,6 +158,7 @@ def test_a_name_of_a_shipped_card_does_not_lend_it_a_server() -> None:
     assert own(cards.load("proxy"), (), "run", "") == cards.load("proxy")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["../mine", "models/mine", "", "mine\0", "MINE", "proxy:", "a/b", "replay:run"]
 )

@@ -44,6 +44,7 @@ def value(summary: pd.DataFrame, at: Any, metric: str) -> float:
     return float(rows["mean"].item())
 
 
+@pytest.mark.slow
 def test_at_the_runs_own_point_a_sweep_says_what_the_run_said(
     done: Evaluated, source: ReplayedRun, tmp_path: Path
 ) -> None:
