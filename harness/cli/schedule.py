@@ -133,5 +133,5 @@ def compare(
         ]
         for each in stored:
             each.settle()
-    caveats = [source.lost for source in stored if source.lost]
+    caveats = [caveat for source in stored for caveat in source.caveats]
     finish(schedule_study(found, [each.manifest() for each in stored], draws, caveats), where, as_json, quiet)

@@ -278,7 +278,7 @@ def attribution_study(found: Attribution, run: ReplayedRun) -> Study:
             "What was left out", ("left out", "of", "shift [95 %]", "flips % [95 %]", "failed", "n"), cells,
             terminal=range(6),
         )],
-        {}, {}, answer, caveats=[run.lost] if run.lost else [],
+        {}, {}, answer, caveats=run.caveats,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ What decides success is drawn stratified. Every seed has each kind of episode, b
 and who reads it rightly, in its share to within one, and each link's luck is spread evenly over each kind.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from operator import attrgetter
@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
+from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints, any_of
-from harness.evaluate.walk import Decided, Due, Fuses
-from harness.radio.channel import Draws, Unit
+from harness.evaluate.walk import Decided, Due
+from harness.radio.channel import Draws
 from harness.studies.axes import Setting
 from harness.studies.play import WalkResult, walk_through
 
@@ -145,30 +145,20 @@ class CalibratedWorld:
         own = np.where(self._knows[:, None], self._now.knowing, self._now.intents.own)
         return replace(self._now.intents, own=own)
 
-    def blind(self, moments: Sequence[int], at: Ints) -> Intents:
-        """Nobody is asked blindly: no point of the study has it."""
+    def blind(self, *_: Any, **__: Any) -> Any:
+        """Refuse: the intents of all are drawn, and nobody can be asked."""
         raise NotImplementedError
 
-    def helpers(self, moments: Sequence[int], wanted: Bools, blind: bool = False) -> Intents:
-        """Nobody is asked later: the intents of all are drawn."""
-        raise NotImplementedError
-
-    def fusion_call(self, moments: Sequence[int], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
-        """Nobody calls: no point of the study has its model fuse."""
-        raise NotImplementedError
+    helpers = fusion_call = blind
 
     def due(self, point: OperatingPoint) -> Due:
         """Every episode."""
         return Due(np.arange(len(self._knows)), self._episode, self._seed, self._now.draws)
 
-    def site(self, units: Collection[Unit]) -> None:
-        """The study's vehicles are nowhere in particular."""
+    def outlook(self, *_: Any) -> None:
+        """The study's vehicles are nowhere in particular, see nothing and claim nothing."""
 
-    def outlook(self) -> None:
-        """They see nothing in particular."""
-
-    def claims(self) -> None:
-        """They say nothing of themselves."""
+    site = claims = outlook
 
     def step(self, decided: Sequence[Decided[int]]) -> None:
         """Learn what was heard, and see whether the last action is the right one."""

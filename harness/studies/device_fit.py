@@ -31,13 +31,13 @@ class Fit:
     joules: Estimate  # that it takes; of a run, the mean
 
 
-def fits(device: Device, rows: Sequence[DeviceRow], told: "Told", window_s: float) -> list[Fit]:
+def fits(device: Device, rows: Sequence[DeviceRow], answers: "Answers", window_s: float) -> list[Fit]:
     """Each row with each kind of answer, within so many seconds from seeing to having the ego's answer."""
-    return [_fit(device, row, kind, told, window_s) for row in rows for kind in told.output]
+    return [_fit(device, row, kind, answers, window_s) for row in rows for kind in answers.output]
 
 
 @dataclass(frozen=True)
-class Told:
+class Answers:
     """Answers of which a fit is asked."""
 
     prompt: Floats  # tokens read, (n,)
@@ -46,13 +46,13 @@ class Told:
     who: str = ""  # the model that wrote them
 
 
-def declared(prompt_tokens: int, answer_tokens: int) -> Told:
+def declared(prompt_tokens: int, answer_tokens: int) -> Answers:
     """One answer of so many tokens, read out or written."""
-    one = {READOUT: np.array([1.0]), WRITTEN: np.array([float(answer_tokens)])}
-    return Told(np.array([float(prompt_tokens)]), one)
+    output = {READOUT: np.array([1.0]), WRITTEN: np.array([float(answer_tokens)])}
+    return Answers(np.array([float(prompt_tokens)]), output)
 
 
-def of_run(run: Run) -> Told:
+def of_run(run: Run) -> Answers:
     """The ego's answers of a run, as they were given, and as if one letter of each prompt were read out.
 
     Raises:
@@ -64,26 +64,26 @@ def of_run(run: Run) -> Told:
         raise UserError(f"{printable(run.path)} has no answer of its ego; give another run")
     mode, ones = run.manifest.answer, np.ones(len(counts))
     _, place = np.unique([answer.scene.partition("-")[0] for answer in egos], return_inverse=True)
-    return Told(counts[:, 0], {READOUT: ones, mode: counts[:, 1]}, place, run.manifest.model["name"])
+    return Answers(counts[:, 0], {READOUT: ones, mode: counts[:, 1]}, place, run.manifest.model["name"])
 
 
-def _fit(device: Device, row: DeviceRow, kind: str, told: Told, window_s: float) -> Fit:
-    speed, output = devices.speed(device, row), told.output[kind]
-    pairs = list(zip(told.prompt.tolist(), output.tolist(), strict=True))
+def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: float) -> Fit:
+    speed, output = devices.speed(device, row), answers.output[kind]
+    pairs = list(zip(answers.prompt.tolist(), output.tolist(), strict=True))
     seconds, joules = (
         np.array([of(speed, *pair) for pair in pairs]) for of in (devices.seconds, devices.joules)
     )
     hits = np.where(np.isnan(seconds), np.nan, (seconds <= window_s).astype(float))
-    if told.episodes is None:
+    if answers.episodes is None:
         once = [Estimate(float(each[0]), np.nan, np.nan, 1, 0) for each in (hits, joules)]
     else:
-        once = [rate_interval(hits, told.episodes), episode_interval(joules, told.episodes)]
-    read, written, took = (float(np.median(each)) for each in (told.prompt, output, seconds))
+        once = [rate_interval(hits, answers.episodes), episode_interval(joules, answers.episodes)]
+    read, written, took = (float(np.median(each)) for each in (answers.prompt, output, seconds))
     return Fit(row, kind, read, written, took, *once)
 
 
 @dataclass(frozen=True)
-class Held:
+class Comparison:
     """A figure of a run's answers that were asked alone, beside what a device profile says of it."""
 
     what: str  # `seconds` of an answer, or a rate by its name in a profile
@@ -92,30 +92,33 @@ class Held:
     stated: float  # what the profile says: of seconds the median over the same answers
 
 
-def held(device: Device, row: DeviceRow, run: Run) -> list[Held]:
+def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
     """A profile beside a run's own times. Raises UserError if no answer of the run was asked alone."""
     alone = [a for a in run.answers if a.seconds is not None and a.error is None and not a.retries]
     alone = [a for a in alone if not a.first and a.prompt_tokens is not None and a.completion_tokens]
-    found = [each for role in dict.fromkeys(a.role for a in alone)
-             for each in _held(device, row, [a for a in alone if a.role == role])]  # fmt: skip
-    if not found:
+    figures = [
+        figure
+        for role in dict.fromkeys(a.role for a in alone)
+        for figure in _held(device, row, [a for a in alone if a.role == role])
+    ]
+    if not figures:
         raise UserError(
             f"{printable(run.path)} has no answer that was asked alone and timed; run it with --batch-size 1 "
             "--no-cache"
         )
-    return found
+    return figures
 
 
-def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[Held]:
+def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[Comparison]:
     speed, role = devices.speed(device, row), alone[0].role
     stated = [devices.seconds(speed, *tokens(answer)) for answer in alone]
-    yield Held("seconds", role, _median([(a.seconds, a) for a in alone]), float(np.median(stated)))
+    yield Comparison("seconds", role, _median([(a.seconds, a) for a in alone]), float(np.median(stated)))
     read = [(a.prompt_tokens / a.first_token_s, a) for a in alone if a.first_token_s and a.prompt_tokens]
     written = [(1 / a.token_s, a) for a in alone if a.token_s]
     for name, pairs in zip(devices.RATES, (read, written), strict=True):
         if pairs:
             value = getattr(speed, name)
-            yield Held(name, role, _median(pairs), np.nan if value is None else value)
+            yield Comparison(name, role, _median(pairs), np.nan if value is None else value)
 
 
 def _median(pairs: Sequence[tuple[float | None, Answer]]) -> Estimate:

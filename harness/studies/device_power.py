@@ -15,7 +15,7 @@ WINDOWS = 5  # of asking; the intervals are over them
 
 
 @dataclass(frozen=True)
-class Drawn:
+class Power:
     """What one meter says."""
 
     meter: str  # its name
@@ -28,7 +28,7 @@ class Drawn:
 def measure(
     backend: Backend, requests: Sequence[Request], meters: Sequence[Counter], window_s: float,
     progress: Callable[[int], None], sleep: Callable[[float], None] = time.sleep,
-) -> tuple[list[Drawn], int]:  # fmt: skip
+) -> tuple[list[Power], int]:  # fmt: skip
     """Ask alone, again and again, for some windows of time, and say what that took.
 
     Args:
@@ -62,13 +62,13 @@ def measure(
         for name, total in spent.items():
             joules[name][n] = total
         progress(1)
-    drawn = []
+    powers = []
     for name, spent_j in joules.items():
         idle_watts = idle[name] / idled_s
         more = spent_j - idle_watts * seconds
         estimates = (seed_interval(each) for each in (spent_j / seconds, spent_j / answers, more / answers))
-        drawn.append(Drawn(name, idle_watts, *estimates))
-    return drawn, int(answers.sum())
+        powers.append(Power(name, idle_watts, *estimates))
+    return powers, int(answers.sum())
 
 
 def _ask(backend: Backend, request: Request) -> None:

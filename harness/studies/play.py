@@ -53,6 +53,7 @@ class Source(Protocol):
     """Whose intents are coordinated: the calibrated proxy's, or a run's."""
 
     name: str  # what figures call it
+    episodes: int  # how many a seed plays
     same_episodes: bool  # whether every seed plays the same episodes
 
     def manifest(self) -> dict[str, Any]:

@@ -61,6 +61,7 @@ class ReplayedRun:
         seeds: the run's own.
         points: the run's operating points, by name.
         dataset: its episodes.
+        episodes: how many a seed plays.
         same_episodes: every seed plays the run's.
         left_out: ids of the decision points without an answer at which walks were left out.
     """
@@ -115,6 +116,7 @@ class ReplayedRun:
                     )
         self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
         self.dataset = dataset_of(self.run, dataset).of_episodes(self.run.grid.episodes)
+        self.episodes = len(self.dataset.episodes)
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
         self._asks, self._models = asks, models
         self._say, self._more, self._done = say, more, done
@@ -235,20 +237,15 @@ class ReplayedRun:
         return self._asker.answers
 
     @property
-    def lost(self) -> str:
-        """What was asked here and got no answer, in a sentence; empty if everything did."""
-        counts = self._asker.tally.counts()
-        return (
-            f"{printable(self.name)}: no answer to {counts}; left out, as lost messages are" if counts else ""
+    def caveats(self) -> tuple[str, ...]:
+        """What was asked here and got no answer, and where walks were left out, in sentences."""
+        counts, name, n = self._asker.tally.counts(), printable(self.name), len(self.left_out)
+        lost = f"{name}: no answer to {counts}; left out, as lost messages are" if counts else ""
+        left_out = (
+            f"{name}: left out episodes that reach one of {n} decision points without a stored answer; "
+            "without --no-model the model is asked there"
         )
-
-    @property
-    def leaves_out(self) -> str:
-        """Where walks were left out, in a sentence."""
-        return (
-            f"{printable(self.name)}: left out episodes that reach one of {len(self.left_out)} decision "
-            "points without a stored answer; without --no-model the model is asked there"
-        )
+        return tuple(filter(None, (lost, left_out if n else "")))
 
     def settle(self) -> None:
         """Raise Unanswered if too many of the questions that were asked here got no answer."""

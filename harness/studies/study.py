@@ -1,7 +1,7 @@
 """A study: what was computed, in tables, figures and sentences, and one writer of its folder and page."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT
 from harness.core.files import bytes_of, neutral, replacing, text_of, write_whole
@@ -163,13 +164,10 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
 
 
 class Cells:
-    """Finished parts of a study in a file, a line each, so that the same command continues a killed one.
-
-    Lines that depend on something else, or are torn, do not count.
-    """
+    """Finished parts of a study in a file, a line each, so that the same command continues a killed one."""
 
     def __init__(self, path: Path, depends_on: str) -> None:
-        """Read the file at `path`; `depends_on` is the digest of all that decides a part."""
+        """Read a file. Torn lines and those of another digest of all that decides a part do not count."""
         self._path, self._of = path, depends_on
         data = bytes_of(path, "rows") if path.is_file() else b""
         self._torn = bool(data) and not data.endswith(b"\n")
@@ -180,27 +178,33 @@ class Cells:
             try:
                 cell = json.loads(line)
                 if cell["of"] == self._of:
-                    yield tuple(cell["key"]), dict(cell["values"])
+                    yield tuple(cell["key"]), {k: _array(v) for k, v in cell["values"].items()}
             except (ValueError, KeyError, TypeError):
                 continue
 
-    def get(self, *key: Any) -> dict[str, Any] | None:
-        """Return what was kept of a part, with None for NaN; None if it is yet to be computed."""
-        return self._cells.get(key)
-
-    def add(self, key: Sequence[Any], **values: Any) -> None:
-        """Keep a part: arrays and plain values, to the last bit."""
-        line = json.dumps({"of": self._of, "key": key, "values": {k: _exact(v) for k, v in values.items()}})
+    def part(self, key: Sequence[Any], compute: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+        """Return a part as it was kept, to the last bit, or else compute it and keep it."""
+        if (kept := self._cells.get(tuple(key))) is not None:
+            return kept
+        values = compute()
+        plain = {
+            name: {"array": _exact(value)} if isinstance(value, np.ndarray) else value
+            for name, value in values.items()
+        }
+        line = json.dumps({"of": self._of, "key": key, "values": plain})
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("ab") as file:
             file.write(b"\n" * self._torn + line.encode() + b"\n")
         self._torn = False
+        return values
 
 
-def _exact(value: Any) -> Any:
-    if not isinstance(value, np.ndarray):
-        return value
-    return [[None if np.isnan(x) else float(x) for x in row] for row in value]
+def _exact(rows: Floats) -> list[list[float | None]]:
+    return [[None if np.isnan(x) else float(x) for x in row] for row in rows]
+
+
+def _array(value: Any) -> Any:
+    return np.array(value["array"], dtype=float) if isinstance(value, dict) else value
 
 
 def _lasting(key: str, value: Any) -> Any:

@@ -146,13 +146,22 @@ def run_sweep(
     return Study(
         "sweep", f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",
         [f"{table.title}: {in_a_sentence(table)}." for table in shown],
-        [f"{PAIRED} Channel seeds: {', '.join(map(str, seeds))}."], shown,
+        [f"n = {counts(sources, seeds)}. {PAIRED}"], shown,
         {"conditions": summary, "episodes": whole.episodes},
         # Anew, since sources state what was left out.
         {**stated, "sources": [s.manifest() for s in sources], "versions": versions()},
         summary, figures,
-        [text for run in runs for text in (run.lost, run.left_out and run.leaves_out) if text],
+        [caveat for run in runs for caveat in run.caveats],
     )  # fmt: skip
+
+
+def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
+    """Return how many episodes and seeds each source has, in words."""
+    of_sources = (
+        f"{source.name}: {source.episodes} episodes × {len(seeds)} seeds"
+        + (" of their own" if not source.same_episodes else "") for source in sources
+    )  # fmt: skip
+    return f"{'; '.join(of_sources)} (channel seeds {', '.join(map(str, seeds))})"
 
 
 def _map(part: "pd.DataFrame") -> Figure:

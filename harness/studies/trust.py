@@ -6,7 +6,8 @@ same episodes, channel draws and attackers, so differences are paired by episode
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from fractions import Fraction
+from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from harness.studies.study import Cells, refuse_other
 from harness.studies.sweep import point_of
 
 RESAMPLES = 2000
+Key = tuple[str, str, float]  # rule, attack, share
 TRUSTED = 0.5  # of trust; below it a helper is taken for an attacker
 PEACE, EXCLUDED = "", "absent"
 BASE = "linear"
@@ -40,54 +42,48 @@ CAPPED = "linear:weight_cap=0.3"
 
 @dataclass(frozen=True)
 class Cell:
-    """A rule under an attack by a share of the helpers."""
+    """A rule under an attack by a share of the helpers: seeds S, episodes E."""
 
-    rule: str  # of consensus
+    rule: str
     attack: str  # without its share; empty for peace
     share: float  # of the helpers that attack
-    success: Floats  # which episodes succeed, (S, E)
-    unsafe: Floats  # which end unsafely, (S, E)
-    # mean of -ln of the probability that the policy gives to safe actions, of an episode's decisions where
-    # some action was safe, (S, E); NaN where there is none
-    nats: Floats
-    # messages heard, by episode: of attackers that were taken for such, of attackers that were not, of honest
-    # helpers that were, and that were not, (4, E); None of a rule that judges nobody
-    flagged: Floats | None
-    # how many decisions with an attacker's message it took until it was taken for one, for each attacker of
-    # an episode and seed; 0 where it never was
-    first: tuple[int, ...]
+    success: Floats  # (S, E)
+    unsafe: Floats  # which episodes end unsafely, (S, E)
+    # mean -ln of the probability that the policy gives to safe actions, over decisions with one; NaN without
+    nats: Floats  # (S, E)
+    # messages heard, by episode: attackers' that were suspected, and not; honest ones that were, and not
+    flagged: Floats | None  # (4, E); None of a rule that judges nobody
+    first: Sequence[int]  # messages until an attacker was suspected, by attacker, episode and seed; 0: never
 
     def detection(self) -> Mapping[str, Estimate] | None:
-        """Precision, recall, F1 and false alarms of messages, with a bootstrap over episodes.
+        """Return precision, recall, F1 and false alarms of messages; None if the rule judges nobody.
 
-        False alarms are the share of honest messages that were taken for an attacker's. None if the rule
-        judges nobody.
+        False alarms are the share of honest messages that were suspected. Intervals resample episodes.
         """
         if self.flagged is None:
             return None
-        hit, missed, wrong, right = self.flagged
-        times = resampled(noise.generator("trust", "detection"), len(hit), RESAMPLES)
-        hits, misses, wrongs, rights = times @ hit, times @ missed, times @ wrong, times @ right
+        n = self.flagged.shape[1]
+        times = resampled(noise.generator("trust", "detection"), n, RESAMPLES)
+        hits, misses, wrongs, rights = (times @ counts for counts in self.flagged)
         with np.errstate(invalid="ignore", divide="ignore"):
-            found = {
+            shares = {
                 "precision": hits / (hits + wrongs),
                 "recall": hits / (hits + misses),
                 "f1": 2 * hits / (2 * hits + wrongs + misses),
                 "false_alarms": wrongs / (wrongs + rights),
             }
-        return {name: resampled_estimate(of, len(hit)) for name, of in found.items()}
+        return {name: resampled_estimate(values, n) for name, values in shares.items()}
 
     @property
     def time_to_detection(self) -> float:
-        """Median of how many messages it takes until an attacker is found, of those that are; NaN if none."""
-        found = [n for n in self.first if n]
-        return float(np.median(found)) if found else float("nan")
+        """Median of the messages until an attacker is suspected, of those that are; NaN if none is."""
+        return float(np.median(caught)) if (caught := [n for n in self.first if n]) else float("nan")
 
 
 def under(point: OperatingPoint, rule: str, attack: str, share: float) -> OperatingPoint:
-    """The operating point with a rule and attackers; every part of the attack has the same share.
+    """Return the operating point with a rule, such as `linear:weight_cap=0.3`, and attackers.
 
-    A rule may have a cap on weights: `linear:weight_cap=0.3`.
+    Every part of the attack has the same share.
     """
     text = "+".join(f"{part}:share={share:.10g}" for part in attack.split("+") if part)
     consensus, *settings = rule.split(":")
@@ -100,52 +96,44 @@ def under(point: OperatingPoint, rule: str, attack: str, share: float) -> Operat
 
 
 def names_of(option: str, text: str, usual: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
-    """The names of a list such as `liar,brake`, or the usual ones for `all`. Raises UserError."""
+    """Return the names of a list such as `liar,brake`, or the usual ones for `all`. Raises UserError."""
     if text == "all":
         return tuple(usual)
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
-    for name in names:
-        for part in name.split("+"):
-            if part.partition(":")[0] not in known:
-                raise unknown(option, part.partition(":")[0], ("all", *known))
-            if "share=" in part:
-                raise UserError(f"{option} {printable(name)}: give shares with --share")
+    for part in (part for name in names for part in name.split("+")):
+        if part.partition(":")[0] not in known:
+            raise unknown(option, part.partition(":")[0], ("all", *known))
+        if "share=" in part:
+            raise UserError(f"{option} {printable(part)}: give shares with --share")
     return names
 
 
 def shares_of(text: str) -> tuple[float, ...]:
-    """Shares above 0 of a list such as `0,1/3,2/3`; peace is always played. Raises UserError."""
-    found = []
-    for part in text.split(","):
-        above, slash, below = part.strip().partition("/")
-        try:
-            share = float(above) / (float(below) if slash else 1.0)
-        except (ValueError, ZeroDivisionError):
-            share = np.nan
-        if not 0 <= share <= 1:
-            raise UserError(f"--share {printable(text)}: give shares from 0 to 1, such as 0,1/3,2/3")
-        found.append(share)
-    if not any(found):
+    """Return the shares above 0 of a list such as `0,1/3,2/3`; peace is always played. Raises UserError."""
+    try:
+        shares = [float(Fraction(part.strip())) for part in text.split(",")]
+    except (ValueError, ZeroDivisionError):
+        shares = [np.nan]
+    if not all(0 <= share <= 1 for share in shares):
+        raise UserError(f"--share {printable(text)}: give shares from 0 to 1, such as 0,1/3,2/3")
+    if not any(shares):
         raise UserError(f"--share {printable(text)}: nobody attacks; give a share above 0 as well: 0,1/3")
-    return tuple(dict.fromkeys(share for share in found if share))
+    return tuple(dict.fromkeys(share for share in shares if share))
 
 
-def play(run: ReplayedRun, point: OperatingPoint, seeds: Sequence[int], of: tuple[str, str, float]) -> Cell:
+def play(run: ReplayedRun, point: OperatingPoint, seeds: Sequence[int], key: Key) -> Cell:
     """Play one cell: a rule, an attack and a share."""
-    at = under(point, *of)
+    at = under(point, *key)
     world = FrozenWorld(run.dataset, [at], seeds)
     parts = [part for [part] in walk(world, [at], run.asked_in(world, [at]), run.spec.ties)]
-    ends = world.ends(at)
-    place = {number: n for n, number in enumerate(world.numbers.tolist())}
-    row = {seed: n for n, seed in enumerate(seeds)}
-    cells = [
-        np.array([row[s] * len(place) + place[e] for e, s in part.due.episodes], dtype=int) for part in parts
-    ]
-    nats = np.concatenate([_nats(run, part) for part in parts])
-    flagged, first = _flagged(parts, len(place), place)
-    means = mean_by_place(nats, np.concatenate(cells), len(seeds) * len(place)).reshape(len(seeds), -1)
-    means[np.isnan(ends["success_rate"])] = np.nan  # left out
-    return Cell(*of, ends["success_rate"], ends["unsafe_rate"], means, flagged, first)
+    ends, shape = world.ends(at), (len(seeds), len(world.numbers))
+    row, column = ({number: n for n, number in enumerate(of)} for of in (seeds, world.numbers.tolist()))
+    places = [row[seed] * shape[1] + column[episode] for part in parts for episode, seed in part.due.episodes]
+    nats = mean_by_place(
+        np.concatenate([_nats(run, p) for p in parts]), np.array(places), shape[0] * shape[1]
+    )
+    nats = np.where(np.isnan(ends[SUCCESS]), np.nan, nats.reshape(shape))  # left out
+    return Cell(*key, ends[SUCCESS], ends["unsafe_rate"], nats, *_flagged(parts, column))
 
 
 def _nats(run: ReplayedRun, part: Decided[Scene]) -> Floats:
@@ -155,25 +143,21 @@ def _nats(run: ReplayedRun, part: Decided[Scene]) -> Floats:
     return negative_log_likelihood(part.result.fused, forest.safe[at])
 
 
-def _flagged(
-    parts: Sequence[Decided[Scene]], episodes: int, place: Mapping[int, int]
-) -> tuple[Floats | None, tuple[int, ...]]:
-    counts = np.zeros((4, episodes))
+def _flagged(parts: Sequence[Decided[Scene]], column: Mapping[int, int]) -> tuple[Floats | None, list[int]]:
+    counts, judged = np.zeros((4, len(column))), False
     heard: dict[tuple[int, int, int], int] = {}
     first: dict[tuple[int, int, int], int] = {}
-    judged = False
     for part in parts:
         trust, attackers = part.result.trust, part.said.attackers
         for n, h in zip(*np.nonzero(~np.isnan(trust)), strict=True):
-            judged = True
-            who = (*part.due.episodes[n], int(h))
-            suspect, attacks = bool(trust[n, h] < TRUSTED), bool(attackers[n, h])
-            counts[(0 if suspect else 1) if attacks else (2 if suspect else 3), place[who[0]]] += 1
+            judged, helper = True, (*part.due.episodes[n], int(h))
+            suspected, attacks = bool(trust[n, h] < TRUSTED), bool(attackers[n, h])
+            counts[2 * (not attacks) + (not suspected), column[helper[0]]] += 1
             if attacks:
-                heard[who] = heard.get(who, 0) + 1
-                if suspect:
-                    first.setdefault(who, heard[who])
-    return (counts if judged else None), tuple(first.get(who, 0) for who in heard)
+                heard[helper] = heard.get(helper, 0) + 1
+                if suspected:
+                    first.setdefault(helper, heard[helper])
+    return (counts if judged else None), [first.get(helper, 0) for helper in heard]
 
 
 @dataclass(frozen=True)
@@ -184,7 +168,7 @@ class Bench:
     source: str  # its dataset
     condition: str  # the operating point that is attacked
     seeds: tuple[int, ...]  # of the channel
-    cells: Mapping[tuple[str, str, float], Cell]  # by rule, attack and share
+    cells: Mapping[Key, Cell]
     alone: Floats  # success of an ego that never asks, (S, E)
     caveats: tuple[str, ...] = ()  # what the run lacks
 
@@ -204,44 +188,43 @@ class Bench:
         return tuple(dict.fromkeys(share for _, _, share in self.cells if share))
 
     def at(self, rule: str, attack: str = PEACE, share: float = 0.0) -> Cell:
-        """A cell."""
+        """Return a cell."""
         return self.cells[rule, attack, share]
 
-    def success(self, *of: Any) -> Estimate:
-        """Success, over episodes."""
-        return over_episodes(SUCCESS, self.at(*of).success)
+    def success(self, *key: Any) -> Estimate:
+        """Return success in a cell, over episodes."""
+        return over_episodes(SUCCESS, self.at(*key).success)
 
     def price(self, rule: str) -> Estimate:
-        """What a rule costs while nobody attacks: its success less the linear pool's, paired."""
+        """Return what a rule costs while nobody attacks: its success less the linear pool's, paired."""
         return difference(SUCCESS, self.at(rule).success.T, self.at(BASE).success.T)
 
     def loss(self, rule: str, attack: str, share: float) -> Estimate:
-        """What an attack takes from a rule: success under it less success in peace, paired."""
+        """Return what an attack takes from a rule: success under it less success in peace, paired."""
         return difference(SUCCESS, self.at(rule, attack, share).success.T, self.at(rule).success.T)
 
     @cached_property
-    def holm(self) -> Mapping[tuple[str, str, float], float]:
+    def holm(self) -> Mapping[Key, float]:
         """P of no difference to the linear pool under the same attack, by Holm's method over the grid."""
-        places = [of for of in self.cells if of[0] != BASE and of[1] not in (PEACE, EXCLUDED)]
         p_values = {
-            of: p
-            for of in places
-            if (p := p_value(SUCCESS, self.cells[of].success.T, self.at(BASE, *of[1:]).success.T)) is not None
-        }
-        return dict(zip(p_values, holm(list(p_values.values())), strict=True))
+            key: p_value(SUCCESS, cell.success.T, self.at(BASE, *key[1:]).success.T)
+            for key, cell in self.cells.items() if cell.rule != BASE and cell.attack not in (PEACE, EXCLUDED)
+        }  # fmt: skip
+        known = {key: p for key, p in p_values.items() if p is not None}
+        return dict(zip(known, holm(list(known.values())), strict=True))
 
-    def clear(self, *of: Any) -> bool:
+    def clear(self, *key: Any) -> bool:
         """Whether a rule differs from the linear pool under an attack by more than chance explains."""
-        return self.holm.get(of, 1.0) <= LEVEL
+        return self.holm.get(key, 1.0) <= LEVEL
 
     def worst(self, rule: str, share: float) -> str:
-        """The attack under which it succeeds least."""
+        """Return the attack under which a rule succeeds least."""
         return min(self.attacks, key=lambda attack: self.success(rule, attack, share).value)
 
     def mean(self, rule: str, share: float) -> Estimate:
-        """Success as a mean over all attacks, over episodes."""
-        each = [self.at(rule, attack, share).success for attack in self.attacks]
-        return over_episodes(SUCCESS, np.mean(each, axis=0))
+        """Return success as a mean over all attacks, over episodes."""
+        values = [self.at(rule, attack, share).success for attack in self.attacks]
+        return over_episodes(SUCCESS, np.mean(values, axis=0))
 
 
 def run_bench(
@@ -286,25 +269,20 @@ def run_bench(
         run.manifest(), str(run.run.manifest.identity), asdict(point), list(seeds), versions(),
         code_sha256("**/*.py"),
     ]  # fmt: skip
-    kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[tuple[str, str, float], Cell]()
+    kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[Key, Cell]()
+
+    def compute(key: Key) -> Mapping[str, Any]:
+        values = vars(play(run, point, seeds, key))
+        run.settle()
+        return {name: value for name, value in values.items() if name not in ("rule", "attack", "share")}
+
     more(len(every))
-    for rule, attack, share in every:
-        key = rule, attack, share
-        if values := kept.get(*key):
-            first, flagged = values.pop("first"), values.pop("flagged")
-            success, unsafe, nats = (np.array(values[k], dtype=float) for k in ("success", "unsafe", "nats"))
-            judged = None if flagged is None else np.array(flagged, dtype=float)
-            cell = Cell(rule, attack, share, success, unsafe, nats, judged, tuple(first))
-        else:
-            cell = play(run, point, seeds, key)
-            run.settle()
-            kept.add(key, **{k: v for k, v in vars(cell).items() if k not in ("rule", "attack", "share")})
-        cells[key] = cell
+    for key in every:
+        cells[key] = Cell(*key, **kept.part(key, partial(compute, key)))
         progress(1)
     never = FrozenWorld(run.dataset, [alone := OperatingPoint("never asks", None)], seeds)
     for _ in walk(never, [alone], run.asked_in(never, [alone]), run.spec.ties):
         pass
     run.settle()
-    caveats = tuple(text for text in (run.lost, run.left_out and run.leaves_out) if text)
-    success = never.ends(alone)["success_rate"]
-    return Bench(run.name, run.run.source, condition, tuple(seeds), cells, success, caveats)
+    success = never.ends(alone)[SUCCESS]
+    return Bench(run.name, run.run.source, condition, tuple(seeds), cells, success, run.caveats)

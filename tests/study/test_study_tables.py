@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
@@ -44,12 +45,16 @@ def test_a_page_shows_text_as_text_and_a_terminal_no_markup(tmp_path: Path) -> N
     assert json.loads((tmp_path / "sweep.json").read_text()) == {"format": "swarmdrive-sweep/1", "a": 1}
 
 
-def test_cells_of_something_else_and_torn_ones_do_not_count(tmp_path: Path) -> None:
-    path = tmp_path / "cells.jsonl"
-    for n in (1, 2):
-        Cells(path, "this").add(("a", n), value=n)
+def test_parts_are_kept_to_the_last_bit_but_those_of_something_else_and_torn_ones(tmp_path: Path) -> None:
+    path, computed = tmp_path / "cells.jsonl", list[str]()
+
+    def part(depends_on: str, n: int) -> object:
+        values = {"n": n, "array": np.array([[0.1 + 0.2, np.nan]])}
+        kept = Cells(path, depends_on).part(("a", n), lambda: computed.append(f"{depends_on}{n}") or values)
+        np.testing.assert_array_equal(kept["array"], values["array"])
+        return kept["n"]
+
+    assert [part("this", 1), part("this", 2), part("this", 1)] == [1, 2, 1]
     path.write_bytes(path.read_bytes()[:-5])
-    Cells(path, "that").add(("a", 2), value=3)
-    kept = Cells(path, "this")
-    assert (kept.get("a", 1), kept.get("a", 2)) == ({"value": 1}, None)
-    assert Cells(path, "that").get("a", 2) == {"value": 3}
+    assert [part("that", 2), part("this", 1), part("this", 2), part("that", 2)] == [2, 1, 2, 2]
+    assert computed == ["this1", "this2", "that2", "this2"]

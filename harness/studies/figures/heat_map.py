@@ -41,7 +41,7 @@ def heat_map(
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
         for (i, j), value in np.ndenumerate(percent):
-            light = high > low and value > (low + 2 * high) / 3
+            light = high > low and value > low + 0.55 * (high - low)
             axes.text(
                 j, i, f"{value:.0f}", ha="center", va="center", fontsize=7, color="white" if light else INK
             )
