@@ -95,7 +95,7 @@ def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> At
 
 
 def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[dict[str, int], int]:
-    """Decision points, each with the channel seed of one of its decisions, and of how many they are drawn.
+    """Draw decision points, each with the channel seed of one of its decisions; return also of how many.
 
     Each that the condition came to is as likely as any other, and so is each seed. A larger sample has the
     smaller one in it.
@@ -209,7 +209,7 @@ def _left_out(
 
 
 def rows(found: Attribution) -> list[Row]:
-    """A row for each kind of thing that was left out; intervals are over episodes."""
+    """Return a row for each kind of thing that was left out; intervals are over episodes."""
     return [
         _row(role, kind, of)
         for role, kind in KINDS
@@ -230,7 +230,7 @@ def _row(role: str, kind: str, left_out: Sequence[LeftOut]) -> Row:
 
 
 def headline(table: Sequence[Row]) -> str:
-    """What moved most, in a sentence."""
+    """Say what moved most."""
     known = [row for row in table if row.shift.n]
     if not known:
         return "Nothing was left out: no prompt of the sample lists an object, and no message was in time."

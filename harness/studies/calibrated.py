@@ -93,14 +93,14 @@ class _Drawn:
     draws: Draws  # of the channel; a link is up or down for a whole episode
 
     def step(self, number: int) -> "_Drawn":
-        """The rows of one step."""
+        """Return the rows of one step."""
         at = np.arange(number, len(self.right), STEPS)
         return _Drawn(
             self.right[at], self.intents.take(at), self.knowing[at], self.witness[at], self.draws.take(at)
         )
 
     def of_first(self, helpers: int) -> "_Drawn":
-        """The same with only the first helpers, whose draws no other moves."""
+        """Return the same with only the first helpers, whose draws no other moves."""
         draws = Draws(self.draws.link[:, :helpers], self.draws.jitter[:, :helpers])
         return replace(
             self, intents=self.intents.of_first(helpers), witness=self.witness[:, :helpers], draws=draws
@@ -133,7 +133,7 @@ class CalibratedWorld:
         self.success: Bools = self._knows
 
     def observe(self) -> Sequence[int]:
-        """The episodes, while there are decisions to make."""
+        """Return the episodes, while there are decisions to make."""
         self._step += 1
         if self._step == STEPS:
             return ()
@@ -156,7 +156,7 @@ class CalibratedWorld:
         return Due(np.arange(len(self._knows)), self._episode, self._seed, self._now.draws)
 
     def outlook(self, *_: Any) -> None:
-        """The study's vehicles are nowhere in particular, see nothing and claim nothing."""
+        """Return None: the study's vehicles are nowhere in particular, see nothing and claim nothing."""
 
     site = claims = outlook
 
@@ -184,7 +184,7 @@ class Calibrated:
         self._of_seeds = lru_cache(maxsize=2)(self._drawn)  # all points of a panel have the same draws
 
     def manifest(self) -> dict[str, Any]:
-        """What a reader needs to know of where the intents come from."""
+        """Return what a reader needs to know of where the intents come from."""
         rows = sorted({row for rows in FITTED_ON.values() for row in rows})
         return {
             "proxy_model_version": VERSION,
@@ -195,7 +195,7 @@ class Calibrated:
         }
 
     def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Iterable[WalkResult]]:
-        """Episodes of every seed, `CHUNK` at a time, which bounds memory."""
+        """Return episodes of every seed, `CHUNK` at a time, which bounds memory."""
         most = max((setting.vehicles for setting in settings), default=1) - 1
         for setting in settings:
             yield self._walked(setting, most, seeds)
@@ -259,7 +259,7 @@ class Calibrated:
 
 
 def stratified(generator: np.random.Generator, kinds: Ints) -> Floats:
-    """Uniform draws for rows of some kinds, both (n,): of the k rows of a kind one in each k-th of [0, 1).
+    """Return uniform draws for rows of kinds, both (n,): of the k rows of a kind one in each k-th of [0, 1).
 
     One such column a dimension is a Latin hypercube (McKay, Beckman and Conover 1979).
     """
@@ -272,7 +272,7 @@ def stratified(generator: np.random.Generator, kinds: Ints) -> Floats:
 
 
 def peaked(nats: Floats, top: Ints) -> Floats:
-    """Intents `(..., A)` of a given entropy: most on one action, the rest shared alike."""
+    """Return intents `(..., A)` of a given entropy: most on one action, the rest shared alike."""
     entropies, shares = _by_entropy()
     most = np.interp(nats, entropies, shares)[..., None]
     return np.where(np.asarray(top)[..., None] == np.arange(ACTIONS), most, (1 - most) / (ACTIONS - 1))
@@ -286,7 +286,7 @@ def _by_entropy() -> tuple[Floats, Floats]:
 
 
 def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
-    """Draws of a normal distribution, cut at `CUT` standard deviations either side, by its quantiles."""
+    """Return draws of a normal distribution, cut at `CUT` standard deviations, by its quantiles."""
     from scipy.special import ndtr, ndtri
 
     below = ndtr(-CUT)

@@ -61,7 +61,7 @@ class Choices:
     levels: tuple[Level, ...]  # of decision points, the first step's first
 
     def backwards(self, choose: Choose) -> Iterator[tuple[Level, Floats, Floats, Ints]]:
-        """Each level, the last first, with what its sets come to and which are chosen.
+        """Yield each level, the last first, with what its sets come to and which are chosen.
 
         Args:
             choose: index of the set chosen in each decision, (S, N), from the level, and from the success,
@@ -84,17 +84,17 @@ class Choices:
             yield level, ends, spent, k
 
     def played(self, choose: Choose) -> tuple[Floats, Floats]:
-        """Success, (S, E), and costs, (S, E, C), of every episode, by a rule as in `backwards`."""
+        """Return success, (S, E), and costs, (S, E, C), of every episode, by a rule as in `backwards`."""
         [*_, (level, ends, spent, k)] = self.backwards(choose)
         root = np.searchsorted(level.at, self.forest.root)
         return _of(ends, k)[:, root], _of(spent, k)[:, root]
 
     def oracle(self) -> tuple[Floats, Floats]:
-        """What the best choice of helpers comes to, with the fewest messages that it takes."""
+        """Return what the best choice of helpers comes to, with the fewest messages that it takes."""
         return self.played(lambda level, ends, spent: np.argmax(ends - PRICE * spent[..., 0], axis=-1))
 
     def index(self, asked: Bools) -> Ints:
-        """The sets of these helpers `(..., H)`, by number."""
+        """Return the sets of these helpers `(..., H)`, by number."""
         codes = self.sets @ (1 << np.arange(self.sets.shape[1]))
         order = np.argsort(codes)
         wide = np.pad(asked, [(0, 0)] * (asked.ndim - 1) + [(0, self.sets.shape[1] - asked.shape[-1])])
@@ -102,7 +102,7 @@ class Choices:
         return found
 
     def scheduled(self, point: OperatingPoint, worths: Sequence[Floats] | None = None) -> Choose:
-        """The rule that asks whom a point's schedule asks; `worths` of each level, if they are known."""
+        """Return the rule that asks whom a point's schedule asks, with each level's `worths` if known."""
         known = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
 
         def choose(level: Level, ends: Floats, spent: Floats) -> Ints:
@@ -115,7 +115,7 @@ class Choices:
         return choose
 
     def worths(self, point: OperatingPoint) -> list[Floats]:
-        """What asking each helper is worth by the point's schedule, `(S x N, H)` or `(S x N, 1)` a level."""
+        """Return what asking each helper is worth to a schedule, `(S x N, H)` or `(S x N, 1)` a level."""
         return [worth_of(point, level.intents, level.draws) for level in self.levels]
 
 
@@ -141,7 +141,7 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
 def choices(
     stored: ReplayedRun, point: OperatingPoint, seeds: Sequence[int], progress: Callable[[int], None]
 ) -> Choices:
-    """All choices of an operating point. What the run has no answer to its model is asked.
+    """Return all choices of an operating point. What the run has no answer to its model is asked.
 
     Args:
         stored: a run.

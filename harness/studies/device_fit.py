@@ -32,7 +32,7 @@ class Fit:
 
 
 def fits(device: Device, rows: Sequence[DeviceRow], answers: "Answers", window_s: float) -> list[Fit]:
-    """Each row with each kind of answer, within so many seconds from seeing to having the ego's answer."""
+    """Return each row with each kind of answer, of which `window_s` is the time from seeing to the answer."""
     return [_fit(device, row, kind, answers, window_s) for row in rows for kind in answers.output]
 
 
@@ -47,13 +47,13 @@ class Answers:
 
 
 def declared(prompt_tokens: int, answer_tokens: int) -> Answers:
-    """One answer of so many tokens, read out or written."""
+    """Return one answer of so many tokens, read out or written."""
     output = {READOUT: np.array([1.0]), WRITTEN: np.array([float(answer_tokens)])}
     return Answers(np.array([float(prompt_tokens)]), output)
 
 
 def of_run(run: Run) -> Answers:
-    """The ego's answers of a run, as they were given, and as if one letter of each prompt were read out.
+    """Return the ego's answers of a run, as given, and as if one letter of each prompt were read out.
 
     Raises:
         UserError: nobody counted their tokens.
@@ -93,7 +93,7 @@ class Comparison:
 
 
 def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
-    """A profile beside a run's own times. Raises UserError if no answer of the run was asked alone."""
+    """Compare a profile with a run's own times. Raises UserError if no answer of the run was asked alone."""
     alone = [a for a in run.answers if a.seconds is not None and a.error is None and not a.retries]
     alone = [a for a in alone if not a.first and a.prompt_tokens is not None and a.completion_tokens]
     figures = [

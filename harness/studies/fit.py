@@ -15,7 +15,7 @@ from harness.studies.ledger import paper_numbers
 
 
 def fit() -> Parameters:
-    """Parameters from the rows of `paper_numbers.csv` that `FITTED_ON` names."""
+    """Return parameters from the rows of `paper_numbers.csv` that `FITTED_ON` names."""
     from scipy.special import ndtri
 
     paper = {row["id"]: row for row in paper_numbers()}

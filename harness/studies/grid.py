@@ -64,7 +64,7 @@ class Cell:
     run: Run
 
     def level(self, factor: Factor) -> str:
-        """Which level of a factor it has."""
+        """Return the level of a factor."""
         return level(self.ego if factor.half == "ego" else self.helper, factor.field)
 
     @cached_property
@@ -76,7 +76,7 @@ class Cell:
         return {**of, "tokens": mean_by_place(tokens(run), places, n).reshape(run.grid.shape)}
 
     def estimate(self, metric: str, condition: str) -> Estimate:
-        """A metric under a condition, over episodes."""
+        """Return a metric under a condition, over episodes."""
         return over_episodes(metric, self.values[metric][self.run.conditions.index(condition)])
 
 
@@ -112,12 +112,12 @@ class Halves:
 
 
 def level(agent: Agent, field: str) -> str:
-    """A factor's level that an agent has."""
+    """Return a factor's level that an agent has."""
     return {"model": agent.card.name, "prompt": agent.prompt.version, "answer": agent.answer}[field]
 
 
 def tokens(run: Run) -> Floats:
-    """Tokens in and out that a decision took, of the ego and of each helper that was to reply, (n,).
+    """Return tokens in and out that a decision took, of the ego and of each helper that was to reply, (n,).
 
     NaN throughout where a model of the run counts none.
     """
@@ -196,7 +196,7 @@ class Grid:
         return tuple(factor for factor in every if len(factor.levels) > 1)
 
     def name(self, agent: Agent, half: str) -> str:
-        """An agent by what is varied of its half; by its model where nothing is."""
+        """Return an agent by what is varied of its half; by its model where nothing is."""
         varied = [factor.field for factor in self.factors if factor.half == half]
         return " ".join(level(agent, field) for field in varied or ("model",))
 
@@ -245,7 +245,7 @@ class Grid:
                 yield f"{one.name} → {x} × {two.name} → {y}", crossed, same
 
     def halves(self, condition: str) -> Halves | None:
-        """What each half explains; None without a channel, where one alone varies, or all may be alike."""
+        """Return what each half explains; None without a channel, if one varies, or if all may be alike."""
         at = self.conditions.index(condition)
         if 1 in (self.rows, self.columns) or not self.cells[0].run.manifest.conditions[at]["profile"]:
             return None

@@ -35,7 +35,7 @@ THRESHOLDS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
 
 
 def layouts(stored: ReplayedRun, wanted: Purpose) -> str:
-    """A run with its layout seeds in words. Raises UserError unless all are for this purpose."""
+    """Return a run with its layout seeds in words. Raises UserError unless all are for this purpose."""
     seeds = stored.dataset.forest.seeds
     first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
     if purposes(first, count) != [wanted]:
@@ -47,7 +47,7 @@ def layouts(stored: ReplayedRun, wanted: Purpose) -> str:
 
 
 def gains(made: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:
-    """Inputs (n, F) and gains (n,) of asking each helper alone, at every point where it may be asked."""
+    """Return inputs (n, F) and gains (n,) of asking each helper alone, wherever it may be asked."""
     alone = [made.index(np.eye(made.sets.shape[1], dtype=bool)[h]) for h in range(made.sets.shape[1])]
     rows, targets = [], []
     for level, ends, _, _ in made.backwards(choose):
@@ -61,7 +61,7 @@ def gains(made: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats,
 
 
 def fit(x: Floats, y: Floats) -> Network:
-    """The network that says y (n,) of x (n, F), by least squares: Adam, whole batches, weights decay."""
+    """Fit the network that says y (n,) of x (n, F), by least squares: Adam, whole batches, decay."""
     draws = noise.generator("schedule", "weights")
     centre, scale = x.mean(axis=0), np.maximum(x.std(axis=0), LEAST)
     z, n = (x - centre) / scale, len(y)
@@ -89,7 +89,7 @@ def fit(x: Floats, y: Floats) -> Network:
 
 
 def learn(train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]) -> Network:
-    """The network learnt from runs on train layouts, under an operating point.
+    """Learn the network from runs on train layouts, under an operating point.
 
     Its `max_helpers` are asked while it is learnt; the first round decides by its own schedule.
     """
@@ -106,7 +106,7 @@ def learn(train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callabl
 
 
 def by_network(made: Choices, point: OperatingPoint, network: Network, threshold: float) -> Choose:
-    """The rule that asks whom the network says to."""
+    """Return the rule that asks whom the network says to."""
     schedule = Learnt(network, threshold)
     worths = [schedule.worth(known_of(point, level.intents, level.draws)) for level in made.levels]
     return made.scheduled(replace(point, threshold=threshold), worths)
@@ -115,7 +115,7 @@ def by_network(made: Choices, point: OperatingPoint, network: Network, threshold
 def tuned(
     network: Network, tune: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]
 ) -> float:
-    """The threshold with the most success on tune layouts, the mean over runs; of equals the highest."""
+    """Return the threshold with the most success on tune layouts, averaged over runs; the highest such."""
     success = np.zeros(len(THRESHOLDS))
     looks = replace(point, schedule="coverage", threshold=None)
     for stored in tune:
@@ -125,7 +125,7 @@ def tuned(
 
 
 def text(stated: Stated) -> str:
-    """The file of a schedule: TOML, whose strings and lists are JSON's."""
+    """Return the file of a schedule: TOML, whose strings and lists are JSON's."""
     fields = asdict(stated)
     network = fields.pop("network")
     lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]

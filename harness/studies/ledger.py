@@ -37,13 +37,13 @@ ASSUMED = {
 
 
 def paper_numbers() -> list[dict[str, str]]:
-    """The rows of `paper_numbers.csv`, taken from the paper's text and figures."""
+    """Return the rows of `paper_numbers.csv`, taken from the paper's text and figures."""
     text = text_of(Path(__file__).with_name("paper_numbers.csv"))
     return list(csv.DictReader(text.splitlines()))
 
 
 def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
-    """A row for each number of the paper.
+    """Return a row for each number of the paper.
 
     Columns: `id`, `panel`, `condition`, `variable`, `value`, `metric`, `unit`, `paper_low`, `paper_high`,
     `ours`, `ci_low`, `ci_high`, `difference` (to the nearest end of the paper's range), `allowed`, `verdict`,
@@ -81,7 +81,7 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: float) -> str:
-    """Of a mean with its interval, where `least` to `most` is allowed."""
+    """Return the verdict on a mean with its interval, where `least` to `most` is allowed."""
     if least <= mean <= most:
         return "within"
     return "misses" if ci_low > most or ci_high < least else "unclear"  # also where no interval is known
@@ -106,7 +106,7 @@ def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[
 
 
 def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
-    """The paper's values for figures, a row a grid point: `panel`, `condition` and `metric` as we name them.
+    """Return the paper's values for figures, a row a grid point, with our names of condition and metric.
 
     `low` and `high` are in the unit of the ledger, equal where the paper gives one value.
     """
@@ -120,7 +120,7 @@ def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def tally(ledger: "pd.DataFrame") -> dict[str, int]:
-    """Numbers of the paper that can be run; how many of them have which verdict, and are predicted."""
+    """Count the numbers of the paper that can be run, by verdict, and those that are predicted."""
     ran = ledger[ledger.kind != "cited"]
     total, misses = set(ran.id), set(ran[ran.verdict == "misses"].id)
     unclear = set(ran[ran.verdict == "unclear"].id) - misses

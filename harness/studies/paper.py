@@ -32,7 +32,7 @@ class Panel:
 
 
 def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
-    """The paper's four panels, and one of our own that takes Equation 2 away.
+    """Return the paper's four panels, and one of our own that takes Equation 2 away.
 
     Seeds times episodes is read as 5 x 1 500 and, at a grid point, 5 x 300.
     """

@@ -57,11 +57,11 @@ class Source(Protocol):
     same_episodes: bool  # whether every seed plays the same episodes
 
     def manifest(self) -> dict[str, Any]:
-        """What a reader needs to know of where the intents come from."""
+        """Return what a reader needs to know of where the intents come from."""
         ...
 
     def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Iterable[WalkResult]]:
-        """Walks at each grid point in turn, in parts of some episodes; every point has the same draws.
+        """Yield walks at each grid point in turn, in parts of some episodes; every point has the same draws.
 
         A grid point's vehicles are the nearest ones. Its parts are taken before the next point.
         """
@@ -72,7 +72,7 @@ def walk_through(
     world: World[Any], points: Sequence[OperatingPoint], ask: Ask[Any], seeds: Sequence[int],
     episodes: Ints, ties: str,
 ) -> Iterator[tuple[dict[str, Floats], Ints]]:  # fmt: skip
-    """`COLUMNS` and `places` of each point's decisions, rounded as rows are; `episodes` (E,) ascending."""
+    """Yield `COLUMNS` and `places` of each point's decisions, rounded as rows; `episodes` (E,) ascending."""
     parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
     places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
     ascending = np.argsort(seeds)
@@ -171,7 +171,7 @@ def _estimates(
 
 
 def over_own_episodes(name: str, values: Floats) -> Estimate:
-    """Student's t over seeds that have episodes of their own, of a metric's values (S, E).
+    """Return Student's t over seeds that have episodes of their own, of a metric's values (S, E).
 
     A stratified share of E episodes is exact but for rounding to whole ones, so that seeds may agree to the
     last episode and be wrong by the same. Half an episode, the largest standard deviation that rounding up or

@@ -24,7 +24,7 @@ class Standing:
 
 
 def rank(dataset: Dataset, workers: Workers, progress: Callable[[int], None]) -> dict[str, Standing]:
-    """Each driver's standing over the dataset's episodes, every one of which is driven again."""
+    """Return each driver's standing over the dataset's episodes, every one of which is driven again."""
     live = drive_apart(dataset.scenario, dataset.seeds, workers, progress)
     frozen = dataset.reference_success()
     return {

@@ -41,13 +41,13 @@ class Drawn:
 
 
 def by_sight(channel: Physical, distances_m: Sequence[float] | Floats) -> dict[str, Floats]:
-    """The channel's own curve behind each of `SIGHTS`."""
+    """Return the channel's own curve behind each of `SIGHTS`."""
     metres = np.asarray(distances_m, dtype=float)
     return {name: channel.reception(metres, sight) for name, sight in SIGHTS.items()}
 
 
 def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Drawn]:
-    """`n` trips with one helper at each distance, in sight along one road."""
+    """Draw `n` trips with one helper at each distance, in sight along one road."""
     result = []
     for distance_m in distances_m:
         trips = Trips(np.arange(n), np.full(n, seed), np.zeros(n, dtype=int), 1)
@@ -81,7 +81,7 @@ class Gap:
 
 
 def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Gap]:
-    """Of `n` trips of two vehicles at each distance, in sight, 14 m/s along one road, for `PACKETS` packets.
+    """Drive `n` trips of two vehicles at each distance, in sight, 14 m/s on one road, for `PACKETS`.
 
     Their shadowing changes as they go; a packet is drawn by its own loss, as runs draw messages. What a
     trip's end cuts off is left out, so waits that would be longer than a tenth of a trip are unknown.
@@ -135,7 +135,7 @@ class _Row(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def curves_of(path: Path) -> list[Curve]:
-    """Curves out of a CSV: `distance_m`, `reception`, and if it has them `configuration` and `source`.
+    """Read curves from a CSV: `distance_m`, `reception`, and if it has them `configuration` and `source`.
 
     Raises:
         UserError: it is none, or a value is not allowed: file, line, value.
@@ -186,7 +186,7 @@ class Compared:
 
 
 def compared(channel: Channel, curve: Curve, where: str) -> Compared:
-    """The channel, with the curve's settings, against the curve. Raises UserError for one it has not."""
+    """Compare the channel, with the curve's settings, with the curve. Raises UserError for an unknown one."""
     there = changed(channel, pairs(curve.configuration), where)
     assert isinstance(there, Physical)
     return Compared(curve, there.reception(curve.distance_m))
@@ -195,7 +195,7 @@ def compared(channel: Channel, curve: Curve, where: str) -> Compared:
 def crowded(
     channel: Channel, vehicles: Sequence[int], radius_m: float, distance_m: float, sight: str
 ) -> Floats:
-    """Loss of one transmission when so many vehicles stand within a radius and nobody else does, `(n,)`.
+    """Return the loss of one transmission with only so many vehicles, within a radius, `(n,)`.
 
     Those other than sender and receiver are the background's load, evenly along one road through the radius.
 

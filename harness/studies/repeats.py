@@ -31,7 +31,7 @@ STATED, SAMPLED, DOUBT = "stated_entropy_nats", "sampled_entropy_nats", "stated_
 
 
 def each(spec: Spec, repeats: int) -> dict[str, Spec]:
-    """The runs of several repeats, by the name of their folders."""
+    """Return the runs of several repeats, by the name of their folders."""
     seeds = range(spec.sampling_seed, spec.sampling_seed + repeats)
     return {f"repeat-{n}": replace(spec, sampling_seed=seed) for n, seed in enumerate(seeds, 1)}
 
@@ -103,7 +103,7 @@ class Repeats:
         return tuple(Score.of(*each, "episodes") for each in found)
 
     def estimate(self, condition: str, metric: str) -> Estimate:
-        """One figure; NaN where it is not known."""
+        """Return one figure; NaN where it is not known."""
         [found] = [s for s in self.scores if (s.condition, s.metric) == (condition, metric)]
         return found.estimate
 
@@ -143,7 +143,7 @@ class Repeats:
         return scenes, counts, episodes
 
     def wavering(self, most: int) -> list[Wavering]:
-        """The decision points that repeats disagree on, those with most pairs that do first."""
+        """Return the decision points that repeats disagree on, those with most pairs that do first."""
         scenes, counts, _ = self._actions
         of = np.nan_to_num(known_mean(flips(counts), axis=-1))
         n = counts.sum(axis=-1)
@@ -171,25 +171,25 @@ class Repeats:
 
 
 def flips(counts: Ints) -> Floats:
-    """Share of pairs of repeats that took different actions, (...), of counts (..., A); NaN for no pair."""
+    """Return the share of pairs of repeats that act differently, (...), of counts (..., A); NaN for none."""
     n = counts.sum(axis=-1)
     pairs, same = n * (n - 1), (counts * (counts - 1)).sum(axis=-1)
     return np.where(pairs > 0, 1 - same / np.maximum(pairs, 1), np.nan)
 
 
 def stable(counts: Ints) -> Floats:
-    """1 where all repeats took one action, else 0, (...), of counts (..., A); NaN for fewer than two."""
+    """Return 1 where all repeats act alike, else 0, (...), of counts (..., A); NaN for fewer than two."""
     n = counts.sum(axis=-1)
     return np.where(n > 1, counts.max(axis=-1) == n, np.nan)
 
 
 def all_of(wins: Floats, k: int, j: int) -> Floats:
-    """Probability that j of k repeats, drawn without replacement, all succeed: pass^j without bias."""
+    """Return the probability that j of k repeats, drawn without replacement, all succeed: pass^j."""
     return np.asarray(_choose(wins, j) / math.comb(k, j))
 
 
 def any_of(wins: Floats, k: int, j: int) -> Floats:
-    """Probability that at least one of j of k repeats succeeds: any@j without bias (Chen et al. 2021)."""
+    """Return the probability that one or more of j of k succeed: any@j without bias (Chen et al. 2021)."""
     return 1 - all_of(k - wins, k, j)
 
 
@@ -198,7 +198,7 @@ def _choose(n: Floats, j: int) -> Floats:
 
 
 def between_share(values: Floats) -> Estimate:
-    """Share of the variance of values (E, k) that lies between episodes: ICC(1) of Shrout and Fleiss (1979).
+    """Return the share of variance of values (E, k) between episodes: ICC(1) of Shrout and Fleiss (1979).
 
     Below 0 where repeats of one episode differ more than episodes do; NaN where nothing differs. The interval
     resamples episodes.

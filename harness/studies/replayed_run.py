@@ -163,7 +163,7 @@ class ReplayedRun:
         return [forest.ids[n] for n in forest.root.tolist()]
 
     def manifest(self) -> dict[str, Any]:
-        """The run, the digest of its dataset, and where its times come from."""
+        """Return the run, the digest of its dataset, and where its times come from."""
         return {
             "name": self.name, "run": str(self.run.path), "dataset_sha256": self.dataset.sha256,
             "latency": msgspec.to_builtins(self._asker.latency),
@@ -171,7 +171,7 @@ class ReplayedRun:
         }  # fmt: skip
 
     def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Sequence[WalkResult]]:
-        """All episodes, with the ego and so many of the nearest vehicles.
+        """Walk all episodes, with the ego and so many of the nearest vehicles.
 
         Raises:
             UserError: a point has the run's model fuse, and it cannot.
@@ -199,7 +199,7 @@ class ReplayedRun:
     def asked_in(
         self, world: FrozenWorld, points: Sequence[OperatingPoint], helpers: int | None = None
     ) -> Ask[Scene]:
-        """What intends whoever a walk of this world asks, of so many of the nearest helpers; None for all."""
+        """Return what answers a walk of this world, with so many of the nearest helpers; None for all."""
 
         def leave_out(moments: Bools) -> None:
             for point in points:
@@ -208,7 +208,7 @@ class ReplayedRun:
         return _Nearest(self, self.vehicles - 1 if helpers is None else helpers, leave_out)
 
     def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> Floats:
-        """Joules of each vehicle's answer, (n, 1+H); NaN where unknown."""
+        """Return joules of each vehicle's answer, (n, 1+H); NaN where unknown."""
         manifest = self.run.manifest
         if manifest.device_profile is None:
             return np.full((len(moments), self.vehicles), np.nan)
@@ -218,7 +218,7 @@ class ReplayedRun:
         return taken
 
     def radio_j(self, point: OperatingPoint, heard: Exchange) -> Floats:
-        """Joules that radios take to send the messages of each decision, (n,); NaN where unknown."""
+        """Return joules that radios take to send the messages of each decision, (n,); NaN where unknown."""
         profile = self.run.manifest.device_profile
         if profile is None:
             return np.full(heard.messages.shape, np.nan)
@@ -231,7 +231,7 @@ class ReplayedRun:
         return self._asker.spec
 
     def answered(self, requests: Sequence[Request]) -> Mapping[str, Answer]:
-        """All answers by request id, these among them; what is not there is asked, and kept in the run."""
+        """Return all answers by request id, with these; what is not there is asked, and kept in the run."""
         with self._writing():
             self._asker.answer(requests)
         return self._asker.answers
@@ -257,12 +257,12 @@ class ReplayedRun:
             return self._asker(moments)
 
     def whole(self, moments: Sequence[Scene]) -> Intents:
-        """What every vehicle intends. Where the run has no answer its model is asked."""
+        """Return what every vehicle intends. Where the run has no answer its model is asked."""
         with self._writing():
             return self._asker.whole(moments)
 
     def helpers(self, moments: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
-        """What vehicles intend where a helper is wanted; the model is asked for what the run has not."""
+        """Return what vehicles intend where a helper is wanted; the model is asked what the run lacks."""
         scenes, places = wanted_in(moments, wanted)
         if not self._asks and any(self._asker.lacks(scenes, blind, places)):
             lacks = "that are shown nothing, which messages=blind needs" if blind else "that it did not ask"
@@ -278,7 +278,7 @@ class ReplayedRun:
         return there
 
     def intents(self, moments: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
-        """What every vehicle intends; where its model is not asked, walks without an answer are left out."""
+        """Return what vehicles intend; unless the model is asked, walks without an answer are left out."""
         new = [scene for scene in moments if scene.id not in self._row]
         if any(self._asker.lacks(new, places=[EGO] * len(new))):
             if self._asks:
@@ -304,12 +304,12 @@ class ReplayedRun:
         return self._laid_out.take([self._row[scene.id] for scene in scenes]).of_first(helpers)
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
-        """The same where helpers are shown nothing, as far as the run has answers or asks them all."""
+        """Return the same where helpers are shown nothing, as far as the run has answers or asks them all."""
         with self._writing():
             return self._asker.blind(moments, at)
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
-        """The ego's answers to these sets of messages; what the run has not is asked, and kept in it."""
+        """Return the ego's answers to these sets of messages; what the run lacks is asked, and kept in it."""
         if not self._asks:
             raise UserError(
                 f"--no-model: {printable(self.run.path)} may lack answers to other sets of messages, which "

@@ -37,7 +37,7 @@ class Setting:
     most: int
 
     def at(self, point: OperatingPoint) -> OperatingPoint:
-        """The operating point with this setting."""
+        """Return the operating point with this setting."""
         if self.schedule == PAPER and self.threshold is not None:
             changed = replace(point, schedule=PAPER, threshold=None, tau_nats=self.threshold)
         else:
@@ -57,7 +57,7 @@ class Play:
     costs: Floats
 
     def of(self, cost: str) -> Floats:
-        """One of `COSTS` of every episode, (S, E)."""
+        """Return one of `COSTS` of every episode, (S, E)."""
         return np.asarray(self.costs[..., COSTS.index(cost)])
 
     @property
@@ -81,7 +81,7 @@ def plays(made: Choices, point: OperatingPoint, settings: Sequence[Setting]) -> 
 
 
 def settings(made: Choices, point: OperatingPoint, schedule: str) -> list[Setting]:
-    """The settings of a schedule that are tried: tenths of what asking is worth, its own threshold, and 0."""
+    """Return the settings to try: tenths of what asking is worth, the own threshold, and 0."""
     most = range(1, point.max_helpers + 1)
     own = replace(point, schedule=schedule, threshold=None)
     if schedule != PAPER and SCHEDULES[schedule].threshold is None:
@@ -143,10 +143,10 @@ class Compared:
         return np.asarray(resampled(noise.generator("schedule", "episodes"), n, RESAMPLES) / n)
 
     def chosen(self, schedule: str) -> Play:
-        """At the setting with the most success on tune layouts within the budget; of equals the cheapest.
+        """Return the play with the most success on tune layouts within the budget; of equals the cheapest.
 
-        Where none is within the budget, at the cheapest.
-        Without tune layouts at the schedule's own threshold, with all the helpers that the point allows.
+        Where none is within the budget, it is the cheapest.
+        Without tune layouts it is at the schedule's own threshold, with all helpers that the point allows.
         """
         if not self.tune:
             threshold = self.point.tau_nats if schedule == PAPER else SCHEDULES[schedule].threshold
@@ -163,7 +163,7 @@ class Compared:
         return bool(np.isfinite(self.oracle.means["energy_j"]))
 
     def front(self, schedule: str, cost: str = "messages") -> list[Play]:
-        """The settings that are taken as the budget grows: of those it allows, the best on tune layouts.
+        """Return what is taken as the budget grows: of the settings it allows, the best on tune layouts.
 
         Without tune layouts the best on these, which flatters them. The first asks nobody.
         """
@@ -183,7 +183,7 @@ class Compared:
         return [(play, float(tuned.get(play.setting, play).success.mean())) for play in every]
 
     def of_oracle(self) -> list[Play]:
-        """The oracle where a success may cost so many messages at most, from none on."""
+        """Return the oracle where a success may cost so many messages at most, from none on."""
         bound, alone = self.oracle, self.plays[NEVER][0].costs
         cheap = [bound.messages <= cap for cap in range(int(bound.messages.max()) + 1)]
         costs = [np.where(of[..., None], bound.costs, alone) for of in cheap]
@@ -192,7 +192,7 @@ class Compared:
         ]
 
     def area(self, schedule: str, cost: str = "messages") -> Estimate:
-        """Success averaged over budgets beyond never asking, with a bootstrap interval over episodes."""
+        """Return success averaged over budgets beyond never asking, with a bootstrap over episodes."""
         of_bound = [(play, float(play.success.mean())) for play in self.of_oracle()]
         ranked = of_bound if schedule == ORACLE else self._ranked(schedule)
         success = self._resampled([play.success for play, _ in ranked])
@@ -236,7 +236,7 @@ class Compared:
         )  # fmt: skip
 
     def random_like(self, play: Play) -> Floats:
-        """Success of `random` with as many messages, (S, E): a mean of its two shares next to that budget."""
+        """Return success of `random` with as many messages, (S, E): a mean of its two shares next to it."""
         most = self.point.max_helpers
         every = [play for play in self.plays[RANDOM] if play.setting.most == most]
         ladder = sorted(

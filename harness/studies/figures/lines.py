@@ -93,7 +93,7 @@ def reception(
     name: str, curves: Mapping[str, Floats], distances_m: Floats, messages: "Sequence[Drawn]",
     against: "Sequence[Compared]",
 ) -> Figure:  # fmt: skip
-    """A radio's reception against distance, and beside it, if there are any, against others' curves.
+    """Draw a radio's reception against distance, and beside it, if there are any, against others' curves.
 
     Args:
         name: of the condition.

@@ -50,7 +50,7 @@ class Questions:
             raise UserError(f"--twin: none applies here: {self.lacks(self.twins)}")
 
     def lacks(self, names: Sequence[str]) -> str:
-        """What these twins need and nothing here has."""
+        """Return what these twins need and nothing here has."""
         needs = ((name, lack(self.spec, TWINS[name]) or TWINS[name].needs) for name in names)
         return "; ".join(f"{name} needs {what}" for name, what in needs)
 
@@ -61,7 +61,7 @@ class Questions:
         return self.spec.source.dataset
 
     def points(self) -> dict[int, list[str]]:
-        """Decision points by episode: of each step one of those on the drivers' courses."""
+        """Return decision points by episode: of each step one of those on the drivers' courses."""
         forest, drawn = self.dataset.forest, dict[int, dict[int, str]]()
 
         def draw(scene: str) -> float:
@@ -79,7 +79,7 @@ class Questions:
         return sum(map(len, self.points().values()))
 
     def begin(self, identity: str) -> work.Begun:
-        """What the work begins with; `identity` is the digest of the model's."""
+        """Return what the work begins with; `identity` is the digest of the model's."""
         settings = {**self.spec.settings(), "twins": self.twins, "seed": self.seed, "identity": identity}
         return work.Begun(settings=msgspec.json.decode(msgspec.json.encode(settings)))
 
@@ -98,7 +98,7 @@ class Questions:
 
 
 def lack(spec: Spec, twin: Twin) -> str | None:
-    """What a twin needs that this evaluation never has; None where some question may have it."""
+    """Return what a twin needs that this evaluation never has; None where some question may have it."""
     language_model = spec.ego.can.language_model
     if twin.actions and spec.scenario.one_sided is not None:
         return f"{twin.needs}: {spec.scenario.one_sided}"

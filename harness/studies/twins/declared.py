@@ -75,7 +75,7 @@ class Twin:
 
 
 def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
-    """A copy of plain data whose leaves are `leaf(key, value)`; those of a list have the list's key."""
+    """Return a copy of plain data with `leaf(key, value)` for leaves; those of a list have the list's key."""
     if isinstance(value, Mapping):
         return {name: changed(of, leaf, name) for name, of in value.items()}
     if isinstance(value, list):
@@ -84,7 +84,7 @@ def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
 
 
 def mirrored(spec: Spec, scene: Scene, graph: Graph) -> Graph:
-    """Left and right swapped; the same graph if the scenario is one-sided, or has no such path."""
+    """Swap left and right; the same graph if the scenario is one-sided, or has no such path."""
     if spec.scenario.one_sided is not None:
         return graph
     twin = swapped(graph)
@@ -94,7 +94,7 @@ def mirrored(spec: Spec, scene: Scene, graph: Graph) -> Graph:
 
 
 def swapped(graph: Graph) -> Graph:
-    """Left and right swapped in positions, headings and words; sectors in the order that they had."""
+    """Swap left and right in positions, headings and words; sectors in the order that they had."""
 
     def leaf(key: str, value: Any) -> Any:
         if key in ("left_m", "heading_deg") and value is not None:
@@ -111,7 +111,7 @@ def swapped(graph: Graph) -> Graph:
 
 
 def flipped(image: Image) -> Image:
-    """What the cameras would see in a mirror, which is what those of the mirrored scene see."""
+    """Return what the cameras would see in a mirror, which is what those of the mirrored scene see."""
     return Image(np.ascontiguousarray(image.pixels[:, ::-1]))
 
 
@@ -127,7 +127,7 @@ NAMES = ("id", "with", "viewer", "by")
 
 
 def rounded(spec: Spec, scene: Scene, graph: Graph) -> Graph:
-    """Metres and m/s without decimals, shares with one. Times stay: half a second decides conflicts."""
+    """Round metres and m/s to none, shares to one decimal. Times stay: half a second decides conflicts."""
 
     def leaf(key: str, value: Any) -> Any:
         if isinstance(value, float) and key.endswith(("_m", "_mps")):
@@ -138,7 +138,7 @@ def rounded(spec: Spec, scene: Scene, graph: Graph) -> Graph:
 
 
 def far_vehicle(spec: Spec, scene: Scene, graph: Graph) -> Graph:
-    """One more vehicle: it stands beside the road, away from viewer, ego and conflict zone."""
+    """Add a vehicle: it stands beside the road, away from viewer, ego and conflict zone."""
     away = max(FAR_M, CLEAR_M + graph["self"]["zone_m"])
     ahead = graph["ego"]["forward_m"] < 0  # the other way than the ego; behind the ego itself
     used = {int(v["id"][1:]) for v in scene.record["state"]["vehicles"]}
@@ -153,7 +153,7 @@ def far_vehicle(spec: Spec, scene: Scene, graph: Graph) -> Graph:
 
 
 def jittered(spec: Spec, scene: Scene, graph: Graph) -> Graph:
-    """Distances of what sensors report as another look would have them, with the same noise once more."""
+    """Jitter the distances that sensors report with their noise once more, as another look would."""
     draws = noise.generator("twins", "jitter", scene.id, graph["viewer"])
     twin = changed(graph, lambda key, value: value)
     by_id = {}
@@ -172,7 +172,7 @@ def jittered(spec: Spec, scene: Scene, graph: Graph) -> Graph:
 
 
 def reversed_lines(spec: Spec, request: Request) -> Request:
-    """Neighbouring lines that begin with a vehicle's name, the last first."""
+    """Reverse neighbouring lines that begin with a vehicle's name."""
 
     def turned(run: re.Match[str]) -> str:
         return "".join(reversed(run[0].splitlines(keepends=True)))
@@ -181,12 +181,12 @@ def reversed_lines(spec: Spec, request: Request) -> Request:
 
 
 def reversed_lists(graph: Graph) -> Graph:
-    """Objects and conflicts, the last first."""
+    """Reverse objects and conflicts."""
     return {**graph, "nodes": graph["nodes"][::-1], "conflicts": graph["conflicts"][::-1]}
 
 
 def in_feet(spec: Spec, scene: Scene, graph: Graph) -> Graph:
-    """Feet and km/h where a template has metres and m/s as words that can be replaced."""
+    """Put feet and km/h where a template has metres and m/s as words that can be replaced."""
     return dict(changed(graph, _in_feet)) if _says_units(spec, graph["role"]) else graph
 
 
@@ -216,7 +216,7 @@ def _speeds(spec: Spec, factor: float) -> str:
 
 
 def other_units(spec: Spec, request: Request) -> Request:
-    """The words of units, and the target speeds."""
+    """Replace the words of units, and the target speeds."""
     if not _says_units(spec, request.role):
         return request
 
@@ -242,13 +242,13 @@ def paraphrased(spec: Spec, request: Request) -> Request:
 
 @cache
 def paraphrases() -> dict[str, str]:
-    """Other words for sentences."""
+    """Return other words for sentences."""
     text = text_of(Path(__file__).parent / "paraphrases.toml", "settings")
     return {str(sentence): str(other) for sentence, other in tomllib.loads(text).items()}
 
 
 def reordered_keys(spec: Spec, request: Request) -> Request:
-    """The members of the JSON objects that a prompt shows, the last first."""
+    """Reverse the members of the JSON objects that a prompt shows."""
     return _reworded(request, _reversed_members)
 
 
@@ -280,7 +280,7 @@ def _closing(text: str, start: int) -> int:
 
 
 def permuted_letters(spec: Spec, request: Request) -> Request:
-    """Each letter of a read-out stands for the next action, the first for the last."""
+    """Let each letter of a read-out stand for the next action, the first for the last."""
     moved = (*request.actions[-1:], *request.actions[:-1])
     letters = readout.letters(moved)
     letter = dict(zip(letters, letters[1:] + letters[:1], strict=True))

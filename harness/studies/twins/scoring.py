@@ -48,7 +48,7 @@ class Row:
 
 
 def distance(p: Sequence[float] | None, q: Sequence[float] | None) -> float | None:
-    """Total variation between two distributions, 0 to 1; None where one is missing."""
+    """Return total variation between two distributions, 0 to 1; None where one is missing."""
     return float(np.abs(np.subtract(p, q)).sum() / 2) if p and q else None
 
 
@@ -62,7 +62,7 @@ def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bo
 
 
 def rows(pairs: Sequence[Pair], twins: Sequence[Twin]) -> list[Row]:
-    """A row a twin and role that was asked."""
+    """Return a row a twin and role that was asked."""
     return [
         _row(twin, role, of)
         for twin in twins
@@ -85,7 +85,7 @@ def _row(twin: Twin, role: str, pairs: Sequence[Pair]) -> Row:
 
 
 def headline(table: Sequence[Row]) -> str:
-    """The result in a sentence."""
+    """Say what holds, and what holds least often."""
     whole = sum(not row.broken for row in table)
     least = min(table, key=lambda row: row.invariance_rate.value)
     if not least.broken:

@@ -179,7 +179,7 @@ def same_answer(questions: Questions, rows: Sequence[Row]) -> str:
 
 
 def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
-    """The lines that two texts do not share, `-` of the first and `+` of the other, with words marked."""
+    """Yield the lines that two texts do not share, `-` of the first and `+` of the other, words marked."""
     old, new = a.splitlines(), b.splitlines()
     for kind, i, j, k, n in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
         if kind != "equal":
