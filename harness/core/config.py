@@ -135,6 +135,16 @@ def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
         raise UserError(f"{where}: {printable(problem)}") from None
 
 
+def check(record: Any) -> None:
+    """Raise UserError unless a dataclass's numbers and choices are what its annotations allow; NaN is not."""
+    for name, hint in _hints(type(record)).items():
+        value = getattr(record, name)
+        bounds = [meta for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, msgspec.Meta)]
+        allowed = [str(choice) for choice in get_args(hint)] if get_origin(hint) is Literal else []
+        if not all(meta.ge <= value <= meta.le for meta in bounds) or (allowed and str(value) not in allowed):
+            raise UserError(f"{name} is {value}: give {' or '.join(allowed) or _description(hint)}")
+
+
 def settable(record: Any) -> list[str]:
     """Return the names of the fields that hold one number, boolean or string."""
     values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}

@@ -68,6 +68,7 @@ class ItsG5(Transceiver):
     frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89  # carrier frequency, here the control channel's
     # see `Propagation`; the source's 0.5 m leaves effective antennas of 1 m
     environment_height_m: Annotated[float, between(0, 100)] = 0.5
+    antenna_m: Annotated[float, between(0, 10)] = 1.5  # height of every antenna
     density_per_km: Annotated[float, between(0, 10000)] = 60.0
     sensing_dbm: Annotated[float, between(-200, 50)] = -85.0
     packet_bytes: Annotated[int, between(1, 2304)] = 190  # size of a background packet
@@ -86,14 +87,7 @@ class ItsG5(Transceiver):
     curve: str = "11p-goubet"
 
     def __post_init__(self) -> None:
-        numbers = {
-            "density_per_km": (0.0, 10_000.0), "rate_hz": (0.0, 1000.0), "packet_bytes": (1, 2304),
-            "header_bytes": (0, 2304), "aifs_slots": (0, 15), "contention_window": (1, 1023),
-            "antenna_m": (self.environment_height_m + 0.1, 10.0),
-        }  # fmt: skip
-        for name, (least, most) in numbers.items():
-            if not least <= getattr(self, name) <= most:
-                raise UserError(f"its-g5: {name} is {getattr(self, name)}; it must be from {least} to {most}")
+        super().__post_init__()
         if self.data_rate_mbps not in RATES_MBPS:
             allowed = ", ".join(f"{rate:g}" for rate in RATES_MBPS)
             raise UserError(f"its-g5: data_rate_mbps is {self.data_rate_mbps}; it must be one of {allowed}")

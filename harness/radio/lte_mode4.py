@@ -9,7 +9,6 @@ vehicles a kilometre, 10 and 20 Hz, 20 and 23 dBm, distances up to 500 m.
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from harness.core.errors import UserError
 from harness.radio.block_error import BlockError, block_error
 from harness.radio.propagation import noise_dbm
 from harness.radio.sidelink import Sidelink
@@ -25,11 +24,6 @@ class LteMode4(Sidelink):
     # packets beside each other in a subframe, and with them the coding: 4 of QPSK at rate 0.7, or 2 at 0.5
     subchannels: Literal[2, 4] = 4
     ranks: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.subchannels not in CODINGS:
-            raise UserError(f"subchannels is {self.subchannels}: block errors are known for 2 and 4")
 
     @property
     def slot_s(self) -> float:

@@ -38,6 +38,7 @@ CELLS = 160
 class Sidelink(Transceiver):
     """The common part of LTE Mode 4 and NR Mode 2; its fields and `Transceiver`'s are settings of both."""
 
+    rate_hz: Annotated[float, between(0.1, 1000)] = 10.0  # packets that each vehicle sends a second
     # probability that a vehicle keeps its resource when it might choose a new one
     keep: Annotated[float, between(0, 1)] = 0.0
     # how often every vehicle sends each block (blind repetition). Given the link's shadowing, copies are
@@ -52,15 +53,9 @@ class Sidelink(Transceiver):
     """Whether vehicles rank the remaining resources by received power (Step 3 of Mode 4)."""
 
     def __post_init__(self) -> None:
-        least = {
-            "density_per_km": 0.0, "rate_hz": 0.1, "keep": 0.0, "transmissions": 1, "t1_slots": 0,
-            "t2_slots": self.t1_slots, "antenna_m": self.environment_height_m + 0.1,
-        }  # fmt: skip
-        for name, bound in least.items():
-            if not getattr(self, name) >= bound:
-                raise UserError(f"{name} is {getattr(self, name)}: give {bound} or more")
-        if self.keep > 1:
-            raise UserError(f"keep is {self.keep}: give a probability, 0 to 1")
+        super().__post_init__()
+        if self.t2_slots < self.t1_slots:
+            raise UserError(f"t2_slots is {self.t2_slots}: give {self.t1_slots} or more")
 
     @property
     @abstractmethod

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.config import between
+from harness.core.config import between, check
+from harness.core.errors import UserError
 from harness.radio.channel import Broadcast, Delivery, Draws, Links, Site
 from harness.radio.propagation import Propagation
 
@@ -28,6 +29,13 @@ class Transceiver(Propagation):
     noise_figure_db: Annotated[float, between(0, 50)] = 9.0  # noise figure of the receivers
     # least power of a whole packet at which it is received or sensed
     sensing_dbm: Annotated[float, between(-200, 50)] = -90.5
+
+    def __post_init__(self) -> None:
+        check(self)
+        if not self.antenna_m >= self.environment_height_m + 0.1:
+            raise UserError(
+                f"antenna_m is {self.antenna_m}: give {self.environment_height_m + 0.1:g} or more"
+            )
 
     @abstractmethod
     def wait_s(self, uniforms: Floats) -> Floats:
