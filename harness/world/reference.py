@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.parallel import Workers, spread
-from harness.core.statistics import Estimate, rate_interval
+from harness.core.statistics import rate_interval
 from harness.world import lockstep
 from harness.world.drivers import DRIVERS, PRIVILEGED, choices
 from harness.world.outcome import Outcome
@@ -92,18 +92,14 @@ def check(
 
 def summary(outcomes: list[Outcome]) -> dict[str, Any]:
     """Return the rate of each result, and collisions by fault."""
-    share = partial(_share, outcomes)
-    return {
-        "success": share("cleared"),
-        "collision": share("collision"),
-        "late": share("late"),
-        "time_out": share("time_out"),
-        "off_road": share("off_road"),
-        "ego_at_fault": sum(o.fault == "ego" for o in outcomes),
-        "other_at_fault": sum(o.fault == "other" for o in outcomes),
-        "other_crashes": sum(o.other_crashes for o in outcomes),
+    rates = {
+        result: rate_interval(np.array([float(outcome.result == result) for outcome in outcomes]))
+        for result in ("cleared", "collision", "late", "time_out", "off_road")
     }
-
-
-def _share(outcomes: list[Outcome], result: str) -> Estimate:
-    return rate_interval(np.array([float(o.result == result) for o in outcomes]))
+    return {
+        "success": rates.pop("cleared"),
+        **rates,
+        "ego_at_fault": sum(outcome.fault == "ego" for outcome in outcomes),
+        "other_at_fault": sum(outcome.fault == "other" for outcome in outcomes),
+        "other_crashes": sum(outcome.other_crashes for outcome in outcomes),
+    }
