@@ -144,9 +144,12 @@ def spread(
 
 
 def _executor(
-    work: Callable[[Any], Any], items: list[Any], workers: Workers, label: Callable[[Any], str],
+    work: Callable[[Any], Any],
+    items: list[Any],
+    workers: Workers,
+    label: Callable[[Any], str],
     repeatable: bool,
-) -> Executor:  # fmt: skip
+) -> Executor:
     if isinstance(workers, int):
         return _Processes(work, workers)
     extras.need(f"--workers {workers.address or 'ray'}", "ray")

@@ -70,8 +70,7 @@ class FilesAndPlugins(Plugins[T]):
     Built-in ones come first, then files, then packages.
     """
 
-    folder: str
-    """Kind of resource that the files are, such as `channels`."""
+    folder: str  # kind of resource that the files are, such as `channels`
 
     @abstractmethod
     def read(self, file: Path) -> T:

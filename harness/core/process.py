@@ -15,8 +15,11 @@ AGAIN_S = 0.05  # after which a stop that fell where nothing can be raised is ra
 LEAST_MB = 768  # of address space; with less, libraries end the process in ways that cannot be caught
 # Texts of the errors, other than MemoryError, of a process whose memory ran out.
 MEMORY = (
-    "failed to map segment", "Cannot allocate memory", "can't start new thread", "Failed to launch worker",
-)  # fmt: skip
+    "failed to map segment",
+    "Cannot allocate memory",
+    "can't start new thread",
+    "Failed to launch worker",
+)
 STREAMS = {"stdin": "r", "stdout": "w", "stderr": "w"}  # in the order of their numbers
 
 

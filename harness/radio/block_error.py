@@ -19,8 +19,8 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import text_of
 
+# Maps SINR in dB to the probability that a block is lost, of the same shape.
 BlockError = Callable[[Floats], Floats]
-"""Maps SINR in dB to the probability that a block is lost, of the same shape."""
 
 
 @cache

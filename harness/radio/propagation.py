@@ -19,8 +19,7 @@ from harness.radio.channel import CLEAR, VEHICLE
 Environment = Literal["winner-b1", "tr37885-highway", "tr37885-urban"]
 
 LIGHT_M_PER_S = 3e8
-NEAREST_M = 3.0
-"""No formula here is valid below this distance; a shorter link has the loss of this distance."""
+NEAREST_M = 3.0  # no formula here is valid below this distance; a shorter link has the loss of this distance
 
 
 @dataclass(frozen=True)

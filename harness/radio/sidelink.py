@@ -27,11 +27,11 @@ from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Links
 from harness.radio.sps import Scheduling
 from harness.radio.transceiver import STEP_DB, STEP_M, Transceiver
 
+# Interferers farther away do not count, as in the source; longer links have this length's collisions.
 FURTHEST_M = 1000
-"""Interferers farther away do not count, as in the source; longer links have this length's collisions."""
 
+# Power cells above the sensing threshold; with the distances they form the grid of the success table.
 CELLS = 160
-"""Power cells above the sensing threshold; with the distances they form the grid of the success table."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Sidelink(Transceiver):
     # reservation
     t2_slots: Annotated[int, between(0, 10000)] = 100
 
+    # Whether vehicles rank the remaining resources by received power (Step 3 of Mode 4).
     ranks: ClassVar[bool]
-    """Whether vehicles rank the remaining resources by received power (Step 3 of Mode 4)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

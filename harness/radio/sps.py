@@ -14,14 +14,12 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from harness.core.arrays import Floats
 
-REACH_M = 1500
-"""Vehicles farther away are not sensed."""
+REACH_M = 1500  # vehicles farther away are not sensed
 
+# Share of the resources that must be left to choose from (TS 36.213, 14.1.1.6; TS 38.214, 8.1.4).
 LEAST_SHARE = 0.2
-"""Share of the resources that must be left to choose from (TS 36.213, 14.1.1.6; TS 38.214, 8.1.4)."""
 
-STEP_DB = 0.1
-"""Step by which Step 3 raises the threshold until enough resources are left."""
+STEP_DB = 0.1  # step by which Step 3 raises the threshold until enough resources are left
 
 
 @dataclass(frozen=True)

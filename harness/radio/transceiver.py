@@ -13,8 +13,8 @@ from harness.core.errors import UserError
 from harness.radio.channel import Broadcast, Delivery, Draws, Links, Site
 from harness.radio.propagation import Propagation
 
+# Steps of a model's tables: of distance between rows, and of received power between columns.
 STEP_M, STEP_DB = 10.0, 0.5
-"""Steps of a model's tables: of distance between rows, and of received power between columns."""
 
 
 @dataclass(frozen=True)

@@ -66,9 +66,12 @@ class Outputs:
 
 
 def compare(
-    reference: Card, gguf: Card, asked: Sequence[Request], letters: Sequence[Request],
+    reference: Card,
+    gguf: Card,
+    asked: Sequence[Request],
+    letters: Sequence[Request],
     progress: Callable[[int], None],
-) -> Comparison:  # fmt: skip
+) -> Comparison:
     """Hold a GGUF card's model against the same model on transformers.
 
     Args:

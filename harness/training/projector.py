@@ -47,8 +47,11 @@ def describe(vision: Mapping[str, Any], name: str, writer: Any, file_type: int) 
 
 def names(vision: Mapping[str, Any]) -> dict[str, str]:
     """Return each tensor's name in the projector, and in the checkpoint."""
-    pairs = {f"v.blk.{i}.{ours}": f"blocks.{i}.{theirs}" for i in range(vision["depth"])
-             for theirs, ours in _BLOCK.items()}  # fmt: skip
+    pairs = {
+        f"v.blk.{i}.{ours}": f"blocks.{i}.{theirs}"
+        for i in range(vision["depth"])
+        for theirs, ours in _BLOCK.items()
+    }
     pairs |= {ours: f"merger.{theirs}" for theirs, ours in _MERGER.items()}
     for place, layer in enumerate(vision["deepstack_visual_indexes"]):
         pairs |= {

@@ -144,10 +144,13 @@ def _sequences(
     sequences, ends = [s for s, fits in zip(sequences, stays, strict=True) if fits], ends[stays]
     order = sorted(range(len(sequences)), key=lambda n: [CALM[a] for a in sequences[n]])
     return Sequences(
-        [s[0] for s in sequences], _levels(sequences), ends[:, -1], np.argsort(order),
+        [s[0] for s in sequences],
+        _levels(sequences),
+        ends[:, -1],
+        np.argsort(order),
         _right_m(ends, parameters) if any(sides) else None,
         np.unique(ends, axis=0, return_inverse=True)[1].reshape(-1),
-    )  # fmt: skip
+    )
 
 
 def _levels(sequences: Sequence[tuple[str, ...]]) -> Ints:

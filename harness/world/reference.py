@@ -71,9 +71,12 @@ def drive_apart(
     chunks = [seeds[at : at + TOGETHER] for at in range(0, len(seeds), TOGETHER)]
     sizes = iter(map(len, chunks))  # all but the last have one size, so the order of completion is no matter
     parts = spread(
-        partial(drive_all, scenario), chunks, workers, lambda done: progress(next(sizes)),
+        partial(drive_all, scenario),
+        chunks,
+        workers,
+        lambda done: progress(next(sizes)),
         lambda chunk: f"layout seeds {chunk[0]} to {chunk[-1]}",
-    )  # fmt: skip
+    )
     return [outcomes for part in parts for outcomes in part]
 
 

@@ -59,9 +59,12 @@ def _together(ahead: Route, lanes: Sequence[Lane]) -> int:
 
 
 def routes(
-    name: str, network: Any, begin: Street, origin_m: tuple[float, float] = (0.0, 0.0),
+    name: str,
+    network: Any,
+    begin: Street,
+    origin_m: tuple[float, float] = (0.0, 0.0),
     reach_m: float = math.inf,
-) -> Routes:  # fmt: skip
+) -> Routes:
     """Build every path of a network, as far as it lies within reach.
 
     Args:
