@@ -22,7 +22,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.parameters import Parameters as Common
-from harness.world.road import Lane, Path, Road, crossings, ground
+from harness.world.road import Lane, Path, PathKey, Road, crossings, ground
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import Building
 
@@ -179,18 +179,18 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         return SECTORS[int(draws.share(what) >= p.sector_shares[0])]
 
     start, ring_mps = draws.between("ego_start", p.ego_start_m), draws.between("ring_speed", p.ring_mps)
+
+    def helper(id_: str, key: PathKey, begin_m: float, what: str, beyond_m: tuple[float, float]) -> Spawn:
+        arc = begin_m + draws.between(f"helper_{what}", beyond_m)
+        return Spawn(id_, "car", "helper", *key, arc, draws.between(f"helper_{what}_speed", p.helper_mps))
+
+    leaves, crosses, enters = ("oncoming", "right"), ("own", "left"), ("own", "straight")
     spawns = [
-        Spawn("v1", "car", "ego", "own", "straight", road().zone_arc_m - start, p.ego_speed_mps),
-        Spawn("v2", "car", "helper", "oncoming", "right",
-              paths["oncoming", "right"].ends_m[-2] + draws.between("helper_south", p.helper_south_m),
-              draws.between("helper_south_speed", p.helper_mps)),
-        Spawn("v3", "car", "helper", "own", "left",
-              paths["own", "left"].ends_m[-2] + draws.between("helper_west", p.helper_west_m),
-              draws.between("helper_west_speed", p.helper_mps)),
-        Spawn("v4", "car", "helper", "own", "straight",
-              road().zone_arc_m + draws.between("helper_ahead", p.helper_ahead_m),
-              draws.between("helper_ahead_speed", p.helper_mps)),
-    ]  # fmt: skip
+        Spawn("v1", "car", "ego", *enters, road().zone_arc_m - start, p.ego_speed_mps),
+        helper("v2", leaves, paths[leaves].ends_m[-2], "south", p.helper_south_m),
+        helper("v3", crosses, paths[crosses].ends_m[-2], "west", p.helper_west_m),
+        helper("v4", enters, road().zone_arc_m, "ahead", p.helper_ahead_m),
+    ]
 
     def car(what: str, sector: str, route: str, bounds: tuple[float, float]) -> Spawn:
         """Return a car that is, or would be, where the ego enters so long after a cruising ego."""
