@@ -137,7 +137,7 @@ def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
 
 def check(record: Any) -> None:
     """Raise UserError unless a dataclass's numbers and choices are what its annotations allow; NaN is not."""
-    for name, hint in _hints(type(record)).items():
+    for name, hint in _hints(record.__class__).items():
         value = getattr(record, name)
         bounds = [meta for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, msgspec.Meta)]
         allowed = [str(choice) for choice in get_args(hint)] if get_origin(hint) is Literal else []

@@ -33,7 +33,7 @@ _NAMED_WIDE = re.compile(r"\d{3}|\*")  # in one with `%(name)`, whose name may h
 FREE = "free "  # prefix of the name of a filter that pays nothing
 _STEP = "spent step"  # name of the node that pays; as those with the prefix, no template can write it
 
-_VIEWS = (type({}.keys()), type({}.values()), type({}.items()))
+_VIEWS: tuple[type[Any], ...] = (type({}.keys()), type({}.values()), type({}.items()))
 _LISTS: tuple[type[Any], ...] = (list, tuple, set, frozenset, range, *_VIEWS)
 _MAPPINGS = (dict, MappingProxyType)
 _SMALL = frozenset({float, bool, type(None)})
