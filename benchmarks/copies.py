@@ -1,9 +1,7 @@
 """A dataset many times over, for benchmarks: every copy has other episodes, and other prompts."""
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from msgspec import structs
 
@@ -30,12 +28,14 @@ class Copies(Dataset):
         apart = len(self.original.trees)
         again = int(name[:5]) // apart
         [scene] = self.original.scenes([shifted(name, -again * apart)])
-        record: dict[str, Any] = copy.deepcopy(scene.record)
-        record |= {"scene": name, "episode": int(name[:5])}
-        record["episode_seed"] += again * apart
-        for graph in record["graphs"].values():
-            graph["ego"]["zone_m"] = round(graph["ego"]["zone_m"] + again / 10, 1)
-        return Scene(record)
+        graphs = {
+            viewer: structs.replace(
+                graph, ego=structs.replace(graph.ego, zone_m=round(graph.ego.zone_m + again / 10, 1))
+            )
+            for viewer, graph in scene.graphs.items()
+        }
+        episode_seed = scene.record.episode_seed + again * apart
+        return scene.changed(scene=name, episode=int(name[:5]), episode_seed=episode_seed, graphs=graphs)
 
 
 def copies(dataset: Dataset, n: int) -> Copies:

@@ -64,7 +64,7 @@ def questions(folder: Path, version: str, image: ImageMode, decisions: int) -> l
     scenes = dataset.scenes(dataset.courses()[:decisions])
     if not (folder / "config.json").is_file():
         words = dataset.scenario.prompt_words
-        graphs = [graph for scene in scenes for graph in scene.record["graphs"].values()]
+        graphs = [graph for scene in scenes for graph in scene.graphs.values()]
         texts = [m["content"] for g in graphs for m in prompt.render(g, dataset.actions, words=words)]
         tokenizer = train_tokenizer(texts, sees=True)
         new_model(tokenizer, 0, sees=True).save_pretrained(folder)

@@ -214,7 +214,7 @@ def course(dataset: Dataset, steps: int = 6, outcomes: Mapping[str, Mapping[str,
         if not named:
             continue
         for name, scene in named.items():
-            scenes[name] = replace(scene, record={**scene.record, "scene": name})
+            scenes[name] = scene.changed(scene=name)
         levels = [
             [Branching(name, dict.fromkeys(DRIVERS, (drives or {}).get(name, "IDLE")), [
                 _edge(action, (outcomes or {}).get(name, {}).get(action), last=step == len(named) - 1)

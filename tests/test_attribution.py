@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluating import decisions, run, says, spec_of
+from msgspec import structs
 from reading import unpacked
 from run_on_disk import answers_of
 
@@ -19,12 +20,11 @@ from harness.coordination.consensus import Fused, linear_pool
 from harness.coordination.operating_point import named_point
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
-from harness.core.files import canonical_json
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate.agent import Agent
+from harness.prompts.versions import listed
 from harness.prompts.versions import load as prompt
-from harness.prompts.versions import shown as listed
 from harness.report.decisions import Decisions
 from harness.report.runs import gather
 from harness.runs import folder
@@ -104,19 +104,19 @@ def test_a_graph_without_an_object_is_one_that_no_sensor_reported(small: Dataset
     """Its line and its conflict go, what it hid is seen, and nothing else changes."""
     opened = 0
     for scene in small.scenes(small.courses()):
-        for viewer, graph in scene.record["graphs"].items():
-            for item in (node["id"] for node in graph["nodes"]):
+        for viewer, graph in scene.graphs.items():
+            for item in (node.id for node in graph.nodes):
                 less = scene_graph(small.scenario, scene.state, viewer, [item])
-                assert less["nodes"] == [node for node in graph["nodes"] if node["id"] != item]
-                assert less["conflicts"] == [c for c in graph["conflicts"] if c["with"] != item]
-                for before, after in zip(graph["sectors"], less["sectors"], strict=True):
-                    assert after["seen_share"] >= before["seen_share"]
-                    assert item not in after["by"]
-                    opened += after["seen_share"] > before["seen_share"]
-                alike = ("nodes", "conflicts", "sectors")
-                assert canonical_json({k: v for k, v in less.items() if k not in alike}) == canonical_json(
-                    {k: v for k, v in graph.items() if k not in alike}
+                assert less.nodes == tuple(node for node in graph.nodes if node.id != item)
+                assert less.conflicts == tuple(c for c in graph.conflicts if c.vehicle != item)
+                for before, after in zip(graph.sectors, less.sectors, strict=True):
+                    assert after.seen_share >= before.seen_share
+                    assert item not in after.by
+                    opened += after.seen_share > before.seen_share
+                alike = structs.replace(
+                    less, nodes=graph.nodes, conflicts=graph.conflicts, sectors=graph.sectors
                 )
+                assert alike == graph
     assert opened > 10
 
 
@@ -129,16 +129,16 @@ def test_each_listed_object_moves_what_a_viewer_says_of_conflicts(
     objects = [each for each in found.left_out if each.role != "fusion"]
     expected = {}
     for scene in {each.scene for each in objects}:
-        graphs = small.scene(scene).record["graphs"]
+        graphs = small.scene(scene).graphs
         for viewer, graph in graphs.items():
-            conflicts = [c["with"] for c in graph["conflicts"]]
-            for node in listed(graph, prompt("v4").max_objects):
-                alone = viewer != "v1" and set(conflicts) == {node["id"]}
+            conflicts = [c.vehicle for c in graph.conflicts]
+            for node in (graph.nodes[n] for n in listed(graph, prompt("v4").max_objects)):
+                alone = viewer != "v1" and set(conflicts) == {node.id}
                 kind = "other object"
-                if node["id"] in conflicts:
-                    seen = node["id"] in {n["id"] for n in graphs["v1"]["nodes"]}
+                if node.id in conflicts:
+                    seen = node.id in {n.id for n in graphs["v1"].nodes}
                     kind = f"{'seen' if seen else 'hidden'} conflict vehicle"
-                expected[scene, viewer, node["id"]] = (kind, 0.5 if alone else 0.0)
+                expected[scene, viewer, node.id] = (kind, 0.5 if alone else 0.0)
     assert {(e.scene, e.viewer, e.item): (e.kind, pytest.approx(e.shift)) for e in objects} == expected
     turned = [e for e in objects if e.shift]
     assert turned

@@ -60,7 +60,7 @@ class Perceiving(Prior):
 
     def helper(self, request: Request) -> str:
         assert request.view
-        return sure("SLOWER", "helper") if request.view["nodes"] else says((0.3, 0.4, 0.3), "helper")
+        return sure("SLOWER", "helper") if request.view.nodes else says((0.3, 0.4, 0.3), "helper")
 
 
 def success(told: Walked) -> dict[str, float | None]:
@@ -191,7 +191,7 @@ def test_a_sweep_has_them_asks_for_them_or_says_that_it_lacks_them(
 
 class Counting(Perceiving):
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        assert all(r.role == "helper" and r.view and not r.view["nodes"] for r in requests
+        assert all(r.role == "helper" and r.view and not r.view.nodes for r in requests
                    if r.id.endswith("~blind"))  # fmt: skip
         return super().complete(requests)
 

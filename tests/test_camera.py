@@ -1,12 +1,12 @@
 """What a vehicle's cameras see: nothing that its sensors do not, and everything else where it is."""
 
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from harness.core.errors import UserError
 from harness.core.image import Image
@@ -92,7 +92,7 @@ def vehicle(name: str, x_m: float, y_m: float = 0.0, **others: Any) -> VehicleSt
     approach, route = ROAD.road().ego
     stated: dict[str, Any] = {"kind": "car", "part": "other", "heading_rad": 0.0, "speed_mps": 20.0}
     stated |= {"approach": approach, "route": route}
-    return VehicleState(**{"id": name, "x_m": x_m, "y_m": y_m, **stated, **others})
+    return VehicleState(**{"id": name, "crashed": False, "x_m": x_m, "y_m": y_m, **stated, **others})
 
 
 def seen_by_the_first(*vehicles: VehicleState, ambient: str = "day") -> Frame:
@@ -153,7 +153,7 @@ def reported(ambient: str, *others: VehicleState) -> dict[str, bool]:
     """Whether the camera is among the sensors that the first vehicle has of each other one."""
     state = WorldState(ROAD.name, 0, 0, 0.0, 20.0, (vehicle("v1", 0.0, part="ego"), *others), ())
     graph = scene_graph(scenarios.get(f"{ROAD.name}:ambient={ambient}"), state, "v1")
-    return {node["id"]: "camera" in node["sensors"] for node in graph["nodes"]}
+    return {node.id: "camera" in node.sensors for node in graph.nodes}
 
 
 def test_bad_light_takes_range_from_the_camera_and_from_no_other_sensor():

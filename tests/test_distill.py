@@ -88,10 +88,10 @@ def test_of_each_level_as_many_are_learnt_from_as_a_whole_tree_has():
         name for name, at in forest.place.items()
         if forest.tree[at] == 9 and any(ends_well(at, action) for action in range(len(CROSSING.actions)))
     }  # fmt: skip
-    points = [point["moment"] for point in lessons.decision_points(CROSSING, 200_009, 9)]
+    points = [point.moment for point in lessons.decision_points(CROSSING, 200_009, 9)]
     by_step = Counter(int(forest.step[forest.place[name]]) for name in in_tree)
-    assert {point["scene"] for point in points} <= in_tree
-    assert Counter(point["step"] for point in points) == {
+    assert {point.scene for point in points} <= in_tree
+    assert Counter(point.step for point in points) == {
         step: min(lessons.PER_LEVEL, n) for step, n in by_step.items()
     }
 
@@ -100,9 +100,9 @@ def test_the_levels_of_a_layout_weigh_alike(few: list[Lessons]) -> None:
     """In whatever an ego is asked."""
     for each in few:
         by_level: dict[tuple[int, int], list[float]] = {}
-        egos = [q for q in alone(each) if q.graph["role"] == "ego" and q.prompt == each.prompts[0]]
+        egos = [q for q in alone(each) if q.graph.role == "ego" and q.prompt == each.prompts[0]]
         for scene, q in zip(each.scenes, egos, strict=True):
-            by_level.setdefault((scene.record["episode"], scene.record["step"]), []).append(q.weight)
+            by_level.setdefault((scene.record.episode, scene.record.step), []).append(q.weight)
         assert [sum(level) for level in by_level.values()] == pytest.approx([1.0] * len(by_level))
         assert max(map(len, by_level.values())) > 1
 
@@ -152,8 +152,8 @@ def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(fe
     for each in few:
         scenario = each.scenario
         for scene in each.scenes:
-            if scene.record["step"] == 0:
-                seed = scene.record["episode_seed"]
+            if scene.record.step == 0:
+                seed = scene.record.episode_seed
                 reference = drive(scenario, "full-view", seed)
                 safe = []
                 for action in scenario.actions:
@@ -184,13 +184,13 @@ def test_every_text_it_learns_says_what_it_should(
         weights = data.draw(st.lists(st.floats(0.001, 1), min_size=len(actions), max_size=len(actions)))
         intent = np.array(weights) / sum(weights)
         for prompt in each.prompts:
-            for graph in each.scenes[2].record["graphs"].values():
+            for graph in each.scenes[2].graphs.values():
                 text = answer(prompt, graph, intent, actions, bare=bare)
-                said = parse(text, role=graph["role"], actions=actions)
+                said = parse(text, role=graph.role, actions=actions)
                 reasons_first = prompt.helper_answer == "recommendation" and not bare
                 assert said.verdict == ("recovered" if reasons_first else "strict")
                 assert said.intent is not None
-                if graph["role"] == "ego" or prompt.helper_answer == "distribution":
+                if graph.role == "ego" or prompt.helper_answer == "distribution":
                     assert said.intent == pytest.approx(intent, abs=0.0501)
                 else:
                     assert said.intent[int(np.argmax(intent))] == pytest.approx(intent.max(), abs=0.0501)
@@ -208,7 +208,7 @@ def test_the_ego_with_messages_reads_what_helpers_sent(few: list[Lessons], asked
         assert heard
         for q in heard:
             assert q.key.endswith("+m")
-            assert q.graph["role"] == "ego"
+            assert q.graph.role == "ego"
             assert ("90 5" if q.prompt.version == "v4" else "0.90") in q.messages[-1]["content"]
 
 
@@ -219,8 +219,8 @@ def test_an_excerpt_shows_the_conflicts_alone_and_keeps_the_label(asked: list[Qu
     for q in short:
         text = q.messages[-1]["content"]
         assert len(text) < len(whole[q.key].messages[-1]["content"])
-        shown = min(q.graph["conflicts"], key=lambda c: float(c["other"]["time_s"] or 1e9))
-        assert shown["other"]["time_s"] is None or str(shown["other"]["time_s"]) in text
+        shown = min(q.graph.conflicts, key=lambda c: float(c.other.time_s or 1e9))
+        assert shown.other.time_s is None or str(shown.other.time_s) in text
         assert np.array_equal(q.label, whole[q.key].label)
 
 
@@ -237,7 +237,7 @@ def test_a_read_out_asks_for_a_letter_alone_as_an_evaluation_does(
     intents = {q.key: np.array([0.91, 0.06, 0.03, 0.0, 0.0])[: len(q.actions)] for q in asked}
     for short in excerpts(asked):
         assert short.read_out == in_mode(
-            "readout", short.prompt, short.messages, short.graph["role"], short.actions
+            "readout", short.prompt, short.messages, short.graph.role, short.actions
         ), "where a question is no block, the letter follows it"
     told = next(with_messages(few[0], few[0].scenes, intents))
     assert "0.90" in told.read_out[-1]["content"], "the messages are there as well"
@@ -399,7 +399,7 @@ def test_it_learns_from_every_level_of_a_tree(few: list[Lessons]) -> None:
     """Not from one driver's course alone, and from no more scenes than it needs."""
     for each in few:
         for number in each.episodes:
-            steps = [s.record["step"] for s in each.scenes if s.record["episode"] == number]
+            steps = [s.record.step for s in each.scenes if s.record.episode == number]
             assert set(steps) == set(range(min(steps), max(steps) + 1))
             assert max(steps) > 1
             assert all(steps.count(step) <= lessons.PER_LEVEL for step in steps)
@@ -407,7 +407,7 @@ def test_it_learns_from_every_level_of_a_tree(few: list[Lessons]) -> None:
 
 def test_a_layout_teaches_the_same_wherever_it_is_drawn(few: list[Lessons]) -> None:
     again = msgspec.json.encode(lessons.decision_points(PASSING, CURRICULUM.seed + 1, 1))
-    assert msgspec.json.decode(again) == [
-        {"moment": scene.record, "label": few[1].labels[scene.id].tolist()}
-        for scene in few[1].scenes if scene.record["episode"] == 1
+    assert msgspec.json.decode(again, type=list[lessons.Point]) == [
+        lessons.Point(scene.record, few[1].labels[scene.id].tolist())
+        for scene in few[1].scenes if scene.record.episode == 1
     ]  # fmt: skip

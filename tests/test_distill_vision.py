@@ -7,6 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from graphs import CAR, graph
+from msgspec import structs
+
+from harness.training.lessons import Point
+from harness.world.scene_graph import Node
 
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("highway_env", reason="needs the sim extra")
@@ -47,6 +52,9 @@ def silent(*_: object) -> None:
     pass
 
 
+CAMERA = {"sensors": ("camera", "lidar"), "indicator": "off"}
+
+
 @pytest.fixture(scope="module")
 def lessons(tmp_path_factory: pytest.TempPathFactory) -> Lessons:
     place = tmp_path_factory.mktemp("lessons")
@@ -58,8 +66,8 @@ def folder(lessons: Lessons, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("distilled") / "seer"
     of_layout: list[Any] = [[], []]
     for scene in lessons.scenes:
-        point = {"moment": scene.record, "label": lessons.labels[scene.id].tolist()}
-        of_layout[scene.record["episode"]].append(point)
+        point = Point(scene.record, lessons.labels[scene.id].tolist())
+        of_layout[scene.record.episode].append(point)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("harness.training.lessons.decision_points", lambda scenario, seed, n: of_layout[n])
         distill(Curriculum({SCENARIO: VERSIONS}, LAYOUTS, FIRST["train"]), PLAN, out, silent, silent, "cpu")
@@ -73,7 +81,7 @@ def asked(lessons: Lessons) -> list[Question]:
 
 def request(q: Question, answer: Any = "readout") -> Request:
     messages = q.read_out if answer == "readout" else q.messages
-    return Request(q.key, q.graph["role"], messages, q.actions, 160, answer=answer, image=q.image)
+    return Request(q.key, q.graph.role, messages, q.actions, 160, answer=answer, image=q.image)
 
 
 def test_every_question_of_an_image_prompt_has_its_viewers_picture(asked: list[Question]):
@@ -87,27 +95,31 @@ def test_an_answer_names_only_those_whom_its_prompt_names(lessons: Lessons):
     for q in alone(lessons):
         if q.named:
             assert q.prompt.version == "v7"
-            assert any(f"{c['with']} " in q.messages[-1]["content"] for c in q.graph["conflicts"])
+            assert any(f"{c.vehicle} " in q.messages[-1]["content"] for c in q.graph.conflicts)
 
 
 def test_whom_the_cameras_show_is_listed_nearest_first():
-    def node(kind: str, forward_m: float, left_m: float, **more: Any) -> dict[str, Any]:
-        seen = {"type": kind, "forward_m": forward_m, "left_m": left_m, "sensors": ["camera", "lidar"]}
-        return {**seen, "indicator": "off", **more}
+    def node(kind: str, forward_m: float, left_m: float, **more: Any) -> Node:
+        return structs.replace(
+            CAR, **{"type": kind, "forward_m": forward_m, "left_m": left_m, **CAMERA, **more}
+        )
+
+    def listed(*nodes: Node) -> str:
+        return sights(graph("ego", nodes, ()))
 
     near = node("van", 11.7, 0.3, braking=True, indicator="left")
     far = node("car", 30.2, -3.6, braking=False, indicator="left")
-    unseen = node("vehicle", 5.0, 1.0, sensors=["radar"], indicator=None)
-    assert sights({"nodes": [far, unseen, near]}) == "van 12 0 brake; car 30 -4 left"
-    assert sights({"nodes": [unseen]}) == "nobody"
-    many = {"nodes": [node("car", 10.0 * n, 0.0) for n in range(1, 9)]}
-    assert sights(many) == "; ".join(f"car {10 * n} 0" for n in range(1, 6))
+    unseen = node("vehicle", 5.0, 1.0, sensors=("radar",), indicator=None)
+    assert listed(far, unseen, near) == "van 12 0 brake; car 30 -4 left"
+    assert listed(unseen) == "nobody"
+    many = [node("car", 10.0 * n, 0.0) for n in range(1, 9)]
+    assert listed(*many) == "; ".join(f"car {10 * n} 0" for n in range(1, 6))
 
 
 def test_the_first_stage_asks_whom_the_picture_shows(lessons: Lessons, tmp_path: Path):
     student = Student([lessons], PLAN, tmp_path, "cpu")
     learnt = student.lessons[0].scenes
-    listed = [sights(scene.record["graphs"][v]) for scene in learnt for v in scene.viewers]
+    listed = [sights(scene.graphs[v]) for scene in learnt for v in scene.viewers]
     samples = student.samples("excerpts")
     said = [
         student.tokenizer.decode(s.ids[s.answer_at :].tolist(), skip_special_tokens=False) for s in samples

@@ -36,14 +36,8 @@ Harness = Callable[..., Said]
 CROSSING = scenarios.get(scenarios.DEFAULT)
 
 
-def seen(role: str, nodes: list[Any], conflicts: list[Any]) -> dict[str, Any]:
-    """A graph as datasets have it."""
-    view = graph(role, nodes, conflicts)
-    return {**view, "ego": {**view["ego"], "age_s": 0.0}}
-
-
-SEES, STANDS = seen("ego", [CAR, TRUCK], [COMING]), seen("ego", [TRUCK], [STANDING])
-HELPS = seen("helper", [CAR], [COMING])
+SEES, STANDS = graph("ego", [CAR, TRUCK], [COMING]), graph("ego", [TRUCK], [STANDING])
+HELPS = graph("helper", [CAR], [COMING])
 YIELD = '{"action_distribution":{"SLOWER":0.90,"IDLE":0.10,"FASTER":0.00}}'
 GO = '{"action_distribution":{"SLOWER":0.00,"IDLE":0.25,"FASTER":0.75}}'
 WARN = f'{{"evidence":"v2 from left","risk":"high",{YIELD[1:]}'
@@ -136,7 +130,7 @@ def test_free_and_constrained_answers_have_the_same_chat(small: Dataset) -> None
 
 # -- what is refused ------------------------------------------------------------------------------------
 
-LINE = {"layout_seed": 100_007, "graph": SEES, "answer": YIELD}
+LINE = {"layout_seed": 100_007, "graph": SEES.plain(), "answer": YIELD}
 FILE = {"scenario": scenarios.DEFAULT, "ego": [LINE], "helper": []}
 
 
@@ -148,8 +142,8 @@ FILE = {"scenario": scenarios.DEFAULT, "ego": [LINE], "helper": []}
         ({**FILE, "ego": [{**LINE, "layout_seed": 200_000}]}, "examples come from train seeds alone"),
         ({**FILE, "ego": [{**LINE, "layout_seed": -1}]}, "examples come from train seeds alone"),
         ({**FILE, "ego": [], "helper": [LINE]}, "helper example 1 has the graph of a viewer whose role is"),
-        ({**FILE, "ego": [{**LINE, "graph": {**SEES, "nodes": 3}}]}, "ego example 1: its graph: nodes = 3"),
-        ({**FILE, "ego": [{**LINE, "graph": {**SEES, "hint": "go"}}]}, "unknown key"),
+        ({**FILE, "ego": [{**LINE, "graph": {**SEES.plain(), "nodes": 3}}]}, "[ego.0.graph]: nodes = 3"),
+        ({**FILE, "ego": [{**LINE, "graph": {**SEES.plain(), "hint": "go"}}]}, "unknown key"),
         ({**FILE, "ego": [{**LINE, "reply": GO}]}, "key in prompt mine examples.json [ego.0] 'reply'"),
         ({"ego": [LINE]}, "prompt mine examples.json has no scenario; add it"),
         ([FILE], "prompt mine examples.json is no object; give scenario, ego and helper"),
@@ -250,7 +244,7 @@ def test_where_letters_stand_for_other_actions_so_do_those_of_the_examples(small
 
 def test_a_prompt_with_metres_in_its_examples_has_no_twin_in_feet(small: Dataset) -> None:
     spec, scene = spec_of(small, "swarm-tiny"), scenes_of(small)[0]
-    view = scene.record["graphs"]["v1"]
+    view = scene.graphs["v1"]
     assert TWINS["units"].graph(spec, scene, view) != view
     shown = with_examples(spec)
     assert TWINS["units"].graph(shown, scene, view) == view

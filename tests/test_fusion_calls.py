@@ -229,7 +229,7 @@ def test_the_policy_is_what_it_answered_and_the_record_has_it(done: Evaluated, s
         if said.heard:
             senders = [answers[f"{said.scene}/{viewer}"] for viewer in said.heard]
             told = [{"sender": a.viewer, "intent": list(a.intent), **a.message} for a in senders]
-            graph = small.scene(said.scene).record["graphs"]["v1"]
+            graph = small.scene(said.scene).graphs["v1"]
             assert said.prompt_sha256 == digest(prompt("v2").render(graph, small.actions, told))
 
 

@@ -76,8 +76,8 @@ def test_another_scene_is_of_another_episode_at_the_same_step_and_always_the_sam
     for scene in crossing.scenes(forest.ids[:40:7]):
         other = another(of, scene)
         assert other.id == another(of, scene).id
-        assert other.record["episode"] != scene.record["episode"]
-        assert other.record["step"] == scene.record["step"]
+        assert other.record.episode != scene.record.episode
+        assert other.record.step == scene.record.step
         viewer = scene.viewers[1]
         request = asked(of, scene)[viewer]
         assert request.image is not None
@@ -95,9 +95,9 @@ def test_without_its_picture_a_prompt_is_its_text(crossing: Dataset):
 
 def test_image_alone_says_nothing_of_anybody_around(crossing: Dataset):
     for scene in crossing.scenes(crossing.forest.ids[:20]):
-        for viewer, graph in scene.record["graphs"].items():
+        for viewer, graph in scene.graphs.items():
             _, user = prompts.load("v8").render(graph, crossing.actions, words=crossing.scenario.prompt_words)
-            named = {node["id"] for node in graph["nodes"]} - {graph["ego"]["id"], viewer}
+            named = {node.id for node in graph.nodes} - {graph.ego.id, viewer}
             assert not named & set(user["content"].replace(":", " ").replace(",", " ").split())
 
 

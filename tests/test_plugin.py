@@ -111,10 +111,10 @@ def smoothed(run: Tables, decisions: pd.DataFrame) -> tuple[np.ndarray, np.ndarr
 def test_the_backend_answers_by_its_rule_on_what_each_viewer_sees(frozen: Tables, small: Dataset):
     assert frozen.config["identity"] == {"engine": "cautious", "version": 1}
     asked = small.scenes(frozen.answers.scene.unique().tolist())
-    graphs = {scene.id: scene.record["graphs"] for scene in asked}
+    graphs = {scene.id: scene.graphs for scene in asked}
     answers = frozen.answers
     assert sum(answers.role == "ego") == len(graphs)
-    wary = np.array([bool(graphs[str(a.scene)][str(a.viewer)]["conflicts"]) for a in answers.itertuples()])
+    wary = np.array([bool(graphs[str(a.scene)][str(a.viewer)].conflicts) for a in answers.itertuples()])
     assert 0 < wary.sum() < len(wary)
     expected = np.where(wary[:, None], (0.6, 0.3, 0.1), (0.2, 0.4, 0.4))
     assert answers[[f"intent_{action}" for action in ACTIONS]].to_numpy() == pytest.approx(expected)
@@ -135,7 +135,7 @@ def test_the_rule_remembers_from_step_to_step(kind: str, condition: str, request
 def test_the_channel_takes_its_time_and_loses_with_distance(frozen: Tables, small: Dataset):
     """An answer takes 10 ms, its way 10 ms more; one transmission is lost with 1 % a metre."""
     asked_scenes = small.scenes(frozen.answers.scene.unique().tolist())
-    range_m = {(s.id, v): known_m for s in asked_scenes for v, known_m in s.record["range_m"].items()}
+    range_m = {(s.id, v): known_m for s in asked_scenes for v, known_m in s.record.range_m.items()}
     for condition, farthest_m in (("fog", 100.0), (CLOSE, 60.0)):
         decisions = decided(frozen, condition)
         sent = replies(decisions)
@@ -182,7 +182,7 @@ def test_helpers_that_mumble_are_half_as_sure(frozen: Tables):
 
 def test_the_nearest_helper_within_half_the_way_is_asked(frozen: Tables, small: Dataset):
     known_m = {
-        scene.id: scene.record["range_m"] for scene in small.scenes(frozen.answers.scene.unique().tolist())
+        scene.id: scene.record.range_m for scene in small.scenes(frozen.answers.scene.unique().tolist())
     }
     decisions, asked = decided(frozen, NEAREST), 0
     sent = replies(decisions)

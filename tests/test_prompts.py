@@ -13,6 +13,7 @@ from evaluating import scenes_of, spec_of
 from graphs import ACTIONS, CAR, CASES, MESSAGES, STANDING, TRUCK, graph
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 
 from harness.backends.base import Completion
 from harness.backends.tokens import counter, tokenizer
@@ -58,7 +59,7 @@ def test_every_golden_text_is_of_a_version_and_a_case() -> None:
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_those_in_conflict_are_listed_first_then_the_nearest_and_the_rest_is_counted(version: str) -> None:
-    near = [{**CAR, "id": f"v{20 + i}", "forward_m": 1.0 + i, "left_m": 0.0} for i in range(4)]
+    near = [structs.replace(CAR, id=f"v{20 + i}", forward_m=1.0 + i, left_m=0.0) for i in range(4)]
     prompt = prompts.load(version)
     *_, user = prompt.render(graph("ego", [*near, TRUCK], [STANDING]), ACTIONS, (), CROSSING)
     listed = [v for v in ("v4", "v20", "v21", "v22", "v23") if re.search(rf"^{v}\b", user["content"], re.M)]
@@ -93,8 +94,8 @@ def test_nobody_is_named_who_is_not_in_the_viewers_graph(version: str, small: Da
     prompt = prompts.load(version)
     for scene in scenes_of(small):
         present = {v.id for v in scene.state.vehicles}
-        for viewer, seen in scene.record["graphs"].items():
-            known = {viewer, seen["ego"]["id"], *(n["id"] for n in seen["nodes"])}
+        for viewer, seen in scene.graphs.items():
+            known = {viewer, seen.ego.id, *(n.id for n in seen.nodes)}
             system, *_, user = prompt.render(seen, small.actions, (), CROSSING)
             named = set(ID.findall(text_of((system, user))))
             assert named <= known, f"{scene.id} {viewer}: {named - known}"
@@ -108,8 +109,8 @@ WORDS = "{{ graph }} {% raw %} </s> \x1b[31m \n ${x} %s {# #} \u202e \U0001f697"
 @pytest.mark.parametrize("role", prompts.ROLES)
 def test_hostile_words_in_a_graph_stay_words(version: str, role: str) -> None:
     def count(words: str) -> int:
-        node = {**TRUCK, "id": words, "lane": words, "type": words}
-        seen = graph(role, [node], [{**STANDING, "with": words}])
+        node = structs.replace(TRUCK, id=words, lane=words, type=words)
+        seen = graph(role, [node], [structs.replace(STANDING, vehicle=words)])
         messages = ({**MESSAGES[0], "sender": words, "evidence": words},) if role == "ego" else ()
         return text_of(prompts.load(version).render(seen, ACTIONS, messages, CROSSING)).count(words)
 
@@ -121,7 +122,7 @@ def test_hostile_words_in_a_graph_stay_words(version: str, role: str) -> None:
 @given(st.text(max_size=30), st.sampled_from(VERSIONS))
 def test_any_id_is_rendered_as_it_is(name: str, version: str) -> None:
     said = text_of(
-        prompts.load(version).render(graph("ego", [{**CAR, "id": name}], []), ACTIONS, (), CROSSING)
+        prompts.load(version).render(graph("ego", [structs.replace(CAR, id=name)], []), ACTIONS, (), CROSSING)
     )
     assert name in said or version in LISTS_NOBODY
 
@@ -403,8 +404,8 @@ def test_every_prompt_keeps_its_token_budget(
     least, most = prompt.token_budget
     assert most <= 400 or prompt.examples
     for scene in scenes_of(small)[::3]:
-        for viewer, seen in scene.record["graphs"].items():
-            if messages and seen["role"] == "helper":
+        for viewer, seen in scene.graphs.items():
+            if messages and seen.role == "helper":
                 continue
             n = count(prompt.render(seen, small.actions, messages, CROSSING)) + bool(prompt.image) * PICTURE
             assert least <= n <= most, f"{version} {scene.id} {viewer}: {n} tokens"
@@ -422,7 +423,7 @@ def test_no_evidence_takes_a_fusion_call_over_its_budget(
     for scene in scenes_of(small):
         ego, *helpers = scene.viewers
         messages = densest_messages(helpers[:senders], small.actions)
-        n = count(prompt.render(scene.record["graphs"][ego], small.actions, messages, CROSSING))
+        n = count(prompt.render(scene.graphs[ego], small.actions, messages, CROSSING))
         assert 200 <= n <= 400, f"{version} {scene.id}: {n} tokens"
 
 

@@ -41,7 +41,7 @@ def questions(dataset: Dataset, form: str) -> list[Request]:
     return [
         Request(
             f"{scene.id}/{viewer}",
-            graph["role"],
+            graph.role,
             (),
             dataset.actions,
             64,
@@ -50,7 +50,7 @@ def questions(dataset: Dataset, form: str) -> list[Request]:
             scenario=dataset.scenario,
         )
         for scene in scenes_of(dataset)
-        for viewer, graph in scene.record["graphs"].items()
+        for viewer, graph in scene.graphs.items()
     ]
 
 

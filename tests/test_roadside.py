@@ -276,7 +276,7 @@ def lossless() -> tuple[Intents, Draws]:
 
 def car(name: str, x_m: float, y_m: float, kind: str = "car") -> VehicleState:
     part = {"v1": "ego"}.get(name, "helper")
-    return VehicleState(name, kind, part, x_m, y_m, 0.0, 8.0, "west", "straight")  # type: ignore[arg-type]
+    return VehicleState(name, kind, part, x_m, y_m, 0.0, 8.0, "west", "straight", False)  # type: ignore[arg-type]
 
 
 def test_a_unit_above_the_crossing_sees_round_the_corner_and_past_no_truck():

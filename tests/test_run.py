@@ -207,7 +207,7 @@ def test_a_replay_of_another_dataset_or_fewer_scenes_is_refused(
         f"holds no answer for {small.scene('00003-0').id}/v1; replay a run of the same dataset and limit"
     )
     root, after = scenes_of(small)[:2]
-    moved = replace(root, record={**root.record, "graphs": after.record["graphs"]})
+    moved = root.changed(graphs=after.graphs)
     other = replace(small, _scenes={root.id: moved})
     assert "another prompt or dataset" in refused(spec_of(other, f"replay:{proxy_run}"), tmp_path / "out")
 

@@ -267,7 +267,7 @@ def test_the_episodes_table_says_how_each_ended(played: Dataset) -> None:
 def test_a_consensus_weighs_those_heard_by_their_distance(told: Walked, played: Dataset) -> None:
     """Paper Eq. 1 and 2: closeness 1/d, the sum of all is one; alone the ego has it all."""
     at = [s.id for s in scenes_of(played)].index("00001-0")
-    distance = scenes_of(played)[at].record["distance_m"]
+    distance = scenes_of(played)[at].record.distance_m
     closeness = np.array([1 / max(distance[v], 1.0) for v in ("v1", "v2", "v3", "v4")])
     w = closeness / closeness.sum()
     expected = [w[0] * 0.3 + 1 - w[0], w[0] * 0.4, w[0] * 0.3]

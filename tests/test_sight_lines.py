@@ -12,7 +12,7 @@ from harness.world.state import Building, VehicleState, WorldState
 
 def vehicle(name: str, x_m: float, y_m: float, heading_rad: float = 0.0, kind: str = "car") -> VehicleState:
     part = {"v1": "ego"}.get(name, "helper")
-    return VehicleState(name, kind, part, x_m, y_m, heading_rad, 8.0, "west", "straight")  # type: ignore[arg-type]
+    return VehicleState(name, kind, part, x_m, y_m, heading_rad, 8.0, "west", "straight", False)  # type: ignore[arg-type]
 
 
 def state(*vehicles: VehicleState, buildings: tuple[Building, ...] = ()) -> WorldState:

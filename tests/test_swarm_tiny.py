@@ -41,9 +41,9 @@ def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset
     said = [d for d in decisions(done.out, "single-local") if d.seed == 0]  # nothing of it depends on luck
     hidden = []
     for scene, decision in zip(shipped.scenes([d.scene for d in said]), said, strict=True):
-        graph, danger = scene.record["graphs"][scene.state.ego.id], scene.record["danger"]["vehicle"]
-        seen = danger in {node["id"] for node in graph["nodes"]}
-        if danger and not seen and any(sector["occluded"] for sector in graph["sectors"]):
+        graph, danger = scene.graphs[scene.state.ego.id], scene.record.danger.vehicle
+        seen = danger in {node.id for node in graph.nodes}
+        if danger and not seen and any(sector.occluded for sector in graph.sectors):
             hidden.append(decision.entropy_nats)
     assert len(hidden) >= 50
     assert np.mean(hidden) > POINTS["6g"].tau_nats, "so that it asks for help"

@@ -13,6 +13,7 @@ import pytest
 from evaluating import Scripted, failed, says, spec_of, with_ego
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from harness.backends.base import Completion, Request
 from harness.core.errors import UserError
@@ -30,6 +31,7 @@ from harness.studies.twins.declared import TWINS, changed
 from harness.studies.twins.scoring import METRICS, Pair
 from harness.world import scenarios
 from harness.world.planner import plan
+from harness.world.scene_graph import SceneGraph
 
 SHIPPED = sorted(path.parent.name for path in folder("datasets").glob("*/manifest.json"))
 GRAPHS = [name for name, twin in TWINS.items() if twin.graph and not twin.text]
@@ -65,13 +67,13 @@ def scenes_in(dataset: Dataset) -> list[Scene]:
     return dataset.scenes(dataset.courses()[::3])
 
 
-def twins_of(name: str, dataset: Dataset) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+def twins_of(name: str, dataset: Dataset) -> Iterator[tuple[SceneGraph, SceneGraph]]:
     """Every graph and its twin's."""
     spec, graph_of = spec_for(dataset), TWINS[name].graph
     assert graph_of
     for scene in scenes_in(dataset):
-        for graph in scene.record["graphs"].values():
-            yield graph, dict(graph_of(spec, scene, graph))
+        for graph in scene.graphs.values():
+            yield graph, graph_of(spec, scene, graph)
 
 
 def asked(spec: Spec, out: Path, *names: str) -> list[scoring.Row]:
@@ -94,7 +96,7 @@ def leaves(value: Any, *keys: str) -> list[Any]:
     return found
 
 
-def renamed(graph: Mapping[str, Any], to: Mapping[str, str]) -> Any:
+def renamed(graph: SceneGraph, to: Mapping[str, str]) -> Any:
     def leaf(key: str, value: Any) -> Any:
         return to.get(value, value) if key in declared.NAMES else value
 
@@ -106,7 +108,7 @@ def renamed(graph: Mapping[str, Any], to: Mapping[str, str]) -> Any:
 
 def test_mirroring_twice_gives_the_scene_back(family: Dataset) -> None:
     for scene in scenes_in(family):
-        for graph in scene.record["graphs"].values():
+        for graph in scene.graphs.values():
             assert declared.swapped(declared.swapped(graph)) == graph
 
 
@@ -115,21 +117,21 @@ def test_a_mirrored_scene_has_its_dangers_on_the_other_side(crossing: Dataset) -
     sides = {"left": "right", "right": "left", "oncoming": "oncoming"}
     assert pairs
     for graph, twin in pairs:
-        assert [sides[c["sector"]] for c in graph["conflicts"]] == [c["sector"] for c in twin["conflicts"]]
+        assert [sides[c.sector] for c in graph.conflicts] == [c.sector for c in twin.conflicts]
         assert leaves(graph, "left_m") == [-left for left in leaves(twin, "left_m")]
         assert leaves(graph, "forward_m", "speed_mps", "arc_m") == leaves(
             twin, "forward_m", "speed_mps", "arc_m"
         )
-        assert [s["sector"] for s in twin["sectors"]] == ["left", "right", "oncoming"]
-        seen = {s["sector"]: s["seen_share"] for s in graph["sectors"]}
-        assert {sides[s["sector"]]: s["seen_share"] for s in twin["sectors"]} == seen
+        assert [s.sector for s in twin.sectors] == ["left", "right", "oncoming"]
+        seen = {s.sector: s.seen_share for s in graph.sectors}
+        assert {sides[s.sector]: s.seen_share for s in twin.sectors} == seen
 
 
 def test_an_oncoming_left_turn_has_no_mirrored_twin(crossing: Dataset) -> None:
     turns = [
         (graph, twin)
         for graph, twin in twins_of("mirrored", crossing)
-        if any((c["sector"], c["route"]) == ("oncoming", "left") for c in graph["conflicts"])
+        if any((c.sector, c.route) == ("oncoming", "left") for c in graph.conflicts)
     ]
     assert turns
     assert all(graph == twin for graph, twin in turns)
@@ -142,9 +144,9 @@ def test_the_planner_mirrors_at_the_intersection_and_keeps_right_on_the_motorway
         dataset = load(folder("datasets") / name, 8)
         scenario, paths, said = dataset.scenario, dataset.scenario.road().paths, list[bool]()
         for scene in dataset.scenes(dataset.courses()[::2]):
-            for graph in scene.record["graphs"].values():
+            for graph in scene.graphs.values():
                 twin = declared.swapped(graph)
-                if all((c["sector"], c["route"]) in paths for c in twin["conflicts"]):
+                if all((c.sector, c.route) in paths for c in twin.conflicts):
                     action = plan(scenario, twin)
                     said.append(declared.LANES.get(action, action) == plan(scenario, graph))
         held[name] = sum(said), len(said)
@@ -163,11 +165,11 @@ def test_every_scenario_that_ships_says_whether_it_may_be_mirrored(scenario: str
 def test_permuted_names_are_the_same_vehicles(family: Dataset) -> None:
     spec = spec_for(family)
     for scene in scenes_in(family):
-        own = [vehicle["id"] for vehicle in scene.record["state"]["vehicles"]]
+        own = [vehicle.id for vehicle in scene.state.vehicles]
         named: dict[str, str] = {}
-        for graph in scene.record["graphs"].values():
+        for graph in scene.graphs.values():
             twin = declared.permuted_ids(spec, scene, graph)
-            keys = ("id", "with", "viewer")
+            keys = ("id", "vehicle", "viewer")
             for old, new in zip(leaves(graph, *keys), leaves(twin, *keys), strict=True):
                 assert named.setdefault(old, new) == new  # alike in all graphs of a scene
                 assert old != new
@@ -178,14 +180,12 @@ def test_permuted_names_are_the_same_vehicles(family: Dataset) -> None:
 
 def test_the_far_vehicle_is_far_from_everything_and_all_that_is_new(family: Dataset) -> None:
     for graph, twin in twins_of("far-vehicle", family):
-        *others, far = twin["nodes"]
-        assert {**twin, "nodes": others} == graph
-        assert far["id"] not in leaves(graph, "id", "with", "viewer")
-        from_viewer = np.hypot(far["forward_m"], far["left_m"])
-        from_ego = np.hypot(
-            far["forward_m"] - graph["ego"]["forward_m"], far["left_m"] - graph["ego"]["left_m"]
-        )
-        from_zone = from_viewer - graph["self"]["zone_m"]  # at least
+        *others, far = twin.nodes
+        assert structs.replace(twin, nodes=tuple(others)) == graph
+        assert far.id not in leaves(graph, "id", "vehicle", "viewer")
+        from_viewer = np.hypot(far.forward_m, far.left_m)
+        from_ego = np.hypot(far.forward_m - graph.ego.forward_m, far.left_m - graph.ego.left_m)
+        from_zone = from_viewer - graph.itself.zone_m  # at least
         assert min(from_viewer, from_ego, from_zone) > 60
 
 
@@ -223,15 +223,15 @@ def texts(spec: Spec, name: str, scene: Scene, viewer: str) -> tuple[str, str]:
 
 def test_units_change_in_values_and_in_words(crossing: Dataset) -> None:
     scene = scenes_in(crossing)[0]
-    graph = scene.record["graphs"]["v1"]
+    graph = scene.graphs["v1"]
     old, new = texts(spec_for(crossing, "swarm-tiny"), "units", scene, "v1")
     assert "of 14, 7, 0 m/s)" in old
     assert "of 50.4, 25.2, 0 km/h)" in new
-    ego = graph["ego"]
-    assert f"EGO speed {ego['speed_mps']} target" in old
-    assert f"EGO speed {round(3.6 * ego['speed_mps'], 1)} target" in new
-    assert f"zone in {ego['zone_m']} m" in old
-    assert f"zone in {round(ego['zone_m'] / 0.3048, 1)} ft" in new
+    ego = graph.ego
+    assert f"EGO speed {ego.speed_mps} target" in old
+    assert f"EGO speed {round(3.6 * ego.speed_mps, 1)} target" in new
+    assert f"zone in {ego.zone_m} m" in old
+    assert f"zone in {round(ego.zone_m / 0.3048, 1)} ft" in new
     assert "CONFLICTS id sector: ego ft, s / it ft, s" in new
     assert not re.search(r"\bm\b|m/s", new)
     assert "within about 1 s" in new  # seconds stay

@@ -54,7 +54,7 @@ def played(small: Dataset) -> Dataset:
     """Episode 1 ends a step before its neighbours. Every vehicle is as far from the zone as any other."""
     data = course(small, 3, OUTCOMES)
     for scene in all_scenes(data):
-        scene.record["distance_m"] = dict.fromkeys(scene.record["distance_m"], 10.0)
+        scene.record.distance_m.update(dict.fromkeys(scene.record.distance_m, 10.0))
     return data
 
 
@@ -62,7 +62,7 @@ def script(data: Dataset) -> Scripted:
     """Helpers are sure of SLOWER at the first step, of IDLE at the second and of FASTER at the third."""
     lines = {}
     for scene in all_scenes(data):
-        action = data.actions[scene.record["step"]]
+        action = data.actions[scene.record.step]
         lines |= {f"{scene.id}/{viewer}": sure(action, "helper") for viewer in scene.viewers[1:]}
         lines[f"{scene.id}/{scene.viewers[0]}"] = EGO
     return Scripted(lines)
@@ -125,7 +125,7 @@ def test_shuffled_messages_are_those_of_the_next_layout_that_decides(played: Dat
     """
     lines = {f"{scene.id}/{scene.viewers[0]}": EGO for scene in all_scenes(played)}
     for scene in all_scenes(played):
-        intent = sure(played.actions[scene.record["episode"]], "helper")
+        intent = sure(played.actions[scene.record.episode], "helper")
         lines |= {f"{scene.id}/{viewer}": intent for viewer in scene.viewers[1:]}
     control = replace(POOLED, name="control", messages="shuffled")
     told = walked(spec_of(played, points=(control,), seeds=(0, 1)), Scripted(lines))

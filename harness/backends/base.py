@@ -15,6 +15,7 @@ from harness.prompts.answer_schema import Shape
 if TYPE_CHECKING:
     from harness.runs.records import Latency
     from harness.world.scenario import Scenario
+    from harness.world.scene_graph import SceneGraph
 
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
@@ -60,9 +61,9 @@ class Request:
     image: Image | None = None  # the picture before the text of the last user message; None if there is none
     # the viewer's own scene graph, for backends without a language model; it holds nothing that the prompt's
     # author could not see
-    view: Mapping[str, Any] | None = None
+    view: "SceneGraph | None" = None
     # scene graph with everything in view; None unless the card is `privileged`
-    truth: Mapping[str, Any] | None = None
+    truth: "SceneGraph | None" = None
     scenario: "Scenario | None" = None  # scenario of the view; only backends that read the view read it
 
     @property

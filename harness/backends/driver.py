@@ -40,7 +40,7 @@ class DriverBackend:
             raise UserError(
                 f"driver {CONSTANT}: none was chosen for {printable(scenario.name)}; give brake or cruise"
             )
-        asked = [(driver, request.view or {}, request.truth) for request in requests]
+        asked = [(driver, request.view, request.truth) for request in requests]
         return [
             self._answer(request, [action])
             for request, action in zip(requests, choices(scenario, asked), strict=True)

@@ -5,7 +5,7 @@ is less sure the more of the ego's sectors it cannot see. Its numbers are chosen
 something about the harness and nothing about any language model. Its card may make it fail at known rates.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -17,6 +17,7 @@ from harness.core.rounding import rounded
 from harness.prompts.answer_schema import plainest
 from harness.world.planner import plan, plans
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 
 VERSION = "proxy/1"
 
@@ -78,7 +79,7 @@ def _answers(requests: Sequence[Request]) -> list[str]:
     ]
 
 
-def _text(request: Request, view: Mapping[str, Any], intent: dict[str, float]) -> str:
+def _text(request: Request, view: SceneGraph, intent: dict[str, float]) -> str:
     best = max(intent, key=intent.__getitem__)
     body = {name: plainest(schema) for name, schema in request.shape.further.items()}
     if request.role == "helper":
@@ -94,16 +95,16 @@ def _text(request: Request, view: Mapping[str, Any], intent: dict[str, float]) -
     return canonical_json(body)
 
 
-def distribution(scenario: Scenario, view: Mapping[str, Any]) -> dict[str, float]:
+def distribution(scenario: Scenario, view: SceneGraph) -> dict[str, float]:
     """Return a viewer's intent: the planner's action on its graph, hedged by what it cannot see."""
     return _hedged(scenario.actions, plan(scenario, view), view)
 
 
-def _hedged(actions: Sequence[str], planned: str, view: Mapping[str, Any]) -> dict[str, float]:
+def _hedged(actions: Sequence[str], planned: str, view: SceneGraph) -> dict[str, float]:
     if planned == "SLOWER":
         braking = SURE_SLOWER
     else:
-        hidden = max((1.0 - s["seen_share"] for s in view["sectors"]), default=0.0)
+        hidden = max((1.0 - sector.seen_share for sector in view.sectors), default=0.0)
         braking = LEAST_DOUBT + (MOST_DOUBT - LEAST_DOUBT) * hidden
     rest = 1.0 - braking
     others = [a for a in actions if a not in ("SLOWER", planned)]
@@ -115,15 +116,12 @@ def _hedged(actions: Sequence[str], planned: str, view: Mapping[str, Any]) -> di
     return dict(zip(actions, rounded([shares.get(a, braking) for a in actions]), strict=True))
 
 
-def _reason(view: Mapping[str, Any]) -> str:
-    for conflict in view["conflicts"]:
-        if conflict["other"].get("braking") and conflict["kind"] == "ahead":
-            away_m, lane = conflict["ego"]["arc_m"], conflict["lane"]
-            return f"{conflict['with']} brakes {away_m:.0f} m ahead of the ego, {lane} lane."
-    if view["conflicts"]:
-        first = min(view["conflicts"], key=lambda c: abs(c["other"]["arc_m"]))
-        return (
-            f"{first['with']} from {first['sector']} {first['other']['arc_m']:.0f} m before the ego's path."
-        )
-    hidden = [s["sector"] for s in view["sectors"] if s["occluded"]]
-    return f"Nothing on the ego's path; hidden: {', '.join(hidden) or 'none'}."
+def _reason(view: SceneGraph) -> str:
+    for conflict in view.conflicts:
+        if conflict.other.braking and conflict.kind == "ahead":
+            away_m = conflict.ego.arc_m
+            return f"{conflict.vehicle} brakes {away_m:.0f} m ahead of the ego, {conflict.lane} lane."
+    if view.conflicts:
+        first = min(view.conflicts, key=lambda conflict: abs(conflict.other.arc_m))
+        return f"{first.vehicle} from {first.sector} {first.other.arc_m:.0f} m before the ego's path."
+    return f"Nothing on the ego's path; hidden: {', '.join(view.occluded) or 'none'}."

@@ -71,7 +71,7 @@ def closed_loop(
     """
     from harness.backends import cards
     from harness.backends.cache import default_file
-    from harness.dataset.schema import LAST_EPISODE, LAST_SEED
+    from harness.core.seeds import LAST_EPISODE, LAST_SEED
     from harness.evaluate.agent import Agent
     from harness.evaluate.live_world import LiveSource
     from harness.evaluate.spec import Spec

@@ -57,7 +57,7 @@ def command(
     If the run is stopped, the same command continues it.
     """
     from harness.backends.cache import default_file
-    from harness.dataset.schema import LAST_EPISODE, LAST_SEED
+    from harness.core.seeds import LAST_EPISODE, LAST_SEED
     from harness.evaluate import resolve
     from harness.evaluate.live_world import LiveSource
     from harness.evaluate.run import evaluate, evaluate_shard

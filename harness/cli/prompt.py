@@ -105,10 +105,7 @@ def show(
     if taker is None and out:
         raise UserError(f"--out: prompt {version} shows no picture; leave it out")
     system = resolve(model).system if model else None
-    sent = {
-        v: with_system(prompt.render(at.record["graphs"][v], data.actions, words=words), system)
-        for v in viewers
-    }
+    sent = {v: with_system(prompt.render(at.graphs[v], data.actions, words=words), system) for v in viewers}
     seen = {v: Sight(data.scenario, at.state, v, taker.vision.size_px) for v in viewers if taker}
     wrote = {v: pictures.write(image, out / f"{at.id}-{v}.png") for v, image in seen.items() if out}
     if as_json:
@@ -214,8 +211,8 @@ def check(
     outside: list[dict[str, Any]] = []
 
     def render(scene: "Scene", viewer: str, messages: Sequence[Mapping[str, Any]] = ()) -> None:
-        graph = scene.record["graphs"][viewer]
-        role, rendered = graph["role"], prompt.render(graph, data.actions, messages, words)
+        graph = scene.graphs[viewer]
+        role, rendered = graph.role, prompt.render(graph, data.actions, messages, words)
         if not count:
             return
         n = count(rendered) + picture

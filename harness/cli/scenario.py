@@ -111,7 +111,7 @@ def audit(
 
 def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episodes") -> "Scenario":
     """The scenario. Raises UserError if there is none, or where those layouts cannot be driven together."""
-    from harness.dataset.schema import LAST_EPISODE, LAST_SEED
+    from harness.core.seeds import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios
 
     scenario = scenarios.get(options.typed_scenario(name))

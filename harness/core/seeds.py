@@ -12,6 +12,7 @@ from harness.core.errors import UserError
 Purpose = Literal["tune", "train", "report"]
 
 FIRST: dict[Purpose, int] = {"tune": 0, "train": 100_000, "report": 200_000}  # each range ends at the next
+LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
 
 
 def purpose(first: int, count: int) -> Purpose:

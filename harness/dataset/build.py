@@ -30,7 +30,6 @@ from harness.dataset.freeze import freeze
 from harness.dataset.schema import (
     FILE_NAME,
     LAYOUTS,
-    Danger,
     Tree,
     manifest_schema,
     record_schema,
@@ -195,14 +194,13 @@ def _write_dataset(
 def _freeze_layout(scenario: Scenario, seed: int, episode: int) -> bytes:
     """Freeze a layout and return its file in the working folder."""
     levels, scenes = freeze(scenario, seed + episode, episode)
-    texts = ["".join(canonical_json(record) + "\n" for record in level).encode() for level in scenes]
+    texts = [
+        "".join(canonical_json(msgspec.to_builtins(record)) + "\n" for record in level).encode()
+        for level in scenes
+    ]
     for line in b"".join(texts).splitlines():
         msgspec.json.decode(line, type=record_type(scenario))  # a record that breaks its own form is a bug
-    danger = scenes[0][0]["danger"]
-    tree = Tree(
-        episode, seed + episode, Danger(danger["sector"], danger["vehicle"]), levels,
-        list(map(sha256_bytes, texts)),
-    )  # fmt: skip
+    tree = Tree(episode, seed + episode, scenes[0][0].danger, levels, list(map(sha256_bytes, texts)))
     _check(scenario, tree)
     data = BytesIO()
     with ZipFile(data, "w") as file:

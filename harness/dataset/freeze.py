@@ -6,46 +6,45 @@ target are one edge. So the tree of six decisions has some hundred decision poin
 a decided episode.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from harness.core.files import digest
-from harness.dataset.schema import Branching, Edge, End
+from harness.dataset.schema import Branching, Danger, Edge, End, Record
 from harness.world import lockstep
 from harness.world.beacons import known
 from harness.world.drivers import DRIVERS, choices
 from harness.world.outcome import Outcome
-from harness.world.perception.graph import Graph, scene_graphs, truth_graphs
+from harness.world.perception.graph import scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import Target, World
-
-Record = dict[str, Any]
 
 
 def freeze(scenario: Scenario, seed: int, episode: int) -> tuple[list[list[Branching]], list[list[Record]]]:
     """Return a layout's decision tree and the scene of each of its decision points, both level by level."""
     level = [World.start(scenario, seed)]
     branchings, scenes = [], []
+    facts = dict(scenario.road().facts)
     while level:
         out_edges, following = edges(level, episode)
         states = [world.state() for world in level]
-        seen = moments([
+        records = moments([
             (world, state, episode, (state.ego, *state.helpers))
             for world, state in zip(level, states, strict=True)
         ])  # fmt: skip
-        graphs = [record["graphs"][state.ego.id] for record, state in zip(seen, states, strict=True)]
-        drivers = _drivers(scenario, states, graphs)
+        drivers = _drivers(scenario, states, [record.graphs[record.state.ego.id] for record in records])
         branchings.append([
-            Branching(record["scene"], actions, out)
-            for record, actions, out in zip(seen, drivers, out_edges, strict=True)
+            Branching(record.scene, actions, out)
+            for record, actions, out in zip(records, drivers, out_edges, strict=True)
         ])  # fmt: skip
-        road = scenario.road().facts
         scenes.append([
-            {**record, "road": road, "snapshot": world.snapshot()}
-            for world, record in zip(level, seen, strict=True)
+            replace(record, road=facts, snapshot=world.snapshot())
+            for world, record in zip(level, records, strict=True)
         ])  # fmt: skip
         level = following
     return branchings, scenes
@@ -92,7 +91,7 @@ def _edge(actions: list[str], branch: World, episode: int, following: dict[str, 
 
 
 def _drivers(
-    scenario: Scenario, states: Sequence[WorldState], seen: Sequence[Mapping[str, Any]]
+    scenario: Scenario, states: Sequence[WorldState], seen: Sequence[SceneGraph]
 ) -> list[dict[str, str]]:
     """Return each reference driver's action at some decision points; `seen` has the ego's scene graphs."""
     known = list(zip(seen, truth_graphs(scenario, states), strict=True))
@@ -102,11 +101,7 @@ def _drivers(
 
 def scene_id(episode: int, state: WorldState) -> str:
     """Return `<episode>-<step>-<digest>`; equal states have equal ids, frozen and in the closed loop."""
-    return _id(episode, state.to_dict())
-
-
-def _id(episode: int, state: Mapping[str, Any]) -> str:
-    return f"{episode:05d}-{state['step']}-{digest(state)[:12]}"
+    return f"{episode:05d}-{state.step}-{digest(msgspec.to_builtins(state))[:12]}"
 
 
 def moment(world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]) -> Record:
@@ -120,32 +115,25 @@ def moment(world: World, state: WorldState, episode: int, viewers: Sequence[Vehi
 
 def moments(points: Sequence[tuple[World, WorldState, int, Sequence[VehicleState]]]) -> list[Record]:
     """Return the `moment` of some decision points of one scenario."""
-    scenario = points[0][0].scenario
     looks = [(state, viewer.id) for _, state, _, viewers in points for viewer in viewers]
-    graphs = iter(scene_graphs(scenario, looks))
+    graphs = iter(scene_graphs(points[0][0].scenario, looks))
     return [
         _moment(world, state, episode, {viewer.id: next(graphs) for viewer in viewers})
         for world, state, episode, viewers in points
     ]
 
 
-def _moment(world: World, state: WorldState, episode: int, graphs: dict[str, Graph]) -> Record:
+def _moment(world: World, state: WorldState, episode: int, graphs: dict[str, SceneGraph]) -> Record:
     """Return a decision point's record, with the scene graphs of its viewers, by their ids."""
     zone, (ego_id, *others) = world.scenario.road().zone_m, graphs
     ego = state.vehicle(ego_id)
     known_states = {name: known(state, name, ego_id) for name in graphs}
-    stated = state.to_dict()
-    return {
-        "scene": _id(episode, stated),
-        "episode": episode,
-        "episode_seed": world.seed,
-        "step": state.step,
-        "danger": {"sector": world.layout.danger, "vehicle": world.layout.danger_id},
-        "state": stated,
-        "graphs": graphs,
-        "distance_m": {name: _distance_m(v, *zone) for name, v in known_states.items()},
-        "range_m": {name: _distance_m(known_states[name], ego.x_m, ego.y_m) for name in others},
-    }
+    return Record(
+        scene=scene_id(episode, state), episode=episode, episode_seed=world.seed, step=state.step,
+        danger=Danger(world.layout.danger, world.layout.danger_id), state=state, graphs=graphs,
+        distance_m={name: _distance_m(v, *zone) for name, v in known_states.items()},
+        range_m={name: _distance_m(known_states[name], ego.x_m, ego.y_m) for name in others},
+    )  # fmt: skip
 
 
 def _distance_m(v: VehicleState, x_m: float, y_m: float) -> float:

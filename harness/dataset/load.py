@@ -3,7 +3,7 @@
 import os
 import re
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -13,6 +13,7 @@ from zipfile import ZipFile
 
 import msgspec
 import numpy as np
+from msgspec import structs
 
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, unknown
@@ -21,7 +22,7 @@ from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
 from harness.core.resources import find as beside
 from harness.dataset.forest import Forest
-from harness.dataset.schema import Manifest, Tree
+from harness.dataset.schema import Manifest, Record, Tree, plain_type
 from harness.dataset.verify import (
     Damaged,
     decoded,
@@ -35,6 +36,7 @@ from harness.dataset.verify import (
 )
 from harness.world.drivers import CONSTANT, UNIFORM, constant
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 from harness.world.state import WorldState
 
 # How many of a dataset's scenes and trees stay in memory, the last ones read: some 120 and 100 MB.
@@ -51,30 +53,33 @@ class Scene:
         notes: results computed from it, by name, kept so that they are computed once.
     """
 
-    record: dict[str, Any]
+    record: Record
     notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def id(self) -> str:
         """`<episode>-<step>-<digest>`."""
-        return str(self.record["scene"])
+        return self.record.scene
 
-    @cached_property
+    @property
     def state(self) -> WorldState:
         """The whole state."""
-        return WorldState.from_dict(self.record["state"])
+        return self.record.state
+
+    @cached_property
+    def graphs(self) -> Mapping[str, SceneGraph]:
+        """The scene graph of the ego and of each helper, by id, the ego first."""
+        graphs = self.record.graphs
+        return {v.id: graphs[v.id] for v in self.state.vehicles if v.id in graphs}
 
     @property
     def viewers(self) -> tuple[str, ...]:
         """Ids of the ego and the helpers, the ego first."""
-        return tuple(self.record["graphs"])
+        return tuple(self.graphs)
 
-    def __post_init__(self) -> None:
-        order = [v["id"] for v in self.record["state"]["vehicles"]]
-        graphs = self.record["graphs"]
-        object.__setattr__(
-            self, "record", {**self.record, "graphs": {v: graphs[v] for v in order if v in graphs}}
-        )
+    def changed(self, **fields: Any) -> "Scene":
+        """Return the scene with other values in some fields of its record."""
+        return Scene(structs.replace(self.record, **fields))
 
 
 class Trees(Sequence[Tree]):
@@ -210,7 +215,7 @@ class Dataset:
             with opened(self.path) as file:
                 for (number, step), places in missing.items():
                     for record in self._records(file, self.trees.read(number), step, places):
-                        self._scenes[record["scene"]] = Scene(record)
+                        self._scenes[record.scene] = Scene(record)
         scenes = [self._scenes[name] for name in ids]
         for name in list(islice(self._scenes, max(0, len(self._scenes) - SCENES_KEPT))):
             del self._scenes[name]
@@ -234,9 +239,7 @@ class Dataset:
                         return episode, step, place
         raise KeyError(name)
 
-    def _records(
-        self, file: ZipFile, tree: Tree, step: int, places: Sequence[int]
-    ) -> Iterator[dict[str, Any]]:
+    def _records(self, file: ZipFile, tree: Tree, step: int, places: Sequence[int]) -> Iterator[Record]:
         try:
             lines = read_level(file, tree, step)
         except Damaged as damage:
@@ -244,13 +247,14 @@ class Dataset:
         for place in places:
             name = tree.levels[step][place].scene
             if self.trusted or name in self._checked:  # the level's digest vouches for it
-                yield msgspec.json.decode(lines[place])
+                yield msgspec.json.decode(lines[place], type=plain_type(self.scenario))
                 continue
             record, problems = decoded(lines[place], self.manifest, name)
             for problem in problems:
                 raise unusable(self.path, problem)
-            self._checked.add(name)
-            yield record
+            if record:
+                self._checked.add(name)
+                yield record
 
     def scene(self, scene_id: str) -> Scene:
         """Return the scene with this id, or with the only id that begins like this."""

@@ -11,179 +11,32 @@ from types import GenericAlias
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta, field
+from msgspec import UNSET, Meta, UnsetType
 
-from harness.core.seeds import Purpose
+from harness.core.seeds import LAST_EPISODE, LAST_SEED, Purpose
 from harness.world.scenario import Scenario
-from harness.world.state import Kind, Part, indicator
+from harness.world.scene_graph import Conflict, Node, SceneGraph, Sector
+from harness.world.state import (
+    ActionsTaken,
+    Closed,
+    Count,
+    Number,
+    Seed,
+    Snapshot,
+    VehicleId,
+    VehicleState,
+    WorldState,
+    indicator,
+)
 
 FILE_NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"  # names of a dataset and its files; never a path
-LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
 LAYOUTS = "layouts.zip"
 
-# No metre, second or share comes near these bounds, and infinity and huge integers do not pass them.
-Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
-Count = Annotated[int, Meta(ge=0, le=1_000_000)]
 Episode = Annotated[int, Meta(ge=0, le=LAST_EPISODE)]
-Seed = Annotated[int, Meta(ge=0, le=LAST_SEED + LAST_EPISODE)]
 Text = Annotated[str, Meta(max_length=200)]
 FileName = Annotated[str, Meta(pattern=FILE_NAME)]
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
-VehicleId = Annotated[str, Meta(pattern="^v[1-9][0-9]?$")]
 SceneId = Annotated[str, Meta(pattern="^[0-9]{5}-[0-9]-[0-9a-f]{12}$")]
-
-
-class Closed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A record with these members and no other."""
-
-
-class Vehicle(Closed, frozen=True):
-    """`harness.world.state.VehicleState` in a file."""
-
-    id: VehicleId
-    kind: Kind
-    part: Part
-    x_m: Number
-    y_m: Number
-    heading_rad: Number
-    speed_mps: Number
-    approach: str
-    route: str
-    crashed: bool
-    braking: bool = False
-
-
-class Building(Closed, frozen=True):
-    """A box that blocks sight; its walls in metres."""
-
-    id: Annotated[str, Meta(pattern="^b[1-9]$")]
-    west_m: Number
-    north_m: Number
-    east_m: Number
-    south_m: Number
-
-
-class Beacon(Closed, frozen=True):
-    """`harness.world.state.Beacon` in a file."""
-
-    sender: VehicleId
-    time_s: Number
-    arrives_s: Number
-    x_m: Number
-    y_m: Number
-    heading_rad: Number
-    speed_mps: Number
-    target_speed_mps: Number | None
-    heard_by: list[VehicleId]
-    interval_s: Number | None = None
-    unmoved: Count = 0
-
-
-class State(Closed, frozen=True):
-    """`harness.world.state.WorldState` in a file."""
-
-    scenario: str
-    episode_seed: Seed
-    step: Count
-    time_s: Number
-    target_speed_mps: Number
-    vehicles: Annotated[list[Vehicle], Meta(min_length=1)]
-    buildings: list[Building]
-    beacons: list[Beacon]
-
-
-class Viewer(Closed, frozen=True):
-    """The viewer itself."""
-
-    speed_mps: Number
-    lane: str
-    zone_m: Number
-    type: Kind | None = None
-
-
-class Ego(Closed, frozen=True):
-    """The ego, in the viewer's frame."""
-
-    id: VehicleId
-    speed_mps: Number
-    target_speed_mps: Number
-    zone_m: Number
-    forward_m: Number
-    left_m: Number
-    age_s: Number
-    route: str | None = None
-
-
-class Node(Closed, frozen=True):
-    """A vehicle that the viewer's sensors report."""
-
-    id: VehicleId
-    type: Literal["vehicle", "car", "van", "truck"]
-    forward_m: Number
-    left_m: Number
-    heading_deg: Number | None
-    speed_mps: Number
-    range_rate_mps: Number | None
-    lane: str
-    indicator: str | None
-    sensors: list[Literal["camera", "lidar", "radar"]]
-    braking: bool | None = None
-
-
-class Point(Closed, frozen=True):
-    """A place in the viewer's frame."""
-
-    forward_m: Number
-    left_m: Number
-
-
-class EgoArrival(Closed, frozen=True):
-    """How far the ego is from a conflict; no time where it stands."""
-
-    arc_m: Number
-    time_s: Number | None
-
-
-class Arrival(EgoArrival, frozen=True):
-    """How far another vehicle is from a conflict, how fast it is, and whether it is seen to brake."""
-
-    speed_mps: Number
-    braking: bool | None = None
-
-
-class Conflict(Closed, frozen=True):
-    """A vehicle whose path meets the ego's: the one it is on, or one beside, `lane`."""
-
-    vehicle: VehicleId = field(name="with")
-    sector: str
-    route: str
-    point: Point
-    ego: EgoArrival
-    other: Arrival
-    kind: Literal["crossing", "merging", "ahead", "behind", "oncoming"] = "crossing"
-    lane: Literal["own", "left", "right"] = "own"
-
-
-class SectorSeen(Closed, frozen=True):
-    """How much of a sector is in sight, and what hides the rest."""
-
-    sector: str
-    seen_share: Number
-    occluded: bool
-    by: list[str]
-
-
-class Graph(Closed, frozen=True):
-    """What one viewer knows."""
-
-    viewer: VehicleId
-    role: Literal["ego", "helper"]
-    step: Count
-    itself: Viewer = field(name="self")
-    ego: Ego
-    nodes: list[Node]
-    conflicts: list[Conflict]
-    sectors: list[SectorSeen]
 
 
 class Road(Closed, frozen=True):
@@ -197,35 +50,40 @@ class Danger(Closed, frozen=True):
     vehicle: VehicleId | None
 
 
-class Snapshot(Closed, frozen=True):
-    """What the simulator needs beyond the state to go on from here."""
-
-    frame: Count
-    sections: list[Count]
-    speed_index: Count
-
-
-class Taken(Closed, frozen=True):
-    """What leads an environment from its seed to here again: the frame and the name of each action."""
-
-    frame: Count
-    taken: list[tuple[Count, Text]]
-
-
 class Record(Closed, frozen=True):
-    """A decision point: a line of `<episode>/<step>.jsonl`. `record_type` has a scenario's own names."""
+    """A decision point: a line of `<episode>/<step>.jsonl`. `record_type` has a scenario's own names.
+
+    Attributes:
+        scene: `<episode>-<step>-<digest>`.
+        episode: number of the episode.
+        episode_seed: seed of its layout.
+        step: index of the decision about to be taken.
+        danger: the vehicle that the layout sends against the ego, if any.
+        state: the state of everything, seen or not.
+        graphs: what each viewer knows, by its id.
+        distance_m: distance of each viewer to the conflict zone, as the ego knows it.
+        range_m: distance of each helper to the ego, as the ego knows it.
+        road: what the scenario says of its road; like the next, in datasets only.
+        snapshot: what the simulator needs beyond the state to go on from here.
+    """
 
     scene: SceneId
     episode: Episode
     episode_seed: Seed
     step: Count
-    road: Road
     danger: Danger
-    state: State
-    graphs: dict[VehicleId, Graph]
+    state: WorldState
+    graphs: dict[VehicleId, SceneGraph]
     distance_m: dict[VehicleId, Number]
     range_m: dict[VehicleId, Number]
-    snapshot: Snapshot | Taken
+    road: dict[str, str | Number] | UnsetType = UNSET
+    snapshot: Snapshot | UnsetType = UNSET
+
+
+class EnvironmentRecord(Record, frozen=True):
+    """A decision point of an environment."""
+
+    snapshot: ActionsTaken | UnsetType = UNSET  # type: ignore[assignment]
 
 
 class End(Closed, frozen=True):
@@ -305,6 +163,11 @@ class Manifest(Closed, frozen=True):
     environment: dict[str, Any] | None = None
 
 
+def plain_type(scenario: Scenario) -> type[Record]:
+    """Return the type of a scenario's records, which allows any names in them."""
+    return EnvironmentRecord if scenario.is_environment else Record
+
+
 @lru_cache(maxsize=8)
 def record_type(scenario: Scenario) -> type[Record]:
     """Return `Record` narrowed to the approaches, routes, sectors and facts of the scenario's road."""
@@ -314,20 +177,21 @@ def record_type(scenario: Scenario) -> type[Record]:
     sector = _choice(road.sectors)
     signal = _choice([*(r for _, r in road.paths if indicator(r) == r), "off"])
     section = Annotated[int, Meta(ge=0, le=max(len(path.lanes) for path in road.paths.values()) - 1)]
-    vehicle = _narrowed(Vehicle, approach=approach, route=route)
+    vehicle = _narrowed(VehicleState, approach=approach, route=route)
+    sensors = Literal["camera", "lidar", "radar"]
     graph = _narrowed(
-        Graph,
-        nodes=_list(_narrowed(Node, indicator=signal | None)),
-        conflicts=_list(_narrowed(Conflict, sector=approach, route=route)),
-        sectors=_list(_narrowed(SectorSeen, sector=sector)),
+        SceneGraph,
+        nodes=_tuple(_narrowed(Node, indicator=signal | None, sensors=_tuple(sensors))),
+        conflicts=_tuple(_narrowed(Conflict, sector=approach, route=route)),
+        sectors=_tuple(_narrowed(Sector, sector=sector)),
     )
     kind: type[Record] = _narrowed(
         Record,
         road=_narrowed(Road, **{k: str if isinstance(v, str) else Number for k, v in road.facts.items()}),
         danger=_narrowed(Danger, sector=sector | None),
-        state=_narrowed(State, vehicles=Annotated[_list(vehicle), Meta(min_length=1)]),
+        state=_narrowed(WorldState, vehicles=Annotated[_tuple(vehicle), Meta(min_length=1)]),
         graphs=GenericAlias(dict, (VehicleId, graph)),
-        snapshot=Taken if scenario.is_environment else _narrowed(Snapshot, sections=_list(section)),
+        snapshot=ActionsTaken if scenario.is_environment else _narrowed(Snapshot, sections=_tuple(section)),
     )
     return kind
 
@@ -338,8 +202,8 @@ def _choice(names: Iterable[str]) -> Any:
     return Annotated[str, Meta(pattern=pattern, extra_json_schema={"enum": unique})]
 
 
-def _list(kind: Any) -> Any:
-    return GenericAlias(list, (kind,))
+def _tuple(kind: Any) -> Any:
+    return GenericAlias(tuple, (kind, ...))
 
 
 def _narrowed(kind: type[Closed], /, **fields: Any) -> Any:

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 from weakref import finalize
 from zipfile import ZipFile
 
@@ -19,11 +18,12 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import bytes_of, sha256_bytes, sha256_file
 from harness.core.files import opened as opened_file
-from harness.dataset.schema import LAYOUTS, Manifest, Record, Taken, Tree, record_type
+from harness.dataset.schema import LAYOUTS, Manifest, Record, Tree, plain_type, record_type
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
 from harness.world.environments import environment
 from harness.world.scenario import Scenario
+from harness.world.state import Snapshot
 
 _MANIFEST = msgspec.json.Decoder(Manifest)
 _TREE = msgspec.json.Decoder(Tree)
@@ -237,18 +237,18 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
     return [problem for problem, holds in conditions.items() if not holds]
 
 
-def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[dict[str, Any], list[str]]:
+def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, list[str]]:
     """Return a scene's record and what is wrong with it; the record is usable only if nothing is."""
     scenario = scenarios.get(manifest.scenario)
     kind, where = record_type(scenario), f"{LAYOUTS} scene {name}"
     try:
         record = msgspec.json.decode(line, type=kind)
     except msgspec.ValidationError as error:
-        return {}, [f"{where}: {misfit(error, line, kind, 'record')}"]
+        return None, [f"{where}: {misfit(error, line, kind, 'record')}"]
     except (ValueError, RecursionError) as error:
-        return {}, [f"{where}: no JSON ({printable(error)})"]
+        return None, [f"{where}: no JSON ({printable(error)})"]
     problems = [f"{where}: {what}" for what in contradictions(scenario, record, manifest, name)]
-    return _JSON.decode(line), problems
+    return msgspec.json.decode(line, type=plain_type(scenario)), problems
 
 
 def unusable(path: Path, problem: str) -> UserError:
@@ -278,7 +278,7 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
     nodes = {node.id for graph in graphs.values() for node in graph.nodes}
     conflicts = [conflict for graph in graphs.values() for conflict in graph.conflicts]
     speeds, road, snapshot = manifest.parameters["target_speeds_mps"], scenario.road(), record.snapshot
-    own_snapshot = None if isinstance(snapshot, Taken) else snapshot
+    own_snapshot = snapshot if isinstance(snapshot, Snapshot) else None
     conditions = {
         "it is the scene of another decision point": record.scene == name,
         "there is no target speed of that index": isinstance(speeds, list)
@@ -295,8 +295,7 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
         "a graph is of another viewer": all(graph.viewer == viewer for viewer, graph in graphs.items()),
         "distances are not those of the ego and the helpers": record.distance_m.keys() == viewers,
         "a conflict is on a path that does not meet the ego's": all(
-            (c.sector, c.route) in (road.crossings if c.kind in ("crossing", "merging") else road.paths)
-            for c in conflicts
+            (c.sector, c.route) in (road.crossings if c.meets else road.paths) for c in conflicts
         ),
         "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts} <= set(ids),
         "ranges are not those of the helpers": record.range_m.keys() == viewers - {ids[0]},

@@ -11,6 +11,7 @@ from harness.core.errors import UserError, printable, unknown
 from harness.parsing.parse import Status, parse
 from harness.prompts import readout
 from harness.prompts.versions import Prompt
+from harness.world.scene_graph import SceneGraph
 
 ImageMode = Literal["own", "blank", "another", "none"]
 
@@ -126,16 +127,14 @@ class Agent:
             reasons_first=role in self.prompt.reasons_first,
         )  # fmt: skip
 
-    def chats(
-        self, graph: Mapping[str, Any], actions: tuple[str, ...], words: Mapping[str, str]
-    ) -> dict[str, Any]:
+    def chats(self, graph: SceneGraph, actions: tuple[str, ...], words: Mapping[str, str]) -> dict[str, Any]:
         """Return the chat about a scene graph in the agent's answer mode, as fields of a request.
 
         They are the `messages`, and those of the further `orders` and the `flips` of a read-out's letters.
         """
         rendered = self.rendered(graph, actions, (), words)
         return self.in_orders(
-            actions, lambda order: in_mode(self.answer, self.prompt, rendered, graph["role"], order)
+            actions, lambda order: in_mode(self.answer, self.prompt, rendered, graph.role, order)
         )
 
     def in_orders(
@@ -156,7 +155,7 @@ class Agent:
         return chats
 
     def rendered(
-        self, graph: Mapping[str, Any], actions: tuple[str, ...], heard: Sequence[Mapping[str, Any]],
+        self, graph: SceneGraph, actions: tuple[str, ...], heard: Sequence[Mapping[str, Any]],
         words: Mapping[str, str],
     ) -> tuple[Mapping[str, str], ...]:  # fmt: skip
         """Return the chat about a scene graph and the messages heard, before the answer mode changes it."""

@@ -32,7 +32,7 @@ from harness.parsing.parse import parse
 from harness.runs.records import BLIND, REWRITTEN, Answer, Latency
 from harness.runs.records import Role as RecordedRole
 from harness.runs.unanswered import HELPERS, Tally
-from harness.world.perception.graph import blinded, truth_graph
+from harness.world.perception.graph import truth_graph
 
 T = TypeVar("T")
 CHUNK = 64  # fewest requests that are asked, and kept, together
@@ -59,11 +59,11 @@ def requests(
         for place, viewer in enumerate(spec.viewers(scene)):
             if (blind and not place) or (asked is not None and place not in asked):
                 continue
-            graph, index = scene.record["graphs"][viewer], spec.agent(place)
+            graph, index = scene.graphs[viewer], spec.agent(place)
             if blind:
-                graph = blinded(graph)
+                graph = graph.blinded()
             agent = agents[index]
-            yield blank(index, graph["role"]).alike(
+            yield blank(index, graph.role).alike(
                 id=_id(scene, viewer, blind), **agent.chats(graph, actions, words),
                 image=picture(spec, index, scene, viewer, blind) if sees else None, view=graph,
                 truth=truth if agent.card.privileged else None, scenario=scenario,
@@ -77,7 +77,7 @@ def wanted_in(moments: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Pla
 
 
 def _id(scene: Scene, viewer: str, blind: bool) -> str:
-    return f"{scene.record['scene']}/{viewer}{BLIND}" if blind else f"{scene.record['scene']}/{viewer}"
+    return f"{scene.id}/{viewer}{BLIND}" if blind else f"{scene.id}/{viewer}"
 
 
 def _blank(spec: Spec, index: int, role: Role) -> Request:
@@ -93,7 +93,7 @@ def fusion_request(
     spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str]
 ) -> Request:
     """Return the fusion call with these senders' messages; `answers` has the same keys as `senders`."""
-    graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders, spec.actions)
+    graph, heard = scene.graphs[scene.viewers[0]], messages_of(answers, senders, spec.actions)
     messages = spec.ego.rendered(graph, spec.actions, heard, spec.scenario.prompt_words)
     image = picture(spec, 0, scene, scene.viewers[0])
     return _blank(spec, 0, "ego").alike(id=_fusion_id(scene, senders), messages=messages, image=image)
@@ -365,10 +365,10 @@ class Asker:
             unasked.append([*[answer is None for answer in row[1:]], *[False] * absent])
             row += [None] * absent
             p.append([answer.intent or unknown if answer else unknown for answer in row])
-            distance_m, range_m = record["distance_m"], record["range_m"]
+            distance_m, range_m = record.distance_m, record.range_m
             distances_m.append([distance_m[ego], *[distance_m[v] for v in helpers], *[math.nan] * absent])
             ranges_m.append([*[range_m[v] for v in helpers], *[math.nan] * absent])
-            xy_m = {v["id"]: (v["x_m"], v["y_m"]) for v in record["state"]["vehicles"]}
+            xy_m = {v.id: (v.x_m, v.y_m) for v in scene.state.vehicles}
             sent = zip(helpers, row[1:], strict=False)
             bits.append([*[payload_bits(xy_m[v], a) if a else 0 for v, a in sent], *[0] * absent])
         intents = np.array(p, dtype=float)

@@ -40,15 +40,15 @@ def _claims(road: Road, scene: Scene) -> tuple[Floats, Floats, Floats]:
     if (notes := scene.notes.get("claims")) is None:
         state, (ego, *names) = scene.state, scene.viewers
         helpers = [known(state, name, ego) for name in names]
-        nodes = {node["id"]: node for node in scene.record["graphs"][ego]["nodes"]}
+        nodes = {node.id: node for node in scene.graphs[ego].nodes}
         cos, sin = math.cos(state.ego.heading_rad), math.sin(state.ego.heading_rad)
         zone_x, zone_y = road.zone_m
 
         def sensed(name: str) -> float:
             if (node := nodes.get(name)) is None:
                 return math.nan
-            x = state.ego.x_m + node["forward_m"] * cos + node["left_m"] * sin
-            y = state.ego.y_m + node["forward_m"] * sin - node["left_m"] * cos
+            x = state.ego.x_m + node.forward_m * cos + node.left_m * sin
+            y = state.ego.y_m + node.forward_m * sin - node.left_m * cos
             return math.hypot(x - zone_x, y - zone_y)
 
         notes = (

@@ -6,12 +6,13 @@ decision that is still open when the next one is due continues, and the next one
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
+from msgspec import structs
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.dataset.freeze import moments
@@ -198,12 +199,12 @@ def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
 
 def looks(trajectories: Sequence[Trajectory], step: int, ego_alone: bool) -> list[Scene]:
     """Return the decision point of each trajectory at this frame."""
-    states = [replace(t.world.state(), step=step) for t in trajectories]
+    states = [structs.replace(t.world.state(), step=step) for t in trajectories]
     points = [
         (t.world, state, t.number, [state.ego] if ego_alone else [state.ego, *state.helpers])
         for t, state in zip(trajectories, states, strict=True)
     ]
-    return [Scene(record) for record in moments(points)]
+    return list(map(Scene, moments(points)))
 
 
 def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) -> Episode:

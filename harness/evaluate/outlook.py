@@ -1,10 +1,9 @@
 """Compute what an ego sees of the regions, and what it can infer about its helpers' views before it asks."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
+from msgspec.structs import replace
 
 from harness.coordination.scheduling import Outlook
 from harness.core.arrays import Bools, Floats
@@ -12,6 +11,7 @@ from harness.dataset.load import Scene
 from harness.world.beacons import known
 from harness.world.perception.rays import blocked_by
 from harness.world.road import Road
+from harness.world.scene_graph import Node
 from harness.world.state import VehicleState, WorldState
 
 MOVING_MPS = 0.1  # a slower vehicle counts as standing
@@ -31,16 +31,15 @@ def outlook(road: Road, moments: Sequence[Scene]) -> Outlook:
 def _outlook(road: Road, scene: Scene) -> Outlook:
     """Return a moment's outlook; kept with the immutable scene."""
     if (kept := scene.notes.get("outlook")) is None:
-        graph, state = scene.record["graphs"][scene.viewers[0]], scene.state
+        graph, state = scene.graphs[scene.viewers[0]], scene.state
         helpers = [known(state, name, state.ego.id) for name in scene.viewers[1:]]
-        as_known = _as_known(state, graph["nodes"], helpers)
+        as_known = _as_known(state, graph.nodes, helpers)
         # What the ego sees is decided by where occluders truly are, and not by where it measures them.
-        reported = {state.ego.id, *(node["id"] for node in graph["nodes"])}
+        reported = {state.ego.id, *graph.seen}
         in_sight = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
         unseen = _unseen(road, in_sight, state.ego)
         added = [_by_region(road, unseen & ~_unseen(road, as_known, helper)) for helper in helpers]
-        ego = graph["ego"]
-        distance_m, speed_mps = max(ego["zone_m"], 0.0), ego["speed_mps"]
+        distance_m, speed_mps = max(graph.ego.zone_m, 0.0), graph.ego.speed_mps
         to_zone_s = distance_m / speed_mps if speed_mps > MOVING_MPS else np.inf if distance_m else 0.0
         regions = len(road.sectors)
         kept = Outlook(_by_region(road, unseen), np.reshape(added, (-1, regions)), np.array(to_zone_s))
@@ -48,19 +47,16 @@ def _outlook(road: Road, scene: Scene) -> Outlook:
     return kept
 
 
-def _as_known(
-    state: WorldState, nodes: Sequence[Mapping[str, Any]], helpers: Sequence[VehicleState]
-) -> WorldState:
+def _as_known(state: WorldState, nodes: Sequence[Node], helpers: Sequence[VehicleState]) -> WorldState:
     """Return the state as the ego knows it: vehicles as its sensors and its radio report them."""
     ego, by_beacon = state.ego, {helper.id: helper for helper in helpers}
     cos, sin = np.cos(ego.heading_rad), np.sin(ego.heading_rad)
     vehicles = [ego, *helpers]
     for node in nodes:
-        if node["id"] not in by_beacon:
-            forward_m, left_m = node["forward_m"], node["left_m"]
-            x_m = ego.x_m + forward_m * cos + left_m * sin
-            y_m = ego.y_m + forward_m * sin - left_m * cos
-            vehicles.append(replace(state.vehicle(node["id"]), x_m=float(x_m), y_m=float(y_m)))
+        if node.id not in by_beacon:
+            x_m = ego.x_m + node.forward_m * cos + node.left_m * sin
+            y_m = ego.y_m + node.forward_m * sin - node.left_m * cos
+            vehicles.append(replace(state.vehicle(node.id), x_m=float(x_m), y_m=float(y_m)))
     return replace(state, vehicles=tuple(vehicles))
 
 

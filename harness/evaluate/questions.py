@@ -5,12 +5,13 @@ at which the ego sees one conflict and a helper is near, as `harness dataset bui
 --seed 1000` freezes it. No layout is one of a report.
 """
 
-import json
 from collections.abc import Mapping
-from copy import deepcopy
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
+
+import msgspec
+from msgspec.structs import replace
 
 from harness.backends.base import Request, Role
 from harness.core.files import text_of
@@ -18,6 +19,7 @@ from harness.evaluate.agent import Agent
 from harness.prompts import readout
 from harness.world import scenarios
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 
 SCENARIO = "occluded-intersection"
 # How much later than the ego the other vehicle arrives, in the two halves of a pair.
@@ -33,7 +35,7 @@ _DANGER = (
 _NUMBERS = ((5, 3), (9, 2), (8, 1), (7, 4))
 
 
-class Question(NamedTuple):
+class Question(msgspec.Struct, frozen=True):
     """A decision point of a tune layout.
 
     Attributes:
@@ -44,7 +46,7 @@ class Question(NamedTuple):
 
     layout_seed: int
     step: int
-    graphs: Mapping[Role, Mapping[str, Any]]
+    graphs: Mapping[Role, SceneGraph]
 
 
 class Pair(NamedTuple):
@@ -67,7 +69,7 @@ class Pair(NamedTuple):
 def questions() -> tuple[Question, ...]:
     """Return the twelve questions."""
     text = text_of(Path(__file__).with_name("questions.json"), "settings")
-    return tuple(Question(**record) for record in json.loads(text))
+    return msgspec.json.decode(text, type=tuple[Question, ...])
 
 
 def scenario() -> Scenario:
@@ -90,7 +92,7 @@ def scene_pairs(agent: Agent) -> list[Pair]:
     should be likelier with the conflict, and with the small gap.
     """
 
-    def pair(fact: Fact, number: int, present: Mapping[str, Any], absent: Mapping[str, Any]) -> Pair:
+    def pair(fact: Fact, number: int, present: SceneGraph, absent: SceneGraph) -> Pair:
         halves = (("a", present), ("b", absent))
         return Pair(
             fact, "SLOWER", *(_request(agent, half, f"{fact}-{number}{end}/ego") for end, half in halves)
@@ -99,7 +101,7 @@ def scene_pairs(agent: Agent) -> list[Pair]:
     every = []
     for n, question in enumerate(questions()[::3]):
         graph = question.graphs["ego"]
-        every.append(pair("conflict", n, graph, {**graph, "conflicts": []}))
+        every.append(pair("conflict", n, graph, replace(graph, conflicts=())))
         every.append(pair("gap", n, _arriving(graph, SOON_S), _arriving(graph, LATE_S)))
     return every
 
@@ -119,19 +121,18 @@ def plain_pairs(agent: Agent) -> list[Pair]:
     return every
 
 
-def _request(agent: Agent, graph: Mapping[str, Any], name: str) -> Request:
+def _request(agent: Agent, graph: SceneGraph, name: str) -> Request:
     actions, words, here = scenario().actions, scenario().prompt_words, scenario()
-    return agent.blank(graph["role"], actions).alike(
+    return agent.blank(graph.role, actions).alike(
         id=name, view=graph, scenario=here, **agent.chats(graph, actions, words)
     )
 
 
-def _arriving(graph: Mapping[str, Any], later_s: float) -> dict[str, Any]:
+def _arriving(graph: SceneGraph, later_s: float) -> SceneGraph:
     """Return a graph whose conflict has the other vehicle arrive so much later than the ego."""
-    changed = deepcopy(dict(graph))
-    [conflict] = changed["conflicts"]
-    conflict["other"]["time_s"] = round(conflict["ego"]["time_s"] + later_s, 1)
-    return changed
+    [conflict] = graph.conflicts
+    later = replace(conflict.other, time_s=round((conflict.ego.time_s or 0.0) + later_s, 1))
+    return replace(graph, conflicts=(replace(conflict, other=later),))
 
 
 def _plain(agent: Agent, fact: Fact, number: int, present: str, absent: str) -> Pair:

@@ -430,7 +430,7 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
     senders = [
         [*scene.viewers[1:], *[None] * (vehicles + 1 - len(scene.viewers)), *voices] for scene in scenes
     ]
-    episode, step = (of_scenes(scene.record[name] for scene in scenes) for name in ("episode", "step"))
+    episode, step = (of_scenes(getattr(s.record, name) for s in scenes) for name in ("episode", "step"))
     ids = [scene.id for scene in scenes]
     rank = np.unique(ids, return_inverse=True)[1]
     order = np.lexsort((point, rank[at], step, episode))
@@ -446,7 +446,7 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
         "seed": np.concatenate([part.due.seed for part in decided]), "episode": episode, "step": step,
     }  # fmt: skip
     labels = {
-        "scene": _labels(ids, at), "danger": _labels([s.record["danger"]["sector"] for s in scenes], at),
+        "scene": _labels(ids, at), "danger": _labels([s.record.danger.sector for s in scenes], at),
         "condition": Labels(point, points),
         "action": Labels(np.concatenate([part.result.action for part in decided]), actions),
         **{

@@ -143,7 +143,7 @@ def sent(
         questions += [(helpers[0], "helper", ()), (ego, "fusion", helpers)]
     result = []
     for viewer, role, senders in questions:
-        graph = scene.record["graphs"][viewer]
+        graph = scene.graphs[viewer]
         received = [
             {
                 **message,

@@ -13,7 +13,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import sha256_bytes
 from harness.core.seeds import FIRST
-from harness.dataset.schema import Graph
+from harness.world.scene_graph import SceneGraph
 
 EXAMPLES = "examples.json"
 
@@ -28,7 +28,7 @@ class Example(Struct, frozen=True):
     """
 
     layout_seed: int
-    graph: dict[str, Any]
+    graph: SceneGraph
     answer: str
 
 
@@ -98,9 +98,8 @@ def _check(example: Example, role: str, what: str) -> None:
             f"{what} is of layout seed {seed}; examples come from train seeds alone, {FIRST['train']} to "
             f"{FIRST['report'] - 1}: `harness prompt examples` draws such"
         )
-    convert(example.graph, Graph, f"{what}: its graph")
-    if example.graph["role"] != role:
-        raise UserError(f"{what} has the graph of a viewer whose role is {example.graph['role']}")
+    if example.graph.role != role:
+        raise UserError(f"{what} has the graph of a viewer whose role is {example.graph.role}")
 
 
 def text_of(examples: Examples) -> str:

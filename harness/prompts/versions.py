@@ -30,8 +30,8 @@ from harness.prompts.extension import ANSWER
 from harness.prompts.extension import read as read_extension
 from harness.prompts.template import Template
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import Conflict, SceneGraph
 
-Graph = Mapping[str, Any]
 _compiled = lru_cache(maxsize=64)(Template)  # a process may load a version many times
 FILES = ("ego.j2", "helper.j2", "prompt.toml")
 NO_WORDS: Mapping[str, str] = MappingProxyType({})
@@ -139,7 +139,7 @@ class Prompt:
 
     def render(
         self,
-        graph: Graph,
+        graph: SceneGraph,
         actions: tuple[str, ...],
         messages: Sequence[Mapping[str, Any]] = (),
         words: Mapping[str, str] = NO_WORDS,
@@ -159,7 +159,7 @@ class Prompt:
             letter: whether a letter is asked for in place of the block `question` (`readout.asked`).
         """
         system, user = self._render_graph(graph, actions, messages, words, letter, "system", "user")
-        turns = self._turns(graph["role"], actions, words, letter)
+        turns = self._turns(graph.role, actions, words, letter)
         question = {"role": "user", "content": user} | ({"image": self.image} if self.image else {})
         return ({"role": "system", "content": system}, *turns, question)
 
@@ -186,28 +186,31 @@ class Prompt:
         return {}
 
     def _render_graph(
-        self, graph: Graph, actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]],
+        self, graph: SceneGraph, actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]],
         words: Mapping[str, str], letter: bool, *blocks: str,
     ) -> list[str]:  # fmt: skip
         """Render some blocks of a template for a scene graph, the last of which ends with the question."""
-        objects = shown(graph, self.max_objects - bool(messages))
+        template, plain = self._templates[graph.role], graph.plain()
+        objects = [plain["nodes"][n] for n in listed(graph, self.max_objects - bool(messages))]
         variables = {
-            "graph": graph,
+            "graph": plain,
             "actions": actions,
             "objects": objects,
-            "more": len(graph["nodes"]) - len(objects),
+            "more": len(graph.nodes) - len(objects),
             "messages": messages,
             "words": words,
         }
-        if "conflicts" in self._templates[graph["role"]].reads:
-            variables["conflicts"] = soonest(graph["conflicts"])[: self.max_conflicts]
+        if "conflicts" in template.reads:
+            variables["conflicts"] = [
+                plain["conflicts"][n] for n in soonest(graph.conflicts)[: self.max_conflicts]
+            ]
         needs = (
             "it needs the blocks system and user, and may use graph, actions, objects, more, conflicts, "
             "messages, words"
         )
-        if letter or "question" not in self._templates[graph["role"]].blocks:
-            return self._rendered(graph["role"], variables, blocks, needs)
-        *others, user, question = self._rendered(graph["role"], variables, (*blocks, "question"), needs)
+        if letter or "question" not in template.blocks:
+            return self._rendered(graph.role, variables, blocks, needs)
+        *others, user, question = self._rendered(graph.role, variables, (*blocks, "question"), needs)
         return [*others, f"{user}\n{question}"]
 
     def _rendered(
@@ -227,26 +230,19 @@ class Prompt:
             ) from None
 
 
-def shown(graph: Graph, most: int) -> list[Mapping[str, Any]]:
-    """Return the objects that a prompt lists: those in conflict with the ego first, then the nearest."""
-
-    def away(node: Mapping[str, Any]) -> Any:
-        return node["forward_m"] ** 2 + node["left_m"] ** 2
-
-    near = sorted(graph["nodes"], key=away)
-    if in_conflict := {conflict["with"] for conflict in graph["conflicts"]}:
-        near.sort(key=lambda node: node["id"] not in in_conflict)
-    return near[:most]
+def listed(graph: SceneGraph, most: int) -> list[int]:
+    """Return the indices of the nodes that a prompt lists: those in conflict first, then the nearest."""
+    meets = {conflict.vehicle for conflict in graph.conflicts}
+    order = [(node.id not in meets, node.forward_m**2 + node.left_m**2) for node in graph.nodes]
+    return sorted(range(len(order)), key=order.__getitem__)[:most]
 
 
-def soonest(conflicts: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Sort conflicts by when the ego reaches them at present speeds; those that it never reaches are last."""
-
-    def order(conflict: Mapping[str, Any]) -> tuple[float, float]:
-        ego_s, distance_m = conflict["ego"]["time_s"], conflict["ego"]["arc_m"] + conflict["other"]["arc_m"]
-        return np.inf if ego_s is None else ego_s, distance_m
-
-    return sorted(conflicts, key=order)
+def soonest(conflicts: Sequence[Conflict]) -> list[int]:
+    """Return the indices of conflicts, the soonest first; those that the ego never reaches are last."""
+    order = [
+        (np.inf if c.ego.time_s is None else c.ego.time_s, c.ego.arc_m + c.other.arc_m) for c in conflicts
+    ]
+    return sorted(range(len(order)), key=order.__getitem__)
 
 
 def names(where: Path | None = None) -> list[str]:

@@ -27,7 +27,6 @@ from harness.runs.folder import Run, check_scenes
 from harness.runs.records import Answer, Decision, Episode
 from harness.runs.sources import prompt_of
 from harness.world import scenarios
-from harness.world.perception.graph import blinded
 
 BLOCK = 24  # scenes that are compressed and read together
 
@@ -58,14 +57,14 @@ def prompts_of(run: Run) -> Sent | None:
         words = scenarios.get(scene.state.scenario).prompt_words
         agent = manifest.agent(scene.viewers.index(viewer))
         prompt = prompts[agent["prompt"]["version"]]
-        graph = scene.record["graphs"][viewer]
+        graph = scene.graphs[viewer]
         if prompt.version in failed:  # it would take as long again
             return ()
         try:
             letter = agent["answer"] == "readout"
             rendered = prompt.render(graph, run.actions, heard, words, letter)
             messages = shown(agent.get("image", "own"), rendered)
-            return in_mode(agent["answer"], prompt, messages, graph["role"], run.actions)
+            return in_mode(agent["answer"], prompt, messages, graph.role, run.actions)
         except UserError:  # a stranger's, which no run can have used
             failed.add(prompt.version)
             return ()
@@ -77,8 +76,7 @@ def as_shown(scene: Scene, answer: Answer) -> Scene:
     """A decision point as it was shown to who answered."""
     if answer.role != "blind":
         return scene
-    graphs = {viewer: blinded(graph) for viewer, graph in scene.record["graphs"].items()}
-    return Scene({**scene.record, "graphs": graphs})
+    return scene.changed(graphs={viewer: graph.blinded() for viewer, graph in scene.graphs.items()})
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ class Details:
             for run in self.runs.runs:
                 check_scenes(run, dataset, ids)
             scenes = dict(zip(ids, dataset.scenes(ids), strict=True))
-            forest = dataset.of_episodes({scene.record["episode"] for scene in scenes.values()}).forest
+            forest = dataset.of_episodes({scene.record.episode for scene in scenes.values()}).forest
         for at in range(0, len(ids), BLOCK):
             yield [self._detail(name, scenes.get(name), forest) for name in ids[at : at + BLOCK]]
 

@@ -13,8 +13,8 @@ from harness.report.drawing.geometry import conflict_points
 from harness.report.drawing.view import spots, view_of
 from harness.report.library import picture
 from harness.world.perception.camera import frame
-from harness.world.perception.graph import Graph
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 from harness.world.state import WorldState
 
 # A camera's picture in a page: half as wide and high as a model is shown it, and in 32 shades of each colour.
@@ -27,7 +27,7 @@ def world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) ->
 
     Of each viewer, too, the part that is shown of it: for whom the ego asked in each of some decisions.
     """
-    state, danger = scene.state, scene.record["danger"]["vehicle"]
+    state, danger = scene.state, scene.record.danger.vehicle
     zone_m, heard = scenario.road().zone_m, sorted({(), *asked})
     return {
         "time_s": round(state.time_s, 3),
@@ -45,16 +45,16 @@ def world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) ->
         ],
         "viewers": {
             viewer: {
-                "role": graph["role"],
-                "seen": [node["id"] for node in graph["nodes"]],
-                "occluded": [s["sector"] for s in graph["sectors"] if s["occluded"]],
+                "role": graph.role,
+                "seen": [*graph.seen],
+                "occluded": [*graph.occluded],
                 "conflicts": _conflicts(state, graph),
                 "views": {
                     " ".join(ids): [round(view.west_m, 1), round(view.south_m, 1), round(view.width_m, 1)]
                     for ids in heard for view in [view_of(spots(state, zone_m, graph, (danger, *ids)))]
                 },
             }
-            for viewer, graph in scene.record["graphs"].items()
+            for viewer, graph in scene.graphs.items()
         },
     }  # fmt: skip
 
@@ -62,21 +62,21 @@ def world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) ->
 def cameras(scenario: Scenario, scene: Scene) -> dict[str, Any]:
     """Of each viewer, what its cameras see and boxes around what its sensors list (`Frame.boxes`)."""
     shown = {}
-    for viewer, graph in scene.record["graphs"].items():
+    for viewer, graph in scene.graphs.items():
         seen = frame(scenario, scene.state, viewer, FRAME_PX)
         boxes = seen.boxes()
         shown[viewer] = {
             "size": FRAME_PX,
             "picture": picture(Image(seen.pixels & SHADES | HALF_A_SHADE).png(), "png"),
-            "boxes": [[n["id"], *box] for n in graph["nodes"] for box in boxes.get(n["id"], ())],
+            "boxes": [[name, *box] for name in graph.seen for box in boxes.get(name, ())],
         }
     return shown
 
 
-def _conflicts(state: WorldState, graph: Graph) -> list[dict[str, Any]]:
+def _conflicts(state: WorldState, graph: SceneGraph) -> list[dict[str, Any]]:
     conflicts, points = conflict_points(state, graph)
     return [
-        {"x": x, "y": y, "with": c["with"]} | {who: c[who]["time_s"] for who in ("ego", "other")}
+        {"x": x, "y": y, "with": c.vehicle, "ego": c.ego.time_s, "other": c.other.time_s}
         for c, (x, y) in zip(conflicts, points.round(1).tolist(), strict=True)
     ]
 

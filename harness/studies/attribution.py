@@ -29,7 +29,7 @@ from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.walk import Decided, Memory, shown, walk
-from harness.prompts.versions import shown as listing
+from harness.prompts.versions import listed as listing
 from harness.runs.attribution import FILE, Attribution, LeftOut
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, Table
@@ -130,16 +130,18 @@ def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
 
 def _questions(stored: ReplayedRun, scene: Scene) -> Iterator[tuple[Scene, str, str, Request]]:
     """The decision point, who is asked, what is left out, and the question."""
-    spec, graphs = stored.spec, scene.record["graphs"]
+    spec, graphs = stored.spec, scene.graphs
     listed: dict[str, list[str]] = {}
     for place, viewer in enumerate(spec.viewers(scene)):
         agent, graph = spec.agents[spec.agent(place)], graphs[viewer]
-        reads = listing(graph, agent.prompt.max_objects) if agent.can.language_model else graph["nodes"]
-        listed[viewer] = [node["id"] for node in reads]
+        reads = (
+            listing(graph, agent.prompt.max_objects) if agent.can.language_model else range(len(graph.nodes))
+        )
+        listed[viewer] = [graph.nodes[n].id for n in reads]
     for item in dict.fromkeys(chain.from_iterable(listed.values())):
         less = {v: scene_graph(spec.scenario, scene.state, v, [item]) for v in listed if item in listed[v]}
         name = f"{scene.id}~without-{item}"
-        for request in requests(spec, [Scene({**scene.record, "graphs": graphs | less, "scene": name})]):
+        for request in requests(spec, [scene.changed(graphs={**graphs, **less}, scene=name)]):
             viewer = request.id.rpartition("/")[2]
             if viewer in less:
                 yield scene, viewer, item, request
@@ -147,10 +149,9 @@ def _questions(stored: ReplayedRun, scene: Scene) -> Iterator[tuple[Scene, str, 
 
 def _kind(scene: Scene, viewer: str, item: str) -> str:
     """Whether its viewer sees an object in conflict with the ego, and if so, whether the ego sees it too."""
-    graphs = scene.record["graphs"]
-    if item not in {conflict["with"] for conflict in graphs[viewer]["conflicts"]}:
+    if item not in {conflict.vehicle for conflict in scene.graphs[viewer].conflicts}:
         return OTHER
-    return SEEN if item in {node["id"] for node in graphs[scene.viewers[0]]["nodes"]} else HIDDEN
+    return SEEN if item in scene.graphs[scene.viewers[0]].seen else HIDDEN
 
 
 def messages(stored: ReplayedRun, point: OperatingPoint, drawn: Mapping[str, int]) -> Iterator[LeftOut]:
@@ -183,7 +184,7 @@ def _messages(
         helper = voice if said.intents.voice_of is None else int(said.intents.voice_of[n, voice])
         scene = moments[at[n]]
         sender = scene.viewers[1 + helper]
-        items = (node["id"] for node in scene.record["graphs"][sender]["nodes"])
+        items = scene.graphs[sender].seen
         sight = any(_kind(scene, sender, item) == HIDDEN for item in items)
         q = None if less.fusion_failed[n] else less.fused[n].tolist()
         if not whole.fusion_failed[n]:
@@ -202,7 +203,7 @@ def _left_out(
 ) -> LeftOut:
     best = int(np.argmax(p))
     return LeftOut(
-        scene=scene.id, episode=int(scene.record["episode"]), **{"seed": None, **what}, action=actions[best],
+        scene=scene.id, episode=scene.record.episode, **{"seed": None, **what}, action=actions[best],
         instead=actions[int(np.argmax(q))] if q else None, change=q[best] - p[best] if q else None,
         shift=distance(p, q),
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """What a distilled model learns to write: a given distribution, in the form that its prompt asks for."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,56 +10,54 @@ from harness.core.files import canonical_json
 from harness.core.rounding import rounded
 from harness.prompts.answer_schema import plainest
 from harness.prompts.versions import Prompt
+from harness.world.scene_graph import Conflict, SceneGraph
 
 PARTS = 20  # of a stated distribution: so small a model cannot make hundredths sum to 1
 MOST_SEEN = 5  # vehicles of a picture that are listed
 HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which risk has that name
 
 
-def evidence(view: Mapping[str, Any], named: bool = True) -> str:
+def evidence(view: SceneGraph, named: bool = True) -> str:
     """Report who brakes ahead of the ego, or comes closest to it, or what the viewer cannot see.
 
     The gap is by how many seconds that vehicle is later than the ego where their ways meet. A vehicle that
     is not `named` in the prompt is no more than one.
     """
 
-    def who(conflict: Mapping[str, Any]) -> str:
-        return str(conflict["with"]) if named else "one"
+    def who(conflict: Conflict) -> str:
+        return conflict.vehicle if named else "one"
 
-    for conflict in view["conflicts"]:
-        if conflict["other"].get("braking") and conflict["kind"] == "ahead":
-            return f"{who(conflict)} brakes, {conflict['lane']} lane, {conflict['ego']['arc_m']:.0f} m"
-    gaps = [(_gap_s(c), c) for c in view["conflicts"]]
+    for conflict in view.conflicts:
+        if conflict.other.braking and conflict.kind == "ahead":
+            return f"{who(conflict)} brakes, {conflict.lane} lane, {conflict.ego.arc_m:.0f} m"
+    gaps = [(_gap_s(conflict), conflict) for conflict in view.conflicts]
     moving = [(gap, c) for gap, c in gaps if gap is not None]
     if moving:
         gap, first = min(moving, key=lambda pair: abs(pair[0]))
-        return f"{who(first)} from {first['sector']}, gap {gap:+.1f} s"
+        return f"{who(first)} from {first.sector}, gap {gap:+.1f} s"
     if gaps:
-        return f"{who(gaps[0][1])} from {gaps[0][1]['sector']}, one of us stands"
-    hidden = [s["sector"] for s in view["sectors"] if s["occluded"]]
-    return f"nothing crosses, hidden {' '.join(hidden) or 'none'}"
+        return f"{who(gaps[0][1])} from {gaps[0][1].sector}, one of us stands"
+    return f"nothing crosses, hidden {' '.join(view.occluded) or 'none'}"
 
 
-def sights(view: Mapping[str, Any]) -> str:
+def sights(view: SceneGraph) -> str:
     """Report what a viewer's cameras show, the nearest first: kinds, metres ahead and to the left, lamps."""
-    seen = [node for node in view["nodes"] if "camera" in node["sensors"]]
-    seen.sort(key=lambda node: float(np.hypot(node["forward_m"], node["left_m"])))
+    seen = [node for node in view.nodes if "camera" in node.sensors]
+    seen.sort(key=lambda node: float(np.hypot(node.forward_m, node.left_m)))
     parts = []
     for node in seen[:MOST_SEEN]:
-        lamps = "brake" if node.get("braking") else node["indicator"]
+        lamps = "brake" if node.braking else node.indicator
         lit = f" {lamps}" if lamps not in (None, "off") else ""
-        parts.append(f"{node['type']} {node['forward_m']:.0f} {node['left_m']:.0f}{lit}")
+        parts.append(f"{node.type} {node.forward_m:.0f} {node.left_m:.0f}{lit}")
     return "; ".join(parts) or "nobody"
 
 
-def _gap_s(conflict: Mapping[str, Any]) -> float | None:
-    ours, theirs = conflict["ego"]["time_s"], conflict["other"]["time_s"]
-    return None if ours is None or theirs is None else float(theirs - ours)
+def _gap_s(conflict: Conflict) -> float | None:
+    ours, theirs = conflict.ego.time_s, conflict.other.time_s
+    return None if ours is None or theirs is None else theirs - ours
 
 
-def message(
-    view: Mapping[str, Any], intent: Floats, actions: Sequence[str], named: bool = True
-) -> dict[str, Any]:
+def message(view: SceneGraph, intent: Floats, actions: Sequence[str], named: bool = True) -> dict[str, Any]:
     """Return a helper's message that states an intent, with what any prompt may show of it."""
     stated = rounded(intent.tolist(), PARTS)
     best = int(np.argmax(intent))
@@ -74,7 +72,7 @@ def message(
 
 
 def answer(
-    prompt: Prompt, view: Mapping[str, Any], intent: Floats, actions: Sequence[str], *, bare: bool = False,
+    prompt: Prompt, view: SceneGraph, intent: Floats, actions: Sequence[str], *, bare: bool = False,
     named: bool = True,
 ) -> str:  # fmt: skip
     """Return the answer that states an intent; `bare` without free text, as a constrained answer begins."""
@@ -82,13 +80,13 @@ def answer(
     numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, sent["intent"], strict=True))
     body = f'"action_distribution":{{{numbers}}}'
     best, confidence = sent["recommended_maneuver"], f'"confidence":{sent["confidence"]:.2f}'
-    shape = prompt.shape(view["role"], actions)
+    shape = prompt.shape(view.role, actions)
     if key := shape.named:
         body = f'"{key}":"{best}",{confidence}'
-    if view["role"] == "helper":
+    if view.role == "helper":
         reported = "" if bare else sent["evidence"]
         body = f'"evidence":{canonical_json(reported)},"risk":"{sent["risk"]}",{body}'
     for name, schema in reversed(shape.further.items()):
         body = f'"{name}":{canonical_json(plainest(schema))},{body}'
-    reasons_first = view["role"] in prompt.reasons_first and not bare
+    reasons_first = view.role in prompt.reasons_first and not bare
     return f"{sent['evidence']}. {{{body}}}" if reasons_first else f"{{{body}}}"

@@ -18,7 +18,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -29,6 +28,7 @@ from harness.core.files import bytes_of, write_whole
 from harness.core.parallel import Workers, each
 from harness.dataset.freeze import edges, moment, scene_id
 from harness.dataset.load import Scene
+from harness.dataset.schema import Record
 from harness.prompts.versions import Prompt
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import Outcome
@@ -47,6 +47,13 @@ PRIOR = {
 }  # weight of an action beside equals, 1 if not named
 
 
+class Point(msgspec.Struct, frozen=True):
+    """A decision point that is learnt from."""
+
+    moment: Record
+    label: list[float]  # soft label, (A,)
+
+
 @dataclass(frozen=True)
 class Lessons:
     """What is learnt from one scenario."""
@@ -59,20 +66,20 @@ class Lessons:
     @property
     def episodes(self) -> tuple[int, ...]:
         """Return the numbers of the layouts."""
-        return tuple(dict.fromkeys(scene.record["episode"] for scene in self.scenes))
+        return tuple(dict.fromkeys(scene.record.episode for scene in self.scenes))
 
     @cached_property
     def weights(self) -> Mapping[str, float]:
         """Return how often each scene is learnt from, by its id: each level of a layout in all as often."""
-        levels = [(scene.record["episode"], scene.record["step"]) for scene in self.scenes]
+        levels = [(scene.record.episode, scene.record.step) for scene in self.scenes]
         points = Counter(levels)
         return {scene.id: 1 / points[level] for scene, level in zip(self.scenes, levels, strict=True)}
 
     def split(self, held_out: float) -> "tuple[Lessons, Lessons]":
         """Split off a share of the layouts, the last ones, at least one: those that are kept, and those."""
         last = self.episodes[-max(1, round(len(self.episodes) * held_out)) :]
-        kept = tuple(scene for scene in self.scenes if scene.record["episode"] not in last)
-        held = tuple(scene for scene in self.scenes if scene.record["episode"] in last)
+        kept = tuple(scene for scene in self.scenes if scene.record.episode not in last)
+        held = tuple(scene for scene in self.scenes if scene.record.episode in last)
         return replace(self, scenes=kept), replace(self, scenes=held)
 
 
@@ -101,9 +108,10 @@ def draw(
         progress(1)
 
     each(partial(_encoded, scenario, seed), todo, workers, keep, lambda number: f"layout {number}")
-    points = [point for file in files for point in msgspec.json.decode(bytes_of(file, "record"))]
-    scenes = tuple(Scene(point["moment"]) for point in points)
-    labels = {point["moment"]["scene"]: np.array(point["label"]) for point in points}
+    decoder = msgspec.json.Decoder(list[Point])
+    points = [point for file in files for point in decoder.decode(bytes_of(file, "record"))]
+    scenes = tuple(Scene(point.moment) for point in points)
+    labels = {point.moment.scene: np.array(point.label) for point in points}
     return Lessons(scenario, tuple(prompts), scenes, labels)
 
 
@@ -111,7 +119,7 @@ def _encoded(scenario: Scenario, seed: int, number: int) -> bytes:
     return msgspec.json.encode(decision_points(scenario, seed + number, number))
 
 
-def decision_points(scenario: Scenario, seed: int, number: int) -> list[dict[str, Any]]:
+def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
     """Draw a layout's decision points that are learnt from: the `moment` and the soft `label` of each."""
     rng = noise.generator("lessons", scenario.name, seed)
     reference, points = drive(scenario, PRIVILEGED, seed), []
@@ -134,7 +142,7 @@ def decision_points(scenario: Scenario, seed: int, number: int) -> list[dict[str
                 if np.isfinite(list(ends_s.values())).any():
                     taken += 1
                     record = moment(world, state, number, (state.ego, *state.helpers))
-                    points.append({"moment": record, "label": label(ends_s).tolist()})
+                    points.append(Point(record, label(ends_s).tolist()))
             following.update({scene_id(number, child.state()): child for child in children})
         level = list(following.values())
     return points

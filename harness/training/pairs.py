@@ -89,7 +89,7 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
     for scene in scenes:
         answers = {stored.key: stored for stored in run.answers_by_scene.get(scene.id, ())}
         for stored in (each for each in answers.values() if BLIND not in each.key):
-            if stored.viewer not in scene.record["graphs"]:
+            if stored.viewer not in scene.graphs:
                 raise UserError(
                     f"{printable(run.path / 'answers.jsonl')} has an answer of {printable(stored.viewer)!r} "
                     f"in {scene.id}, where {', '.join(scene.viewers)} were asked; make the run again"
@@ -99,11 +99,11 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
             messages = messages_of(answers, stored.heard, run.actions)
             q = question(lessons, scene, stored.viewer, prompt, messages)
             texts = shown(agent["image"], q.messages)
-            sent = in_mode(agent["answer"], prompt, texts, q.graph["role"], q.actions)
+            sent = in_mode(agent["answer"], prompt, texts, q.graph.role, q.actions)
             completion = answer(prompt, q.graph, q.label, q.actions)
             if agent["answer"] == "readout":
                 completion = readout.letters(q.actions)[int(q.label.argmax())]
-            seed = int(scene.record["episode_seed"])
+            seed = int(scene.record.episode_seed)
             yield {
                 "prompt": sent, "completion": [{"role": "assistant", "content": completion}],
                 "scene": scene.id, "viewer": stored.key, "layout_seed": seed, "purpose": purpose(seed, 1),

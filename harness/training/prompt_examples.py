@@ -1,7 +1,6 @@
 """Examples for a prompt version: decision points of train layouts, answered as their outcomes ask for."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -12,13 +11,12 @@ from harness.core.seeds import FIRST, purposes
 from harness.prompts.examples import Example, Examples
 from harness.prompts.versions import ROLES, Prompt
 from harness.training.answers import answer
-from harness.training.lessons import decision_points
+from harness.training.lessons import Point, decision_points
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 
 PATIENCE = 8  # layouts that are passed over, at most, for want of an action that was shown less
-Point = tuple[
-    dict[str, Any], Floats, int
-]  # a scene graph, its soft label (A,), and its best action by number
+Candidate = tuple[SceneGraph, Floats, int]  # a scene graph, its soft label (A,), and its best action's number
 
 
 def examples(
@@ -57,18 +55,18 @@ def examples(
     return Examples(scenario.name, ego=tuple(chosen["ego"]), helper=tuple(chosen["helper"]))
 
 
-def _pick(points: list[dict[str, Any]], role: str, times: list[int], seed: int) -> Point | None:
+def _pick(points: list[Point], role: str, times: list[int], seed: int) -> Candidate | None:
     """Return the decision point of a role that is shown; None where nobody has the role."""
-    candidates: list[Point] = [
-        (graph, label := np.array(point["label"]), int(label.argmax()))
+    candidates: list[Candidate] = [
+        (graph, label := np.array(point.label), int(label.argmax()))
         for point in points
-        for graph in point["moment"]["graphs"].values()
-        if graph["role"] == role
+        for graph in point.moment.graphs.values()
+        if graph.role == role
     ]
     order = noise.generator("examples", role, seed).permutation(len(candidates)).tolist()
 
-    def rank(point: Point) -> tuple[int, int, bool]:
-        graph, _, best = point
-        return times[best], best, not graph["conflicts"]
+    def rank(candidate: Candidate) -> tuple[int, int, bool]:
+        graph, _, best = candidate
+        return times[best], best, not graph.conflicts
 
     return min((candidates[n] for n in order), default=None, key=rank)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from harness.core import noise
 from harness.core.arrays import Floats
@@ -16,6 +17,7 @@ from harness.training.lessons import Lessons
 from harness.training.model import VISION
 from harness.world.perception.camera import Sight
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 
 ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
 
@@ -27,18 +29,18 @@ class Question:
     key: str  # scenario, scene, viewer and prompt version, and `+m` where messages are in it
     scenario: Scenario  # what is decided in
     prompt: Prompt  # which version
-    graph: Mapping[str, Any]  # the viewer's scene graph
+    graph: SceneGraph  # the viewer's scene graph
     messages: tuple[Mapping[str, str], ...]  # chat messages
     label: Floats  # soft label, (A,)
     weight: float  # how often it is learnt, beside others
     image: Sight | None = None  # what the viewer's cameras see, if the prompt shows it
     heard: Sequence[Mapping[str, Any]] = ()  # helpers' messages in the prompt
-    excerpt: Mapping[str, Any] | None = None  # what of the graph the prompt shows, if not all
+    excerpt: SceneGraph | None = None  # what of the graph the prompt shows, if not all
 
     @property
     def named(self) -> bool:
         """Whether the prompt names those of whom the answer may speak; a picture names nobody."""
-        return any(f"{c['with']} " in self.messages[-1]["content"] for c in self.graph["conflicts"])
+        return any(f"{c.vehicle} " in self.messages[-1]["content"] for c in self.graph.conflicts)
 
     @property
     def actions(self) -> tuple[str, ...]:
@@ -49,7 +51,7 @@ class Question:
         """Return the chat messages that ask for a letter."""
         shown, words = self.excerpt or self.graph, self.scenario.prompt_words
         messages = self.prompt.render(shown, self.actions, self.heard, words, letter=True)
-        return in_mode("readout", self.prompt, messages, self.graph["role"], self.actions)
+        return in_mode("readout", self.prompt, messages, self.graph.role, self.actions)
 
 
 def alone(lessons: Lessons) -> Iterator[Question]:
@@ -63,8 +65,8 @@ def alone(lessons: Lessons) -> Iterator[Question]:
 def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
     """Repeat the questions that have conflicts or a picture, with no text in them but the conflicts."""
     for q in questions:
-        if q.graph["conflicts"] or q.image:
-            shown = {**q.graph, "nodes": [], "sectors": []}
+        if q.graph.conflicts or q.image:
+            shown = structs.replace(q.graph, nodes=(), sectors=())
             messages = q.prompt.render(shown, q.actions, words=q.scenario.prompt_words)
             yield replace(q, messages=messages, excerpt=shown, heard=())
 
@@ -74,15 +76,14 @@ def with_messages(
 ) -> Iterator[Question]:
     """Ask the ego with what some of its helpers sent; `intents` are the helpers' read-outs, by key."""
     for scene in scenes:
-        graphs = scene.record["graphs"]
         ego, *helpers = scene.viewers
         for prompt in lessons.prompts:
-            draws = noise.uniforms((len(helpers),), "arrives", scene.record["episode_seed"], scene.id)
+            draws = noise.uniforms((len(helpers),), "arrives", scene.record.episode_seed, scene.id)
             heard = []
             for h, u in zip(helpers, draws, strict=True):
                 if u < ARRIVES:
                     asked = question(lessons, scene, h, prompt)
-                    sent = message(graphs[h], intents[asked.key], asked.actions, asked.named)
+                    sent = message(scene.graphs[h], intents[asked.key], asked.actions, asked.named)
                     heard.append({"sender": h, **sent})
             if heard:
                 yield question(lessons, scene, ego, prompt, heard)
@@ -92,7 +93,7 @@ def question(
     lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt, heard: Sequence[Mapping[str, Any]] = ()
 ) -> Question:
     """Return what a viewer is asked in a scene, with the messages that it heard."""
-    graph, scenario = scene.record["graphs"][viewer], lessons.scenario
+    graph, scenario = scene.graphs[viewer], lessons.scenario
     sent = prompt.render(graph, scenario.actions, heard, scenario.prompt_words)
     name = key(lessons, scene, viewer, prompt) + ("+m" if heard else "")
     image = Sight(scenario, scene.state, viewer, VISION.size_px) if prompt.image else None

@@ -130,7 +130,7 @@ class Student:
             return with_heard + self.some(self.asked, len(self.heard))
         # As many texts of the ego, alone and with messages, as of all helpers: each decision needs the ego's.
         pairs = list(zip(self.questions, self.asked, strict=True))
-        kinds = [[pair for pair in pairs if pair[0].graph["role"] == role] for role in ("helper", "ego")]
+        kinds = [[pair for pair in pairs if pair[0].graph.role == role] for role in ("helper", "ego")]
         kinds.append(list(zip(self.heard, with_heard, strict=True)))
         most = self.plan.samples["answers"] // 6
         stated = [pair for kind in kinds for pair in self.some(kind, most)]

@@ -23,6 +23,7 @@ from harness.world.drivers import choose
 from harness.world.perception.graph import scene_graph
 from harness.world.road import Road
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 from harness.world.world import World
 
 MOST_AUC = 0.60  # above it, a scenario gives its danger away
@@ -100,7 +101,7 @@ def _hidden(scenario: Scenario, seed: int) -> Hidden:
         if world.outcome.ended or world.step >= scenario.parameters.decisions:
             continue
         graph = scene_graph(scenario, world.state(), world.layout.spawns[0].id)
-        if any(node["id"] == world.layout.danger_id or node.get("braking") for node in graph["nodes"]):
+        if any(node.id == world.layout.danger_id or node.braking for node in graph.nodes):
             continue
         hidden.append((world.step, dict(numbers(graph, scenario.road()))))
         ways: dict[str, tuple[str, ...]] = {}
@@ -114,29 +115,28 @@ def _hidden(scenario: Scenario, seed: int) -> Hidden:
     return start.layout.danger or NONE, hidden
 
 
-def numbers(graph: Mapping[str, Any], road: Road) -> Iterator[tuple[str, float]]:
+def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float]]:
     """Yield a scene graph's numbers with names, the same names for every graph of a road."""
     for name in ("speed_mps", "target_speed_mps", "zone_m"):
-        yield f"ego {name}", graph["ego"][name]
+        yield f"ego {name}", getattr(graph.ego, name)
     for lane in (*sorted({role for path in road.paths.values() for role in path.roles}), "off-lane"):
-        nodes = [n for n in graph["nodes"] if n["lane"] == lane]
-        nodes.sort(key=lambda n: float(np.hypot(n["forward_m"], n["left_m"])))
-        node = nodes[0] if nodes else {}
+        nodes = [node for node in graph.nodes if node.lane == lane]
+        node = min(nodes, key=lambda n: float(np.hypot(n.forward_m, n.left_m)), default=None)
         yield f"{lane}: vehicles", float(len(nodes))
         for name in ("forward_m", "left_m", "speed_mps", "heading_deg", "range_rate_mps"):
-            yield f"{lane}: nearest {name}", _known(node.get(name))
-        yield f"{lane}: nearest kind", _known(BY_SIZE.get(node.get("type", "")))
-        yield f"{lane}: nearest indicator", _known(INDICATORS.get(node.get("indicator") or ""))
-        yield f"{lane}: nearest sensors", float(len(node.get("sensors", ())))
-    seen = {s["sector"]: s for s in graph["sectors"]}
-    for sector in road.sectors:
-        yield f"{sector}: seen_share", seen[sector]["seen_share"]
-        yield f"{sector}: hidden by", float(len(seen[sector]["by"]))
-        others = [c["other"] for c in graph["conflicts"] if c["sector"] == sector]
-        first: Mapping[str, Any] = min(others, key=lambda other: float(other["arc_m"]), default={})
-        yield f"{sector}: conflicts", float(len(others))
-        for name in ("arc_m", "time_s", "speed_mps"):
-            yield f"{sector}: first conflict {name}", _known(first.get(name))
+            yield f"{lane}: nearest {name}", _known(getattr(node, name, None))
+        yield f"{lane}: nearest kind", _known(BY_SIZE.get(node.type) if node else None)
+        yield f"{lane}: nearest indicator", _known(INDICATORS.get((node and node.indicator) or ""))
+        yield f"{lane}: nearest sensors", float(len(node.sensors) if node else 0)
+    seen = {sector.sector: sector for sector in graph.sectors}
+    for name in road.sectors:
+        yield f"{name}: seen_share", seen[name].seen_share
+        yield f"{name}: hidden by", float(len(seen[name].by))
+        others = [conflict.other for conflict in graph.conflicts if conflict.sector == name]
+        first = min(others, key=lambda other: other.arc_m, default=None)
+        yield f"{name}: conflicts", float(len(others))
+        for number in ("arc_m", "time_s", "speed_mps"):
+            yield f"{name}: first conflict {number}", _known(getattr(first, number, None))
 
 
 def _known(value: float | None) -> float:

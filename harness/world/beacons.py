@@ -25,11 +25,11 @@ beacon, so no condition, no seed of the channel and no order of asking changes w
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 from functools import cache, lru_cache
 from itertools import chain
 
 import numpy as np
+from msgspec.structs import replace
 
 from harness.core import noise
 from harness.core.arrays import Floats
@@ -177,7 +177,7 @@ def _sent(
 def _cam(beacon: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon | None:
     """Return the CAM if one is due by the last one and the vehicle's true pose (EN 302 637-2, 6.1.3)."""
     if last is None or last.interval_s is None:
-        return replace(beacon, interval_s=LONGEST_S)
+        return replace(beacon, interval_s=LONGEST_S, unmoved=0)
     age_s = beacon.time_s - last.time_s + ROUNDING_S
     x, y, heading, speed = pose
     turned_rad = abs(math.remainder(heading - last.heading_rad, math.tau))
@@ -187,9 +187,9 @@ def _cam(beacon: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon |
         or abs(speed - last.speed_mps) > CHANGE_MPS
     )
     if age_s >= SHORTEST_S and moved:
-        return replace(beacon, interval_s=round(age_s, 3))
+        return replace(beacon, interval_s=round(age_s, 3), unmoved=0)
     if age_s >= last.interval_s:
-        unmoved = min(last.unmoved + 1, UNMOVED)
+        unmoved = min((last.unmoved or 0) + 1, UNMOVED)
         return replace(
             beacon, interval_s=LONGEST_S if unmoved == UNMOVED else last.interval_s, unmoved=unmoved
         )

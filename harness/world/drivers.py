@@ -12,11 +12,11 @@ import csv
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from harness.core.files import text_of
 from harness.world.planner import plans
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 
 DRIVERS = ("cruise", "brake", "local-view", "full-view")
 ALWAYS = {"cruise": "IDLE", "brake": "SLOWER"}
@@ -25,16 +25,16 @@ UNIFORM, CONSTANT = "uniform", "constant"
 BLIND = (*ALWAYS, UNIFORM, CONSTANT)  # look at nothing
 CONSTANTS = Path(__file__).with_name("constants.csv")
 
-Graph = Mapping[str, Any]
 
-
-def choose(scenario: Scenario, driver: str, graph: Graph, truth: Graph | None) -> str:
+def choose(scenario: Scenario, driver: str, graph: SceneGraph | None, truth: SceneGraph | None) -> str:
     """Return a driver's meta-action for the ego's scene graph; only `full-view` reads `truth`."""
     [action] = choices(scenario, [(driver, graph, truth)])
     return action
 
 
-def choices(scenario: Scenario, asked: Sequence[tuple[str, Graph, Graph | None]]) -> list[str]:
+def choices(
+    scenario: Scenario, asked: Sequence[tuple[str, SceneGraph | None, SceneGraph | None]]
+) -> list[str]:
     """Return the meta-action of each driver for a scene graph of the ego, and the truth.
 
     A driver may also be an action, which is always taken.
@@ -60,10 +60,9 @@ def _constants() -> Mapping[str, str]:
     return {name: row["action"] for name, row in best.items()}
 
 
-def _read(driver: str, graph: Graph, truth: Graph | None) -> Graph:
+def _read(driver: str, graph: SceneGraph | None, truth: SceneGraph | None) -> SceneGraph:
     """Return the graph that a driver plans with."""
-    if driver == "local-view":
-        return graph
-    if truth is None:
-        raise ValueError(f"driver {driver!r} reads the truth and was given none")
-    return truth
+    read = graph if driver == "local-view" else truth
+    if read is None:
+        raise ValueError(f"driver {driver!r} was not given the graph that it reads")
+    return read

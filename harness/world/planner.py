@@ -6,11 +6,10 @@ the conflict zone soonest without meeting anyone. A vehicle that is seen to brak
 stands. The planner does not guess what it cannot see, so occlusion has a cost.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.world.parameters import Parameters
 from harness.world.road import Path, PathKey, Road
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import Arrival, Ego, SceneGraph
 from harness.world.state import SIZES_M
 
 SPEED = {"FASTER": 1, "SLOWER": -1}  # levels by which an action changes the target speed
@@ -70,22 +70,22 @@ class Rollouts:
 Start = tuple[float, float, int, tuple[int, int]]  # speed, its target, decisions left, ways on either side
 
 
-def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
+def plan(scenario: Scenario, graph: SceneGraph) -> str:
     """Return the planner's meta-action for a scene graph."""
     [action] = plans(scenario, [graph])
     return action
 
 
-def plans(scenario: Scenario, graphs: Sequence[Mapping[str, Any]]) -> list[str]:
+def plans(scenario: Scenario, graphs: Sequence[SceneGraph]) -> list[str]:
     """Return the planner's meta-action for each scene graph."""
     p, road = scenario.parameters, scenario.road()
-    places = [(_way(road, graph["ego"]), road.zone_arc_m - graph["ego"]["zone_m"]) for graph in graphs]
+    places = [(_way(road, graph.ego), road.zone_arc_m - graph.ego.zone_m) for graph in graphs]
     beside = [road.beside(own, at_m) for own, at_m in places]
     starts: list[Start] = [
         (
-            graph["ego"]["speed_mps"],
-            graph["ego"]["target_speed_mps"],
-            p.decisions - graph["step"],
+            graph.ego.speed_mps,
+            graph.ego.target_speed_mps,
+            p.decisions - graph.step,
             (int("left" in ways), int("right" in ways)),
         )
         for graph, ways in zip(graphs, beside, strict=True)
@@ -98,13 +98,13 @@ def plans(scenario: Scenario, graphs: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _chosen(
-    scenario: Scenario, graph: Mapping[str, Any], at_m: float, own: PathKey, sequences: Sequences,
+    scenario: Scenario, graph: SceneGraph, at_m: float, own: PathKey, sequences: Sequences,
     tried: Rollouts,
 ) -> str:  # fmt: skip
     """Return the first action of the best sequence, for an ego at an arc length of its own way."""
     p, road = scenario.parameters, scenario.road()
     # The goal lies well behind the conflict points, so that a late burst of speed counts too.
-    to_go = graph["ego"]["zone_m"] + 15.0 if road.goal_m is None else road.goal_m(p) - at_m
+    to_go = graph.ego.zone_m + 15.0 if road.goal_m is None else road.goal_m(p) - at_m
     short = tried.travelled_m < to_go
     under_way = True if road.goal_m is None else short
     gap = np.full(len(tried.travelled_m), np.inf)
@@ -128,8 +128,8 @@ def _too_fast(way: Path, at_m: float, tried: Rollouts, under_way: Bools | bool) 
     return np.asarray(((tried.speed_mps**2 * way.bends[places] > LATERAL_MPS2) & under_way).any(axis=1))
 
 
-def _way(road: Road, ego: Mapping[str, Any]) -> PathKey:
-    return (road.ego[0], ego["route"]) if "route" in ego else road.ego
+def _way(road: Road, ego: Ego) -> PathKey:
+    return road.ego[0], ego.route or road.ego[1]
 
 
 @lru_cache(maxsize=64)
@@ -238,32 +238,30 @@ class Motion:
     size_m: tuple[float, float]  # the other's length and width
 
 
-def predicted(road: Road, graph: Mapping[str, Any], steps: int) -> list[Motion]:
+def predicted(road: Road, graph: SceneGraph, steps: int) -> list[Motion]:
     """Predict the vehicles that the ego could meet: they keep path and speed, and their place in a queue."""
     time_s = np.arange(1, steps + 1, dtype=np.float64) * STEP_S
-    key = _way(road, graph["ego"])
+    key = _way(road, graph.ego)
     way = road.paths[key]
-    type_of = {node["id"]: node["type"] for node in graph["nodes"]}
-    type_of[graph["viewer"]] = graph["self"].get("type", "car")
+    type_of: dict[str, str] = {node.id: node.type for node in graph.nodes}
+    type_of[graph.viewer] = graph.itself.type or "car"
     motions, queue = [], dict[str, Motion]()
-    for conflict in sorted(
-        graph["conflicts"], key=lambda c: -c["ego"]["arc_m"]
-    ):  # the first in a queue first
-        kind, ego, other = conflict.get("kind", "crossing"), conflict["ego"], conflict["other"]
-        size = SIZES_M.get(type_of.get(conflict["with"], ""), SIZES_M["car"])
+    for conflict in sorted(graph.conflicts, key=lambda c: -c.ego.arc_m):  # the first in a queue first
+        kind, ego, other = conflict.kind, conflict.ego, conflict.other
+        size = SIZES_M.get(type_of.get(conflict.vehicle, ""), SIZES_M["car"])
         its_m = _travelled_m(other, time_s)
-        if kind in ("crossing", "merging"):
-            its = conflict["sector"], conflict["route"]
+        if conflict.meets:
+            its = conflict.sector, conflict.route
             crossing = road.crossings[its]
-            arc = crossing.other_arc_m - other["arc_m"] + its_m
-            motions.append(Motion(way, crossing.ego_arc_m - ego["arc_m"], road.paths[its], arc, size))
+            arc = crossing.other_arc_m - other.arc_m + its_m
+            motions.append(Motion(way, crossing.ego_arc_m - ego.arc_m, road.paths[its], arc, size))
             continue
-        begin, lane = road.zone_arc_m - graph["ego"]["zone_m"], conflict["lane"]
+        begin, lane = road.zone_arc_m - graph.ego.zone_m, conflict.lane or "own"
         if kind == "behind" and lane == "own":
             continue  # it keeps its distance by itself
-        arc = begin + ego["arc_m"] - other["arc_m"] + its_m
+        arc = begin + ego.arc_m - other.arc_m + its_m
         if kind == "oncoming":
-            arc = begin + ego["arc_m"] + other["arc_m"] - its_m
+            arc = begin + ego.arc_m + other.arc_m - its_m
         elif before := queue.get(lane):
             arc = np.minimum(arc, before.arc_m - (before.size_m[0] + size[0]) / 2 - 2.0)
         motion = Motion(way, begin, road.paths[road.beside(key)[lane]], arc, size)
@@ -273,12 +271,12 @@ def predicted(road: Road, graph: Mapping[str, Any], steps: int) -> list[Motion]:
     return motions
 
 
-def _travelled_m(other: Mapping[str, Any], time_s: Floats) -> Floats:
+def _travelled_m(other: Arrival, time_s: Floats) -> Floats:
     """Return the distance that a vehicle travels at its speed, or while it brakes until it stands."""
-    if not other.get("braking"):
-        return np.asarray(other["speed_mps"] * time_s)
-    until_s = np.minimum(time_s, other["speed_mps"] / EMERGENCY_MPS2)
-    return np.asarray(other["speed_mps"] * until_s - EMERGENCY_MPS2 / 2 * until_s**2)
+    if not other.braking:
+        return np.asarray(other.speed_mps * time_s)
+    until_s = np.minimum(time_s, other.speed_mps / EMERGENCY_MPS2)
+    return np.asarray(other.speed_mps * until_s - EMERGENCY_MPS2 / 2 * until_s**2)
 
 
 def least_gap(

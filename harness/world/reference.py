@@ -28,10 +28,9 @@ def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[str]:
             states[driver].append(world.state())
     seen = iter(scene_graphs(scenario, [(state, state.ego.id) for state in states["local-view"]]))
     truths = iter(truth_graphs(scenario, states[PRIVILEGED]))
-    return choices(scenario, [
-        (driver, next(seen) if driver == "local-view" else {}, next(truths) if driver == PRIVILEGED else None)
-        for driver in drivers
-    ])  # fmt: skip
+    graphs = {"local-view": seen, PRIVILEGED: truths}
+    knows = [next(graphs[driver]) if driver in graphs else None for driver in drivers]
+    return choices(scenario, [(driver, graph, graph) for driver, graph in zip(drivers, knows, strict=True)])
 
 
 def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:

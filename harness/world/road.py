@@ -18,6 +18,7 @@ from shapely import LineString, intersection
 
 from harness.core.arrays import Floats, Ints
 
+Side = Literal["own", "left", "right"]  # of the ego's ways, from the one that it is on
 PathKey = tuple[str, str]  # approach and route
 Lane = tuple[str, str, int]  # highway-env's lane index: two nodes, and a number from the left
 STEP_M = 0.25  # distance between the points of a path
@@ -191,7 +192,7 @@ class Road:
     # vehicles beyond do not matter. None if the goal is not a place on its path
     goal_m: Callable[[Any], float] | None = None
 
-    def beside(self, key: PathKey, arc_m: float | None = None) -> dict[str, PathKey]:
+    def beside(self, key: PathKey, arc_m: float | None = None) -> dict[Side, PathKey]:
         """Return the way that the ego is on, `own`, and those to its `left` and `right` if there are any.
 
         With an arc length, only ways that are in a separate lane at that place.
@@ -199,7 +200,7 @@ class Road:
         if key not in self.ways:
             return {"own": key}
         place = self.ways.index(key)
-        places = {"own": place, "left": place - 1, "right": place + 1}
+        places: dict[Side, int] = {"own": place, "left": place - 1, "right": place + 1}
         sides = {side: self.ways[n] for side, n in places.items() if 0 <= n < len(self.ways)}
         if arc_m is None:
             return sides

@@ -1,17 +1,22 @@
 """Records of a scene: vehicles, buildings, beacons, and the state of the whole world at one moment."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from harness.core.arrays import Floats
+from harness.core.seeds import LAST_EPISODE, LAST_SEED
 
 Kind = Literal["car", "van", "truck"]
 Part = Literal["ego", "helper", "other"]
+# No metre, second or share comes near these bounds, and infinity and huge integers do not pass them.
+Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
+Count = Annotated[int, Meta(ge=0, le=1_000_000)]
+Seed = Annotated[int, Meta(ge=0, le=LAST_SEED + LAST_EPISODE)]
+VehicleId = Annotated[str, Meta(pattern="^v[1-9][0-9]?$")]
 
 # Length and width; a van has those of SUMO's delivery van.
 SIZES_M: dict[str, tuple[float, float]] = {"car": (5.0, 2.0), "van": (6.5, 2.16), "truck": (10.0, 2.6)}
@@ -23,8 +28,11 @@ def indicator(route: str) -> str:
     return route if route in ("left", "right") else "off"
 
 
-@dataclass(frozen=True)
-class VehicleState:
+class Closed(Struct, frozen=True, forbid_unknown_fields=True):
+    """A record with these members and no other; its bounds hold where it is read."""
+
+
+class VehicleState(Closed, frozen=True, omit_defaults=True):
     """One vehicle at one moment, in the frame of `harness.world.road`.
 
     Attributes:
@@ -41,16 +49,16 @@ class VehicleState:
         braking: whether its brake lamps are on; always false if the scenario has none.
     """
 
-    id: str
+    id: VehicleId
     kind: Kind
     part: Part
-    x_m: float
-    y_m: float
-    heading_rad: float
-    speed_mps: float
+    x_m: Number
+    y_m: Number
+    heading_rad: Number
+    speed_mps: Number
     approach: str
     route: str
-    crashed: bool = False
+    crashed: bool
     braking: bool = False
 
     @property
@@ -118,15 +126,14 @@ def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: 
     return apart
 
 
-@dataclass(frozen=True)
-class Building:
+class Building(Closed, frozen=True):
     """An axis-parallel box that blocks sight, by the positions of its walls in metres."""
 
-    id: str
-    west_m: float
-    north_m: float
-    east_m: float
-    south_m: float
+    id: Annotated[str, Meta(pattern="^b[1-9]$")]
+    west_m: Number
+    north_m: Number
+    east_m: Number
+    south_m: Number
 
     def corners(self) -> NDArray[np.float64]:
         """Return the corners, (4, 2) m: north-west first, then clockwise as seen from above."""
@@ -134,8 +141,7 @@ class Building:
         return np.array([[w, n], [e, n], [e, s], [w, s]])
 
 
-@dataclass(frozen=True)
-class Beacon:
+class Beacon(Closed, frozen=True, omit_defaults=True):
     """A vehicle's message about itself, with its errors: see `harness.world.beacons`.
 
     Attributes:
@@ -150,24 +156,24 @@ class Beacon:
         heard_by: ids of the receivers that receive it.
         interval_s: under the rule `cam`, the interval until the next one if the vehicle does not move enough
             to send earlier; else None.
-        unmoved: number of consecutive beacons that were sent because that interval was over.
+        unmoved: number of consecutive beacons that were sent because that interval was over; None where there
+            is none.
     """
 
-    sender: str
-    time_s: float
-    arrives_s: float
-    x_m: float
-    y_m: float
-    heading_rad: float
-    speed_mps: float
-    target_speed_mps: float | None
-    heard_by: tuple[str, ...]
-    interval_s: float | None = None
-    unmoved: int = 0
+    sender: VehicleId
+    time_s: Number
+    arrives_s: Number
+    x_m: Number
+    y_m: Number
+    heading_rad: Number
+    speed_mps: Number
+    target_speed_mps: Number | None
+    heard_by: tuple[VehicleId, ...]
+    interval_s: Number | None = None
+    unmoved: Count | None = None
 
 
-@dataclass(frozen=True)
-class WorldState:
+class WorldState(Closed, frozen=True):
     """The state of everything, seen or not.
 
     Attributes:
@@ -183,11 +189,11 @@ class WorldState:
     """
 
     scenario: str
-    episode_seed: int
-    step: int
-    time_s: float
-    target_speed_mps: float
-    vehicles: tuple[VehicleState, ...]
+    episode_seed: Seed
+    step: Count
+    time_s: Number
+    target_speed_mps: Number
+    vehicles: Annotated[tuple[VehicleState, ...], Meta(min_length=1)]
     buildings: tuple[Building, ...]
     beacons: tuple[Beacon, ...] = ()
 
@@ -208,25 +214,17 @@ class WorldState:
                 return v
         raise KeyError(vehicle_id)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-ready mapping, without `braking` if it is false and without unused beacon fields."""
-        vehicles, buildings, beacons = (
-            tuple(dict(vars(thing)) for thing in things)
-            for things in (self.vehicles, self.buildings, self.beacons)
-        )
-        for vehicle in vehicles:
-            if not vehicle["braking"]:
-                del vehicle["braking"]
-        for beacon in beacons:
-            if beacon["interval_s"] is None:
-                del beacon["interval_s"], beacon["unmoved"]
-        return {**vars(self), "vehicles": vehicles, "buildings": buildings, "beacons": beacons}
 
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "WorldState":
-        """Read a state from a mapping of `to_dict`."""
-        fields = dict(data)
-        fields["vehicles"] = tuple(VehicleState(**v) for v in data["vehicles"])
-        fields["buildings"] = tuple(Building(**b) for b in data["buildings"])
-        fields["beacons"] = tuple(Beacon(**{**b, "heard_by": tuple(b["heard_by"])}) for b in data["beacons"])
-        return cls(**fields)
+class Snapshot(Closed, frozen=True):
+    """What the simulator needs beyond the state to go on from here."""
+
+    frame: Count
+    sections: tuple[Count, ...]
+    speed_index: Count
+
+
+class ActionsTaken(Closed, frozen=True):
+    """What leads an environment from its seed to here again: the frame and the name of each action."""
+
+    frame: Count
+    taken: tuple[tuple[Count, Annotated[str, Meta(max_length=200)]], ...]

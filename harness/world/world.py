@@ -5,7 +5,7 @@ it is decided.
 """
 
 import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -18,9 +18,16 @@ from harness.world import beacons
 from harness.world.outcome import Outcome, fault, outline, striker
 from harness.world.scenario import Layout, Scenario
 from harness.world.simulator import copied, new_road, populated, spawn_of, state_of, vehicle_on
-from harness.world.state import Beacon, VehicleState, WorldState, rectangle, separation_m
+from harness.world.state import (
+    ActionsTaken,
+    Beacon,
+    Snapshot,
+    VehicleState,
+    WorldState,
+    rectangle,
+    separation_m,
+)
 
-Snapshot = Mapping[str, Any]
 Target = tuple[str, int]  # route, and index of the scenario's target speeds
 TOUCHING_M = 1.0  # two wrecks farther apart than this did not meet in this frame
 HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
@@ -73,11 +80,10 @@ class World:
     def branch(self) -> "World":
         return replace(self, road=copied(self.road))
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> Snapshot | ActionsTaken:
         """Return what `thaw` needs besides `state()` to continue exactly as this world would."""
         vehicles = self.road.vehicles
-        sections = [self._section(v) for v in vehicles]
-        return {"frame": self.frame, "sections": sections, "speed_index": int(vehicles[0].speed_index)}
+        return Snapshot(self.frame, tuple(map(self._section, vehicles)), int(vehicles[0].speed_index))
 
     def _section(self, v: Any) -> int:
         """Return the section of its path that a vehicle is in; its route has only the remaining lanes."""
@@ -87,31 +93,31 @@ class World:
         return len(road.paths[v.spawn.approach, v.spawn.route].lanes) - len(v.route) + int(left)
 
     @classmethod
-    def thaw(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot) -> "World":
+    def thaw(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot | ActionsTaken) -> "World":
         """Restore the world that `state` and `snapshot` were taken from, if its episode was undecided."""
         return (scenario.world or World).resumed(scenario, state, snapshot)
 
     @classmethod
-    def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot) -> "World":
+    def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> "World":
         """Do what `thaw` says, in this kind of world."""
         layout, road = scenario.layout(state.episode_seed, scenario.parameters), new_road(scenario)
-        for v, section in zip(state.vehicles, snapshot["sections"], strict=True):
+        for v, section in zip(state.vehicles, snapshot.sections, strict=True):
             spawn = spawn_of(scenario, layout, v)
             vehicle = vehicle_on(road, scenario, spawn, section, (v.x_m, v.y_m), v.heading_rad)
             vehicle.crashed, vehicle.braking = v.crashed, v.braking
             road.vehicles.append(vehicle)
         vehicles = road.vehicles
         ego = vehicles[0]
-        ego.speed_index = snapshot["speed_index"]
+        ego.speed_index = snapshot.speed_index
         ego.target_speed = ego.index_to_speed(ego.speed_index)
-        if snapshot["frame"]:
+        if snapshot.frame:
             # highway-env ends every frame with collisions, which push touching vehicles apart in the next.
             for n, vehicle in enumerate(vehicles):
                 for other in vehicles[n + 1 :]:
                     vehicle.handle_collisions(other, 1 / scenario.parameters.simulation_hz)
         layout = replace(layout, buildings=state.buildings)
         return cls(
-            scenario, state.episode_seed, layout, road, state.step, snapshot["frame"], beacons=state.beacons
+            scenario, state.episode_seed, layout, road, state.step, snapshot.frame, beacons=state.beacons
         )
 
     def state(self) -> WorldState:

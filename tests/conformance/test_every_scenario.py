@@ -1,10 +1,10 @@
 """What holds for every scenario: the contract of `harness.world.scenario.Scenario`."""
 
-import json
 import pickle
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import one_way_crossing
 import pytest
@@ -19,7 +19,7 @@ from harness.world import scenarios
 from harness.world.perception.graph import scene_graph, scene_graphs, truth_graph, truth_graphs
 from harness.world.reference import drive
 from harness.world.scenario import Scenario
-from harness.world.state import WorldState
+from harness.world.state import Snapshot, WorldState
 from harness.world.world import World
 
 SEEDS = range(6)
@@ -95,8 +95,9 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(scenario: Scenario)
     for action in scenario.actions:
         world = World.start(scenario, 1)
         world.act("SLOWER")
-        state, snapshot = json.loads(json.dumps([world.state().to_dict(), world.snapshot()]))
-        thawed, branch = World.thaw(scenario, WorldState.from_dict(state), snapshot), world.branch()
+        text = msgspec.json.encode((world.state(), world.snapshot()))
+        stored = msgspec.json.decode(text, type=tuple[WorldState, Snapshot])
+        thawed, branch = World.thaw(scenario, *stored), world.branch()
         for then in (action, "IDLE"):
             for one in (world, thawed, branch):
                 one.act(then)
@@ -129,7 +130,7 @@ def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenar
             now, there = said.take(n), np.isfinite(said.speed_mps[n])
             distance_m = np.linalg.norm(now.xy_m, axis=-1)
             assert distance_m[np.insert(there, 0, True)] == pytest.approx(
-                [scene.record["distance_m"][viewer] for viewer in scene.viewers], abs=1e-3
+                [scene.record.distance_m[viewer] for viewer in scene.viewers], abs=1e-3
             )
             undecided = np.full((1 + len(there), len(scenario.actions)), 1 / len(scenario.actions))
             weights = inverse_distance_weights(distance_m, there, 1.0)

@@ -74,7 +74,7 @@ def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
     assert found.manifest.world.scenario["parameters"]["perfect_knowledge"] is True
     scenes = [scene_of(found, scene) for scene in found.decisions.scenes]
     assert [scene.id for scene in scenes] == list(found.decisions.scenes)
-    assert all(scene.record["state"]["beacons"] == () for scene in scenes)
+    assert all(scene.record.state.beacons == () for scene in scenes)
     run(spec, tmp_path / "beacons")
     paired = pair(tmp_path / "run", tmp_path / "beacons")
     ours, theirs = (side.settings["scenario.perfect_knowledge"] for side in (paired.a, paired.b))
@@ -190,7 +190,7 @@ def test_prompts_are_the_very_ones_that_were_sent(driven, text):
     assert all(found.values())
     run = read(driven)
     [scene] = {row["scene"] for row in rows_of(driven) if (row["episode"], row["step"]) == (0, 0)}
-    sent = V2.render(scene_of(run, scene).record["graphs"]["v1"], run.actions, [])
+    sent = V2.render(scene_of(run, scene).graphs["v1"], run.actions, [])
     assert found[scene, "v1"] == [dict(message) for message in sent]
 
 

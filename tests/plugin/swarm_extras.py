@@ -102,7 +102,7 @@ class Cautious:
 def answer(request: Request) -> str:
     """The JSON that the prompt asks for. Actions come with the most conservative one first."""
     assert request.view is not None
-    shares = (0.6, 0.3, 0.1) if request.view["conflicts"] else (0.2, 0.4, 0.4)
+    shares = (0.6, 0.3, 0.1) if request.view.conflicts else (0.2, 0.4, 0.4)
     said = {"action_distribution": dict(zip(request.actions, shares, strict=True))}
     return json.dumps(said if request.role == "ego" else {"evidence": "", "risk": "low", **said})
 

@@ -58,13 +58,11 @@ def _nobody():
 def _completion(request):
     """It brakes for what is close, is careful where it sees little, and fails now and then."""
     graph = request.view
-    close = [
-        c for c in graph["conflicts"] if abs((c["ego"]["time_s"] or 99) - (c["other"]["time_s"] or 99)) < 1.5
-    ]
-    blind = any(s["occluded"] for s in graph["sectors"])
+    close = [c for c in graph.conflicts if abs((c.ego.time_s or 99) - (c.other.time_s or 99)) < 1.5]
+    blind = any(s.occluded for s in graph.sectors)
     p: Sequence[float] = (0.9, 0.08, 0.02) if close else (0.3, 0.4, 0.3) if blind else (0.05, 0.8, 0.15)
     text = says(p, request.role, request.actions)
-    place = graph["step"], graph["viewer"]
+    place = graph.step, graph.viewer
     if place == (2, "v3"):
         text = f"```json\n{text}\n```"
     if place == (4, "v4"):

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from harness.core.errors import UserError
-from harness.dataset.load import Scene
 from harness.report.drawing.colours import ROLES
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import styled
@@ -51,7 +50,7 @@ def test_every_vehicle_is_labelled_with_id_and_kind_and_the_file_stays_light(dat
 def test_what_the_viewer_does_not_see_is_labelled_hidden(dataset):
     scene = scenes_of(dataset)[2]
     for viewer in scene.viewers:
-        seen = {node["id"] for node in scene.record["graphs"][viewer]["nodes"]} | {viewer}
+        seen = {node.id for node in scene.graphs[viewer].nodes} | {viewer}
         unseen = [v for v in scene.state.vehicles if v.id not in seen]
         assert unseen
         assert sum(text.endswith("hidden") for text in texts(picture(scene, viewer=viewer))) == len(unseen)
@@ -60,11 +59,11 @@ def test_what_the_viewer_does_not_see_is_labelled_hidden(dataset):
 def test_conflict_points_say_when_the_ego_and_the_other_are_there(dataset):
     scene, conflict = next(
         (s, conflict)
-        for s in scenes_of(dataset) for conflict in s.record["graphs"]["v1"]["conflicts"]
-        if conflict["ego"]["time_s"] and conflict["other"]["time_s"]
+        for s in scenes_of(dataset) for conflict in s.graphs["v1"].conflicts
+        if conflict.ego.time_s and conflict.other.time_s
     )  # fmt: skip
-    ego, other = conflict["ego"]["time_s"], conflict["other"]["time_s"]
-    assert f"v1 in {ego:.1f} s, {conflict['with']} in {other:.1f} s" in texts(picture(scene))
+    ego, other = conflict.ego.time_s, conflict.other.time_s
+    assert f"v1 in {ego:.1f} s, {conflict.vehicle} in {other:.1f} s" in texts(picture(scene))
 
 
 @pytest.mark.slow
@@ -89,7 +88,7 @@ def test_who_is_no_viewer_and_what_is_no_format_is_refused_with_what_is_allowed(
 
 def test_a_hostile_scene_id_is_text_in_the_picture(dataset):
     hostile = '</text><script>alert("$x^2$")</script>\u202e\n'
-    svg = picture(Scene({**scenes_of(dataset)[0].record, "scene": hostile}))
+    svg = picture(scenes_of(dataset)[0].changed(scene=hostile))
     tags = {element.tag.rpartition("}")[2] for element in ElementTree.fromstring(svg).iter()}
     assert "script" not in tags
     assert any("<script>" in text for text in texts(svg))

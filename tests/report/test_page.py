@@ -172,7 +172,7 @@ def test_a_page_names_the_answer_mode_and_has_the_prompt_of_a_read_out(dataset, 
 
     def as_read_out(answer):
         [scene] = dataset.scenes([answer.scene])
-        shown = V2.render(scene.record["graphs"][answer.viewer], dataset.actions)
+        shown = V2.render(scene.graphs[answer.viewer], dataset.actions)
         return structs.replace(answer, prompt_sha256=digest(readout.asked(shown, dataset.actions)), **said)
 
     run = write_run(tmp_path / "run", dataset, change=as_read_out)

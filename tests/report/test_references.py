@@ -82,7 +82,7 @@ def test_a_scenario_in_which_nobody_measured_has_no_constant() -> None:
 
 def test_a_driver_may_be_an_action() -> None:
     scenario = scenarios.get("do-not-pass")
-    assert choose(scenario, "LANE_RIGHT", {}, None) == "LANE_RIGHT"
+    assert choose(scenario, "LANE_RIGHT", None, None) == "LANE_RIGHT"
 
 
 def test_references_have_intervals_and_n_as_a_model_has(small: Dataset) -> None:

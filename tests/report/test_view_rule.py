@@ -7,17 +7,19 @@ import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from harness.report.drawing.geometry import shadows
 from harness.report.drawing.labels import covered, crossed, cut
 from harness.report.drawing.view import EASE, LEAST_M, MARGIN_M, View, spots, view_of, views
+from harness.world.scene_graph import Arrival, Conflict, Ego, EgoArrival, Point, SceneGraph, Viewer
 from harness.world.state import Building, VehicleState, WorldState
 
 EAST = 0.0
 
 
 def vehicle(name, east, north, part="other"):
-    return VehicleState(name, "car", part, east, -north, EAST, 10.0, "west", "straight")
+    return VehicleState(name, "car", part, east, -north, EAST, 10.0, "west", "straight", False)
 
 
 def state(*vehicles, buildings=()):
@@ -30,10 +32,12 @@ ZONE = 5.0, 0.0
 
 def graph(*met, viewer="v1"):
     """A viewer's conflicts: with whom, and how far ahead of it."""
-    return {
-        "viewer": viewer,
-        "conflicts": [{"with": name, "point": {"forward_m": m, "left_m": 0.0}} for name, m in met],
-    }
+    conflicts = (
+        Conflict(name, "east", "straight", Point(m, 0.0), EgoArrival(m, None), Arrival(m, None, 0.0))
+        for name, m in met
+    )
+    ego = Ego("v1", 10.0, 10.0, 0.0, 15.0, 0.0, 0.0)
+    return SceneGraph(viewer, "ego", 0, Viewer(10.0, "west", 15.0), ego, (), tuple(conflicts), ())
 
 
 def held(*others, met=(), who=(), viewer="v1"):
@@ -55,8 +59,8 @@ def test_it_holds_whose_sight_is_shown():
 
 
 def test_a_vehicle_ahead_in_the_lane_is_no_place_where_paths_cross():
-    ahead = graph(("v2", 40.0))
-    ahead["conflicts"][0]["kind"] = "ahead"
+    crosses = graph(("v2", 40.0))
+    ahead = replace(crosses, conflicts=(replace(crosses.conflicts[0], kind="ahead"),))
     assert len(spots(state(EGO, vehicle("v2", 30.0, 0.0)), ZONE, ahead, ())) == 2
 
 

@@ -1,14 +1,15 @@
 """Beacons: what the ego and the helpers know of each other, played by hand."""
 
-import json
 import math
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 
 from harness.core.errors import UserError
 from harness.dataset.freeze import moment
@@ -16,7 +17,7 @@ from harness.world import scenarios
 from harness.world.beacons import broadcast, known, last_heard
 from harness.world.perception.graph import scene_graph
 from harness.world.scenarios.occluded_intersection import SCENARIO
-from harness.world.state import Beacon, WorldState
+from harness.world.state import Beacon, Snapshot, WorldState
 from harness.world.world import World
 
 SILENT: Any = {"beacon_noise_m": 0.0, "beacon_noise_mps": 0.0, "beacon_noise_rad": 0.0}
@@ -130,14 +131,14 @@ def test_beacons_do_not_depend_on_how_time_is_cut(frames, dials):
     whole, cut = World.start(scenario, 3), World.start(scenario, 3)
     for frame in sorted(frames):
         cut.advance(frame)
-        frozen = json.loads(json.dumps([cut.state().to_dict(), cut.snapshot()]))
-        cut = World.thaw(scenario, WorldState.from_dict(frozen[0]), frozen[1])
+        text = msgspec.json.encode((cut.state(), cut.snapshot()))
+        cut = World.thaw(scenario, *msgspec.json.decode(text, type=tuple[WorldState, Snapshot]))
     end = max(frames, default=0) + 7
     whole.advance(end)
     cut.advance(end)
     # A state is kept to the micrometre, a beacon to a centimetre.
-    assert [replace(b, x_m=0.0, y_m=0.0) for b in cut.state().beacons] == [
-        replace(b, x_m=0.0, y_m=0.0) for b in whole.state().beacons
+    assert [structs.replace(b, x_m=0.0, y_m=0.0) for b in cut.state().beacons] == [
+        structs.replace(b, x_m=0.0, y_m=0.0) for b in whole.state().beacons
     ]
     for mine, its in zip(cut.state().beacons, whole.state().beacons, strict=True):
         assert (mine.x_m, mine.y_m) == pytest.approx((its.x_m, its.y_m), abs=0.0101)
@@ -151,12 +152,12 @@ def test_a_helper_knows_the_ego_from_its_beacon_and_the_ego_knows_itself():
     while world.time_s - last_heard(world.state(), "v1", "v2").time_s < 0.5:
         world.advance(world.frame + 1)
     state = world.state()
-    ego, helper = (scene_graph(seldom, state, viewer)["ego"] for viewer in ("v1", "v2"))
+    ego, helper = (scene_graph(seldom, state, viewer).ego for viewer in ("v1", "v2"))
     beacon = last_heard(state, "v1", "v2")
-    assert (ego["age_s"], ego["speed_mps"]) == (0.0, round(state.ego.speed_mps, 1))
-    assert helper["age_s"] == pytest.approx(state.time_s - beacon.time_s)
-    assert helper["speed_mps"] == round(beacon.speed_mps, 1) > ego["speed_mps"]
-    assert helper["zone_m"] < ego["zone_m"]
+    assert (ego.age_s, ego.speed_mps) == (0.0, round(state.ego.speed_mps, 1))
+    assert helper.age_s == pytest.approx(state.time_s - beacon.time_s)
+    assert helper.speed_mps == round(beacon.speed_mps, 1) > ego.speed_mps
+    assert helper.zone_m < ego.zone_m
 
 
 def test_weights_and_ranges_are_from_the_beacons_that_the_ego_heard():
@@ -169,11 +170,11 @@ def test_weights_and_ranges_are_from_the_beacons_that_the_ego_heard():
         there, truth = known(state, helper, "v1"), state.vehicle(helper)
         distance_m = math.hypot(there.x_m - zone[0], there.y_m - zone[1])
         range_m = math.hypot(there.x_m - state.ego.x_m, there.y_m - state.ego.y_m)
-        assert record["distance_m"][helper] == pytest.approx(distance_m, abs=0.001)
-        assert record["range_m"][helper] == pytest.approx(range_m, abs=0.001)
+        assert record.distance_m[helper] == pytest.approx(distance_m, abs=0.001)
+        assert record.range_m[helper] == pytest.approx(range_m, abs=0.001)
         assert (there.x_m, there.y_m) != (truth.x_m, truth.y_m)
     ego = state.ego
-    assert record["distance_m"]["v1"] == round(math.hypot(ego.x_m - zone[0], ego.y_m - zone[1]), 3)
+    assert record.distance_m["v1"] == round(math.hypot(ego.x_m - zone[0], ego.y_m - zone[1]), 3)
 
 
 def test_under_perfect_knowledge_nobody_broadcasts_and_everybody_knows_the_truth():
@@ -182,10 +183,10 @@ def test_under_perfect_knowledge_nobody_broadcasts_and_everybody_knows_the_truth
     state = world.state()
     assert state.beacons == ()
     assert known(state, "v1", "v2") == state.ego
-    assert scene_graph(PERFECT, state, "v2")["ego"]["age_s"] == 0.0
+    assert scene_graph(PERFECT, state, "v2").ego.age_s == 0.0
     there = World.start(SCENARIO, 0)
     there.act("SLOWER")
-    assert replace(there.state(), beacons=()) == state, "beacons move nobody"
+    assert structs.replace(there.state(), beacons=()) == state, "beacons move nobody"
 
 
 @pytest.mark.parametrize(
@@ -368,4 +369,4 @@ def test_dials_that_are_as_before_are_not_stated_so_that_what_was_built_stays_as
     changed = scenarios.get(f"occluded-intersection:beacon_rule=cam,{RADIO}")
     assert changed.parameters.stated()["beacon_channel"] == "its-g5+density_per_km=120+rate_hz=25"
     assert scenarios.stated("occluded-intersection", changed.parameters.stated()) == changed
-    assert "interval_s" not in World.start(SCENARIO, 0).state().to_dict()["beacons"][0]
+    assert "interval_s" not in msgspec.to_builtins(World.start(SCENARIO, 0).state())["beacons"][0]

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from msgspec import structs
 
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
@@ -13,11 +14,11 @@ from harness.world.world import World
 
 P = Parameters()
 LAYOUTS = {seed: layout(seed, P) for seed in range(200)}
-EGO = VehicleState("v1", "car", "ego", -50.0, RAMP_M, 0.0, 14.0, "ramp", "merge")
-TRUCK = VehicleState("v2", "truck", "helper", -95.0, -4.0, 0.0, 14.0, "main left", "straight")
-AHEAD = VehicleState("v3", "car", "helper", 5.0, 0.0, 0.0, 17.0, "main", "straight")
-COMES = VehicleState("v5", "car", "other", -55.0, 0.0, 0.0, 15.0, "main", "straight")
-BESIDE = replace(COMES, y_m=-4.0, approach="main left")
+EGO = VehicleState("v1", "car", "ego", -50.0, RAMP_M, 0.0, 14.0, "ramp", "merge", False)
+TRUCK = VehicleState("v2", "truck", "helper", -95.0, -4.0, 0.0, 14.0, "main left", "straight", False)
+AHEAD = VehicleState("v3", "car", "helper", 5.0, 0.0, 0.0, 17.0, "main", "straight", False)
+COMES = VehicleState("v5", "car", "other", -55.0, 0.0, 0.0, 15.0, "main", "straight", False)
+BESIDE = structs.replace(COMES, y_m=-4.0, approach="main left")
 (WALL,) = layout(0, replace(P, wall_end_m=(34.0, 34.0))).buildings
 
 
@@ -27,7 +28,7 @@ def scene(*others, ego=EGO, wall=(WALL,)):
 
 
 def listed(graph):
-    return {node["id"] for node in graph["nodes"]}
+    return {node.id for node in graph.nodes}
 
 
 def test_the_wall_hides_both_lanes_from_the_ego_and_helpers_see_which_lane_it_is():
@@ -38,19 +39,19 @@ def test_the_wall_hides_both_lanes_from_the_ego_and_helpers_see_which_lane_it_is
         for car in (COMES, BESIDE):
             graph = scene_graph(SCENARIO, scene(car), helper)
             assert "v5" in listed(graph)
-            merging[car] = [(c["with"], c["sector"]) for c in graph["conflicts"] if c["kind"] == "merging"]
+            merging[car] = [(c.vehicle, c.sector) for c in graph.conflicts if c.kind == "merging"]
         assert merging == {COMES: [("v5", "main")], BESIDE: []}
 
 
 def test_past_the_walls_end_the_ego_sees_who_is_beside_it():
-    ego = replace(EGO, x_m=-25.0, y_m=3.5)
-    assert "v5" in listed(scene_graph(SCENARIO, scene(replace(COMES, x_m=-30.0), ego=ego), "v1"))
+    ego = structs.replace(EGO, x_m=-25.0, y_m=3.5)
+    assert "v5" in listed(scene_graph(SCENARIO, scene(structs.replace(COMES, x_m=-30.0), ego=ego), "v1"))
 
 
 def test_it_lets_go_first_who_is_on_its_lane_and_minds_nobody_on_the_other():
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(COMES))) == "SLOWER"
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(BESIDE))) == "IDLE"
-    assert plan(SCENARIO, truth_graph(SCENARIO, scene(replace(COMES, x_m=-150.0)))) == "IDLE"
+    assert plan(SCENARIO, truth_graph(SCENARIO, scene(structs.replace(COMES, x_m=-150.0)))) == "IDLE"
 
 
 @pytest.mark.slow

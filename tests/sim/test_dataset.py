@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from zipfile import ZipFile
 
+import msgspec
 import pytest
 from evaluating import scenes_of
 
@@ -132,18 +133,18 @@ def test_graphs_in_a_record_are_what_the_sensors_say_of_its_state(small):
         assert scene.viewers == ("v1", "v2", "v3", "v4")
         for viewer in scene.viewers:
             graph = scene_graph(SCENARIO, scene.state, viewer)
-            assert canonical_json(graph) == canonical_json(scene.record["graphs"][viewer])
+            assert graph == scene.graphs[viewer]
 
 
 def test_no_graph_says_minus_zero(small):
     for scene in scenes_of(small):
-        assert re.search(r"-0\.0(?!\d)", canonical_json(scene.record["graphs"])) is None
+        assert re.search(r"-0\.0(?!\d)", canonical_json(msgspec.to_builtins(scene.record.graphs))) is None
 
 
 def test_poses_are_kept_to_the_micrometre_so_that_other_machines_write_the_same(small):
     for scene in scenes_of(small)[::9]:
-        for v in scene.record["state"]["vehicles"]:
-            for number in (v["x_m"], v["y_m"], v["heading_rad"], v["speed_mps"]):
+        for v in scene.record.state.vehicles:
+            for number in (v.x_m, v.y_m, v.heading_rad, v.speed_mps):
                 assert number == round(number, 6)
 
 
@@ -154,7 +155,7 @@ def test_an_edge_leads_where_the_thawed_world_goes(small):
     for n in range(0, len(forest.ids), 37):
         [scene] = small.scenes([forest.ids[n]])
         for place, action in enumerate(small.actions):
-            world = World.thaw(SCENARIO, scene.state, scene.record["snapshot"])
+            world = World.thaw(SCENARIO, scene.state, scene.record.snapshot)
             world.act(action)
             child = int(forest.child[n, place])
             if child < 0:
@@ -174,7 +175,7 @@ def test_what_becomes_of_an_action_with_the_full_view_driver_is_what_it_drives(s
     for n in forest.visited(forest.drivers["cruise"]).tolist()[::5]:
         [scene] = small.scenes([forest.ids[n]])
         for place, action in enumerate(small.actions):
-            world = World.thaw(SCENARIO, scene.state, scene.record["snapshot"])
+            world = World.thaw(SCENARIO, scene.state, scene.record.snapshot)
             world.act(action)
             end = forest.end(int(forest.then_full_view[n, place]))
             [outcome] = finish([world], ["full-view"])
@@ -507,7 +508,7 @@ def test_a_folder_that_is_no_dataset_and_a_name_that_is_unknown_are_refused(tmp_
 
 
 def test_a_scene_is_found_by_the_beginning_of_its_id_if_that_is_one_scenes_alone(small):
-    assert small.scene("00005-0").record["step"] == 0
+    assert small.scene("00005-0").record.step == 0
     name = small.trees[5].levels[3][1].scene
     assert small.scene(name).id == small.scene(name[:-4]).id == name
     for unclear in ("00005-9", "00005-3", ""):

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 from evaluating import scenes_of
@@ -28,7 +29,7 @@ from harness.world.environments.place import CAREFUL_FIRST
 from harness.world.environments.world import EnvironmentWorld
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.reference import drive
-from harness.world.state import WorldState
+from harness.world.state import ActionsTaken, WorldState
 from harness.world.world import World
 
 OWN = "env:my_roads:breakdown-v0"
@@ -223,7 +224,7 @@ def test_the_truck_hides_the_breakdown_from_the_ego_and_helpers_see_it():
     scenario = scenarios.get(OWN)
     state = World.start(scenario, 0).state()
     conflicts = {
-        viewer: [(c["with"], c["kind"], c["lane"]) for c in graph["conflicts"]]
+        viewer: [(c.vehicle, c.kind, c.lane) for c in graph.conflicts]
         for viewer, graph in {
             "truth": truth_graph(scenario, state),
             **{v.id: scene_graph(scenario, state, v.id) for v in (state.ego, *state.helpers)},
@@ -232,9 +233,9 @@ def test_the_truck_hides_the_breakdown_from_the_ego_and_helpers_see_it():
     assert ("v5", "ahead", "own") in conflicts["truth"]
     assert ("v5", "ahead", "own") not in conflicts["v1"]
     assert ("v5", "ahead", "own") in conflicts["v3"]
-    sectors = {s["sector"]: s for s in scene_graph(scenario, state, "v1")["sectors"]}
-    assert sectors["to b lane 2"]["seen_share"] < 0.5
-    assert "v3" in sectors["to b lane 2"]["by"]
+    sectors = {s.sector: s for s in scene_graph(scenario, state, "v1").sectors}
+    assert sectors["to b lane 2"].seen_share < 0.5
+    assert "v3" in sectors["to b lane 2"].by
 
 
 def test_cruising_hits_what_stands_and_full_view_passes():
@@ -250,8 +251,9 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from():
     world.act("FASTER")
     world.advance(world.frame + 4)
     world.take("SLOWER")
-    state, snapshot = json.loads(json.dumps([world.state().to_dict(), world.snapshot()]))
-    thawed, branch = World.thaw(scenario, WorldState.from_dict(state), snapshot), world.branch()
+    text = msgspec.json.encode((world.state(), world.snapshot()))
+    stored = msgspec.json.decode(text, type=tuple[WorldState, ActionsTaken])
+    thawed, branch = World.thaw(scenario, *stored), world.branch()
     for each in (world, thawed, branch):
         each.act("IDLE")
     assert world.state() == thawed.state() == branch.state()

@@ -12,7 +12,7 @@ NORTH, EAST, SOUTH, WEST = -math.pi / 2, 0.0, math.pi / 2, math.pi
 
 
 def car(x, y, heading, approach="own", route="straight"):
-    return VehicleState("v5", "car", "other", x, y, heading, 5.0, approach, route)
+    return VehicleState("v5", "car", "other", x, y, heading, 5.0, approach, route, False)
 
 
 EGO = car(2.0, 0.0, NORTH)

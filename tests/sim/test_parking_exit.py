@@ -1,10 +1,10 @@
 """Pulling out between vans: what they hide, who sees it, and that a car that comes later is harmless."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
@@ -22,12 +22,12 @@ from harness.world.state import SIZES_M, VehicleState, WorldState
 
 P = Parameters()
 LAYOUTS = {seed: layout(seed, P) for seed in range(200)}
-EGO = VehicleState("v1", "car", "ego", -14.0, KERB_M, 0.0, 4.0, "own", "pull-out")
-VAN = VehicleState("v5", "van", "other", -21.0, VANS_M, 0.0, 0.0, "kerb", "parked")
+EGO = VehicleState("v1", "car", "ego", -14.0, KERB_M, 0.0, 4.0, "own", "pull-out", False)
+VAN = VehicleState("v5", "van", "other", -21.0, VANS_M, 0.0, 0.0, "kerb", "parked", False)
 LAST_VAN = replace(VAN, id="v2", part="helper", x_m=-36.5)
-OPPOSITE = VehicleState("v3", "car", "helper", -10.0, -6.5, np.pi, 0.0, "opposite", "parked")
-PASSED = VehicleState("v4", "car", "helper", 15.0, 0.0, 0.0, 9.0, "behind", "straight")
-COMES = VehicleState("v6", "car", "other", -34.0, 0.0, 0.0, 9.0, "behind", "straight")
+OPPOSITE = VehicleState("v3", "car", "helper", -10.0, -6.5, np.pi, 0.0, "opposite", "parked", False)
+PASSED = VehicleState("v4", "car", "helper", 15.0, 0.0, 0.0, 9.0, "behind", "straight", False)
+COMES = VehicleState("v6", "car", "other", -34.0, 0.0, 0.0, 9.0, "behind", "straight", False)
 
 
 def scene(*others, ego=EGO):
@@ -36,7 +36,7 @@ def scene(*others, ego=EGO):
 
 
 def listed(graph):
-    return {node["id"] for node in graph["nodes"]}
+    return {node.id for node in graph.nodes}
 
 
 def test_the_egos_way_comes_into_the_lane_behind_what_is_parked():
@@ -52,10 +52,10 @@ def test_a_van_hides_the_lane_from_the_ego_and_three_helpers_see_it():
     assert "v6" not in listed(scene_graph(SCENARIO, scene(VAN, COMES), "v1"))
     assert "v6" in listed(scene_graph(SCENARIO, scene(COMES), "v1"))
     for helper in ("v2", "v3", "v4"):
-        meets = scene_graph(SCENARIO, scene(VAN, COMES), helper)["conflicts"]
-        (conflict,) = [c for c in meets if c["kind"] == "merging"]
-        assert (conflict["with"], conflict["sector"]) == ("v6", "behind")
-        assert conflict["other"]["arc_m"] == pytest.approx(34.0, abs=0.5)
+        meets = scene_graph(SCENARIO, scene(VAN, COMES), helper).conflicts
+        (conflict,) = [c for c in meets if c.kind == "merging"]
+        assert (conflict.vehicle, conflict.sector) == ("v6", "behind")
+        assert conflict.other.arc_m == pytest.approx(34.0, abs=0.5)
 
 
 def test_with_its_nose_in_the_lane_the_ego_sees_along_it():
@@ -67,7 +67,7 @@ def test_with_its_nose_in_the_lane_the_ego_sees_along_it():
 def test_it_waits_for_who_meets_it_and_for_nobody_who_comes_long_after_or_the_other_way():
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(VAN, COMES))) == "SLOWER"
     late = replace(COMES, x_m=-100.0)
-    oncoming = VehicleState("v7", "car", "other", 30.0, -3.5, np.pi, 9.0, "oncoming", "straight")
+    oncoming = VehicleState("v7", "car", "other", 30.0, -3.5, np.pi, 9.0, "oncoming", "straight", False)
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(VAN, late, oncoming))) == "IDLE"
 
 

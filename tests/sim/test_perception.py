@@ -1,25 +1,25 @@
 """Sensors, lines of sight and scene graphs, on scenes placed by hand, and that nothing hidden leaks."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
-from harness.core.files import canonical_json
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.perception.rays import RAYS, blocked_by, sweep
 from harness.world.perception.sensors import detect
 from harness.world.scenarios.occluded_intersection import SCENARIO
+from harness.world.scene_graph import Arrival, EgoArrival, Point, Sector
 from harness.world.state import Building, VehicleState, WorldState
 from harness.world.world import World
 
 NORTH, EAST, SOUTH, WEST = -math.pi / 2, 0.0, math.pi / 2, math.pi
-EGO = VehicleState("v1", "car", "ego", 2.0, 52.0, NORTH, 14.0, "own", "straight")
+EGO = VehicleState("v1", "car", "ego", 2.0, 52.0, NORTH, 14.0, "own", "straight", False)
 
 
 def other(x, y, heading=NORTH, speed=10.0, kind="car", approach="left", route="straight", vehicle="v5"):
-    return VehicleState(vehicle, kind, "other", x, y, heading, speed, approach, route)
+    return VehicleState(vehicle, kind, "other", x, y, heading, speed, approach, route, False)
 
 
 def scene(*others, buildings=(), ego=EGO, step=0, seed=0):
@@ -177,38 +177,38 @@ def draws_of(vehicle, n=200):
 
 def test_positions_are_forward_and_to_the_left_and_headings_counter_clockwise():
     # The ego looks north; a car 20 m ahead and 6 m to the left drives east, to the ego's right.
-    (node,) = truth_graph(SCENARIO, scene(other(-4.0, 32.0, heading=EAST)))["nodes"]
-    assert (node["forward_m"], node["left_m"], node["heading_deg"]) == (20.0, 6.0, -90)
-    (node,) = truth_graph(SCENARIO, scene(other(2.0, 72.0, heading=WEST)))["nodes"]
-    assert (node["forward_m"], node["left_m"], node["heading_deg"]) == (-20.0, 0.0, 90)
+    (node,) = truth_graph(SCENARIO, scene(other(-4.0, 32.0, heading=EAST))).nodes
+    assert (node.forward_m, node.left_m, node.heading_deg) == (20.0, 6.0, -90)
+    (node,) = truth_graph(SCENARIO, scene(other(2.0, 72.0, heading=WEST))).nodes
+    assert (node.forward_m, node.left_m, node.heading_deg) == (-20.0, 0.0, 90)
 
 
 def test_a_conflict_has_the_arc_lengths_and_times_of_both():
     # The ego at y 52 has 50 m to the crossing at (2, 2); a car at x −38 has 40 m at 10 m/s.
     graph = truth_graph(SCENARIO, scene(other(-38.0, 2.0, heading=EAST, speed=10.0)))
-    (conflict,) = graph["conflicts"]
-    assert (conflict["with"], conflict["sector"], conflict["route"]) == ("v5", "left", "straight")
-    assert conflict["point"] == {"forward_m": 50.0, "left_m": 0.0}
-    assert conflict["ego"] == {"arc_m": 50.0, "time_s": 3.6}
-    assert conflict["other"] == {"arc_m": 40.0, "time_s": 4.0, "speed_mps": 10.0}
+    (conflict,) = graph.conflicts
+    assert (conflict.vehicle, conflict.sector, conflict.route) == ("v5", "left", "straight")
+    assert conflict.point == Point(50.0, 0.0)
+    assert conflict.ego == EgoArrival(50.0, 3.6)
+    assert conflict.other == Arrival(40.0, 4.0, 10.0)
 
 
 def test_a_standing_car_has_an_arc_length_and_no_time():
-    (conflict,) = truth_graph(SCENARIO, scene(other(-38.0, 2.0, heading=EAST, speed=0.0)))["conflicts"]
-    assert conflict["other"] == {"arc_m": 40.0, "time_s": None, "speed_mps": 0.0}
+    (conflict,) = truth_graph(SCENARIO, scene(other(-38.0, 2.0, heading=EAST, speed=0.0))).conflicts
+    assert conflict.other == Arrival(40.0, None, 0.0)
 
 
 def test_an_oncoming_car_is_a_conflict_only_if_it_turns_left():
     straight = other(-2.0, -40.0, heading=SOUTH, approach="oncoming")
-    assert truth_graph(SCENARIO, scene(straight))["conflicts"] == []
-    (conflict,) = truth_graph(SCENARIO, scene(replace(straight, route="left")))["conflicts"]
-    assert (conflict["sector"], conflict["route"]) == ("oncoming", "left")
+    assert truth_graph(SCENARIO, scene(straight)).conflicts == ()
+    (conflict,) = truth_graph(SCENARIO, scene(replace(straight, route="left"))).conflicts
+    assert (conflict.sector, conflict.route) == ("oncoming", "left")
 
 
 def test_a_car_that_has_passed_the_conflict_point_is_none():
-    assert truth_graph(SCENARIO, scene(other(10.0, 2.0, heading=EAST)))["conflicts"] == []
+    assert truth_graph(SCENARIO, scene(other(10.0, 2.0, heading=EAST))).conflicts == ()
     assert (
-        truth_graph(SCENARIO, scene(other(6.0, 2.0, heading=EAST)))["conflicts"] != []
+        truth_graph(SCENARIO, scene(other(6.0, 2.0, heading=EAST))).conflicts != []
     )  # its tail is still there
 
 
@@ -221,34 +221,34 @@ def test_lanes_are_named_from_the_egos_seat_and_off_the_road_there_is_none():
         "off-lane": other(30.0, 30.0),
     }
     for lane, vehicle in lanes.items():
-        assert truth_graph(SCENARIO, scene(vehicle))["nodes"][0]["lane"] == lane
+        assert truth_graph(SCENARIO, scene(vehicle)).nodes[0].lane == lane
 
 
 def test_a_helper_judges_the_egos_conflicts_from_its_own_seat():
     helper = replace(other(30.0, 2.0, heading=EAST, vehicle="v2"), part="helper")
     danger = other(-38.0, 2.0, heading=EAST)
     graph = scene_graph(SCENARIO, scene(helper, danger), "v2")
-    (conflict,) = graph["conflicts"]
-    assert (graph["role"], conflict["with"], conflict["sector"]) == ("helper", "v5", "left")
-    assert conflict["ego"] == {"arc_m": 50.0, "time_s": 3.6}  # by the request, so without noise
-    assert conflict["point"] == {"forward_m": -28.0, "left_m": 0.0}
-    assert (graph["ego"]["forward_m"], graph["ego"]["left_m"]) == (-28.0, -50.0)
+    (conflict,) = graph.conflicts
+    assert (graph.role, conflict.vehicle, conflict.sector) == ("helper", "v5", "left")
+    assert conflict.ego == EgoArrival(50.0, 3.6)  # by the request, so without noise
+    assert conflict.point == Point(-28.0, 0.0)
+    assert (graph.ego.forward_m, graph.ego.left_m) == (-28.0, -50.0)
 
 
 def test_a_sector_behind_a_building_is_occluded_by_it_and_an_open_one_is_not():
     corner = Building("b1", west_m=-70.0, north_m=8.0, east_m=-8.0, south_m=70.0)
-    sectors = {s["sector"]: s for s in scene_graph(SCENARIO, scene(buildings=[corner]), "v1")["sectors"]}
-    assert sectors["left"]["occluded"]
-    assert sectors["left"]["by"] == ["b1"]
-    assert sectors["left"]["seen_share"] < 0.5
-    assert sectors["right"] == {"sector": "right", "seen_share": 1.0, "occluded": False, "by": []}
+    sectors = {s.sector: s for s in scene_graph(SCENARIO, scene(buildings=[corner]), "v1").sectors}
+    assert sectors["left"].occluded
+    assert sectors["left"].by == ("b1",)
+    assert sectors["left"].seen_share < 0.5
+    assert sectors["right"] == Sector("right", 1.0, False, ())
 
 
 def test_a_reported_truck_hides_a_stretch_of_a_sector_and_is_named():
     truck = other(-2.0, -20.0, heading=SOUTH, kind="truck", approach="oncoming")
-    sectors = {s["sector"]: s for s in scene_graph(SCENARIO, scene(truck), "v1")["sectors"]}
-    assert sectors["oncoming"]["by"] == ["v5"]
-    assert sectors["oncoming"]["seen_share"] < 1.0
+    sectors = {s.sector: s for s in scene_graph(SCENARIO, scene(truck), "v1").sectors}
+    assert sectors["oncoming"].by == ("v5",)
+    assert sectors["oncoming"].seen_share < 1.0
 
 
 # Nothing hidden leaks.
@@ -267,12 +267,12 @@ def test_a_graph_does_not_change_when_what_it_does_not_list_is_taken_away():
             state = world.state()
             for viewer in (state.ego, *state.helpers):
                 graph = scene_graph(SCENARIO, state, viewer.id)
-                listed = {node["id"] for node in graph["nodes"]} | {viewer.id, state.ego.id}
+                listed = {node.id for node in graph.nodes} | {viewer.id, state.ego.id}
                 for v in state.vehicles:
                     if v.id not in listed:
                         hidden += 1
                         less = scene_graph(SCENARIO, without(state, v.id), viewer.id)
-                        assert canonical_json(less) == canonical_json(graph), (
+                        assert less == graph, (
                             seed,
                             state.step,
                             viewer.id,
@@ -297,9 +297,9 @@ def test_an_episode_without_its_danger_looks_the_same_for_as_long_as_the_ego_doe
         vehicles[:] = [v for v in vehicles if v.spawn.id != danger]
         for _ in range(4):
             graph = scene_graph(SCENARIO, world.state(), "v1")
-            if danger not in {node["id"] for node in graph["nodes"]}:
+            if danger not in {node.id for node in graph.nodes}:
                 hidden_steps += 1
-                assert canonical_json(scene_graph(SCENARIO, harmless.state(), "v1")) == canonical_json(graph)
+                assert scene_graph(SCENARIO, harmless.state(), "v1") == graph
             world.act("IDLE")
             harmless.act("IDLE")
     assert hidden_steps > 40
@@ -312,9 +312,9 @@ def test_a_graph_names_only_its_viewer_the_ego_what_it_lists_and_buildings():
             state = world.state()
             for viewer in (state.ego, *state.helpers):
                 graph = scene_graph(SCENARIO, state, viewer.id)
-                known = {node["id"] for node in graph["nodes"]}
-                assert {c["with"] for c in graph["conflicts"]} <= known
-                hiding = {name for s in graph["sectors"] for name in s["by"]}
+                known = {node.id for node in graph.nodes}
+                assert {c.vehicle for c in graph.conflicts} <= known
+                hiding = {name for s in graph.sectors for name in s.by}
                 assert hiding <= known | {b.id for b in state.buildings}
             world.act("IDLE")
 
@@ -331,8 +331,7 @@ def test_most_dangers_are_hidden_from_the_ego_and_seen_by_a_helper_two_decisions
         world.act("IDLE")
         state = world.state()
         views = [
-            {n["id"] for n in scene_graph(SCENARIO, state, v.id)["nodes"]}
-            for v in (state.ego, *state.helpers)
+            {n.id for n in scene_graph(SCENARIO, state, v.id).nodes} for v in (state.ego, *state.helpers)
         ]
         dangers += 1
         hidden += danger not in views[0]

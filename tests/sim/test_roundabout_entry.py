@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache
 
 import pytest
+from msgspec import structs
 
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
@@ -23,7 +24,8 @@ def seeds(danger):
 
 
 def at(id_, part, way, arc_m, speed_mps):
-    return VehicleState(id_, "car", part, *road().paths[way].at(arc_m), speed_mps, *way)
+    x_m, y_m, heading_rad = road().paths[way].at(arc_m)
+    return VehicleState(id_, "car", part, x_m, y_m, heading_rad, speed_mps, way[0], way[1], False)
 
 
 def scene(route, back_m=20.0, buildings=None):
@@ -40,7 +42,7 @@ def scene(route, back_m=20.0, buildings=None):
 
 
 def listed(graph):
-    return {node["id"] for node in graph["nodes"]}
+    return {node.id for node in graph.nodes}
 
 
 def test_only_who_goes_on_past_the_egos_arm_meets_it_and_where_it_enters():
@@ -54,29 +56,29 @@ def test_the_hedge_hides_from_the_ego_what_two_helpers_see():
     assert "v5" not in listed(scene_graph(SCENARIO, hidden, "v1"))
     assert "v5" in listed(scene_graph(SCENARIO, scene("straight", buildings=()), "v1"))
     for helper in ("v2", "v3"):
-        (conflict,) = [
-            c for c in scene_graph(SCENARIO, hidden, helper)["conflicts"] if c["kind"] == "merging"
-        ]
-        assert (conflict["with"], conflict["sector"]) == ("v5", "left")
-        assert conflict["ego"]["arc_m"] == pytest.approx(20.0, abs=0.5)
-        assert conflict["other"]["arc_m"] == pytest.approx(20.0, abs=0.5)
+        (conflict,) = [c for c in scene_graph(SCENARIO, hidden, helper).conflicts if c.kind == "merging"]
+        assert (conflict.vehicle, conflict.sector) == ("v5", "left")
+        assert conflict.ego.arc_m == pytest.approx(20.0, abs=0.5)
+        assert conflict.other.arc_m == pytest.approx(20.0, abs=0.5)
 
 
 def test_past_the_hedge_the_ego_sees_the_ring():
     near = scene("straight", back_m=12.0)
     ego = at("v1", "ego", ("own", "straight"), road().zone_arc_m - 10.0, 8.0)
-    assert "v5" in listed(scene_graph(SCENARIO, replace(near, vehicles=(ego, *near.vehicles[1:])), "v1"))
+    assert "v5" in listed(
+        scene_graph(SCENARIO, structs.replace(near, vehicles=(ego, *near.vehicles[1:])), "v1")
+    )
 
 
 def test_where_it_goes_decides_and_its_indicator_tells():
     goes_on, leaves = scene("straight", 24.0), scene("right", 24.0)
-    assert [c["with"] for c in truth_graph(SCENARIO, goes_on)["conflicts"]] == ["v5"]
+    assert [c.vehicle for c in truth_graph(SCENARIO, goes_on).conflicts] == ["v5"]
     assert plan(SCENARIO, truth_graph(SCENARIO, goes_on)) == "SLOWER"
-    assert truth_graph(SCENARIO, leaves)["conflicts"] == []
+    assert truth_graph(SCENARIO, leaves).conflicts == ()
     assert plan(SCENARIO, truth_graph(SCENARIO, leaves)) == "IDLE"
-    (seen,) = [n for n in scene_graph(SCENARIO, leaves, "v2")["nodes"] if n["id"] == "v5"]
-    assert seen["indicator"] == "right"
-    assert "v5" not in {c["with"] for c in scene_graph(SCENARIO, leaves, "v2")["conflicts"]}
+    (seen,) = [n for n in scene_graph(SCENARIO, leaves, "v2").nodes if n.id == "v5"]
+    assert seen.indicator == "right"
+    assert "v5" not in {c.vehicle for c in scene_graph(SCENARIO, leaves, "v2").conflicts}
 
 
 @pytest.mark.parametrize("sector", ["left", "oncoming"])

@@ -1,8 +1,8 @@
 """The state of the world as a value."""
 
-import json
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -28,7 +28,7 @@ states = st.builds(
 @pytest.mark.slow
 @given(states)
 def test_a_state_survives_json_exactly(state):
-    assert WorldState.from_dict(json.loads(canonical_json(state.to_dict()))) == state
+    assert msgspec.json.decode(canonical_json(msgspec.to_builtins(state)), type=WorldState) == state
 
 
 @given(states)
@@ -47,6 +47,6 @@ def test_corners_start_at_the_front_left_and_go_round_clockwise():
 
 def test_a_truck_is_longer_and_wider_than_a_car():
     car, truck = (
-        VehicleState("v5", kind, "other", 0, 0, 0, 0, "left", "straight") for kind in ("car", "truck")
+        VehicleState("v5", kind, "other", 0, 0, 0, 0, "left", "straight", False) for kind in ("car", "truck")
     )
     assert (car.length_m, car.width_m, truck.length_m, truck.width_m) == (5.0, 2.0, 10.0, 2.6)

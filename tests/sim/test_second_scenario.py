@@ -77,9 +77,9 @@ def test_both_vehicles_see_its_danger_in_its_sector():
     state = world.state()
     for viewer in ("v1", "v2"):
         graph = scene_graph(SCENARIO, state, viewer)
-        assert [(c["with"], c["sector"]) for c in graph["conflicts"]] == [("v3", "west")]
-        assert [s["sector"] for s in graph["sectors"]] == ["west"]
-        assert [n["lane"] for n in graph["nodes"] if n["id"] == "v3"] == ["street-west"]
+        assert [(c.vehicle, c.sector) for c in graph.conflicts] == [("v3", "west")]
+        assert [s.sector for s in graph.sectors] == ["west"]
+        assert [n.lane for n in graph.nodes if n.id == "v3"] == ["street-west"]
     world.act("IDLE")
     assert plan(SCENARIO, truth_graph(SCENARIO, world.state())) == "SLOWER"
 
@@ -89,7 +89,7 @@ def test_its_dataset_is_sound_and_says_whose_it_is(folder, frozen, tmp_path):
     assert check(folder) == []
     assert (frozen.scenario, frozen.actions) == (SCENARIO, SCENARIO.actions)
     assert [len(tree.levels) for tree in frozen.trees] == [4, 4]
-    assert {s.record["danger"]["sector"] for s in scenes_of(frozen)} == {"west", None}
+    assert {s.record.danger.sector for s in scenes_of(frozen)} == {"west", None}
     build(SCENARIO, tmp_path / "one-way", 2, MEETING, 1, lambda done: None)
     assert (tmp_path / "one-way/manifest.json").read_bytes() == (folder / "manifest.json").read_bytes()
 
@@ -102,7 +102,7 @@ def test_a_dataset_of_a_scenario_that_is_not_here_is_refused_in_a_line(folder, t
 
 
 def test_prompts_list_its_actions_and_say_its_words(frozen, tmp_path):
-    graph = scenes_of(frozen)[1].record["graphs"]["v2"]
+    graph = scenes_of(frozen)[1].graphs["v2"]
     [system, user] = versions.load("v2").render(graph, frozen.actions, words=frozen.scenario.words)
     assert '"LANE_RIGHT":p' in system["content"]
     assert "v3 west:" in user["content"]

@@ -1,6 +1,5 @@
 """The live world: physics, determinism, how episodes end, and thawing."""
 
-import json
 import subprocess
 import sys
 from dataclasses import asdict
@@ -8,18 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 from highway_env.envs.intersection_env import IntersectionEnv
 from highway_env.road.road import Road
 from highway_env.vehicle.behavior import IDMVehicle
+from msgspec import to_builtins
 
 from harness.core.files import digest
 from harness.world import simulator
 from harness.world.outcome import Outcome, outline
 from harness.world.reference import drive
 from harness.world.scenarios.occluded_intersection import SCENARIO
-from harness.world.state import WorldState
+from harness.world.state import Snapshot, WorldState
 from harness.world.world import World
 
 NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING = 0, 1, 6, 10  # seeds
@@ -30,17 +31,17 @@ ACTIONS = SCENARIO.actions
 def trajectory(seed, actions=("IDLE", "SLOWER", "FASTER", "IDLE")):
     """States at each decision, as JSON has them."""
     world = World.start(SCENARIO, seed)
-    states = [world.state().to_dict()]
+    states = [to_builtins(world.state())]
     for action in actions:
         world.act(action)
-        states.append(world.state().to_dict())
+        states.append(to_builtins(world.state()))
     return states
 
 
 def through_json(world):
     """The world thawed from what is left of it in a file."""
-    state, snapshot = json.loads(json.dumps([world.state().to_dict(), world.snapshot()]))
-    return World.thaw(SCENARIO, WorldState.from_dict(state), snapshot)
+    text = msgspec.json.encode((world.state(), world.snapshot()))
+    return World.thaw(SCENARIO, *msgspec.json.decode(text, type=tuple[WorldState, Snapshot]))
 
 
 def advance(world, frames):
@@ -234,7 +235,7 @@ def close(one, other):
 
 def alike(one, other):
     """Whether two worlds are in the same state."""
-    return close(one.state().to_dict(), other.state().to_dict())
+    return close(to_builtins(one.state()), to_builtins(other.state()))
 
 
 @pytest.mark.slow
@@ -289,7 +290,7 @@ def test_a_snapshot_is_a_frame_a_section_a_vehicle_and_a_speed_level():
     world = World.start(SCENARIO, ONCOMING)
     world.act("SLOWER")
     snapshot = world.snapshot()
-    assert snapshot.keys() == {"frame", "sections", "speed_index"}
-    values = [snapshot["frame"], snapshot["speed_index"], *snapshot["sections"]]
+    assert isinstance(snapshot, Snapshot)
+    values = [snapshot.frame, snapshot.speed_index, *snapshot.sections]
     assert {type(value) for value in values} == {int}
-    assert len(snapshot["sections"]) == len(world.state().vehicles)
+    assert len(snapshot.sections) == len(world.state().vehicles)

@@ -101,8 +101,8 @@ def test_the_ego_knows_of_regions_what_its_graph_says(small: Dataset):
     scenes = small.scenes(small.courses())
     seen = outlook(small.scenario.road(), scenes)
     for n, scene in enumerate(scenes):
-        graph = scene.record["graphs"][scene.viewers[0]]
-        shares = [1 - sector["seen_share"] for sector in graph["sectors"]]
+        graph = scene.graphs[scene.viewers[0]]
+        shares = [1 - sector.seen_share for sector in graph.sectors]
         assert seen.unseen[n] == pytest.approx(shares, abs=0.0051)
         assert (np.nan_to_num(seen.added[n]) <= seen.unseen[n] + 1e-9).all()
     assert (seen.added[~np.isnan(seen.added)] > 0.1).any()

@@ -3,14 +3,12 @@
 The frame of `harness.world.road` has south instead, so every position is flipped on its way in.
 """
 
-from typing import Any
-
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.world.perception.graph import Graph
 from harness.world.road import Ground
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import Conflict, SceneGraph
 from harness.world.state import VehicleState, WorldState
 
 VIEW_M = 80.0  # from the origin to the edge of a picture
@@ -23,15 +21,15 @@ def north_up(points: Floats) -> Floats:
     return points * [1.0, -1.0]
 
 
-def conflict_points(state: WorldState, graph: Graph) -> tuple[list[dict[str, Any]], Floats]:
+def conflict_points(state: WorldState, graph: SceneGraph) -> tuple[list[Conflict], Floats]:
     """Conflicts of a viewer's graph, and where, (n, 2) m to the east and north.
 
     Not of who is ahead or behind: there the other vehicle itself is the place.
     """
-    eye = state.vehicle(graph["viewer"])
+    eye = state.vehicle(graph.viewer)
     cos, sin = np.cos(eye.heading_rad), np.sin(eye.heading_rad)
-    conflicts = [c for c in graph["conflicts"] if c.get("kind") not in ("ahead", "behind")]
-    relative = np.array([(c["point"]["forward_m"], c["point"]["left_m"]) for c in conflicts]).reshape(-1, 2)
+    conflicts = [c for c in graph.conflicts if c.kind not in ("ahead", "behind")]
+    relative = np.array([(c.point.forward_m, c.point.left_m) for c in conflicts]).reshape(-1, 2)
     points = north_up(np.array([eye.x_m, eye.y_m]) + relative @ np.array([[cos, sin], [sin, -cos]]))
     return conflicts, points
 

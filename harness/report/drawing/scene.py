@@ -3,7 +3,6 @@
 It shows where it is decided (`view`); who is beyond that is named at its edge.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,6 +21,7 @@ from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import Format, save, styled
 from harness.report.drawing.view import View, spots, view_of
 from harness.world import scenarios
+from harness.world.scene_graph import EgoArrival
 from harness.world.state import VehicleState
 
 SIDE_IN = 5.8  # how wide the picture is
@@ -58,12 +58,12 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     viewer = scene.viewers[0] if viewer is None else viewer
     if viewer not in scene.viewers:
         raise unknown(f"viewer of scene {printable(scene.id, 40)}", viewer, scene.viewers)
-    graph = scene.record["graphs"][viewer]
-    seen = {node["id"] for node in graph["nodes"]} | {viewer}
+    graph = scene.graphs[viewer]
+    seen = {*graph.seen, viewer}
 
     scenario, state = scenarios.get(scene.state.scenario), scene.state
     road, shape = scenario.road(), shape_of(scenario)
-    held = spots(state, road.zone_m, graph, (scene.record["danger"]["vehicle"], *scene.viewers))
+    held = spots(state, road.zone_m, graph, (scene.record.danger.vehicle, *scene.viewers))
     view = view_of(held, shape)
     figure = Figure(figsize=(SIDE_IN + 0.2, SIDE_IN * shape + 1.12))
     height = figure.get_figheight()
@@ -98,7 +98,7 @@ def style_of(look: str, hidden: bool) -> dict[str, Any]:
 
 
 def _look(scene: Scene, vehicle: VehicleState) -> str:
-    return "danger" if vehicle.id == scene.record["danger"]["vehicle"] else vehicle.part
+    return "danger" if vehicle.id == scene.record.danger.vehicle else vehicle.part
 
 
 def _sight_lines(axes: Axes, scene: Scene, viewer: str, seen: set[str]) -> None:
@@ -159,13 +159,13 @@ def _vehicle(axes: Axes, labels: Labels, view: View, vehicle: VehicleState, look
 
 def _conflicts(axes: Axes, labels: Labels, view: View, scene: Scene, viewer: str) -> None:
     ego = printable(scene.state.ego.id)
-    conflicts, points = conflict_points(scene.state, scene.record["graphs"][viewer])
+    conflicts, points = conflict_points(scene.state, scene.graphs[viewer])
     for conflict, point in zip(conflicts, points, strict=True):
         if not view.holds(point):
             continue
         axes.plot(*point, markeredgewidth=0.7, zorder=4, **CROSS)
         labels.block(point + 1.5 * view.scale * np.array([[-1, -1], [1, 1]]))
-        text = f"{ego} {_when(conflict['ego'])}, {printable(conflict['with'])} {_when(conflict['other'])}"
+        text = f"{ego} {_when(conflict.ego)}, {printable(conflict.vehicle)} {_when(conflict.other)}"
         # Labels of two points go apart, or their lines would cross.
         labels.add(point, 2.0, text, colour=INK, toward=point - points.mean(axis=0))
 
@@ -193,22 +193,22 @@ def _signs(axes: Axes, labels: Labels, view: View, scene: Scene) -> None:
         axes.text(left + one, up - one, name, color=BUILDING, size=TEXT_PT, ha="left", va="top")
 
 
-def _when(arrival: Mapping[str, Any]) -> str:
-    if arrival["arc_m"] < 0:
+def _when(arrival: EgoArrival) -> str:
+    if arrival.arc_m < 0:
         return "is past it"
-    return "stands" if arrival["time_s"] is None else f"in {arrival['time_s']:.1f} s"
+    return "stands" if arrival.time_s is None else f"in {arrival.time_s:.1f} s"
 
 
 def _words(figure: Figure, scene: Scene, viewer: str, seen: set[str]) -> None:
-    state, graph = scene.state, scene.record["graphs"][viewer]
+    state, graph = scene.state, scene.graphs[viewer]
     left, height = 0.1 / figure.get_figwidth(), figure.get_figheight()
     title = f"Scene {printable(scene.id, 40)} at {state.time_s:.1f} s, ego {state.ego.speed_mps:.1f} m/s"
     figure.text(left, 1 - 0.24 / height, title, size=10, weight="bold")
     others = [v.id for v in state.vehicles if v.id != viewer]
     parts = [
-        f"{viewer} ({graph['role']}) sees {_list(v for v in others if v in seen)}",
+        f"{viewer} ({graph.role}) sees {_list(v for v in others if v in seen)}",
         f"hidden: {_list(v for v in others if v not in seen)}",
-        f"occluded sectors: {_list(s['sector'] for s in graph['sectors'] if s['occluded'])}",
+        f"occluded sectors: {_list(graph.occluded)}",
     ]
     figure.text(left, 1 - 0.45 / height, printable("; ".join(parts), 110), size=7.5)
 

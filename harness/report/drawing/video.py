@@ -21,8 +21,9 @@ from harness.report.drawing.geometry import shape_of
 from harness.report.drawing.pictures import styled
 from harness.report.drawing.still import Canvas
 from harness.report.drawing.view import View, spots, views
-from harness.world.perception.graph import Graph, scene_graph
+from harness.world.perception.graph import scene_graph
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 
 STILL_MS, LAST_MS = 100, 2500
 COLOURS = 64  # of a GIF
@@ -90,13 +91,13 @@ def _pictures(played: Played, progress: Callable[[int], None]) -> Iterator[Pixel
     graphs = list(_graphs(played.scenario, listed))
     canvas = Canvas(played, listed[0].state.buildings)
     for still, seen, view in zip(listed, graphs, _views(played.scenario, listed, graphs), strict=True):
-        yield canvas.picture(still, {v: [node["id"] for node in g["nodes"]] for v, g in seen.items()}, view)
+        yield canvas.picture(still, {v: [*graph.seen] for v, graph in seen.items()}, view)
         progress(1)
 
 
-def _graphs(scenario: Scenario, listed: Iterable[Still]) -> Iterator[dict[str, Graph]]:
+def _graphs(scenario: Scenario, listed: Iterable[Still]) -> Iterator[dict[str, SceneGraph]]:
     """What each viewer saw when each still's decision began."""
-    moment, found = None, dict[str, Graph]()
+    moment, found = None, dict[str, SceneGraph]()
     for still in listed:
         if still.seen != moment:
             moment = still.seen
@@ -105,7 +106,7 @@ def _graphs(scenario: Scenario, listed: Iterable[Still]) -> Iterator[dict[str, G
 
 
 def _views(
-    scenario: Scenario, listed: Sequence[Still], graphs: Iterable[Mapping[str, Graph]]
+    scenario: Scenario, listed: Sequence[Still], graphs: Iterable[Mapping[str, SceneGraph]]
 ) -> Iterable[View]:
     """What each still shows: one view from each decision to the next, then one for each of their periods."""
     period_s, zone_m = scenario.parameters.decision_period_s, scenario.road().zone_m

@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.core.arrays import Floats
 from harness.report.drawing.geometry import VIEW_M, conflict_points, north_up
-from harness.world.perception.graph import Graph
+from harness.world.scene_graph import SceneGraph
 from harness.world.state import WorldState
 
 MARGIN_M, LEAST_M = 8.0, 60.0  # around what a view holds; its width
@@ -56,7 +56,7 @@ class View:
 
 
 def spots(
-    state: WorldState, zone_m: tuple[float, float], graph: Graph | None, who: Collection[str | None]
+    state: WorldState, zone_m: tuple[float, float], graph: SceneGraph | None, who: Collection[str | None]
 ) -> Floats:
     """What a picture of a moment holds, (n, 2) m to the east and north, the ego first.
 
@@ -67,8 +67,8 @@ def spots(
         who: ids of whom else it holds: the danger and the helpers that were asked.
     """
     conflicts, crossings = conflict_points(state, graph) if graph else ([], np.empty((0, 2)))
-    wanted = {*who, state.ego.id, *(c["with"] for c in conflicts)}
-    wanted |= {graph["viewer"]} if graph else set()
+    wanted = {*who, state.ego.id, *(conflict.vehicle for conflict in conflicts)}
+    wanted |= {graph.viewer} if graph else set()
     at = [(v.x_m, v.y_m) for v in state.vehicles if v.id in wanted]
     found: Floats = np.concatenate([north_up(np.array([*at, zone_m])), crossings])
     near: Floats = found[np.abs(found - found[0]).max(axis=1) <= NEAR_M]

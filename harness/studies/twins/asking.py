@@ -221,7 +221,7 @@ def _asked(
 
 def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -> Iterator[Asked]:
     """The questions about a scene that the twin changes for who reads them, each with its twin."""
-    graphs = scene.record["graphs"]
+    graphs = scene.graphs
     if twin.graph:
         graphs = {viewer: twin.graph(spec, scene, graph) for viewer, graph in graphs.items()}
     others = requests(spec, [_named(scene, twin, graphs=graphs)])
@@ -229,11 +229,11 @@ def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -
         if spec.ego.can.language_model:
             other = twin.text(spec, other) if twin.text else other
             viewer = question.id.rpartition("/")[2]
-            if twin.image and other.image and graphs[viewer] != scene.record["graphs"][viewer]:
+            if twin.image and other.image and graphs[viewer] != scene.graphs[viewer]:
                 other = replace(other, image=twin.image(other.image))
             differ = _differ(question, other)
         else:
-            other = replace(other, view=twin.view(other.view or {})) if twin.view else other
+            other = replace(other, view=twin.view(other.view)) if twin.view and other.view else other
             differ = question.view != other.view
         if differ:
             yield twin, question.role, question, other
@@ -252,7 +252,7 @@ def _fusion(spec: Spec, twin: Twin, scene: Scene, answers: Mapping[str, Answer])
 
 def _named(scene: Scene, twin: Twin, **others: Any) -> Scene:
     """A scene of another name, so that its answers have names of their own."""
-    return Scene({**scene.record, **others, "scene": f"{scene.id}~{twin.name}"})
+    return scene.changed(**others, scene=f"{scene.id}~{twin.name}")
 
 
 def _differ(a: Request, b: Request) -> bool:

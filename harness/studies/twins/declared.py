@@ -4,15 +4,17 @@ These are metamorphic relations (Chen et al. 2018): nobody needs to know the rig
 answers do not go together. A twin that does not apply to a question leaves it as it is.
 """
 
+import dataclasses
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from msgspec import UNSET, Struct
+from msgspec.structs import replace
 
 from harness.backends.base import AnswerMode, Request
 from harness.core import noise
@@ -22,8 +24,8 @@ from harness.dataset.load import Scene
 from harness.evaluate.spec import Spec
 from harness.prompts import readout
 from harness.world.perception.sensors import LIDAR_NOISE_M, RADAR_NOISE_M
+from harness.world.scene_graph import Conflict, Node, SceneGraph
 
-Graph = Mapping[str, Any]
 Leaf = Callable[[str, Any], Any]
 FAR_M = 100.0  # from the viewer to the vehicle that is added, at least
 CLEAR_M = 65.0  # from there to the conflict zone, at least
@@ -36,7 +38,7 @@ SIDES = {"left": "right", "right": "left"}
 LANES = {"LANE_LEFT": "LANE_RIGHT", "LANE_RIGHT": "LANE_LEFT"}
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Twin:
     """One way to put a question otherwise."""
 
@@ -46,10 +48,10 @@ class Twin:
     # greatest total-variation distance that it allows; None where the action must be the same
     within: float | None = None
     # the twin's scene graph, `(spec, scene, graph)`
-    graph: Callable[[Spec, Scene, Graph], Graph] | None = None
+    graph: Callable[[Spec, Scene, SceneGraph], SceneGraph] | None = None
     # the twin's request, `(spec, request)`, of a language model
     text: Callable[[Spec, Request], Request] | None = None
-    view: Callable[[Graph], Graph] | None = None  # the same for who reads the graph and no text
+    view: Callable[[SceneGraph], SceneGraph] | None = None  # the same for who reads the graph and no text
     # the twin's picture, where the graph is another; None where it is the same
     image: Callable[[Image], Image] | None = None
     # whose messages a fusion call has, `(senders)`, in the place of these
@@ -75,25 +77,25 @@ class Twin:
 
 
 def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
-    """Return a copy of plain data with `leaf(key, value)` for leaves; those of a list have the list's key."""
-    if isinstance(value, Mapping):
-        return {name: changed(of, leaf, name) for name, of in value.items()}
-    if isinstance(value, list):
-        return [changed(of, leaf, key) for of in value]
-    return leaf(key, value)
+    """Return a copy of a record with `leaf(key, value)` for leaves; those of a tuple have the tuple's key."""
+    if isinstance(value, Struct):
+        values = {name: getattr(value, name) for name in value.__struct_fields__}
+        return replace(value, **{name: changed(part, leaf, name) for name, part in values.items()})
+    if isinstance(value, tuple):
+        return tuple(changed(part, leaf, key) for part in value)
+    return value if value is UNSET else leaf(key, value)
 
 
-def mirrored(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+def mirrored(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Swap left and right; the same graph if the scenario is one-sided, or has no such path."""
     if spec.scenario.one_sided is not None:
         return graph
     twin = swapped(graph)
     paths = spec.scenario.road().paths
-    legal = all((c["sector"], c["route"]) in paths for c in twin["conflicts"])
-    return twin if legal else graph
+    return twin if all((c.sector, c.route) in paths for c in twin.conflicts) else graph
 
 
-def swapped(graph: Graph) -> Graph:
+def swapped(graph: SceneGraph) -> SceneGraph:
     """Swap left and right in positions, headings and words; sectors in the order that they had."""
 
     def leaf(key: str, value: Any) -> Any:
@@ -103,11 +105,11 @@ def swapped(graph: Graph) -> Graph:
             return re.sub(r"\b(left|right)\b", lambda side: SIDES[side[0]], value)
         return value
 
-    twin = changed(graph, leaf)
-    order = [sector["sector"] for sector in graph["sectors"]]
-    if {sector["sector"] for sector in twin["sectors"]} == set(order):
-        twin["sectors"].sort(key=lambda sector: order.index(sector["sector"]))
-    return dict(twin)
+    twin: SceneGraph = changed(graph, leaf)
+    order = [sector.sector for sector in graph.sectors]
+    if {sector.sector for sector in twin.sectors} != set(order):
+        return twin
+    return replace(twin, sectors=tuple(sorted(twin.sectors, key=lambda sector: order.index(sector.sector))))
 
 
 def flipped(image: Image) -> Image:
@@ -115,18 +117,19 @@ def flipped(image: Image) -> Image:
     return Image(np.ascontiguousarray(image.pixels[:, ::-1]))
 
 
-def permuted_ids(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+def permuted_ids(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Every vehicle has the name of another, in all graphs of the scene alike."""
-    ids = [v["id"] for v in scene.record["state"]["vehicles"]]
+    ids = [vehicle.id for vehicle in scene.state.vehicles]
     order = noise.generator("twins", "ids", scene.id).permutation(len(ids)).tolist()
     named = {ids[n]: ids[m] for n, m in zip(order, [*order[1:], *order[:1]], strict=True)}  # one cycle
-    return dict(changed(graph, lambda key, value: named.get(value, value) if key in NAMES else value))
+    twin: SceneGraph = changed(graph, lambda key, value: named.get(value, value) if key in NAMES else value)
+    return twin
 
 
-NAMES = ("id", "with", "viewer", "by")
+NAMES = ("id", "vehicle", "viewer", "by")
 
 
-def rounded(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+def rounded(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Round metres and m/s to none, shares to one decimal. Times stay: half a second decides conflicts."""
 
     def leaf(key: str, value: Any) -> Any:
@@ -134,41 +137,45 @@ def rounded(spec: Spec, scene: Scene, graph: Graph) -> Graph:
             return round(value) + 0.0
         return round(value, 1) if key == "seen_share" else value
 
-    return dict(changed(graph, leaf))
+    twin: SceneGraph = changed(graph, leaf)
+    return twin
 
 
-def far_vehicle(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+def far_vehicle(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Add a vehicle: it stands beside the road, away from viewer, ego and conflict zone."""
-    away = max(FAR_M, CLEAR_M + graph["self"]["zone_m"])
-    ahead = graph["ego"]["forward_m"] < 0  # the other way than the ego; behind the ego itself
-    used = {int(v["id"][1:]) for v in scene.record["state"]["vehicles"]}
-    own_mps = graph["self"]["speed_mps"]
-    node = {
-        "id": f"v{max(used) + 1}", "type": "vehicle", "forward_m": away if ahead else -away, "left_m": 0.0,
-        "heading_deg": None, "speed_mps": 0.0, "range_rate_mps": 0 - own_mps if ahead else own_mps,
-        "lane": "off-lane", "indicator": None, "sensors": ["radar"],
-        **({"braking": None} if spec.scenario.brake_lamps else {}),
-    }  # fmt: skip
-    return {**graph, "nodes": [*graph["nodes"], node]}
+    away = max(FAR_M, CLEAR_M + graph.itself.zone_m)
+    ahead = graph.ego.forward_m < 0  # the other way than the ego; behind the ego itself
+    last = max(int(vehicle.id[1:]) for vehicle in scene.state.vehicles)
+    own_mps = graph.itself.speed_mps
+    node = Node(
+        f"v{last + 1}", "vehicle", away if ahead else -away, 0.0, None, 0.0,
+        0 - own_mps if ahead else own_mps, "off-lane", None, ("radar",),
+        None if spec.scenario.brake_lamps else UNSET,
+    )  # fmt: skip
+    return replace(graph, nodes=(*graph.nodes, node))
 
 
-def jittered(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+def jittered(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Jitter the distances that sensors report with their noise once more, as another look would."""
-    draws = noise.generator("twins", "jitter", scene.id, graph["viewer"])
-    twin = changed(graph, lambda key, value: value)
-    by_id = {}
-    for node in twin["nodes"]:
-        scale = LIDAR_NOISE_M if "lidar" in node["sensors"] else RADAR_NOISE_M
-        by_id[node["id"]] = forward, left = (scale * draws.standard_normal(2)).tolist()
-        node |= {
-            "forward_m": round(node["forward_m"] + forward, 1),
-            "left_m": round(node["left_m"] + left, 1),
-        }
-    for conflict in twin["conflicts"]:
-        if conflict["with"] in by_id:  # who is not is the viewer itself, which knows where it is
-            to_go = conflict["other"] if conflict["other"]["arc_m"] else conflict["ego"]
-            to_go["arc_m"] = round(to_go["arc_m"] + by_id[conflict["with"]][0], 1)
-    return dict(twin)
+    draws = noise.generator("twins", "jitter", scene.id, graph.viewer)
+    nodes, moved_m = [], {}
+    for node in graph.nodes:
+        scale = LIDAR_NOISE_M if "lidar" in node.sensors else RADAR_NOISE_M
+        forward, left = (scale * draws.standard_normal(2)).tolist()
+        moved_m[node.id] = forward
+        at = round(node.forward_m + forward, 1), round(node.left_m + left, 1)
+        nodes.append(replace(node, forward_m=at[0], left_m=at[1]))
+    conflicts = tuple(_farther(c, moved_m.get(c.vehicle)) for c in graph.conflicts)
+    return replace(graph, nodes=tuple(nodes), conflicts=conflicts)
+
+
+def _farther(conflict: Conflict, by_m: float | None) -> Conflict:
+    """Return a conflict whose way to go is longer; one with the viewer, who knows where it is, as it is."""
+    if by_m is None:
+        return conflict
+    who = "other" if conflict.other.arc_m else "ego"
+    to_go = getattr(conflict, who)
+    return replace(conflict, **{who: replace(to_go, arc_m=round(to_go.arc_m + by_m, 1))})
 
 
 def reversed_lines(spec: Spec, request: Request) -> Request:
@@ -180,14 +187,14 @@ def reversed_lines(spec: Spec, request: Request) -> Request:
     return _reworded(request, lambda text: re.sub(r"(?m)(?:^v\d+\b.*\n){2,}", turned, text))
 
 
-def reversed_lists(graph: Graph) -> Graph:
+def reversed_lists(graph: SceneGraph) -> SceneGraph:
     """Reverse objects and conflicts."""
-    return {**graph, "nodes": graph["nodes"][::-1], "conflicts": graph["conflicts"][::-1]}
+    return replace(graph, nodes=graph.nodes[::-1], conflicts=graph.conflicts[::-1])
 
 
-def in_feet(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+def in_feet(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Put feet and km/h where a template has metres and m/s as words that can be replaced."""
-    return dict(changed(graph, _in_feet)) if _says_units(spec, graph["role"]) else graph
+    return changed(graph, _in_feet) if _says_units(spec, graph.role) else graph
 
 
 def _in_feet(key: str, value: Any) -> Any:
@@ -295,14 +302,16 @@ def permuted_letters(spec: Spec, request: Request) -> Request:
         old = next((question for question in questions if question in text), None)
         return text.replace(old, questions[old]) if old else text
 
-    return replace(_reworded(request, reworded), actions=moved)
+    return dataclasses.replace(_reworded(request, reworded), actions=moved)
 
 
 def _reworded(request: Request, reworded: Callable[[str], str]) -> Request:
     def chat(messages: Sequence[Mapping[str, str]]) -> tuple[Mapping[str, str], ...]:
         return tuple({**message, "content": reworded(message["content"])} for message in messages)
 
-    return replace(request, messages=chat(request.messages), orders=tuple(map(chat, request.orders)))
+    return dataclasses.replace(
+        request, messages=chat(request.messages), orders=tuple(map(chat, request.orders))
+    )
 
 
 _DECLARED = (

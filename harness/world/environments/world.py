@@ -20,8 +20,8 @@ from harness.world.environments.place import Parameters, ends_of, first_target_m
 from harness.world.road import PathKey
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.simulator import DECIMALS, LAMPS_MPS2
-from harness.world.state import SIZES_M, Building, Kind, Part, WorldState
-from harness.world.world import Snapshot, Target, World
+from harness.world.state import SIZES_M, ActionsTaken, Building, Kind, Part, WorldState
+from harness.world.world import Target, World
 
 MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # limits of the ids in a record
 
@@ -69,12 +69,12 @@ class EnvironmentWorld(World):
         return world
 
     @classmethod
-    def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot) -> "World":
+    def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> "World":
         world = cls.begun(scenario, state.episode_seed)
-        for frame, action in snapshot["taken"]:
+        for frame, action in snapshot.taken:
             world.advance(frame)
             world.take(action)
-        world.advance(snapshot["frame"])
+        world.advance(snapshot.frame)
         world.step = state.step
         return world
 
@@ -116,9 +116,9 @@ class EnvironmentWorld(World):
         )  # fmt: skip
         return copy.deepcopy(self, {id(thing): thing for thing in shared})
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> ActionsTaken:
         """Return the actions so far, since equal actions from the start lead to equal worlds."""
-        return {"frame": self.frame, "taken": list(map(list, self.taken))}
+        return ActionsTaken(self.frame, tuple(self.taken))
 
     def take(self, action: str) -> None:
         kind = meta_actions(self.scenario.name, self.env)

@@ -5,13 +5,14 @@ The vehicles that many viewers know are laid on the road in one pass over arrays
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from harness.core.arrays import Floats
 from harness.world.perception.sensors import Detection
 from harness.world.road import ONE_LANE_M, PathKey, Road
+from harness.world.scene_graph import Arrival, Conflict, EgoArrival, Meeting, Point
 from harness.world.state import SIZES_M, VehicleState, indicator
 
 ON_PATH_M = 2.2  # farther from a path than this, an object is not on it
@@ -19,8 +20,6 @@ ALIKE = 0.05  # tolerance of costs: paths that share a lane differ by rounding o
 STANDING_MPS = 0.5  # a lower speed is taken for sensor noise
 ALIGNED_RAD = np.radians(40.0)  # more turned from a path than this, an object does not follow it
 ALIGNED = float(np.cos(ALIGNED_RAD))
-
-Graph = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -32,13 +31,10 @@ class Seat:
     cos: float
     sin: float
 
-    def relative(self, x_m: float, y_m: float) -> dict[str, float]:
+    def relative(self, x_m: float, y_m: float) -> Point:
         """Return a position in the viewer's frame."""
         dx, dy = x_m - self.x_m, y_m - self.y_m
-        return {
-            "forward_m": tenths(dx * self.cos + dy * self.sin),
-            "left_m": tenths(dx * self.sin - dy * self.cos),
-        }
+        return Point(tenths(dx * self.cos + dy * self.sin), tenths(dx * self.sin - dy * self.cos))
 
 
 @dataclass(frozen=True)
@@ -70,6 +66,7 @@ class Known:
         place: where it is; it follows a path.
         ego: the ego.
         ego_arc_m: arc length on the ego's path.
+        has_lamps: whether vehicles have brake lamps.
     """
 
     seat: Seat
@@ -77,6 +74,12 @@ class Known:
     place: Place
     ego: VehicleState
     ego_arc_m: float
+    has_lamps: bool
+
+    def arrival(self, arc_m: float, time_s: float | None) -> Arrival:
+        """Return how far the vehicle is from a conflict, with its speed and its brake lamps."""
+        braking = self.d.braking if self.has_lamps else UNSET
+        return Arrival(tenths(arc_m), time_s, tenths(self.d.speed_mps), braking)
 
     @property
     def key(self) -> PathKey:
@@ -131,9 +134,9 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     return [Place(on, of and of[1]) for on, of in zip(near, best, strict=True)]
 
 
-def conflicts(road: Road, all_known: Sequence[Known]) -> list[list[Graph]]:
+def conflicts(road: Road, all_known: Sequence[Known]) -> list[list[Conflict]]:
     """Return the conflicts of each vehicle with the ego."""
-    met: list[list[Graph]] = [[] for _ in all_known]
+    met: list[list[Conflict]] = [[] for _ in all_known]
     if road.form == 2:
         for n, conflict in _along(road, all_known):
             met[n].append(conflict)
@@ -143,7 +146,7 @@ def conflicts(road: Road, all_known: Sequence[Known]) -> list[list[Graph]]:
     return met
 
 
-def _meeting(road: Road, known: Known) -> Graph | None:
+def _meeting(road: Road, known: Known) -> Conflict | None:
     """Return the conflict where another's path crosses or merges into the ego's; None if one is past it."""
     crossing = road.crossings.get(known.key)
     if crossing is None:
@@ -155,26 +158,20 @@ def _meeting(road: Road, known: Known) -> Graph | None:
     to_go, ego_to_go = crossing.other_arc_m - known.place.arc_m, crossing.ego_arc_m - known.ego_arc_m
     if to_go < -length / 2 - ego.width_m or ego_to_go < -ego.length_m:
         return None
-    return {
-        "with": d.id,
-        "sector": known.key[0],
-        "route": known.key[1],
-        "point": known.seat.relative(crossing.x_m, crossing.y_m),
-        "ego": _arrival(ego_to_go, ego.speed_mps),
-        "other": {**_arrival(to_go, d.speed_mps), "speed_mps": tenths(d.speed_mps)},
-        **({"kind": crossing.kind, "lane": "own"} if road.form == 2 else {}),
-    }
+    return Conflict(
+        d.id, *known.key, known.seat.relative(crossing.x_m, crossing.y_m),
+        EgoArrival(tenths(ego_to_go), _time_s(ego_to_go, ego.speed_mps)),
+        known.arrival(to_go, _time_s(to_go, d.speed_mps)),
+        *((crossing.kind, "own") if road.form == 2 else ()),
+    )  # fmt: skip
 
 
-def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
-    """Return the remaining arc length (m, negative once past) and time (s, None at a standstill)."""
-    return {
-        "arc_m": tenths(to_go_m),
-        "time_s": tenths(to_go_m / speed_mps) if speed_mps > STANDING_MPS else None,
-    }
+def _time_s(to_go_m: float, speed_mps: float) -> float | None:
+    """Return when a conflict is reached, negative once past; None at a standstill."""
+    return tenths(to_go_m / speed_mps) if speed_mps > STANDING_MPS else None
 
 
-def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Graph]]:
+def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Conflict]]:
     """Yield the conflicts in a lane that both share or the ego may change to, at present speeds.
 
     Each comes after the number of its vehicle. Of two vehicles in a row only the one behind has a distance to
@@ -197,7 +194,7 @@ def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Graph]
             continue
         d, ego_mps = known.d, known.ego.speed_mps
         its_mps = d.speed_mps if turned > 0 else -d.speed_mps
-        kind = "oncoming" if turned < 0 else "ahead" if gap > 0 else "behind"
+        kind: Meeting = "oncoming" if turned < 0 else "ahead" if gap > 0 else "behind"
         if kind == "behind" and d.speed_mps <= STANDING_MPS:
             continue  # what is parked behind the ego never meets it
         closing_mps = (ego_mps - its_mps) * (1 if gap > 0 else -1)
@@ -209,19 +206,10 @@ def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Graph]
     ])  # fmt: skip
     for (n, side, _, kind, gap, share, time_s), (x, y, _) in zip(found, points.tolist(), strict=True):
         known = all_known[n]
-        yield n, {
-            "with": known.d.id,
-            "sector": known.key[0],
-            "route": known.key[1],
-            "point": known.seat.relative(x, y),
-            "ego": {"arc_m": tenths(abs(gap) * share), "time_s": time_s},
-            "other": {
-                "arc_m": tenths(abs(gap) * (1 - share)), "time_s": time_s,
-                "speed_mps": tenths(known.d.speed_mps),
-            },
-            "kind": kind,
-            "lane": side,
-        }  # fmt: skip
+        yield n, Conflict(
+            known.d.id, *known.key, known.seat.relative(x, y), EgoArrival(tenths(abs(gap) * share), time_s),
+            known.arrival(abs(gap) * (1 - share), time_s), kind, side,
+        )  # fmt: skip
 
 
 def _apart(road: Road, shared: Sequence[tuple[Known, PathKey]]) -> list[bool]:

@@ -20,7 +20,7 @@ from harness.core import noise
 from harness.core.arrays import Bools, Floats
 from harness.world.ambient import AMBIENTS, DAY, Ambient, sun_rad
 from harness.world.perception.rays import Sweep, turned
-from harness.world.state import VehicleState, WorldState
+from harness.world.state import Kind, VehicleState, WorldState
 
 LIDAR_RANGE_M, RADAR_RANGE_M = 80.0, 150.0
 HALF_FIELD_RAD = np.radians(60.0)
@@ -52,7 +52,7 @@ class Detection:
 
     id: str
     sensors: tuple[str, ...]
-    kind: str | None
+    kind: Kind | None
     indicator: str | None
     x_m: float
     y_m: float
