@@ -104,8 +104,8 @@ def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[d
     here = run.decisions.codes("condition", run.conditions) == run.conditions.index(condition)
     seeds, came = run.decisions.whole("seed"), dict[str, list[int]]()
     for scene, rows in run.decisions.scenes.items():
-        if of := seeds[rows.start : rows.stop][here[rows.start : rows.stop]].tolist():
-            came[scene] = of
+        if here_seeds := seeds[rows.start : rows.stop][here[rows.start : rows.stop]].tolist():
+            came[scene] = here_seeds
 
     def chance(*key: object) -> float:
         return float(noise.uniforms((1,), "attribution", seed, *key)[0])
@@ -212,9 +212,9 @@ def _left_out(
 def rows(found: Attribution) -> list[Row]:
     """Return a row for each kind of thing that was left out; intervals are over episodes."""
     return [
-        _row(role, kind, of)
+        _row(role, kind, some)
         for role, kind in KINDS
-        if (of := [each for each in found.left_out if (each.role, each.kind) == (role, kind)])
+        if (some := [each for each in found.left_out if (each.role, each.kind) == (role, kind)])
     ]
 
 

@@ -18,7 +18,7 @@ from harness.backends.registry import open_backend
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
-from harness.core.multiplicity import LEVEL, holm
+from harness.core.multiplicity import LEVEL
 from harness.core.statistics import Estimate, resampled, resampled_estimate
 from harness.evaluate.agent import Agent
 from harness.evaluate.run import read_or_evaluate
@@ -35,6 +35,7 @@ from harness.runs.metrics import (
     p_value,
 )
 from harness.runs.records import Answer
+from harness.studies.study import corrected
 
 RESAMPLES = 4000
 FIELDS = ("model", "prompt", "answer")
@@ -63,17 +64,17 @@ class Cell:
     helper: Agent
     run: Run
 
-    def level(self, factor: Factor) -> str:
+    def level(self, half: str, field: str) -> str:
         """Return the level of a factor."""
-        return level(self.ego if factor.half == "ego" else self.helper, factor.field)
+        return level(self.ego if half == "ego" else self.helper, field)
 
     @cached_property
     def values(self) -> Mapping[str, Floats]:
         """Success, latency and tokens of a decision, each (C, S, E); NaN where unknown."""
         run = self.run
-        of = by_episode([METRICS[SUCCESS], METRICS[LATENCY]], run.grid, run.decisions, run.episodes)
+        values = by_episode([METRICS[SUCCESS], METRICS[LATENCY]], run.grid, run.decisions, run.episodes)
         places, n = run.grid.places(run.decisions), len(run.episodes)
-        return {**of, "tokens": mean_by_place(tokens(run), places, n).reshape(run.grid.shape)}
+        return {**values, "tokens": mean_by_place(tokens(run), places, n).reshape(run.grid.shape)}
 
     def estimate(self, metric: str, condition: str) -> Estimate:
         """Return a metric under a condition, over episodes."""
@@ -121,13 +122,16 @@ def tokens(run: Run) -> Floats:
 
     NaN throughout where a model of the run counts none.
     """
-    of: dict[str | None, dict[str, list[float]]] = {}
+    by_scene: dict[str | None, dict[str, list[float]]] = {}
     for answer in run.answers:
         counts = (answer.prompt_tokens, answer.completion_tokens)
         total = math.nan if None in counts else float(sum(c or 0 for c in counts))
-        of.setdefault(answer.scene, {}).setdefault(answer.role, []).append(total)
-    each = {scene: [float(np.mean(roles.get(role, [0.0]))) for role in HALVES] for scene, roles in of.items()}
-    ego, helper = np.array([each[scene] for scene in run.decisions.labels("scene")]).T
+        by_scene.setdefault(answer.scene, {}).setdefault(answer.role, []).append(total)
+    means = {
+        scene: [float(np.mean(roles.get(role, [0.0]))) for role in HALVES]
+        for scene, roles in by_scene.items()
+    }
+    ego, helper = np.array([means[scene] for scene in run.decisions.labels("scene")]).T
     messages = run.decisions["messages"]
     total = ego + np.where(messages > 0, messages * helper, 0.0)
     return np.full_like(total, np.nan) if np.isnan(total).any() else total
@@ -152,20 +156,20 @@ def run_cells(
         UserError: the folder holds another grid, or a model is not available.
     """
     opens, asked = cache(open_backend), dict[tuple[str, str], dict[str, Answer]]()
-    specs = {
-        (i, j): replace(spec, ego=ego, helpers=(helper,))
-        for (i, ego), (j, helper) in product(enumerate(egos, 1), enumerate(helpers, 1))
-    }
     cells = []
-    for (i, j), of in specs.items():
-        folder, name = out / "cells" / f"{i}-{j}", helpers[j - 1].name
-        roles = {"ego": egos[i - 1].name, "helper": name, "blind": name}
-        given = {k: v for who in roles.items() for k, v in asked.get(who, {}).items()}
-        run = read_or_evaluate(of, folder, progress, cache_file, more, opens, given)
+    pairs = list(product(enumerate(egos, 1), enumerate(helpers, 1)))
+    specs = [
+        replace(spec, ego=ego, helpers=(helper,)) for (_, ego), (_, helper) in pairs
+    ]  # all are checked first
+    for ((i, ego), (j, helper)), of_pair in zip(pairs, specs, strict=True):
+        roles = {"ego": ego.name, "helper": helper.name, "blind": helper.name}
+        given = {k: v for role in roles.items() for k, v in asked.get(role, {}).items()}
+        folder = out / "cells" / f"{i}-{j}"
+        run = read_or_evaluate(of_pair, folder, progress, cache_file, more, opens, given)
         for answer in run.answers:
             if answer.role in roles and answer.error is None:
                 asked.setdefault((answer.role, roles[answer.role]), {})[answer.id] = answer
-        cells.append(Cell(egos[i - 1], helpers[j - 1], run))
+        cells.append(Cell(ego, helper, run))
     return Grid(tuple(cells), len(egos), len(helpers))
 
 
@@ -189,10 +193,10 @@ class Grid:
     @cached_property
     def factors(self) -> tuple[Factor, ...]:
         """What has more than one level."""
-        every = []
-        for half, field in product(HALVES, FIELDS):
-            levels = dict.fromkeys(c.level(Factor(half, field, ())) for c in self.cells)
-            every.append(Factor(half, field, tuple(levels)))
+        every = (
+            Factor(half, field, tuple(dict.fromkeys(c.level(half, field) for c in self.cells)))
+            for half, field in product(HALVES, FIELDS)
+        )
         return tuple(factor for factor in every if len(factor.levels) > 1)
 
     def name(self, agent: Agent, half: str) -> str:
@@ -208,23 +212,21 @@ class Grid:
             for condition in self.conditions
             for contrast in (*self._main(condition), *self._interactions(condition))
         ]
-        p_values = [p_value(SUCCESS, high, low) for _, _, low, high in contrasts]
-        corrected = iter(holm([p for p in p_values if p is not None]))
+        p_values = corrected([p_value(SUCCESS, high, low) for _, _, low, high in contrasts])
         return tuple(
-            Effect(condition, what, difference(SUCCESS, high, low), None if p is None else next(corrected))
+            Effect(condition, what, difference(SUCCESS, high, low), p)
             for (condition, what, low, high), p in zip(contrasts, p_values, strict=True)
         )
 
     def _mean(self, condition: str, **levels: str) -> Floats:
         """Mean success of the cells with these levels, by factor's name, (E, S)."""
         at = self.conditions.index(condition)
-        by_name = {factor.name: factor for factor in self.factors}
-        chosen = [
+        having = [
             cell.values[SUCCESS][at]
             for cell in self.cells
-            if all(cell.level(by_name[name]) == wanted for name, wanted in levels.items())
+            if all(cell.level(*name.split()) == wanted for name, wanted in levels.items())
         ]
-        return np.asarray(np.mean(chosen, axis=0).T)
+        return np.asarray(np.mean(having, axis=0).T)
 
     def _main(self, condition: str) -> Iterator[tuple[str, Floats, Floats]]:
         for factor in self.factors:
@@ -234,15 +236,14 @@ class Grid:
                 yield f"{factor.name}: {base} → {other}", low, high
 
     def _interactions(self, condition: str) -> Iterator[tuple[str, Floats, Floats]]:
-        for one, two in combinations(self.factors, 2):
-            for x, y in product(one.levels[1:], two.levels[1:]):
-                means = {
-                    at: self._mean(condition, **{one.name: at[0], two.name: at[1]})
-                    for at in product((one.levels[0], x), (two.levels[0], y))
-                }
-                same = (means[one.levels[0], two.levels[0]] + means[x, y]) / 2
-                crossed = (means[x, two.levels[0]] + means[one.levels[0], y]) / 2
-                yield f"{one.name} → {x} × {two.name} → {y}", crossed, same
+        for a, b in combinations(self.factors, 2):
+            for x, y in product(a.levels[1:], b.levels[1:]):
+                low_low, low_high, high_low, high_high = (
+                    self._mean(condition, **{a.name: of_a, b.name: of_b})
+                    for of_a, of_b in product((a.levels[0], x), (b.levels[0], y))
+                )
+                name = f"{a.name} → {x} × {b.name} → {y}"
+                yield name, (high_low + low_high) / 2, (low_low + high_high) / 2
 
     def halves(self, condition: str) -> Halves | None:
         """Return what each half explains; None without a channel, if one varies, or if all may be alike."""

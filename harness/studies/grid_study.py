@@ -15,7 +15,7 @@ from harness.report.drawing.colours import conditions
 from harness.runs.metrics import LATENCY, SUCCESS
 from harness.studies.figures.heat_map import heat_map
 from harness.studies.figures.points import Steps, fronts
-from harness.studies.grid import FIELDS, Cell, Grid, Halves, level
+from harness.studies.grid import FIELDS, HALVES, Cell, Grid, Halves
 from harness.studies.study import Study, Table, ends, p_cell
 
 if TYPE_CHECKING:
@@ -164,8 +164,7 @@ def tables(grid: Grid) -> "dict[str, pd.DataFrame]":
     import pandas as pd
 
     def who(cell: Cell) -> Mapping[str, str]:
-        halves = (("ego", cell.ego), ("helper", cell.helper))
-        return {f"{half}_{field}": level(agent, field) for half, agent in halves for field in FIELDS}
+        return {f"{half}_{field}": cell.level(half, field) for half in HALVES for field in FIELDS}
 
     cells = [
         {**who(cell), "run": cell.run.path.name, "condition": c, "metric": m, **ends(cell.estimate(m, c))}

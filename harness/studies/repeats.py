@@ -94,25 +94,19 @@ class Repeats:
     @cached_property
     def scores(self) -> tuple[Score, ...]:
         """All figures, as a run's summary has its own."""
-        found = [
-            (condition, metric, estimate)
-            for place, condition in enumerate(self.conditions)
-            for metric, estimate in self._of_condition(place)
-        ]
-        found += [(ALL, metric, estimate) for metric, estimate in self._doubts()]
-        return tuple(Score.of(*each, "episodes") for each in found)
+        estimates = [(c, *figure) for n, c in enumerate(self.conditions) for figure in self._of_condition(n)]
+        estimates += [(ALL, *figure) for figure in self._doubts()]
+        return tuple(Score.of(*figure, "episodes") for figure in estimates)
 
     def estimate(self, condition: str, metric: str) -> Estimate:
         """Return one figure; NaN where it is not known."""
-        [found] = [s for s in self.scores if (s.condition, s.metric) == (condition, metric)]
-        return found.estimate
+        return next(s.estimate for s in self.scores if (s.condition, s.metric) == (condition, metric))
 
     def _of_condition(self, place: int) -> Iterator[tuple[str, Estimate]]:
         _, counts, episodes = self._actions
         asked = counts[place].sum(axis=(-2, -1)) > 0
-        of = episodes[asked]
-        yield FLIPS, rate_interval(known_mean(flips(counts[place]), axis=-1)[asked], of)
-        yield STABLE, rate_interval(known_mean(stable(counts[place]), axis=-1)[asked], of)
+        for metric, share in ((FLIPS, flips), (STABLE, stable)):
+            yield metric, rate_interval(known_mean(share(counts[place]), axis=-1)[asked], episodes[asked])
         success = self._success[:, place]
         yield SUCCESS, rate_interval(success.mean(axis=(0, 1)))
         wins = success.sum(axis=0)
@@ -145,16 +139,16 @@ class Repeats:
     def wavering(self, most: int) -> list[Wavering]:
         """Return the decision points that repeats disagree on, those with most pairs that do first."""
         scenes, counts, _ = self._actions
-        of = np.nan_to_num(known_mean(flips(counts), axis=-1))
+        shares = np.nan_to_num(known_mean(flips(counts), axis=-1))
         n = counts.sum(axis=-1)
         pairs = (n**2 - (counts**2).sum(axis=-1)).sum(axis=-1)
         worst = np.argsort(-pairs, axis=None, kind="stable")[:most]
-        found = []
-        for c, d in zip(*np.unravel_index(worst, of.shape), strict=True):
+        points = []
+        for c, d in zip(*np.unravel_index(worst, shares.shape), strict=True):
             totals = counts[c, d].sum(axis=0).tolist()
             actions = {a: n for a, n in zip(self.runs[0].actions, totals, strict=True) if n}
-            found.append(Wavering(scenes[d], self.conditions[c], float(of[c, d]), actions))
-        return [point for point in found if point.flips > 0]
+            points.append(Wavering(scenes[d], self.conditions[c], float(shares[c, d]), actions))
+        return [point for point in points if point.flips > 0]
 
     def _doubts(self) -> Iterator[tuple[str, Estimate]]:
         """The entropy that the ego's answers state, and that of the actions which they rank first."""

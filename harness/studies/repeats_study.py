@@ -20,50 +20,53 @@ MOST_POINTS = 12  # of those at which repeats disagree
 NATS = Unit("nats", 2)
 
 
-def repeats_study(of: Repeats) -> Study:
+def repeats_study(repeats: Repeats) -> Study:
     """Declare the study of repeats."""
     import pandas as pd
 
-    first, source, k = of.runs[0].manifest, of.runs[0].source, of.k
-    variant, place = msgspec.to_builtins(first.variant), beside(of.path / PAGE)
-    rows = [{**variant, **msgspec.to_builtins(score)} for score in of.scores]
-    reports = ((place(run), run.path.name) for run in of.runs)
+    first, source, k = repeats.runs[0].manifest, repeats.runs[0].source, repeats.k
+    variant, place = msgspec.to_builtins(first.variant), beside(repeats.path / PAGE)
+    rows = [{**variant, **msgspec.to_builtins(score)} for score in repeats.scores]
+    reports = ((place(run), run.path.name) for run in repeats.runs)
     links = (Markup('<p><a href="{}">Report of {}</a></p>').format(*each) for each in reports if each[0])
     return Study(
-        "repeats", f"{k} repeats of {first.variant} on {source}", headline(of),
+        "repeats", f"{k} repeats of {first.variant} on {source}", headline(repeats),
         [
-            f"{k} repeats × {len(first.seeds)} channel seeds of {len(of.runs[0].grid.episodes)} episodes "
-            f"at temperature {first.temperature:g}. Each repeat is a whole run with its own sampling seed, "
-            "and with the same episodes and channel seeds, so they differ only in the random draws of the "
-            "model's answers. 95 % intervals are over episodes. All figures are in repeats.csv."
+            f"{k} repeats × {len(first.seeds)} channel seeds of {len(repeats.runs[0].grid.episodes)} "
+            f"episodes at temperature {first.temperature:g}. Each repeat is a whole run with its own "
+            "sampling seed, and with the same episodes and channel seeds, so they differ only in the "
+            "random draws of the model's answers. 95 % intervals are over episodes. All figures are in "
+            "repeats.csv."
         ],
-        list(_tables(of)), {"repeats": pd.DataFrame(rows)},
+        list(_tables(repeats)), {"repeats": pd.DataFrame(rows)},
         {
-            "sources": [{"name": first.variant.model}], "runs": [run.path.name for run in of.runs],
+            "sources": [{"name": first.variant.model}], "runs": [run.path.name for run in repeats.runs],
             "temperature": first.temperature,
-            "sampling_seeds": [run.manifest.sampling_seed for run in of.runs],
-            "dataset": source, "conditions": list(of.conditions), "versions": versions(),
+            "sampling_seeds": [run.manifest.sampling_seed for run in repeats.runs],
+            "dataset": source, "conditions": list(repeats.conditions), "versions": versions(),
         },
         {
-            "repeats": str(of.path), "runs": [str(run.path) for run in of.runs],
+            "repeats": str(repeats.path), "runs": [str(run.path) for run in repeats.runs],
             "temperature": first.temperature, "figures": rows,
         },
-        caveats=said({run.path.name: run for run in of.runs}, lambda run: caveats(run.manifest, run.scores)),
+        caveats=said(
+            {run.path.name: run for run in repeats.runs}, lambda run: caveats(run.manifest, run.scores)
+        ),
         more=Markup("\n").join(links),
     )  # fmt: skip
 
 
-def _tables(of: Repeats) -> Iterator[Table]:
-    k, episodes = of.k, len(of.runs[0].grid.episodes)
+def _tables(repeats: Repeats) -> Iterator[Table]:
+    k, episodes = repeats.k, len(repeats.runs[0].grid.episodes)
 
     def cells(condition: str, *metrics: str) -> list[str]:
-        return [shown(of.estimate(condition, metric)) for metric in metrics]
+        return [shown(repeats.estimate(condition, metric)) for metric in metrics]
 
     yield Table(
         "Decisions", ("condition", "decisions flip, %", "same in all, %", "n", "variance between %"),
         [
-            (c, *cells(c, FLIPS, STABLE), str(of.estimate(c, FLIPS).n), *cells(c, BETWEEN))
-            for c in of.conditions
+            (c, *cells(c, FLIPS, STABLE), str(repeats.estimate(c, FLIPS).n), *cells(c, BETWEEN))
+            for c in repeats.conditions
         ],
         "A decision flips if two repeats that both reached a decision point chose different actions "
         "there. The first column is the share of such pairs; the second is the share of the n decision "
@@ -76,7 +79,7 @@ def _tables(of: Repeats) -> Iterator[Table]:
     passes, anys = ([f"{name}{j}" for j in range(2, k + 1)] for name in ("pass^", "any@"))
     heads = ("condition", "episodes succeed, %", *passes, *anys)
     yield Table(
-        "Episodes", heads, [(c, *cells(c, SUCCESS, *passes, *anys)) for c in of.conditions],
+        "Episodes", heads, [(c, *cells(c, SUCCESS, *passes, *anys)) for c in repeats.conditions],
         f"Of j repeats drawn from the {k} without replacement, pass^j: all succeed, and any@j: one or more "
         "succeeds; in "
         f"percent of n = {episodes} episodes.", terminal=(0, 1, k, len(heads) - 1),
@@ -85,14 +88,14 @@ def _tables(of: Repeats) -> Iterator[Table]:
         "Stated and sampled entropy", ("entropy of the ego's own answers", "nats", "decision points"),
         [
             (name.removesuffix("_nats").replace("_", " "), nats(e), str(e.n))
-            for name in (STATED, SAMPLED, DOUBT) if (e := of.estimate(ALL, name))
+            for name in (STATED, SAMPLED, DOUBT) if (e := repeats.estimate(ALL, name))
         ],
         "Stated: the mean entropy of the distributions in the answers. Sampled: the entropy, over "
         f"repeats, of the most probable action, with the correction of Miller and Madow. From {k} repeats "
         "it is a rough estimate, and too small on average. Points with fewer than two answers that could "
         "be read are left out.",
     )  # fmt: skip
-    if points := of.wavering(MOST_POINTS):
+    if points := repeats.wavering(MOST_POINTS):
         yield Table(
             "Where most pairs of repeats disagree",
             ("decision point", "condition", "pairs that differ, %", "actions chosen"),
@@ -103,7 +106,7 @@ def _tables(of: Repeats) -> Iterator[Table]:
                 )
                 for point in points
             ],
-            f"Over all repeats and channel seeds. harness report {of.runs[0].path.name}, typed in this "
+            f"Over all repeats and channel seeds. harness report {repeats.runs[0].path.name}, typed in this "
             "folder, shows the prompts and answers.",
         )  # fmt: skip
 
@@ -113,17 +116,17 @@ def nats(e: Estimate) -> str:
     return shown(e, NATS)
 
 
-def headline(of: Repeats) -> list[str]:
+def headline(repeats: Repeats) -> list[str]:
     """Say how often decisions flip, how much of success is chance, and what the ego states of it."""
-    return [_flips(of), *_between(of), *_doubt(of)]
+    return [_flips(repeats), *_between(repeats), *_doubt(repeats)]
 
 
-def _flips(of: Repeats) -> str:
-    known = [c for c in of.conditions if not math.isnan(of.estimate(c, FLIPS).value)]
-    m, k = of.runs[0].manifest, of.k
-    c = max(known or of.conditions, key=lambda c: of.estimate(c, FLIPS).value)
-    flips, once = of.estimate(c, FLIPS), of.estimate(c, SUCCESS)
-    everywhere, anywhere = of.estimate(c, f"pass^{k}"), of.estimate(c, f"any@{k}")
+def _flips(repeats: Repeats) -> str:
+    known = [c for c in repeats.conditions if not math.isnan(repeats.estimate(c, FLIPS).value)]
+    m, k = repeats.runs[0].manifest, repeats.k
+    c = max(known or repeats.conditions, key=lambda c: repeats.estimate(c, FLIPS).value)
+    flips, once = repeats.estimate(c, FLIPS), repeats.estimate(c, SUCCESS)
+    everywhere, anywhere = repeats.estimate(c, f"pass^{k}"), repeats.estimate(c, f"any@{k}")
     return (
         f"Asked again at temperature {m.temperature:g}, {m.variant} decides differently in {shown(flips)} % "
         f"of decisions under {c} (n = {flips.n} decision points). {shown(once)} % of its episodes succeed, "
@@ -132,8 +135,8 @@ def _flips(of: Repeats) -> str:
     )
 
 
-def _between(of: Repeats) -> Iterator[str]:
-    shares = {c: e for c in of.conditions if not math.isnan((e := of.estimate(c, BETWEEN)).value)}
+def _between(repeats: Repeats) -> Iterator[str]:
+    shares = {c: e for c in repeats.conditions if not math.isnan((e := repeats.estimate(c, BETWEEN)).value)}
     if shares:
         c = min(shares, key=lambda c: shares[c].value)
         yield (
@@ -142,8 +145,8 @@ def _between(of: Repeats) -> Iterator[str]:
         )
 
 
-def _doubt(of: Repeats) -> Iterator[str]:
-    stated, sampled, more = (of.estimate(ALL, name) for name in (STATED, SAMPLED, DOUBT))
+def _doubt(repeats: Repeats) -> Iterator[str]:
+    stated, sampled, more = (repeats.estimate(ALL, name) for name in (STATED, SAMPLED, DOUBT))
     if math.isnan(more.value):
         return
     verdict = "not clearly more or less than its repeats show"

@@ -17,11 +17,11 @@ from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
-from harness.core.multiplicity import holm
 from harness.core.statistics import Estimate, resampled, resampled_estimate
 from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
 from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.replayed_run import ReplayedRun
+from harness.studies.study import corrected
 
 RESAMPLES = 2000
 SHARES = np.arange(0.0, 1.0, 0.1)  # of decision points that ask nobody, at the thresholds that are tried
@@ -73,20 +73,20 @@ class Play:
         return {**means, "latency_ms": means["latency_ms"] / decisions}
 
 
-def plays(made: Choices, point: OperatingPoint, settings: Sequence[Setting]) -> list[Play]:
+def plays(choices: Choices, point: OperatingPoint, settings: Sequence[Setting]) -> list[Play]:
     """Play settings of one schedule; what asking is worth by it is worked out once."""
-    worths = made.worths(settings[0].at(point))
-    rules = [made.scheduled(setting.at(point), worths) for setting in settings]
-    return [Play(s, *made.played(rule)) for s, rule in zip(settings, rules, strict=True)]
+    worths = choices.worths(settings[0].at(point))
+    rules = [choices.scheduled(setting.at(point), worths) for setting in settings]
+    return [Play(s, *choices.played(rule)) for s, rule in zip(settings, rules, strict=True)]
 
 
-def settings(made: Choices, point: OperatingPoint, schedule: str) -> list[Setting]:
+def settings(choices: Choices, point: OperatingPoint, schedule: str) -> list[Setting]:
     """Return the settings to try: tenths of what asking is worth, the own threshold, and 0."""
     most = range(1, point.max_helpers + 1)
     own = replace(point, schedule=schedule, threshold=None)
     if schedule != PAPER and SCHEDULES[schedule].threshold is None:
         return [Setting(schedule, None, m) for m in most]
-    best = [np.fmax.reduce(worth, axis=-1) for worth in made.worths(own)]
+    best = [np.fmax.reduce(worth, axis=-1) for worth in choices.worths(own)]
     tenths = np.nanquantile(np.concatenate(best), SHARES).tolist()
     tried = {0.0, own.asks_above, *(float(f"{value:.3g}") for value in tenths if value > 0)}
     return [Setting(schedule, threshold, m) for threshold in sorted(tried) for m in most]
@@ -125,7 +125,7 @@ class Compared:
     @property
     def paper(self) -> Play:
         """The paper's schedule at the operating point's tau, with all the helpers that it allows."""
-        return _found(self.plays[PAPER], self._paper)
+        return _at(self.plays[PAPER], self._paper)
 
     @property
     def _paper(self) -> Setting:
@@ -134,7 +134,7 @@ class Compared:
     @property
     def everybody(self) -> Play:
         """Always asking all the helpers that the point allows."""
-        return _found(self.plays[ALWAYS], Setting(ALWAYS, None, self.point.max_helpers))
+        return _at(self.plays[ALWAYS], Setting(ALWAYS, None, self.point.max_helpers))
 
     @cached_property
     def weights(self) -> Floats:
@@ -150,12 +150,12 @@ class Compared:
         """
         if not self.tune:
             threshold = self.point.tau_nats if schedule == PAPER else SCHEDULES[schedule].threshold
-            return _found(self.plays[schedule], Setting(schedule, threshold, self.point.max_helpers))
-        budget = self.budget * _found(self.tune[PAPER], self._paper).messages.mean()
+            return _at(self.plays[schedule], Setting(schedule, threshold, self.point.max_helpers))
+        budget = self.budget * _at(self.tune[PAPER], self._paper).messages.mean()
         cheapest = min(self.tune[schedule], key=lambda play: play.messages.mean())
         within = [play for play in self.tune[schedule] if play.messages.mean() <= budget] or [cheapest]
         best = max(within, key=lambda play: (round(float(play.success.mean()), 9), -play.messages.mean()))
-        return _found(self.plays[schedule], best.setting)
+        return _at(self.plays[schedule], best.setting)
 
     @property
     def energy(self) -> bool:
@@ -217,11 +217,9 @@ class Compared:
     @cached_property
     def rows(self) -> list[Chosen]:
         """The paper's schedule, every one at the setting chosen for it, and last the oracle."""
-        found = [self.paper, *map(self.chosen, self.names), self.oracle]
-        raw = [p_value(SUCCESS, play.success.T, self.paper.success.T) for play in found[1:-1]]
-        corrected = iter(holm([p for p in raw if p is not None]))
-        p_values = [None, *(None if p is None else next(corrected) for p in raw), None]
-        return [self._row(play, p) for play, p in zip(found, p_values, strict=True)]
+        plays = [self.paper, *map(self.chosen, self.names), self.oracle]
+        raw = [p_value(SUCCESS, play.success.T, self.paper.success.T) for play in plays[1:-1]]
+        return [self._row(play, p) for play, p in zip(plays, [None, *corrected(raw), None], strict=True)]
 
     def _row(self, play: Play, p: float | None) -> Chosen:
         success = self._resampled([play.success, self.paper.success, self.oracle.success])
@@ -269,22 +267,22 @@ def compare(
     """
     if why := point.idle("schedule"):
         raise UserError(f"--condition {printable(point.name)}: no schedule changes anything: {why}")
-    made = choices(stored, point, seeds, progress)
-    apart = choices(tune, point, seeds, progress) if tune else None
-    found: dict[str, list[Play]] = {}
-    tuned: dict[str, list[Play]] = {}
+    run = choices(stored, point, seeds, progress)
+    tune_run = choices(tune, point, seeds, progress) if tune else None
+    of_run: dict[str, list[Play]] = {}
+    of_tune: dict[str, list[Play]] = {}
     for name in dict.fromkeys((PAPER, NEVER, ALWAYS, RANDOM, *names)):
-        tried = settings(apart or made, point, name)
-        found[name] = plays(made, point, tried)
-        if apart:
-            tuned[name] = plays(apart, point, tried)
+        tried = settings(tune_run or run, point, name)
+        of_run[name] = plays(run, point, tried)
+        if tune_run:
+            of_tune[name] = plays(tune_run, point, tried)
         progress(1)
-    bound = Play(Setting(ORACLE, None, point.max_helpers), *made.oracle())
-    return Compared(stored.name, point, tuple(names), found, tuned, bound, budget)
+    bound = Play(Setting(ORACLE, None, point.max_helpers), *run.oracle())
+    return Compared(stored.name, point, tuple(names), of_run, of_tune, bound, budget)
 
 
-def _found(played: Sequence[Play], setting: Setting) -> Play:
-    return next(play for play in played if play.setting == setting)
+def _at(plays: Sequence[Play], setting: Setting) -> Play:
+    return next(play for play in plays if play.setting == setting)
 
 
 def _area(success: Floats, messages: Floats, ranks: Floats, most: Floats) -> Floats:

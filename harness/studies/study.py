@@ -15,7 +15,7 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT
 from harness.core.files import bytes_of, neutral, replacing, text_of, write_whole
-from harness.core.multiplicity import LEVEL
+from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.drawing.pictures import FORMATS, save
 from harness.report.library import picture
@@ -83,6 +83,12 @@ def p_cell(p: float | None) -> str:
 def ends(e: Estimate) -> dict[str, Any]:
     """Return an estimate, its 95 % interval and its n as columns of a row."""
     return {"value": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n}
+
+
+def corrected(p_values: Sequence[float | None]) -> list[float | None]:
+    """Return p-values corrected together by Holm's method; None stays None."""
+    known = iter(holm([p for p in p_values if p is not None]))
+    return [None if p is None else next(known) for p in p_values]
 
 
 def percent(row: Any, value: str, low: str, high: str) -> str:

@@ -135,14 +135,8 @@ def ask(
         raise UserError(
             f"--out {printable(out)} already holds finished twins; choose another folder or delete it"
         )
-    [identity] = spread(
-        _identity,
-        [questions.spec],
-        workers,
-        lambda done: None,
-        lambda of: f"the model {of.ego.card.name}",
-        False,
-    )
+    name = f"the model {questions.spec.ego.card.name}"
+    [identity] = spread(_identity, [questions.spec], workers, lambda done: None, lambda spec: name, False)
     begun = questions.begin(identity)
     if left := work.begun(out, work.Begun):
         work.same(out, begun.settings, left.settings)
@@ -151,11 +145,11 @@ def ask(
             (number, questions.dataset.scenes(ids), read_kept(_answers_file(place, number)))
             for number, ids in questions.points().items()
         ]
-        found: dict[int, list[Pair]] = {}
+        by_episode: dict[int, list[Pair]] = {}
         tally = Tally()
 
         def took(at: int, asked: tuple[list[Pair], list[Answer]]) -> None:
-            found[at], answers = asked
+            by_episode[at], answers = asked
             tally.add(answers)
             answered = [answer for answer in answers if answer.error is None]
             write_whole(_answers_file(place, points[at][0]), lines(answered))
@@ -167,7 +161,7 @@ def ask(
         each(asked, points, workers, took, lambda point: f"episode {point[0]}", repeatable=False)
         if tally.missing:
             raise Unanswered(str(tally))
-        pairs = [pair for at in range(len(points)) for pair in found[at]]
+        pairs = [pair for at in range(len(points)) for pair in by_episode[at]]
         if not pairs:
             raise UserError(f"--twin: none applies to what was drawn: {questions.lacks(questions.twins)}")
         return pairs, tally.counts()

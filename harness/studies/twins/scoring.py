@@ -64,10 +64,10 @@ def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bo
 def rows(pairs: Sequence[Pair], twins: Sequence[Twin]) -> list[Row]:
     """Return a row a twin and role that was asked."""
     return [
-        _row(twin, role, of)
+        _row(twin, role, some)
         for twin in twins
         for role in ROLES
-        if (of := [pair for pair in pairs if (pair.twin, pair.role) == (twin.name, role)])
+        if (some := [pair for pair in pairs if (pair.twin, pair.role) == (twin.name, role)])
     ]
 
 
@@ -105,11 +105,11 @@ def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
         UserError: its twin has no row, or its number is not known.
     """
     shown = f"--fail-if {printable(gate.text)!r}"
-    of = [row for row in table if gate.condition in (None, row.twin.name)]
-    if not of:
+    judged = [row for row in table if gate.condition in (None, row.twin.name)]
+    if not judged:
         raise unknown(f"twin of {shown}", gate.condition or "", {row.twin.name for row in table})
     failed = []
-    for row in of:
+    for row in judged:
         value, where = float(getattr(getattr(row, gate.metric), gate.end)), f"{row.twin.name} {row.role}"
         if np.isnan(value):
             # A gate that passes because nothing is known would guard nothing.
