@@ -76,19 +76,12 @@ def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
 
 @dataclass(frozen=True)
 class Together:
-    """Several runs in one folder.
+    """Several runs in one folder."""
 
-    Attributes:
-        specs: by the name of the run's own folder in it.
-        what: they are when all is done: `a finished suite`.
-        marker: the file that is written then.
-        others: files that are written before it.
-    """
-
-    specs: "Mapping[str, Spec]"
-    what: str
-    marker: str
-    others: Sequence[str]
+    specs: "Mapping[str, Spec]"  # by the name of the run's own folder in it
+    what: str  # they are when all is done: `a finished suite`
+    marker: str  # the file that is written then
+    others: Sequence[str]  # files that are written before it
 
     def check(self, out: Path) -> None:
         """Raise UserError unless a folder is new, or these runs were stopped in it."""

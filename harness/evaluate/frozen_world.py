@@ -22,15 +22,10 @@ from harness.world.scenario import Scenario
 
 @dataclass(frozen=True)
 class FrozenSource:
-    """A dataset that is walked.
+    """A dataset that is walked."""
 
-    Attributes:
-        dataset: the dataset, cut to the selected episodes.
-        selection: how they were selected.
-    """
-
-    dataset: Dataset
-    selection: Selection = ALL
+    dataset: Dataset  # the dataset, cut to the selected episodes
+    selection: Selection = ALL  # how they were selected
     kind: ClassVar[World] = "frozen"
 
     @property

@@ -53,43 +53,28 @@ class Columns(Protocol):
 
 @dataclass(frozen=True)
 class Metric:
-    """One metric, 0 or more. It has one function, or is computed where the summary is.
+    """One metric, 0 or more. It has one function, or is computed where the summary is."""
 
-    Attributes:
-        name: its name in tables, with the unit at the end.
-        meaning: its meaning, in words for people.
-        unit: how it is written.
-        better: which change is better.
-        interval: `rate` for a share of events, whose interval is Wilson's; `mean` for Student's t.
-        most: the greatest value that it can have.
-        primary: whether the p of its differences is corrected (decision 0084); all others are exploratory.
-        label: its name for people; by default the name with spaces.
-        decisions: returns its values for decisions (n,), whose mean is the episode's.
-        episodes: returns an episode's value; None where unknown.
-        answers: returns its values for the answers (n,) of one role; NaN where unknown.
-        role: whose answers.
-        percentile: the percent of all decisions whose latency is at most so long.
-        total: whether an episode has the sum over its decisions instead of the mean.
-        world: the world in which it is known; None for every world.
-        optional: whether a run in which it is nowhere known has no row of it.
-    """
-
-    name: str
-    meaning: str
-    unit: Unit
-    better: Better
+    name: str  # its name in tables, with the unit at the end
+    meaning: str  # its meaning, in words for people
+    unit: Unit  # how it is written
+    better: Better  # which change is better
+    # `rate` for a share of events, whose interval is Wilson's; `mean` for Student's t
     interval: Literal["rate", "mean"] = "mean"
-    most: float = math.inf
+    most: float = math.inf  # the greatest value that it can have
+    # whether the p of its differences is corrected (decision 0084); all others are exploratory
     primary: bool = False
-    label: str = ""
+    label: str = ""  # its name for people; by default the name with spaces
+    # returns its values for decisions (n,), whose mean is the episode's
     decisions: Callable[[Any], Floats] | None = None
-    episodes: Callable[[Episode], Any] | None = None
+    episodes: Callable[[Episode], Any] | None = None  # returns an episode's value; None where unknown
+    # returns its values for the answers (n,) of one role; NaN where unknown
     answers: Callable[[Answers], Floats] | None = None
-    role: Role | None = None
-    percentile: int | None = None
-    total: bool = False
-    world: World | None = None
-    optional: bool = False
+    role: Role | None = None  # whose answers
+    percentile: int | None = None  # the percent of all decisions whose latency is at most so long
+    total: bool = False  # whether an episode has the sum over its decisions instead of the mean
+    world: World | None = None  # the world in which it is known; None for every world
+    optional: bool = False  # whether a run in which it is nowhere known has no row of it
 
     def __post_init__(self) -> None:
         if not self.label:
@@ -323,17 +308,11 @@ def entry(name: str) -> Metric:
 
 @dataclass(frozen=True)
 class Grid:
-    """The grid of conditions, seeds and episodes; each cell is one episode of a run.
+    """The grid of conditions, seeds and episodes; each cell is one episode of a run."""
 
-    Attributes:
-        conditions: the conditions' names.
-        seeds: seeds of the channel's draws.
-        episodes: the episodes' numbers.
-    """
-
-    conditions: tuple[str, ...]
-    seeds: tuple[int, ...]
-    episodes: tuple[int, ...]
+    conditions: tuple[str, ...]  # the conditions' names
+    seeds: tuple[int, ...]  # seeds of the channel's draws
+    episodes: tuple[int, ...]  # the episodes' numbers
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -63,15 +63,9 @@ def distill(
 
     Layouts and stages that a killed call finished are read, and a stage that it had begun resumes.
 
-    Args:
-        curriculum: what it learns from.
-        plan: how long.
-        out: folder to make; its name is the model's.
-        drawing: called with the number of layouts just drawn.
-        progress: called with the stage, the sequences seen in it and the loss.
-        device: `cpu` or `cuda`.
-        threads: on a CPU; None is PyTorch's choice.
-        workers: who draws layouts.
+    The name of `out`, a folder to make, becomes the model's. `drawing` is called with the number of layouts
+    just drawn, `progress` with the stage, the sequences seen in it and the loss. Without `threads`, PyTorch
+    chooses how many it takes on a CPU.
 
     Returns:
         What the model card states: data, plan, curves, and the KL of the read-out on held-out layouts.

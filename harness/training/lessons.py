@@ -89,14 +89,8 @@ def draw(
 ) -> Lessons:  # fmt: skip
     """Draw the layouts that the folder `place` lacks, a file each, and read all of them.
 
-    Args:
-        scenario: what is decided in.
-        prompts: versions that are learnt.
-        layouts: how many; number n has layout seed `seed + n`.
-        seed: first layout seed.
-        place: folder of what is drawn, from which a killed call resumes.
-        workers: who draws.
-        progress: called with the number of layouts just done.
+    A killed call resumes from that folder. Layout number n of `layouts` has layout seed `seed + n`;
+    `progress` is called with the number of layouts just done.
     """
     place.mkdir(parents=True, exist_ok=True)
     files = [place / f"{n:05d}.json" for n in range(layouts)]

@@ -43,12 +43,8 @@ EYES = {  # its vision encoder: a quarter of the weights
 def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
     """Make a `Qwen3ForCausalLM` of half a million random weights, or a `Qwen3VLForConditionalGeneration`.
 
-    Matrices are normal with a deviation of 1/sqrt(fan-in), less on what adds to the residual stream.
-
-    Args:
-        tokenizer: its `tokenizers.Tokenizer`.
-        seed: of the weights.
-        sees: whether it takes pictures.
+    Matrices are normal with a deviation of 1/sqrt(fan-in), less on what adds to the residual stream. One that
+    `sees` takes pictures; `tokenizer` is a `tokenizers.Tokenizer`.
     """
     import torch
     import transformers

@@ -52,11 +52,8 @@ def write(run: Run, path: Path, report_seeds_too: bool, dataset: Path | None = N
 def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
     """Yield what each viewer was asked, fusion calls included, and the answer that the tree asks for.
 
-    A decision point after which no action succeeds teaches nothing and is left out.
-
-    Args:
-        run: on frozen scenes.
-        folder: its dataset's; None where the run states.
+    A decision point after which no action succeeds teaches nothing and is left out. The dataset is the one
+    that the run states, or lies in `folder`.
 
     Raises:
         UserError: its dataset or prompt is not here as it was.

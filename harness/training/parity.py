@@ -74,12 +74,9 @@ def compare(
 ) -> Comparison:
     """Hold a GGUF card's model against the same model on transformers.
 
-    Args:
-        reference: a card on transformers: of a checkpoint, or of a GGUF file, which is unpacked.
-        gguf: a card on llama-cpp.
-        asked: requests for JSON; empty to compare read-outs alone.
-        letters: requests for a read-out.
-        progress: called with 1 after each of `PASSES` passes over the prompts, or with those left out.
+    `reference` is a card on transformers: of a checkpoint, or of a GGUF file, which is unpacked. Of `asked`,
+    requests for JSON, there may be none; `letters` ask for a read-out. `progress` is called with 1 after each
+    of `PASSES` passes over the prompts, or with those left out.
 
     Raises:
         UserError: weights that are not there or do not load.

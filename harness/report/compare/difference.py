@@ -21,24 +21,18 @@ from harness.runs.sources import prompt_of
 
 @dataclass(frozen=True)
 class Difference:
-    """One metric in one condition, in its own unit (shares from 0 to 1).
+    """One metric in one condition, in its own unit (shares from 0 to 1)."""
 
-    Attributes:
-        metric: its name.
-        a: mean of A over the episodes and seeds in which both know it; of a latency percentile, itself.
-        b: mean of B over the same.
-        change: B - A, paired by episode and seed, with a 95 % interval over episodes
-            (`harness.runs.metrics.difference`); of a latency percentile, a bootstrap's.
-        p_value: of no difference, of this one alone, by its interval; None where there is none.
-        p_corrected: by Holm's method (Holm 1979) for the primary metrics in all conditions; None of any other
-            metric, which is exploratory.
-    """
-
-    metric: str
-    a: float
-    b: float
+    metric: str  # its name
+    a: float  # mean of A over the episodes and seeds in which both know it; of a latency percentile, itself
+    b: float  # mean of B over the same
+    # B - A, paired by episode and seed, with a 95 % interval over episodes
+    # (`harness.runs.metrics.difference`); of a latency percentile, a bootstrap's
     change: Estimate
+    # of no difference, of this one alone, by its interval; None where there is none
     p_value: float | None = None
+    # by Holm's method (Holm 1979) for the primary metrics in all conditions; None of any other metric, which
+    # is exploratory
     p_corrected: float | None = None
 
     @property
@@ -49,80 +43,50 @@ class Difference:
 
 @dataclass(frozen=True)
 class Flip:
-    """An episode that succeeds in one run and not in the other.
+    """An episode that succeeds in one run and not in the other."""
 
-    Attributes:
-        episode: its number.
-        seeds: in which it does.
-        a: how it ends in A: `success`, or how it fails.
-        b: how it ends in B.
-    """
-
-    episode: int
-    seeds: tuple[int, ...]
-    a: str
-    b: str
+    episode: int  # its number
+    seeds: tuple[int, ...]  # in which it does
+    a: str  # how it ends in A: `success`, or how it fails
+    b: str  # how it ends in B
 
 
 @dataclass(frozen=True)
 class InCondition:
-    """What changed in one condition.
+    """What changed in one condition."""
 
-    Attributes:
-        condition: its name.
-        differences: metrics that both runs know.
-        test: of the difference in success; None for a single episode whose success depends on the seed.
-        gained: episodes from failure to success.
-        lost: episodes from success to failure.
-        decisions: how many both runs have.
-        flips: those whose action is another; what B's gave away first.
-    """
-
-    condition: str
-    differences: tuple[Difference, ...]
+    condition: str  # its name
+    differences: tuple[Difference, ...]  # metrics that both runs know
+    # of the difference in success; None for a single episode whose success depends on the seed
     test: SuccessTest | None
-    gained: tuple[Flip, ...]
-    lost: tuple[Flip, ...]
-    decisions: int
-    flips: tuple[DecisionFlip, ...]
+    gained: tuple[Flip, ...]  # episodes from failure to success
+    lost: tuple[Flip, ...]  # episodes from success to failure
+    decisions: int  # how many both runs have
+    flips: tuple[DecisionFlip, ...]  # those whose action is another; what B's gave away first
 
 
 @dataclass(frozen=True)
 class AnswersFlipped:
-    """Answers to the same requests that were read with another verdict.
+    """Answers to the same requests that were read with another verdict."""
 
-    Attributes:
-        role: of who answered: `ego`, `helper` or `merge`.
-        a: verdict in A: `strict`, `recovered` or `failed`.
-        b: verdict in B.
-        requests: their ids; first of decisions by which B gave success away, then of those by which A did.
-    """
-
-    role: str
-    a: str
-    b: str
+    role: str  # of who answered: `ego`, `helper` or `merge`
+    a: str  # verdict in A: `strict`, `recovered` or `failed`
+    b: str  # verdict in B
+    # their ids; first of decisions by which B gave success away, then of those by which A did
     requests: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """B against A.
+    """B against A."""
 
-    Attributes:
-        pair: the two runs.
-        settings: name, A's value and B's of every setting in which they differ; None where one has none.
-        conditions: what changed in each.
-        answers: which answers changed their verdict.
-        answers_in_both: answers by role that both runs have.
-        prompts: what differs between the texts; None where they are the same; a sentence that says why it is
-            not known.
-    """
-
-    pair: Pair
+    pair: Pair  # the two runs
+    # name, A's value and B's of every setting in which they differ; None where one has none
     settings: tuple[tuple[str, str | None, str | None], ...]
-    conditions: tuple[InCondition, ...]
-    answers: tuple[AnswersFlipped, ...]
-    answers_in_both: dict[str, int]
+    conditions: tuple[InCondition, ...]  # what changed in each
+    answers: tuple[AnswersFlipped, ...]  # which answers changed their verdict
+    answers_in_both: dict[str, int]  # answers by role that both runs have
+    # what differs between the texts; None where they are the same; a sentence that says why it is not known
     prompts: PromptChange | str | None
 
 
