@@ -31,39 +31,31 @@ class Request:
 
     id: str  # unique in a run, `<scene>/<viewer>`; a repair turn has the suffix `AGAIN`
     role: Role  # which prompt of the version was rendered, and which schema the answer has
-    # chat messages, `{"role": "system" | "user" | "assistant", "content": text}`
-    messages: tuple[Mapping[str, str], ...]
+    messages: tuple[Mapping[str, str], ...]  # `{"role": "system" | "user" | "assistant", "content": text}`
     actions: tuple[str, ...]  # meta-action names, in the environment's order
     max_tokens: int  # most tokens the answer may have
     form: str = "distribution"  # what the prompt asks for (`Prompt.form`)
-    # how the model answers. `json`: it writes freely. `constrained`: it fills in numbers and choices of a
-    # fixed text. `readout`: the messages ask for one letter (`harness.prompts.readout`), and the letters'
-    # probabilities are the answer.
+    # How the model answers. `json`: it writes freely. `constrained`: it fills in numbers and choices of a
+    # fixed text. `readout`: it is asked for one letter, and the letters' probabilities are the answer.
     answer: AnswerMode = "json"
-    # of a read-out over cyclic orders, the chat with each further order of the actions behind the letters;
-    # empty if the letters are read once
+    # Of a read-out over cyclic orders, the chat with each further order of the actions behind the letters.
     orders: tuple[tuple[Mapping[str, str], ...], ...] = ()
-    # of a read-out, its chats with the list of actions reversed, `messages` and `orders`, which are asked as
-    # a request of their own (`harness.evaluate.flip`); empty if that is not asked
+    # Of a read-out, its chats with the list of actions reversed, `messages` and `orders`, which are asked as
+    # a request of their own (`harness.evaluate.flip`); empty if that is not asked.
     flips: tuple[tuple[Mapping[str, str], ...], ...] = ()
     extension: str = ""  # further members of its answer (`Shape.extension`)
-    # whether probabilities of `json` that sum to other than 1 fail the answer, or are divided by their sum
-    sums: Sums = "refuse"
+    sums: Sums = "refuse"  # what is done where probabilities of `json` do not sum to 1: fail, or divide
     thinking: bool = False  # whether the model is asked to think first (if its template can switch that)
     reasons_first: bool = False  # whether the prompt asks for reasons before the answer
-    # 0 takes the likeliest token; above, tokens are drawn from softmax(logits / temperature)
-    temperature: float = 0.0
-    # number of the answer among several to one question, which seeds its draws; 0 if there is one
-    sample: int = 0
-    # whether the answer's time is measured; a server then streams it, which shows the first token
-    timed: bool = False
+    temperature: float = 0.0  # of softmax(logits / temperature), of which tokens are drawn; 0: the likeliest
+    sample: int = 0  # number of the answer among several to one question, which seeds its draws
+    timed: bool = False  # whether the time is measured; a server then streams, which shows the first token
     agent: int = 0  # which of the run's agents is asked: 0 is the ego's
     image: Image | None = None  # the picture before the text of the last user message; None if there is none
-    # the viewer's own scene graph, for backends without a language model; it holds nothing that the prompt's
-    # author could not see
+    # The viewer's own scene graph, for backends without a language model; it holds nothing that the prompt's
+    # author could not see.
     view: "SceneGraph | None" = None
-    # scene graph with everything in view; None unless the card is `privileged`
-    truth: "SceneGraph | None" = None
+    truth: "SceneGraph | None" = None  # the same with everything in view, if the card is `privileged`
     scenario: "Scenario | None" = None  # scenario of the view; only backends that read the view read it
 
     @property
@@ -100,32 +92,27 @@ class Completion:
 
     request_id: str
     text: str  # the model's text, unchanged; empty on an error
-    # tokens of the prompt; None if the engine has no tokenizer. Of several orders, what they begin with
-    # counts once in process, and as often as a server counts it.
+    # None if the engine has no tokenizer. Of several orders, what they begin with counts once in process, and
+    # as often as a server counts it.
     prompt_tokens: int | None
     completion_tokens: int | None  # tokens of the answer; None if the engine has no tokenizer
     finish_reason: FinishReason  # `stop`, `length` (cut off by max_tokens) or `error`
-    # time of this answer if its request ran alone (batch_size 1), else None: the wall time of a batch is not
-    # the latency of an answer
+    # Time of this answer if its request ran alone (batch_size 1), else None: the wall time of a batch is not
+    # the latency of an answer.
     seconds: float | None
     batch_size: int  # number of requests that went through the engine together
     error: str | None = None  # the engine's message if finish_reason is `error`
     label_mass: float | None = None  # total probability of the letters in a `readout`; None otherwise
     retries: int = 0  # failed attempts before this one; their time is in `seconds`
     cached: bool = False  # whether it comes from the cache, in which case it has no seconds
-    # declared seconds of this answer beyond its card's latency (the slow tail of a proxy)
-    slow_s: float = 0.0
-    # time to first token (TTFT), prefill included; None if it is not known
-    first_token_s: float | None = None
-    # time per output token (TPOT, see `per_token_s`); None if there is only one token
-    token_s: float | None = None
-    # how much of a read-out over several orders follows the letter, 0 to 1 (`harness.backends.orders`); None
-    # otherwise, like the next
+    slow_s: float = 0.0  # declared seconds beyond its card's latency (the slow tail of a proxy)
+    first_token_s: float | None = None  # time to first token (TTFT), prefill included; None if not known
+    token_s: float | None = None  # time per output token (TPOT, see `per_token_s`); None of only one token
+    # How much of a read-out over several orders follows the letter, 0 to 1 (`harness.backends.orders`), and
+    # whether one letter is the likeliest in every order; None otherwise.
     letter_share: float | None = None
-    follows_letter: bool | None = None  # whether one letter is the likeliest in every order
-    # of a replayed read-out, whether its likeliest action changed in the reversed list; None where that is
-    # not known
-    flipped: bool | None = None
+    follows_letter: bool | None = None
+    flipped: bool | None = None  # of a replayed read-out, whether its likeliest changed in the reversed list
 
 
 def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None) -> float | None:

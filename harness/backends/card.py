@@ -23,8 +23,7 @@ Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z", description="64 digits 
 class Latency:
     """Declared time of one answer."""
 
-    # `card` means `inference_s`; `paper`, for a card that declares no time, the paper's 145 ms
-    source: LatencySource
+    source: LatencySource  # `card` means `inference_s`, `paper` the paper's 145 ms if no time is declared
     inference_s: Seconds | None  # declared seconds of one answer; None for the paper's
     basis: str  # where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date"
 
@@ -37,43 +36,34 @@ class Latency:
 class Card:
     """One model on one engine."""
 
-    # file stem of the card, `<stem>:<engine>`, name of the directory or GGUF file, hub id, or `replay:<run>`
-    name: str
+    name: str  # stem of its file, `<stem>:<engine>`, name of a directory or file, hub id, or `replay:<run>`
     engine: str
     description: str  # one line for people
     latency: Latency
-    # directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for `replay`;
-    # the server's name of the model for `openai`; None without a model
+    # Directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for `replay`;
+    # the server's name of the model for `openai`; None without a model.
     weights: str | None = None
-    # name of the GGUF file in `weights`; None if `weights` is the file itself, or no file is needed
-    file: str | None = None
+    file: str | None = None  # GGUF file in `weights`, unless `weights` is the file itself
     revision: str | None = None  # branch, tag or commit on the hub; None means its default branch
-    # digest of the GGUF file, or of a checkpoint's model.safetensors, checked on loading
-    sha256: Sha256 | None = None
-    # whether the hub gives the weights only to those who have accepted their licence there
-    gated: bool = False
+    sha256: Sha256 | None = None  # of the GGUF file or model.safetensors, checked on loading
+    gated: bool = False  # whether the hub gives the weights only to those who have accepted their licence
     dtype: Dtype = "auto"  # number format of a checkpoint's weights; `auto` is the checkpoint's own
-    # number format of a GGUF file's weights, for people only; the file decides
-    quantisation: str | None = None
-    # most tokens of prompt and answer together; None means the checkpoint's own limit
-    context_tokens: Count | None = None
-    # `switch` if its chat template can turn thinking on and off, `always` if it cannot be off
-    thinking: Thinking = "none"
-    # whether it sees the truth behind the occlusion: an upper reference, never a contestant
-    privileged: bool = False
+    quantisation: str | None = None  # number format of a GGUF file, for people only; the file decides
+    context_tokens: Count | None = None  # most tokens of prompt and answer; None: the checkpoint's own limit
+    thinking: Thinking = "none"  # `switch` if its template can turn it on and off, `always` if never off
+    privileged: bool = False  # whether it sees behind the occlusion: an upper reference, never a contestant
     licence: str | None = None  # SPDX id of the weights' licence, or its name if it has no id
-    # most tokens of an answer, if the model needs another limit than its prompt's
-    max_new_tokens: Count | None = None
+    max_new_tokens: Count | None = None  # of an answer, if the model needs another limit than its prompt's
     thinking_tokens: Count = 2048  # most tokens of a thought, in addition to the answer's, if asked to think
     server: Server | None = None  # the server of an `openai` model
     failures: Failures | None = None  # how often the proxy fails on purpose
     vision: Vision | None = None  # how the model takes pictures; None if it only reads text
     projector: str | None = None  # name of the GGUF file beside `file` that turns pictures into tokens
     # `first-user` puts the system text at the beginning of the first user turn, for a chat template that has
-    # no place for it; None gives it a message of its own
+    # no place for it; None gives it a message of its own.
     system: System | None = None
-    # `raw` for a model that was trained to answer by the letters in one order; None, or `cyclic`, averages a
-    # read-out over their orders, unless `--letters` says otherwise
+    # `raw` for a model that was trained on one order of the letters; None, or `cyclic`, averages a read-out
+    # over their orders, unless `--letters` says otherwise.
     letters: Letters | None = None
 
     @property

@@ -19,7 +19,7 @@ class Looks:
     `text` is an answer to the text alone, in the last answer mode that worked; None if none did.
     """
 
-    answers: dict[AnswerMode, Completion]
+    answers: dict[AnswerMode, Completion]  # one in each mode, asked alone after a warm-up
     blank: dict[AnswerMode, Completion]
     text: Completion | None
 
@@ -52,16 +52,10 @@ class Checkup:
     """Result of checking a model."""
 
     prompt: str  # the first question as the model reads it, or as a server is sent it
-    # its token ids, each with its text; None if only a server knows them
-    tokens: list[tuple[int, str]] | None
-    # number of BOS tokens that it begins with; more than one harms most models. Further on, BOS may be the
-    # mark of a turn.
-    bos_tokens: int | None
-    # text of the token with which its chat template ends an answer; None if there is no such token, and for a
-    # server's
-    turn_end: str | None
-    # what the model's own template can do, whatever its card says; None for a server's
-    thinking: Thinking | None
+    tokens: list[tuple[int, str]] | None  # its ids, each with its text; None if only a server knows them
+    bos_tokens: int | None  # BOS tokens that it begins with; more than one harms most models
+    turn_end: str | None  # text of the token that ends an answer by its chat template, if there is one
+    thinking: Thinking | None  # what the model's own template can do; None for a server's
     # one answer in each answer mode, asked alone after a warm-up; the seconds are of batch size 1
     answers: dict[AnswerMode, Completion]
     identity: dict[str, Any]

@@ -23,20 +23,14 @@ from harness.core.plugins import Plugins
 class Capabilities:
     """What an engine can do. Other code tests these capabilities, never an engine's name."""
 
-    # whether a language model writes the answers: their time can be measured, and it can be asked to fuse
-    # messages
-    language_model: bool = True
-    answer_modes: tuple[AnswerMode, ...] = ("json", "constrained", "readout")  # the supported answer modes
-    # whether it can be asked to think first: `always`, if its `card` says so, or `never`
-    thinks: Literal["always", "card", "never"] = "always"
-    # whether it is a `harness.backends.base.Rendering`: its answers can be cached, and a check can show what
-    # its model reads
-    renders: bool = True
-    # whether it loads weights here: they can be pulled, and a device and a number format can be chosen
-    has_weights: bool = False
+    language_model: bool = True  # whose answers can be timed, and which can be asked to fuse messages
+    answer_modes: tuple[AnswerMode, ...] = ("json", "constrained", "readout")
+    thinks: Literal["always", "card", "never"] = "always"  # if its `card` says so
+    renders: bool = True  # is `Rendering`: its answers can be cached, a check can show what its model reads
+    has_weights: bool = False  # loads weights, which can be pulled, and has a device and a number format
     asks_helpers: bool = True  # whether helpers are asked as well as the ego
     closed_loop: bool = True  # whether it answers for new scenes and not only for recorded ones
-    own_latency: bool = False  # whether it is a `harness.backends.base.Timed`: its answers were timed earlier
+    own_latency: bool = False  # is `Timed`: its answers were timed earlier
     reference: bool = False  # whether it is a driver that a report compares models with
     samples: bool = False  # whether it heeds a request's `temperature` and `sample` (never in a `readout`)
 
@@ -49,18 +43,12 @@ class Registration:
     capabilities: Capabilities  # what the engine can do
     card_keys: tuple[str, ...] = ()  # card keys that this engine understands and not every engine does
     required_keys: tuple[str, ...] = ()  # such keys that its cards must have
-    # packages that it needs, by the name of the module that is imported
-    packages: Mapping[str, str] = field(default_factory=dict)
+    packages: Mapping[str, str] = field(default_factory=dict)  # that it needs, by the module's name
     install: str = ""  # the command that installs them
-    # `module:function`, which returns the path of a card's weights, or raises UserError; for an engine that
-    # has weights
-    finds: str = ""
-    # `module:function`, called with a card whose weights were just fetched; empty if weights are loaded as
-    # they lie
-    prepares: str = ""
-    # `module:function`, which returns the number of tokens that a card's image processor makes of a picture
-    # of the card's size, without loading weights; empty if there is no such way
-    sees: str = ""
+    # For an engine that has weights, `module:function` of a card, each empty if there is no such thing:
+    finds: str = ""  # returns the path of its weights, or raises UserError
+    prepares: str = ""  # makes weights ready that were just fetched
+    sees: str = ""  # returns the tokens that its image processor makes of a picture, without loading weights
 
     @property
     def allowed_keys(self) -> tuple[str, ...]:

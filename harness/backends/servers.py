@@ -40,8 +40,7 @@ class Fields:
     """
 
     max_tokens: _Sent = True  # most tokens of the answer
-    # 0, or that of `--temperature`. Left out, the server draws its answers as it likes.
-    temperature: _Sent = True
+    temperature: _Sent = True  # that of `--temperature`. Left out, the server draws as it likes.
     seed: _Sent = True  # number of the answer among several to one question
     top_p: _Sent = True  # 1, if answers are drawn
     top_k: _Sent = True  # all tokens, if answers are drawn
@@ -92,8 +91,7 @@ class Server:
     # attempts after the first, if a server was busy, broke down or was not reached; of several servers, each
     # is tried at least once
     retries: Annotated[int, Meta(ge=0, le=10, description="0 to 10")] = 3
-    # log-probabilities that it is asked for in a read-out; None asks for 20, the usual limit
-    top_logprobs: _Listed | None = None
+    top_logprobs: _Listed | None = None  # asked for in a read-out; None: 20, the usual limit
     fields: Fields | None = None  # fields of a request that it is sent otherwise; None if there are none
 
     def __post_init__(self) -> None:

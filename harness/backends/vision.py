@@ -22,11 +22,9 @@ class Vision:
     height_px: Count  # their height; even, since one camera's picture is above the other's
     patch_px: Count  # side of a patch
     merge: Count  # number of patches along a side of a token's square
-    # least area of a picture; a smaller one is enlarged. None if there is no limit.
-    least_px: Count | None = None
+    least_px: Count | None = None  # least area of a picture; a smaller one is enlarged
     most_px: Count | None = None  # greatest area; a larger one is scaled down. None if there is no limit.
-    # width and height that every picture is scaled to; None if pictures keep their size
-    scaled_to_px: tuple[Count, Count] | None = None
+    scaled_to_px: tuple[Count, Count] | None = None  # size that every picture is scaled to, if any
 
     def __post_init__(self) -> None:
         if self.height_px % 2:

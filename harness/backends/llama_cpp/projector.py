@@ -26,8 +26,7 @@ class Run(NamedTuple):
     """Tokens that llama.cpp reads together."""
 
     inputs: NDArray[Any]  # token ids, (n,) int32, or embeddings, (n, width) float32
-    # positions relative to the first token, (1, n) int32; with M-RoPE a picture's are (4, n)
-    places: NDArray[np.int32]
+    places: NDArray[np.int32]  # relative to the first, (1, n); with M-RoPE a picture's are (4, n)
     span: int  # number of positions that they take; a picture may take fewer than it has tokens
 
     def at(self, start: int) -> NDArray[np.int32]:

@@ -37,13 +37,11 @@ class Reply:
 
     payload: Any = None  # the JSON value; None on a fault
     fault: str | None = None  # why there is no payload; printable and of limited length
-    # HTTP status, or that of an error inside an answer with 200; None without a response
-    status: int | None = None
+    status: int | None = None  # HTTP status, or that of an error in an answer with 200
     unreached: bool = False  # whether there was no connection at all
     again: bool = False  # whether another attempt may succeed
     after_s: float | None = None  # seconds that the server asks to wait before another attempt
-    # when the first text of a stream came, by `time.perf_counter`; None if it is not known
-    first_at_s: float | None = None
+    first_at_s: float | None = None  # when the first text of a stream came, by `perf_counter`
     retries: int = 0  # earlier failed attempts at the server that gave this reply
     begun_s: float = 0.0  # when the first attempt began, by `time.perf_counter`
     alone: bool = False  # whether the server had no other request of this program at the time

@@ -33,12 +33,9 @@ _WEIGHTS = ("digest", "n_params", "size")  # last names of facts that change if 
 class Model(NamedTuple):
     """A server's statement about its model."""
 
-    # the model's name, owner, root and length in the server's list; None without a list, or if the model is
-    # not on it
-    listed: dict[str, Any] | None = None
+    listed: dict[str, Any] | None = None  # name, owner, root and length in the server's list
     version: str | None = None  # version of the server; None if it does not tell
-    # everything else that it states of the model, by dotted names; long texts as their digests
-    states: Mapping[str, Fact] = {}
+    states: Mapping[str, Fact] = {}  # everything else, by dotted names; long texts as digests
 
     @property
     def tells_weights(self) -> bool:
