@@ -297,7 +297,7 @@ def test_every_profile_that_ships_says_what_each_number_is(name: str) -> None:
 
 def test_what_nobody_states_is_not_known() -> None:
     thor = devices.load("thor")
-    speed = devices.speed(thor, devices.row_of(thor, "qwen3-4b"))
+    speed = devices.speed(thor, devices.find_row(thor, "qwen3-4b"))
     assert devices.seconds(speed, 300, 1) == pytest.approx(300 / 33029.8 + 1 / 73.4)
     assert np.isnan(devices.joules(speed, 300, 1))
     h200 = devices.load("h200")
@@ -306,12 +306,12 @@ def test_what_nobody_states_is_not_known() -> None:
 
 def test_a_size_is_scaled_from_the_nearest_row_where_the_profile_says_how() -> None:
     agx = devices.load("agx-orin")
-    row, near = devices.row_of(agx, "5b"), devices.row_of(agx, "qwen3-vl-4b")
+    row, near = devices.find_row(agx, "5b"), devices.find_row(agx, "qwen3-vl-4b")
     assert row.model == "5b from qwen3-vl-4b"
     assert row.decode_tokens_per_s.value == pytest.approx(near.decode_tokens_per_s.value * 4.4 / 5)
     assert row.decode_tokens_per_s.status == "modelled"
     with pytest.raises(UserError, match="unknown model of device profile desk '5b'; known: big, half, swarm"):
-        devices.row_of(DESK, "5b")
+        devices.find_row(DESK, "5b")
 
 
 MINE = """

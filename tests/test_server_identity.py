@@ -14,7 +14,7 @@ from harness.backends.base import Request, same_model
 from harness.backends.cache import cached
 from harness.backends.cards import Card, Latency
 from harness.backends.openai import backend as openai_backend
-from harness.backends.openai.statements import Model, _flat, stated
+from harness.backends.openai.statements import Model, _flat, read_statement
 from harness.backends.servers import Kind, Server
 from harness.core.errors import UserError
 from harness.core.files import canonical_json, digest
@@ -265,7 +265,7 @@ def test_whatever_is_stated_is_a_short_identity(facts: dict[str, Any], kind: Kin
     async def ask(path: str, content: bytes | None) -> Reply:
         return Reply({**facts, "models": [facts], "data": [facts], "default_generation_settings": facts})
 
-    model = asyncio.run(stated(kind, "m", {"data": [{**facts, "id": "m"}]}, ask))
+    model = asyncio.run(read_statement(kind, "m", {"data": [{**facts, "id": "m"}]}, ask))
     text = canonical_json([model.listed, model.version, dict(model.states)])
     assert len(model.states) <= 64
     assert len(text) < 64 * 500

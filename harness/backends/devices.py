@@ -48,7 +48,7 @@ def _with_sources(value: Any, sources: dict[str, str]) -> Any:
     return {key: _with_sources(inner, sources) for key, inner in value.items()} | named
 
 
-def row_of(device: Device, model: str) -> DeviceRow:
+def find_row(device: Device, model: str) -> DeviceRow:
     """Return the row of a model: its own, or the nearest one scaled if the profile allows scaling.
 
     A model is the name of a row, of a card, or a size such as `3b`, in billions of weights. Raises UserError

@@ -26,7 +26,7 @@ class ModelFacts:
     template: str | None = None  # its chat template
 
 
-def facts(file: Path) -> ModelFacts:
+def read_facts(file: Path) -> ModelFacts:
     """Read what a file states of its model; nothing if it is no GGUF. Raises OSError if it does not open."""
     try:
         values = read_metadata(file)

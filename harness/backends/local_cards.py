@@ -9,7 +9,7 @@ from typing import Any
 
 from harness.backends.base import Letters
 from harness.backends.card import Card, Latency, System, Thinking
-from harness.backends.gguf import facts
+from harness.backends.gguf import read_facts
 from harness.backends.vision import Vision, read_vision
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
@@ -95,7 +95,7 @@ def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
 
     On llama-cpp the projector beside it goes with it, which has the same name behind its prefix.
     """
-    stated = facts(file)
+    stated = read_facts(file)
     engine = "transformers" if engine == "transformers" else "llama-cpp"
     projector = file.with_name(f"{PROJECTOR}{file.name}")
     vision = _vision(text, file.parent) if engine == "llama-cpp" and projector.is_file() else None

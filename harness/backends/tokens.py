@@ -8,6 +8,7 @@ from typing import Any
 
 from harness.backends.card import Card
 from harness.backends.gguf import read_metadata
+from harness.backends.weights import find_gguf, is_gguf
 from harness.core.errors import UserError, printable
 from harness.core.extras import OPTIONAL, without
 from harness.core.files import text_of
@@ -136,8 +137,6 @@ def counter(
 
 def _of_weights(card: Card) -> Path | None:
     """Return the tokenizer with a card's weights: that of a checkpoint, or its GGUF file."""
-    from harness.backends.weights import find_gguf, is_gguf
-
     beside = find("models", card.weights or "")
     if (beside / "tokenizer.json").is_file():
         return beside
@@ -146,7 +145,7 @@ def _of_weights(card: Card) -> Path | None:
     return None
 
 
-def spread_of(counts: Sequence[int]) -> dict[str, float]:
+def summarize_counts(counts: Sequence[int]) -> dict[str, float]:
     """Return `n`, `least`, `mean` and `most` of some token counts."""
     mean = round(sum(counts) / len(counts), 1)
     return {"n": len(counts), "least": min(counts), "mean": mean, "most": max(counts)}

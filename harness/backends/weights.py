@@ -11,7 +11,7 @@ from pathlib import Path
 
 from harness.backends import packages
 from harness.backends.card import Card
-from harness.backends.gguf import ModelFacts, facts
+from harness.backends.gguf import ModelFacts, read_facts
 from harness.backends.registry import capabilities, missing_package, registration, resolve
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, sha256_file, text_of
@@ -102,7 +102,7 @@ def check_digest(card: Card, file: Path) -> Path:
     return file
 
 
-def located(card: Card) -> Path:
+def locate(card: Card) -> Path:
     """Return where the weights of a card lie for its engine. Raises UserError if they are not found."""
     where: Path = resolve(registration(card.engine).finds)(card)
     return where
@@ -113,8 +113,8 @@ def contradictions(card: Card) -> Iterator[str]:
 
     A shorter context than that of the weights is a choice. Raises UserError if the weights are not found.
     """
-    where = located(card)
-    stated = facts(where) if where.is_file() else ModelFacts(context_tokens=_context_tokens(where))
+    where = locate(card)
+    stated = read_facts(where) if where.is_file() else ModelFacts(context_tokens=_context_tokens(where))
     if card.licence and stated.licence and card.licence.casefold() != stated.licence.casefold():
         yield (
             f"licence {printable(card.licence)} by its card, {printable(stated.licence)} by its file; "
@@ -157,7 +157,7 @@ def pull(card: Card) -> Path:
 
 def _prepared(card: Card) -> Path:
     """Return the weights that were fetched, held to their digest and made ready for their engine."""
-    engine, where = registration(card.engine), located(card)
+    engine, where = registration(card.engine), locate(card)
     check_digest(card, where if where.is_file() else where / "model.safetensors")
     if engine.prepares and missing_package(card.engine) is None:
         resolve(engine.prepares)(card)

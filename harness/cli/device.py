@@ -134,7 +134,7 @@ def check(
     from harness.studies.device_fit import held
 
     device, done = devices.load(name), read(run)
-    row = devices.row_of(device, model or str(done.manifest.model["name"]).partition(":")[0])
+    row = devices.find_row(device, model or str(done.manifest.model["name"]).partition(":")[0])
     found = held(device, row, done)
     if as_json:
         echo_json([
@@ -234,9 +234,9 @@ def measure(
 
 
 def _rows(device: "Device", model: str | None) -> "list[DeviceRow]":
-    from harness.backends.devices import row_of
+    from harness.backends.devices import find_row
 
-    return [row_of(device, model)] if model else list(device.rows)
+    return [find_row(device, model)] if model else list(device.rows)
 
 
 def _origins(device: "Device", rows: "list[DeviceRow]") -> None:

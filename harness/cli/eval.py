@@ -165,7 +165,7 @@ def _counted(spec: "Spec", dataset: "Frozen", tokenizer: Path | None) -> dict[st
 
     Who asks a helper depends on answers: unless all are asked, helpers are asked as often at most.
     """
-    from harness.backends.tokens import counter, spread_of
+    from harness.backends.tokens import counter, summarize_counts
     from harness.evaluate.asking import EGO, requests
 
     count = counter(tokenizer, spec.ego.card)
@@ -180,7 +180,7 @@ def _counted(spec: "Spec", dataset: "Frozen", tokenizer: Path | None) -> dict[st
             vision = spec.agents[request.agent].card.vision if request.image else None
             tokens = count(request.messages) + (vision.tokens if vision else 0)
             sizes.setdefault(request.role, []).append(tokens)
-    stats = {role: spread_of(n) for role, n in sizes.items()}
+    stats = {role: summarize_counts(n) for role, n in sizes.items()}
     return {
         **spec.settings(), "requests": asked.total(), "requests_by_role": dict(asked),
         "scenes": len(scenes), "prompt_tokens": stats or None,

@@ -184,7 +184,7 @@ def check(
     wrongly, runs to the limit, follows the letter of a read-out, ignores the scene. The questions are of tune
     layouts. An image prompt is not asked.
     """
-    from harness.backends.tokens import counter, spread_of
+    from harness.backends.tokens import counter, summarize_counts
     from harness.dataset import load
     from harness.evaluate.agent import example_actions
     from harness.prompts import versions as prompts
@@ -232,7 +232,7 @@ def check(
             for n in range(1, len(dense) + 1):
                 render(scene, ego, dense[:n])
             progress(1)
-    stats = {role: spread_of(n) for role, n in sizes.items() if n}
+    stats = {role: summarize_counts(n) for role, n in sizes.items() if n}
     tried = trial.tried(prompt, asks, device, dtype, as_json) if asks else None
     if as_json:
         figures = {"version": version, "budget": [least, most], "tokens": stats, "outside": outside}

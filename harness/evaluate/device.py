@@ -37,7 +37,7 @@ def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> lis
         name = printable(agent.card.name)
         if not agent.can.language_model:
             raise UserError(f"{flag}: {name} is no language model and counts no tokens; leave it out")
-        row = devices.row_of(device, model or agent.card.name.partition(":")[0])
+        row = devices.find_row(device, model or agent.card.name.partition(":")[0])
         for rate in devices.RATES:
             if getattr(row, rate) is None:
                 raise UserError(

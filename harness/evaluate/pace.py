@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from harness.backends.cards import Card, each_engine, names
 from harness.backends.registry import missing, open_backend
-from harness.backends.weights import located
+from harness.backends.weights import locate
 from harness.core.errors import Unanswered
 from harness.evaluate import questions
 from harness.evaluate.agent import Agent
@@ -61,7 +61,7 @@ def _fastest(found: Sequence[Pace], seconds: Sequence[float]) -> str | None:
 
 
 def _small(card: Card) -> bool:
-    where = located(card)
+    where = locate(card)
     files = [file for file in where.rglob("*") if file.is_file()] if where.is_dir() else [where]
     return sum(file.stat().st_size for file in files) <= MOST_BYTES
 

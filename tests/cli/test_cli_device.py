@@ -56,7 +56,7 @@ def test_what_is_not_known_is_said(harness: Callable[..., Said]) -> None:
 
 def test_a_runs_own_tokens(alone: Path, harness: Callable[..., Said]) -> None:
     told, device = folder.read(alone), devices.load("agx-orin")
-    row = devices.row_of(device, "qwen3-0.6b")
+    row = devices.find_row(device, "qwen3-0.6b")
     as_read_out, as_written = fits(device, [row], of_run(told), 0.2)
     egos = [a for a in told.answers if a.role == "ego"]
     took = [a.prompt_tokens / 17277.3 + a.completion_tokens / 162.5 for a in egos]
@@ -143,7 +143,7 @@ def test_the_law_of_weights_is_off_by_less_than_a_factor_of_1_6() -> None:
             if not device.scaling or "vl" in one.model + other.model:
                 continue
             for left, right in ((one, other), (other, one)):
-                scaled = devices.row_of(replace(device, rows=(left,)), f"{right.billions:g}b")
+                scaled = devices.find_row(replace(device, rows=(left,)), f"{right.billions:g}b")
                 for rate in devices.RATES:
                     off = getattr(scaled, rate).value / getattr(right, rate).value
                     assert 1 / 1.6 < off < 1.6

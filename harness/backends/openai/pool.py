@@ -17,7 +17,7 @@ from time import perf_counter
 from typing import Any
 
 from harness.backends.openai.http import COMPLETIONS, Client, Reply
-from harness.backends.openai.statements import Model, stated
+from harness.backends.openai.statements import Model, read_statement
 from harness.backends.servers import Server
 from harness.core.errors import Unanswered, UserError, printable
 
@@ -270,7 +270,7 @@ class ServerPool:
         async def ask(path: str, content: bytes | None) -> Reply:
             return await self._client.get(server.url, beside + path, content)
 
-        return await stated(self._settings.kind, self._weights, reply.payload, ask)
+        return await read_statement(self._settings.kind, self._weights, reply.payload, ask)
 
     def _agree(self, server: _ServerState, model: Model) -> None:
         """Raise UserError unless a server has the same model as the first one."""

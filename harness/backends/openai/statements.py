@@ -49,7 +49,7 @@ class Model(NamedTuple):
         return lists and tells_version and earlier.states.keys() <= self.states.keys()
 
 
-async def stated(kind: Kind, weights: str, models: Any, ask: Ask) -> Model:
+async def read_statement(kind: Kind, weights: str, models: Any, ask: Ask) -> Model:
     """Return what a server states of a model, by its answer to `/v1/models` and what else it is asked.
 
     A server with one model accepts any name for it.

@@ -81,7 +81,7 @@ def _paged(columns: int) -> int:
     return -(-columns // PAGE) * PAGE
 
 
-def joined(parts: Sequence[tuple[Sequence[int], Cache]]) -> Cache:
+def join_caches(parts: Sequence[tuple[Sequence[int], Cache]]) -> Cache:
     """Return one cache of the rows of several, which are emptied. Rows with fewer columns end in zeros.
 
     Each cache has paged layers, and comes with the places of its rows among all.

@@ -23,7 +23,14 @@ from transformers.cache_utils import Cache, DynamicCache, DynamicLayer
 
 from harness.backends.engine import Session, check_logits, common_beginning, group_by_beginning
 from harness.backends.transformers.eyes import Eyes
-from harness.backends.transformers.memory import LEAST_TOKENS, NOTHING, PagedLayer, Prefix, Prefixes, joined
+from harness.backends.transformers.memory import (
+    LEAST_TOKENS,
+    NOTHING,
+    PagedLayer,
+    Prefix,
+    Prefixes,
+    join_caches,
+)
 from harness.core.arrays import Floats
 
 CPU_TOKENS = 1024  # most tokens that a CPU reads together: what more of them need does not stay in its cache
@@ -82,7 +89,7 @@ class Reader:
             for piece in self._pieces(group, [len(prompt) - len(prefix.ids) for prompt in prompts]):
                 at = positions and [positions[place] for place in piece]
                 parts.append((piece, Rows.read(self, prefix, [prompts[place] for place in piece], at)))
-        return Rows.joined(parts, positions)
+        return Rows.join(parts, positions)
 
     def _read_alone(self, prompt: list[int], beginning: list[int]) -> Session:
         # A prompt that is repeated alone is read again, or its time would not be an answer's time.
@@ -184,7 +191,7 @@ class Rows:
         return rows
 
     @classmethod
-    def joined(cls, parts: Sequence[tuple[Sequence[int], "Rows"]], positions: Any) -> "Rows":
+    def join(cls, parts: Sequence[tuple[Sequence[int], "Rows"]], positions: Any) -> "Rows":
         """Return the sequences of several sessions as one, each at its place."""
         if len(parts) == 1:
             return parts[0][1]
@@ -199,7 +206,7 @@ class Rows:
     def _cache(self) -> Cache:
         """The cache of all sequences: of several parts one is made here, so never for a read-out."""
         if len(self._parts) > 1:
-            self._parts = [(range(len(self._mask)), joined(self._parts))]
+            self._parts = [(range(len(self._mask)), join_caches(self._parts))]
         return self._parts[0][1]
 
     def copy(self) -> "Rows":
