@@ -115,6 +115,11 @@ class Completion:
     flipped: bool | None = None  # of a replayed read-out, whether its likeliest changed in the reversed list
 
 
+def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Completion:
+    """Return the completion of a request that has no answer."""
+    return Completion(request.id, "", prompt_tokens, None, "error", None, 1, error)
+
+
 def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None) -> float | None:
     """Return the time per output token (TPOT): the seconds after the first token, for each later token.
 

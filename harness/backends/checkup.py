@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from harness.backends.base import AnswerMode, Completion, Rendering, Request
+from harness.backends.base import AnswerMode, Completion, Rendering, Request, failed
 from harness.backends.card import Thinking
 from harness.backends.chat import Chat
 from harness.core.errors import UserError
@@ -116,5 +116,5 @@ def _answer(backend: Rendering, request: Request, warm: bool = False) -> Complet
         backend.complete([replace(request, messages=(*head, other))])
         [completion] = backend.complete([request])
     except UserError as error:  # the tokenizer or the server leaves no room for this answer mode
-        return Completion(request.id, "", None, None, "error", None, 1, str(error))
+        return failed(request, str(error))
     return completion

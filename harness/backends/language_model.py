@@ -6,7 +6,7 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any, NamedTuple
 
-from harness.backends.base import Completion, Request
+from harness.backends.base import Completion, Request, failed
 from harness.backends.decoding import Decoding
 from harness.backends.engine import Engine, common_length
 from harness.core.arrays import Floats
@@ -50,7 +50,7 @@ class LanguageModel:
             if longest + room > (most := self.engine.context_tokens):
                 parts = f"({longest} in the prompt, {room} for the answer)"
                 error = f"context overflow: {longest + room} tokens > {most} {parts}"
-                done[position] = _failed(request, longest, error)
+                done[position] = failed(request, error, longest)
             else:
                 fitting.append(_Prompt(position, request, orders))
         for batch in self._batches(fitting):
@@ -103,7 +103,7 @@ class LanguageModel:
         # `_try` has returned, so nothing refers to the failed batch and an engine can free its memory.
         alone = [self._try([prompt]) for prompt in batch]
         return [
-            a[0] if isinstance(a, list) else _failed(p.request, len(p.orders[0]), a)
+            a[0] if isinstance(a, list) else failed(p.request, a, len(p.orders[0]))
             for p, a in zip(batch, alone, strict=True)
         ]
 
@@ -114,7 +114,3 @@ class LanguageModel:
         except Exception as error:  # an engine may fail in any way; its message is data
             return f"{type(error).__name__}: {one_line(error)}"
         return [replace(answer, prompt_tokens=p.read) for p, answer in zip(batch, answers, strict=True)]
-
-
-def _failed(request: Request, prompt_tokens: int, error: str) -> Completion:
-    return Completion(request.id, "", prompt_tokens, None, "error", None, 1, error)

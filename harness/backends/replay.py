@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import AGAIN, Backend, Completion, Request, same_model
+from harness.backends.base import AGAIN, Backend, Completion, Request, failed, same_model
 from harness.backends.cache import cached, default_file
 from harness.backends.card import Card
 from harness.backends.cards import own
@@ -127,7 +127,7 @@ class Replay:
         agent = self._run.agent(answer)
         self._check(request, agent)
         if self._run.actions != request.actions == self._run.actions[::-1]:  # only its likeliest was compared
-            return Completion(request.id, "", None, None, "error", None, 1, "the run has no such answer")
+            return failed(request, "the run has no such answer")
         again = request.id.endswith(AGAIN)
         asked = digest(request.messages[: -2 if again else None]), request.image_sha256
         if asked != (answer.prompt_sha256, answer.image_sha256 or None):

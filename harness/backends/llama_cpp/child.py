@@ -17,7 +17,7 @@ from operator import attrgetter
 from threading import Thread
 from typing import Any
 
-from harness.backends.base import Completion, Request
+from harness.backends.base import Completion, Request, failed
 from harness.core.errors import UserError, printable
 from harness.core.parallel import end_with_parent
 
@@ -88,7 +88,7 @@ class Child:
         try:
             (answer,) = self._ask("complete", [request])
         except _Died as death:
-            return Completion(request.id, "", None, None, "error", None, 1, str(death))
+            return failed(request, str(death))
         completion: Completion = answer
         return completion
 

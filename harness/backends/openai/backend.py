@@ -12,12 +12,12 @@ from functools import partial
 from threading import Thread, current_thread
 from typing import Any, TypeVar
 
-from harness.backends.base import Completion, Request, Served, per_token_s
+from harness.backends.base import Completion, Request, Served, failed, per_token_s
 from harness.backends.card import Card
 from harness.backends.openai.http import Client, Reply
 from harness.backends.openai.pool import ServerPool
 from harness.backends.openai.prompt_check import PromptCheck
-from harness.backends.openai.shapes import answering_model, body, digest_url, failed, read
+from harness.backends.openai.shapes import answering_model, body, digest_url, read
 from harness.backends.openai.stream import ASKED, BROKE_OFF
 from harness.backends.orders import average_orders
 from harness.backends.servers import Fields, Server

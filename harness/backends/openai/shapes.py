@@ -8,7 +8,7 @@ from base64 import b64encode
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from harness.backends.base import Completion, FinishReason, Request
+from harness.backends.base import Completion, FinishReason, Request, failed
 from harness.backends.card import Card
 from harness.backends.chat import in_parts
 from harness.backends.chat_template import with_system
@@ -115,11 +115,6 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
         return failed(request, f"the server did not keep to the constraint that was sent: {fault}; {_REMEDY}")
     text = _with_thought(thought, content, finish_reason, request.thinking)
     return Completion(request.id, text, *tokens, finish_reason, None, 1)
-
-
-def failed(request: Request, error: str) -> Completion:
-    """Return the completion of a request that has no answer."""
-    return Completion(request.id, "", None, None, "error", None, 1, error)
 
 
 def _thought(message: Mapping[str, Any]) -> str | None:
