@@ -31,12 +31,12 @@ def request(role: str = "ego", form: str = "distribution") -> Request:
 
 
 def regex(asked: Request) -> str:
-    sent: str = constraint("vllm", asked)["structured_outputs"]["regex"]
+    sent: str = constraint("vllm", asked.shape)["structured_outputs"]["regex"]
     return sent
 
 
 def schema(asked: Request) -> Any:
-    return constraint("generic", asked)["response_format"]["json_schema"]["schema"]
+    return constraint("generic", asked.shape)["response_format"]["json_schema"]["schema"]
 
 
 compact = st.sampled_from(FORMS).flatmap(lambda form: st.tuples(st.just(form), st.from_regex(

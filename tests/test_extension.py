@@ -186,7 +186,7 @@ def test_unasked_for_they_are_a_field_too_many() -> None:
 @given(st.data(), st.sampled_from(SHAPES))
 def test_what_a_server_is_sent_is_what_it_is_held_to(data: st.DataObject, shape: Shape) -> None:
     asked = request(shape)
-    pattern = constraint("vllm", asked)["structured_outputs"]["regex"]
+    pattern = constraint("vllm", asked.shape)["structured_outputs"]["regex"]
     text = data.draw(st.from_regex(re.compile(pattern, re.ASCII), fullmatch=True))
     assert valid(shape, text)
     assert broken("vllm", asked, text, ended=True) is None
@@ -197,7 +197,7 @@ def test_what_a_server_is_sent_is_what_it_is_held_to(data: st.DataObject, shape:
         if broken(kind, asked, changed, ended=True) is None:
             assert valid(shape, changed)
             assert kind != "vllm" or re.fullmatch(pattern, changed)
-    sent = constraint("generic", asked)["response_format"]["json_schema"]["schema"]
+    sent = constraint("generic", asked.shape)["response_format"]["json_schema"]["schema"]
     assert [*sent["properties"]][: len(shape.further)] == [*shape.further]
     assert broken("generic", asked, json.dumps(json.loads(text), indent=1), ended=True) is None
 

@@ -17,6 +17,7 @@ FIRST_USER: Literal["first-user"] = (
     "first-user"  # a card's `system`: the system text begins the first user turn
 )
 _THOUGHT_ENDS = "</think>"
+_REMEDY = "give another model, or mend the template"
 _LONGEST_FORM = 100  # characters of a form of dates
 
 
@@ -25,19 +26,15 @@ class Refused(UserError):
 
 
 class ChatTemplate:
-    """A compiled chat template (`text` in Jinja), rendered as transformers does."""
+    """A compiled chat template, rendered as transformers does."""
 
     def __init__(self, name: str, text: str) -> None:
         """Compile the template of a model. Raises UserError if it is no Jinja, or too long."""
-        self.text = text
-        self._name = name
+        self._shown = f"model {printable(name)!r}: its chat template"
         try:
             self._compiled = _environment().from_string(text)
         except TemplateError as error:
-            raise UserError(
-                f"model {printable(name)!r}: its chat template is no Jinja ({printable(error)}); give "
-                "another model, or mend the template"
-            ) from None
+            raise UserError(f"{self._shown} is no Jinja ({printable(error)}); {_REMEDY}") from None
 
     def render(self, messages: Messages, **values: Any) -> str:
         """Render messages, with the values of further names.
@@ -48,15 +45,9 @@ class ChatTemplate:
         try:
             return self._compiled.render(messages=messages, **given)
         except TooMuch as error:
-            raise UserError(
-                f"model {printable(self._name)!r}: its chat template takes {printable(error)} to render; "
-                "give another model, or mend the template"
-            ) from None
+            raise UserError(f"{self._shown} takes {printable(error)} to render; {_REMEDY}") from None
         except Exception as error:  # a template is a program and may fail in any way
-            raise Refused(
-                f"model {printable(self._name)!r}: its chat template refuses the messages "
-                f"({printable(error)})"
-            ) from None
+            raise Refused(f"{self._shown} refuses the messages ({printable(error)})") from None
 
 
 def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any], ...]:

@@ -31,9 +31,17 @@ _STRING_BEGUN = re.compile(_CHARACTERS + r"(?:\\(?:u[0-9a-fA-F]{0,3})?)?")
 _SHOWN = 40  # characters of an answer that an error shows
 
 
-def constraint(kind: Kind, request: Request) -> Mapping[str, Any]:
-    """Return the fields that ask a kind of server for a constrained answer."""
-    return _fields(kind, request.shape)
+@lru_cache
+def constraint(kind: Kind, shape: Shape) -> Mapping[str, Any]:
+    """Return the fields that ask a kind of server for a constrained answer of a shape."""
+    schema = constrained_schema(shape)
+    match _BY_PATTERN.get(kind):
+        case "regex":
+            return {"structured_outputs": {"regex": _pattern(schema, re.escape)}}
+        case "grammar":
+            return {"grammar": f"root ::= {_pattern(schema, canonical_json)}"}
+    json_schema = {"name": "answer", "strict": True, "schema": schema}
+    return {"response_format": {"type": "json_schema", "json_schema": json_schema}}
 
 
 def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
@@ -55,18 +63,6 @@ def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
     except ValueError:
         pass
     return f"{printable(repr(text[reader.at : reader.at + _SHOWN]))} after {reader.at} characters"
-
-
-@lru_cache
-def _fields(kind: Kind, shape: Shape) -> Mapping[str, Any]:
-    schema = constrained_schema(shape)
-    match _BY_PATTERN.get(kind):
-        case "regex":
-            return {"structured_outputs": {"regex": _pattern(schema, re.escape)}}
-        case "grammar":
-            return {"grammar": f"root ::= {_pattern(schema, canonical_json)}"}
-    json_schema = {"name": "answer", "strict": True, "schema": schema}
-    return {"response_format": {"type": "json_schema", "json_schema": json_schema}}
 
 
 def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:

@@ -72,7 +72,7 @@ def body(
     if card.thinking == "switch":
         json_body["chat_template_kwargs"] = {"enable_thinking": request.thinking}
     if request.answer == "constrained":
-        json_body |= constraint(server.kind, request)
+        json_body |= constraint(server.kind, request.shape)
     if request.answer == "readout":
         json_body |= {"max_tokens": 1, "logprobs": True, "top_logprobs": server.top_logprobs or MOST_LOGPROBS}
     if server.fields is None:
