@@ -635,9 +635,9 @@ def test_a_server_that_nobody_listens_at_is_one_line() -> None:
         url = f"http://127.0.0.1:{free.getsockname()[1]}/v1"
     with pytest.raises(UserError) as caught:
         openai_backend.open(card(url), batch_size=1)
-    assert f"nobody answers at {url} (ClientConnectorError" in str(caught.value)
+    assert f"no server answers at {url} (ClientConnectorError" in str(caught.value)
     assert "start the server" in str(caught.value)
-    with pytest.raises(UserError, match="nobody answers at"):
+    with pytest.raises(UserError, match="no server answers at"):
         openai_backend.open(card("http://a..b/v1"), batch_size=1)
 
 

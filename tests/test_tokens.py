@@ -72,7 +72,7 @@ def test_a_gguf_file_is_read_as_its_model_reads_it(tmp_path: Path) -> None:
 def test_a_gguf_file_that_nobody_knows_or_without_merges_is_one_line(tmp_path: Path) -> None:
     pytest.importorskip("transformers", reason="needs the transformers extra")
     message = refused(gguf(tmp_path / "odd.gguf", pre="of-my-own"))
-    assert "has the pre-tokeniser of-my-own, which nobody here knows; give the model's tokenizer" in message
+    assert "has the pre-tokeniser of-my-own, which is not known here; give the model's tokenizer" in message
     assert "is no readable tokenizer" in refused(gguf(tmp_path / "bare.gguf", merges=True))
 
 

@@ -114,7 +114,7 @@ def test_the_digest_is_the_gguf_files(tmp_path: Path) -> None:
     ("settings", "spoil", "said"),
     [
         ({"template": None}, None, "has no chat template; give the GGUF file of its instruct version"),
-        ({"pre": "of-my-own"}, None, "has the pre-tokeniser of-my-own, which nobody here knows"),
+        ({"pre": "of-my-own"}, None, "has the pre-tokeniser of-my-own, which is not known here"),
         ({"architecture": "odd"}, None, "does not load with transformers: .*odd.*; run it on llama-cpp"),
         ({}, lambda data: data[:200], "does not load: a text is longer than the file; copy or download"),
         ({}, lambda data: b"", "does not load: it ends before"),

@@ -142,7 +142,7 @@ class Child:
 
 
 def _watch(pid: int) -> None:
-    """Kill a process that is found stopped twice in a row; otherwise its caller would wait for ever."""
+    """Kill a process that is found stopped twice in a row; otherwise its caller would wait forever."""
     before = False
     with suppress(ChildProcessError, AttributeError):  # the process is gone, or this is Windows
         while True:

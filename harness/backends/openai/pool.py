@@ -35,7 +35,7 @@ class _ServerState:
     sent: int = 0  # number of requests that it has been sent so far
     failures: int = 0  # failed attempts since it last answered
     pauses: int = 0  # waits for it since it last answered
-    unreached: int = 0  # vain attempts to reach it since it was set aside
+    unreached: int = 0  # failed attempts to reach it since it was set aside
     fault: str = ""  # its last failure
     aside: bool = False  # whether it is set aside: it gets no requests until it answers again
 
@@ -84,7 +84,7 @@ class ServerPool:
         answering = {server: model for server, model in zip(self._servers, models, strict=True) if model}
         if not answering:
             raise Unanswered(
-                f"nobody answers at {self._faults()}; start the server, or fix base_url in the model's card"
+                f"no server answers at {self._faults()}; start the server, or fix base_url in its card"
             )
         self._first, self.model = next(iter(answering.items()))
         for server, model in answering.items():
@@ -277,8 +277,8 @@ class ServerPool:
         url, weights = printable(server.url), printable(self._weights)
         if self._settings.any_may_answer and model.listed is None:
             raise UserError(
-                f"model {self._name!r}: server {url} lists no {weights} at {url}/models, so that nobody can "
-                "tell whether it has the same model as others; fix weights in the card, or what is served"
+                f"model {self._name!r}: server {url} lists no {weights} at {url}/models, so it may have "
+                "another model than others; fix weights in the card, or what is served"
             )
         if self.model.listed is not None and model != self.model:
             first = f"server {printable(self._first.url)} has {_shown(self.model, model)}"
