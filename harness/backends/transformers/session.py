@@ -23,14 +23,7 @@ from transformers.cache_utils import Cache, DynamicCache, DynamicLayer
 
 from harness.backends.engine import Session, check_logits, common_beginning, group_by_beginning
 from harness.backends.transformers.eyes import Eyes
-from harness.backends.transformers.memory import (
-    LEAST_TOKENS,
-    NOTHING,
-    PagedLayer,
-    Prefix,
-    Prefixes,
-    join_caches,
-)
+from harness.backends.transformers.memory import LEAST_TOKENS, PagedLayer, Prefix, Prefixes, join_caches
 from harness.core.arrays import Floats
 
 CPU_TOKENS = 1024  # most tokens that a CPU reads together: what more of them need does not stay in its cache
@@ -75,7 +68,7 @@ class Reader:
 
     def _read(self, prompts: list[list[int]]) -> Session:
         if not self.together:
-            return Apart([Rows.read(self, NOTHING, [p], self.positions([p])) for p in prompts])
+            return Apart([Rows.read(self, Prefix([], []), [p], self.positions([p])) for p in prompts])
         # Each prompt's last token is always read, for the distribution after it.
         beginnings = [prompt[:-1] for prompt in prompts]
         if len(prompts) == 1:
