@@ -306,6 +306,7 @@ def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, as
     assert len(tokenizer("307")["input_ids"]) == 3, "every digit stands alone"
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_model(
     student: Path, drawn_before: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -325,6 +326,7 @@ def test_a_killed_run_goes_on_to_the_same_model(
         assert (out / name).read_bytes() == (student / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
     student: Path, drawn_before: None, tmp_path: Path
 ) -> None:
@@ -349,6 +351,7 @@ def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
         )
 
 
+@pytest.mark.slow
 def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_path: Path) -> None:
     plan = replace(PLAN, samples={**PLAN.samples, "alone": 8, "messages": 1})
     with pytest.raises(UserError, match=r"--samples: 1 sequences of the stage messages take too few scenes"):
@@ -405,6 +408,7 @@ def test_it_learns_from_every_level_of_a_tree(few: list[Lessons]) -> None:
             assert all(steps.count(step) <= lessons.PER_LEVEL for step in steps)
 
 
+@pytest.mark.slow
 def test_a_layout_teaches_the_same_wherever_it_is_drawn(few: list[Lessons]) -> None:
     again = msgspec.json.encode(lessons.decision_points(PASSING, CURRICULUM.seed + 1, 1))
     assert msgspec.json.decode(again, type=list[lessons.Point]) == [

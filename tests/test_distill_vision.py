@@ -144,6 +144,7 @@ def test_each_token_of_a_picture_says_how_far_the_nearest_vehicle_in_its_square_
     assert somebody > 20
 
 
+@pytest.mark.slow
 def test_an_engine_reads_what_the_model_learnt_from(
     folder: Path, lessons: Lessons, asked: list[Question], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -217,6 +218,7 @@ def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
         take_over(model, folder)
 
 
+@pytest.mark.slow
 def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
     model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
     for answer in ("json", "constrained", "readout"):
@@ -225,6 +227,7 @@ def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
             assert completion.prompt_tokens > VISION.tokens
 
 
+@pytest.mark.slow
 def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Question]):
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     requests = [request(q) for q in asked[:6]]

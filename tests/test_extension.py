@@ -101,6 +101,7 @@ def values(schema: Any) -> st.SearchStrategy[Any]:
 # -- filled in ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.sampled_from(SHAPES), st.randoms(use_true_random=False))
 def test_whatever_a_model_chooses_fits_and_is_read(shape: Shape, random: Any) -> None:
@@ -153,6 +154,7 @@ def test_a_number_is_one_of_a_hundred_to_a_thousand(
 # -- read -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.fixed_dictionaries({}, optional={k: values(v) for k, v in json.loads(EGO.extension).items()}))
 def test_strict_is_what_the_library_says_of_the_extended_schema(said: Any) -> None:
@@ -182,6 +184,7 @@ def test_unasked_for_they_are_a_field_too_many() -> None:
 # -- servers --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=30)
 @given(st.data(), st.sampled_from(SHAPES))
 def test_what_a_server_is_sent_is_what_it_is_held_to(data: st.DataObject, shape: Shape) -> None:
@@ -229,6 +232,7 @@ def test_a_version_says_what_it_adds_and_has_room_for_it(copied: Path) -> None:
         assert valid(shape, json.dumps(plainest(answer_schema(**shape._asdict()))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
 def test_a_real_model_fills_in_what_a_version_adds(engine: str, copied: Path) -> None:
     pytest.importorskip({"transformers": "torch", "llama-cpp": "llama_cpp"}[engine])
@@ -250,6 +254,7 @@ def test_a_real_model_fills_in_what_a_version_adds(engine: str, copied: Path) ->
         assert answer.verdict != "failed"
 
 
+@pytest.mark.slow
 def test_the_pages_example_is_one_and_a_run_of_it_keeps_what_was_added(
     harness: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:

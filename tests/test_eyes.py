@@ -110,6 +110,7 @@ def test_a_picture_has_the_tokens_that_the_card_says(model: Any) -> None:
     assert said.prompt_tokens == len(tokens)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["json", "constrained", "readout"])
 def test_a_batch_answers_as_each_alone(model: Any, answer: str) -> None:
     asked = [

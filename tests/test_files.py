@@ -45,6 +45,7 @@ def of_the_standard_library(value: Any) -> str | None:
         return None
 
 
+@pytest.mark.slow
 @given(JSON)
 @example([1e-5, -1e-5, 9.999e-5, 1e-4, 1e16, 9999999999999998.0, 5e-324, -0.0, 2**64, -(2**63) - 1])
 @example({"\ud83d": '\x7f\u2028\x00\x1f\b\f\n\r\t"\\/', "\ue000": 1, "\U0001f600": 2})

@@ -107,6 +107,7 @@ def by_hand(backend: Any, request: Request, listed: tuple[str, ...], cyclic: boo
     return dict(zip(listed, intent, strict=True))
 
 
+@pytest.mark.slow
 @LETTERS
 def test_a_model_flips_where_two_questions_by_hand_say_so(letters: Letters, small: Dataset) -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
@@ -124,6 +125,7 @@ def test_a_model_flips_where_two_questions_by_hand_say_so(letters: Letters, smal
     assert any(sure)
 
 
+@pytest.mark.slow
 @LETTERS
 def test_a_run_and_its_replay_count_it_and_decide_as_without(
     letters: Letters, small: Dataset, tmp_path: Path
@@ -186,6 +188,7 @@ def test_helpers_are_flipped_where_they_read_out() -> None:
         assert helpers[0].settings().get("flip", False) == flips
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [("eval", "--limit", "1"), ("drive", "--episodes", "1")])
 def test_the_terminal_says_how_often_beside_the_letter(
     command: tuple[str, ...], harness: Callable[..., Said], tmp_path: Path

@@ -340,6 +340,7 @@ def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(done: Evaluated, tmp
     assert again == []
 
 
+@pytest.mark.slow
 def test_what_another_process_has_asked_meanwhile_is_not_asked_again(done: Evaluated, tmp_path: Path) -> None:
     """Both looked at the run before either asked."""
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
@@ -356,6 +357,7 @@ def test_what_another_process_has_asked_meanwhile_is_not_asked_again(done: Evalu
     assert len(ids) == len(set(ids)) > len(kept.splitlines())
 
 
+@pytest.mark.slow
 def test_points_that_are_walked_together_make_the_calls_of_each(done: Evaluated, tmp_path: Path) -> None:
     """Each set of messages is asked about once, and answers are what each point has alone."""
     texts = ("loss=0", "loss=0.3", "loss=0.3,defence=quoted+schema", "attack=injection:share=1/3")

@@ -160,6 +160,7 @@ def simulated(
     return met / sent, float(np.mean(waited)) * SLOT_S, busy / slots
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicles", [40, 80, 120, 160])
 def test_collisions_and_waits_are_those_of_simulated_slots(vehicles):
     """400 000 slots at busy ratios from .13 to .5, with packets of 25 slots behind an AIFS of 8."""

@@ -85,6 +85,7 @@ def test_anything_else_is_one_line(text: str, harness: Callable[..., Any]) -> No
     assert "\x1b" not in err
 
 
+@pytest.mark.slow
 def test_a_replay_keeps_its_runs_times_unless_others_are_declared(small: Dataset, tmp_path: Path) -> None:
     first = run(spec_of(small, latency="ego=0.02,helper=0.01"), tmp_path / "run")
     replay = f"replay:{tmp_path / 'run'}"

@@ -117,6 +117,7 @@ def test_a_mixed_swarm_keeps_the_prompts_of_all(project: Path, harness: Typed) -
         assert found.sha256 == agent["prompt"]["sha256"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gone", ["edited", "deleted"])
 def test_the_page_is_the_same_once_the_prompt_is_gone(gone: str, project: Path, harness: Typed) -> None:
     assert harness("report", "reports/run")[0] == 0
@@ -131,6 +132,7 @@ def test_the_page_is_the_same_once_the_prompt_is_gone(gone: str, project: Path, 
     assert page.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_prompts_that_are_gone_are_still_compared(project: Path, harness: Typed) -> None:
     prompt("other", "Beware: ")
     typed = (*EVAL, "--dataset", "own/scenes", "--condition", "mine", "--out", "reports/other")
@@ -151,6 +153,7 @@ def test_prompts_that_are_gone_are_still_compared(project: Path, harness: Typed)
     assert harness("compare", "reports/run", "reports/other", "--html", "less.html")[0] == 0
 
 
+@pytest.mark.slow
 def test_a_page_is_never_replaced_by_one_that_says_less(project: Path, harness: Typed) -> None:
     assert harness("report", "reports/run")[0] == 0
     page = Path("reports/run/report.html")

@@ -57,6 +57,7 @@ def test_the_limit_is_named_with_the_template() -> None:
         ChatTemplate("sly", TEMPLATES["a long template"])
 
 
+@pytest.mark.slow
 def test_each_rendering_has_all_the_steps() -> None:
     template = Sandbox().from_string("{% for i in range(90000) %}{% endfor %}")
     for _ in range(30):

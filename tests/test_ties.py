@@ -85,6 +85,7 @@ def drawn(small: Dataset, line: str = THIRDS, **options: Any) -> Walked:
     return walk_all(spec_of(small, **options), Scripted(egos))
 
 
+@pytest.mark.slow
 def test_an_ego_that_says_all_alike_takes_each_action_a_third_of_the_time(small: Dataset) -> None:
     found = drawn(small, points=(ALONE,), seeds=tuple(range(200))).records(ALONE.name)
     first = Counter(d.action for d in found if d.step == 0)
@@ -150,6 +151,7 @@ def open_tied(card: Card, **_: Any) -> Tied:
     return Tied()
 
 
+@pytest.mark.slow
 def test_a_frozen_episode_is_the_driven_one(tied: Card, small: Dataset, tmp_path: Path) -> None:
     how: dict[str, Any] = {"points": (ALONE,), "seeds": (0, 1, 2)}
     frozen = run(with_ego(spec_of(small, **how), card=tied), tmp_path / "frozen").out
@@ -176,6 +178,7 @@ def test_a_study_of_a_run_draws_as_the_run_did(tied: Card, small: Dataset, tmp_p
             assert walked.ends["success_rate"].ravel().tolist() == ends
 
 
+@pytest.mark.slow
 def test_a_run_without_the_setting_took_the_first(
     tied: Card, small: Dataset, tmp_path: Path, harness: Any
 ) -> None:

@@ -68,6 +68,7 @@ def said(completions: list[Completion]) -> list[tuple[object, ...]]:
 # -- answers ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch_size", [1, 3, 8])
 def test_a_batch_says_what_each_request_alone_would_in_the_order_asked(tiny: Path, batch_size: int) -> None:
     one = open_tiny(tiny, batch_size=1)
@@ -78,6 +79,7 @@ def test_a_batch_says_what_each_request_alone_would_in_the_order_asked(tiny: Pat
     assert len({c.text for c in alone}) > 5, "answers that are all alike would show no order"
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.builds(ask, st.integers(0, 15), max_tokens=st.integers(1, 12)), max_size=6))
 def test_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:
@@ -311,6 +313,7 @@ def test_no_code_of_a_checkpoint_is_run(
     assert not (tmp_path / "caught").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "what"),
     [

@@ -13,7 +13,6 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from transformers import Gemma3ForCausalLM, Gemma3TextConfig, Qwen3Config, Qwen3ForCausalLM
 
 from harness.backends.engine import common_beginning
 from harness.backends.transformers import memory
@@ -31,11 +30,15 @@ tokens = st.integers(0, 63)
 
 
 def full_attention() -> Any:
+    from transformers import Qwen3Config, Qwen3ForCausalLM  # two seconds, which collecting need not take
+
     torch.manual_seed(0)
     return Qwen3ForCausalLM(Qwen3Config(**SHAPE)).eval()
 
 
 def sliding_window() -> Any:
+    from transformers import Gemma3ForCausalLM, Gemma3TextConfig
+
     torch.manual_seed(0)
     layers = ["sliding_attention", "full_attention"]
     return Gemma3ForCausalLM(Gemma3TextConfig(**SHAPE, sliding_window=6, layer_types=layers)).eval()
@@ -76,6 +79,7 @@ def widths(model: Any) -> Iterator[list[tuple[int, int]]]:
 # -- a session ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(
     st.lists(tokens, max_size=20),
     st.lists(st.lists(tokens, min_size=1, max_size=12), min_size=1, max_size=4),
@@ -129,6 +133,7 @@ def test_log_probabilities_are_of_the_whole_vocabulary(model: Any) -> None:
         assert whole.dtype == np.float64
 
 
+@pytest.mark.slow
 @given(st.data())
 def test_of_a_guess_stays_what_the_model_would_have_written(model: Any, data: st.DataObject) -> None:
     """Sequences go forward by right, wrong and empty guesses, and end where one forward of each does."""
@@ -159,6 +164,7 @@ def test_of_a_guess_stays_what_the_model_would_have_written(model: Any, data: st
             np.testing.assert_allclose(session.log_probs(EVERY), naive(model, sequences), atol=1e-4)
 
 
+@pytest.mark.slow
 @given(st.lists(st.lists(tokens, min_size=1, max_size=12), min_size=1, max_size=3), st.data())
 def test_each_way_to_go_on_ends_where_one_forward_does(
     model: Any, sequences: list[list[int]], data: st.DataObject
@@ -299,6 +305,7 @@ def test_a_prompt_that_is_another_ones_beginning_still_has_a_token_of_its_own(qw
                 np.testing.assert_allclose(session.log_probs(EVERY), naive(qwen, sequences), atol=1e-4)
 
 
+@pytest.mark.slow
 @given(st.lists(st.lists(st.sampled_from([SYSTEM, SYSTEM[::-1], SYSTEM[:20]]), min_size=1, max_size=3),
                 min_size=1, max_size=5), st.data())  # fmt: skip
 def test_what_was_read_before_changes_no_answer(

@@ -137,6 +137,7 @@ def test_an_oncoming_left_turn_has_no_mirrored_twin(crossing: Dataset) -> None:
     assert all(graph == twin for graph, twin in turns)
 
 
+@pytest.mark.slow
 def test_the_planner_mirrors_at_the_intersection_and_keeps_right_on_the_motorway() -> None:
     """The counts of docs/decisions/0038."""
     held = {}
@@ -278,6 +279,7 @@ json_objects = st.recursive(
 ).filter(lambda value: isinstance(value, dict))
 
 
+@pytest.mark.slow
 @given(json_objects, st.text("xyz ,.", max_size=9))
 def test_reordered_json_says_the_same(value: dict[str, Any], around: str) -> None:
     text = f"{around}{json.dumps(value)}{around}"
@@ -499,6 +501,7 @@ class Links(HTMLParser):
         self.targets |= {str(found["href"]).removeprefix("#")} if "href" in found else set()
 
 
+@pytest.mark.slow
 def test_the_command_prints_writes_and_gates(
     harness: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
@@ -526,6 +529,7 @@ def test_the_command_prints_writes_and_gates(
     assert "already holds finished twins" in err
 
 
+@pytest.mark.slow
 def test_workers_change_nothing(harness: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
     for workers in ("1", "2"):
         harness("study", "twins", "--sample", "3", "--workers", workers, "--out", workers, "--json")
@@ -533,6 +537,7 @@ def test_workers_change_nothing(harness: Callable[..., tuple[int, str, str]], tm
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("typed", "said"),
     [

@@ -107,6 +107,7 @@ def ask(harness: Typed, play: Play, there: Server, small_path: Path, tmp_path: P
 EVAL = ("--limit", "2", "--condition", "single-local", "--condition", "6g", "--seeds", "0:1", "--no-cache")
 
 
+@pytest.mark.slow
 def test_a_server_that_refuses_everything_is_asked_little_and_its_words_stand_first(
     ask: Typed, harness: Typed, play: Play, tmp_path: Path
 ) -> None:
@@ -155,6 +156,7 @@ def test_repeats_that_could_not_be_asked_are_errors_in_junit(
     assert err.startswith(f"harness: HTTP 404: {WORDS}")
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_so_that_another_model_or_setting_may_begin_in_the_folder(
     ask: Typed, play: Play, there: Server, tmp_path: Path
 ) -> None:
@@ -170,6 +172,7 @@ def test_nothing_is_lost_so_that_another_model_or_setting_may_begin_in_the_folde
     assert [path.name for path in (tmp_path / "reports").iterdir()] == [out.name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("role", ["ego", "helpers"])
 def test_the_same_command_asks_only_the_errors_and_makes_the_run_that_had_none(
     role: str, ask: Typed, play: Play, tmp_path: Path
@@ -217,6 +220,7 @@ def without_batches(run: Path) -> list[Row]:
     return [{k: v for k, v in row.items() if k not in ("batch_size", "seconds", "token_s")} for row in rows]
 
 
+@pytest.mark.slow
 def test_a_few_helpers_without_an_answer_are_lost_messages_that_are_counted_and_shown(
     ask: Typed, harness: Typed, play: Play, tmp_path: Path
 ) -> None:
@@ -242,6 +246,7 @@ def test_a_server_that_breaks_in_the_middle_is_soon_asked_no_more(ask: Typed, pl
     assert len(play.bodies) <= 30 + 3 * IN_A_ROW
 
 
+@pytest.mark.slow
 def test_fusion_calls_count_as_the_egos(ask: Typed, play: Play, tmp_path: Path) -> None:
     fusion = ("--condition", "6g:consensus=ego-prompt", "--seeds", "0:1", "--limit", "1", "--no-cache")
     play.again(of_fusion)
@@ -253,6 +258,7 @@ def test_fusion_calls_count_as_the_egos(ask: Typed, play: Play, tmp_path: Path) 
     assert len(play.bodies) < len(answers_of(tmp_path / "run"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("role", ["ego", "helpers"])
 def test_a_driven_run_asks_only_the_errors_again(role: str, ask: Typed, play: Play, tmp_path: Path) -> None:
     options = ("--episodes", "2", "--condition", "6g", "--seeds", "0:1", "--no-cache", "--workers", "1")
@@ -267,6 +273,7 @@ def test_a_driven_run_asks_only_the_errors_again(role: str, ask: Typed, play: Pl
     assert not [answer for answer in answers_of(tmp_path / "run") if answer.error]
 
 
+@pytest.mark.slow
 def test_a_shard_is_not_done_while_too_many_of_its_questions_have_no_answer(
     ask: Typed, harness: Typed, play: Play
 ) -> None:
@@ -281,6 +288,7 @@ def test_a_shard_is_not_done_while_too_many_of_its_questions_have_no_answer(
     assert harness("run", "merge", "shard", "--out", "run")[0] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "options"),
     [
@@ -305,6 +313,7 @@ def test_every_study_ends_the_same_way_and_goes_on(
     assert set() < set(play.bodies) & before <= refused(refuses, before)
 
 
+@pytest.mark.slow
 def test_what_a_study_asks_of_a_runs_model_is_kept_but_for_errors(
     ask: Typed, harness: Typed, play: Play, tmp_path: Path
 ) -> None:

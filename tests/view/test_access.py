@@ -32,6 +32,7 @@ def test_without_the_token_nothing_is_read(page: str, given: str, stranger: Test
         assert answer.headers["content-security-policy"].startswith("default-src 'none'")
 
 
+@pytest.mark.slow
 def test_the_printed_address_gives_a_cookie_and_leaves_the_token_out(stranger: TestClient) -> None:
     answer = stranger.get(f"/run?path=second&token={TOKEN}", follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, "http://127.0.0.1:7654/run?path=second")

@@ -41,6 +41,7 @@ def served(reports: Path) -> Iterator[tuple["subprocess.Popen[str]", str]]:
             process.kill()
 
 
+@pytest.mark.slow
 def test_the_command_serves_on_loopback_alone_until_it_is_interrupted(
     served: tuple["subprocess.Popen[str]", str],
 ) -> None:
