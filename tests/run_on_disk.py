@@ -9,8 +9,7 @@ import msgspec
 import pyarrow as pa
 
 from harness.coordination.operating_point import POINTS, OperatingPoint
-from harness.core.formats import FORMAT
-from harness.runs import folder
+from harness.runs import folder, formats
 from harness.runs.decisions import Decisions, schema
 from harness.runs.metrics import Grid, World
 from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Latency, Manifest
@@ -79,7 +78,8 @@ def made_up(
     said = [_changed(_answer(scene, viewer), answer) for scene, *_ in scenes for viewer in viewers]
     world = msgspec.structs.replace(_DRIVEN if closed_loop else _FROZEN, episodes=episodes)
     manifest = {
-        "format": FORMAT, "name": out.name, "created": "2026-01-01T00:00:00+00:00", "command": "harness eval",
+        "format": formats.FORMAT, "name": out.name, "created": "2026-01-01T00:00:00+00:00",
+        "command": "harness eval",
         "tags": [], "model": {"name": "made-up", "engine": "proxy"},
         "prompt": {"version": "v2", "sha256": "0" * 64, "released": True},
         "world": msgspec.to_builtins(world), "actions": ACTIONS,
@@ -132,7 +132,7 @@ def answers_of(run: Path) -> list[Answer]:
 def _write(
     out: Path, stated: Mapping[str, Any], rows: Sequence[Row], ends: Sequence[Row], said: Sequence[Row]
 ) -> Path:
-    manifest = msgspec.convert(msgspec.to_builtins(stated), Manifest)
+    manifest = msgspec.convert(formats.upgraded(msgspec.to_builtins(stated)), Manifest)
     helpers = max((int(name[7:]) for name in rows[0] if name.startswith("helper_")), default=0)
     decisions = _decisions(rows, manifest.actions, helpers)
     answers = _all(said, Answer)

@@ -140,12 +140,15 @@ class Backend(Protocol):
         ...
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the answers, as JSON for the manifest: engine, versions, weights, settings."""
+        """Return what decides the answers, as JSON for the manifest: engine, versions, weights, settings.
+
+        Its `answers` is the answer version of the engine's registration.
+        """
         ...
 
 
 def same_model(stored: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether an identity is that of a stored one; what an earlier version did not store is not compared."""
+    """Whether an identity is that of a stored one; what a server did not state then is not compared."""
     return canonical_json(_as_stored(now, stored)) == canonical_json(stored)
 
 

@@ -43,8 +43,6 @@ _EXACT = ("float32", "F32")  # number formats in which a batch changes no answer
 _WAIT_S = 30.0  # longest wait for another process that is writing
 _AT_ONCE = 500  # keys in one query; SQLite has a limit
 _TABLE = "CREATE TABLE IF NOT EXISTS completions (key TEXT PRIMARY KEY, answer TEXT NOT NULL) WITHOUT ROWID"
-# Code that takes part in an answer. Its digest is in the key, so changed code finds no old answers.
-_CODE = ("backends/**/*.py", "prompts/answer_schema.py", "prompts/readout.py", "core/rounding.py")
 
 
 def default_file() -> Path:
@@ -55,12 +53,14 @@ def default_file() -> Path:
 def key(identity: Mapping[str, Any], prompt: str, request: Request, batch_size: int | None = None) -> str:
     """Return the hex digest of all that decides an answer; it reveals no prompt and no secret.
 
+    The identity states the version of the engine's answers.
+
     With float32 weights other requests in a batch change no answer, and `batch_size` is None. With quantised
     and 16-bit weights they move it by rounding: the batch size is part of the key.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
     asked["image"] = request.image_sha256
-    parts = {"identity": identity, "prompt": prompt, "asked": asked, "code": kept.code_sha256(*_CODE)}
+    parts = {"identity": identity, "prompt": prompt, "asked": asked}
     return digest(parts if batch_size is None else {**parts, "batch_size": batch_size})
 
 

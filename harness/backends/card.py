@@ -78,15 +78,9 @@ class Card:
         return replace(self, server=replace(self.server, base_url=urls)) if self.server and urls else self
 
     def record(self) -> dict[str, Any]:
-        """Return the card as plain values, from which `convert` makes it again.
-
-        Keys that later versions added stand in it only where they are set: a run that an earlier version
-        began has the same settings.
-        """
+        """Return the card as plain values, from which `convert` makes it again."""
         record = asdict(self)
         del record["letters"]  # the agent's settings say how its letters are read
-        if self.system is None:
-            del record["system"]
         if self.server:
             server = {key: value for key, value in record["server"].items() if value is not None}
             if self.server.fields:

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
-from harness import __version__
 from harness.backends.base import Completion, Request, split_by_scenario
 from harness.backends.card import Card
+from harness.backends.registry import BUILT_IN
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, sha256_file
 from harness.world.drivers import CONSTANT, CONSTANTS, DRIVERS, UNIFORM, choices, constant
@@ -52,6 +52,6 @@ class DriverBackend:
         return Completion(request.id, text, None, None, "stop", None, 1)
 
     def identity(self) -> dict[str, Any]:
-        """Return the driver and the version of its rules, with what the choice of `constant` follows from."""
+        """Return the driver and its answer version, with what the choice of `constant` follows from."""
         chosen = {"constants": sha256_file(CONSTANTS, "record")} if self.driver == CONSTANT else {}
-        return {"engine": "driver", "driver": self.driver, "harness": __version__, **chosen}
+        return {"engine": "driver", "answers": BUILT_IN["driver"].answers, "driver": self.driver, **chosen}

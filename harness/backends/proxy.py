@@ -12,14 +12,13 @@ from typing import Any
 from harness.backends.base import Completion, FinishReason, Request, split_by_scenario
 from harness.backends.card import Card
 from harness.backends.failures import Failures, draw_failure, spoil
+from harness.backends.registry import BUILT_IN
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded
 from harness.prompts.answer_schema import plainest
 from harness.world.planner import plan, plans
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
-
-VERSION = "proxy/1"
 
 SURE_SLOWER = 0.90  # probability of SLOWER if the viewer sees a conflict that calls for it
 LEAST_DOUBT, MOST_DOUBT = 0.05, 0.38  # probability of SLOWER with every sector in sight, and with one hidden
@@ -55,7 +54,7 @@ class Proxy:
     def identity(self) -> dict[str, Any]:
         return {
             "engine": "proxy",
-            "proxy_model_version": VERSION,
+            "answers": BUILT_IN["proxy"].answers,
             "calibration_label": "none: chosen by hand",
             "failures": asdict(self._failures) if self._failures else None,
         }

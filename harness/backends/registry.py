@@ -41,6 +41,9 @@ class Registration:
 
     opens: str  # `module:function`, called with a card and the options of `open_backend`; returns a backend
     capabilities: Capabilities  # what the engine can do
+    # the version of its answers, which its `identity()` states: it goes up when the engine answers a request
+    # otherwise than before, which tests/conformance/test_answer_versions.py notices
+    answers: int = 1
     card_keys: tuple[str, ...] = ()  # card keys that this engine understands and not every engine does
     required_keys: tuple[str, ...] = ()  # such keys that its cards must have
     packages: Mapping[str, str] = field(default_factory=dict)  # that it needs, by the module's name

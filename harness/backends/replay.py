@@ -9,7 +9,7 @@ from harness.backends.base import AGAIN, Backend, Completion, Request, failed, s
 from harness.backends.cache import cached, default_file
 from harness.backends.card import Card
 from harness.backends.cards import own
-from harness.backends.registry import ENGINES, open_backend
+from harness.backends.registry import BUILT_IN, ENGINES, open_backend
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_file
@@ -150,7 +150,8 @@ class Replay:
     def identity(self) -> dict[str, Any]:
         answers_sha256 = sha256_file(self._run.path / "answers.jsonl", "rows")
         model = {"model": self._run.manifest.model, "identity": self._run.manifest.identity}
-        return {"engine": "replay", "answers_sha256": answers_sha256, "of": model}
+        ours = {"engine": "replay", "answers": BUILT_IN["replay"].answers}
+        return {**ours, "answers_sha256": answers_sha256, "of": model}
 
 
 def _turn(whole: Completion, first: FirstTurn, again: bool) -> Completion:

@@ -9,6 +9,9 @@ from typing import Any
 from harness import __version__
 from harness.core.kept import code_sha256
 
+# Versions of what turns answers into decisions. tests/conformance/test_answer_versions.py pins their results
+# and asks for a new version when one moves. Work that was stopped under another version is not resumed.
+PARSER, DECISIONS = 1, 1
 PACKAGES = ("numpy", "scipy", "jinja2", "highway-env", "torch", "transformers", "llama-cpp-python")
 
 
@@ -17,7 +20,10 @@ _version = cache(metadata.version)
 
 def versions(packages: Sequence[str] = PACKAGES) -> Any:
     """Return the versions of the harness, Python, the platform and those packages that are installed."""
-    installed = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    installed = {
+        "harness": __version__, "parser": str(PARSER), "decisions": str(DECISIONS),
+        "python": platform.python_version(), "platform": platform.platform(),
+    }  # fmt: skip
     for name in packages:
         try:
             installed[name] = _version(name)

@@ -169,10 +169,7 @@ class Agent:
             "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
             "thinking": self.thinking,
             "answer": self.answer,
-            "image": self.image,
-            **({"letters": "cyclic"} if self.letters == "cyclic" else {}),  # earlier runs read them once
-            **({"sums": "divide"} if self.sums == "divide" else {}),  # earlier runs refused them
-            **({"flip": True} if self.flip else {}),  # earlier runs asked for no reversed list
+            **{name: getattr(self, name) for name in ("image", "letters", "sums", "flip")},
         }
 
 

@@ -15,11 +15,8 @@ from harness.core.versions import versions
 from harness.evaluate import latency as latencies
 from harness.evaluate.settings import words
 from harness.evaluate.spec import Spec
-from harness.runs import folder
+from harness.runs import folder, formats
 from harness.runs.records import Latency, Manifest, Score
-
-# Settings that older runs lack, and what they did.
-ABSENT = {"ask": "all", "flip": False, "letters": "raw", "sums": "refuse", "ties": "first"}
 
 
 class Begun(work.Begun, frozen=True, kw_only=True):
@@ -35,11 +32,16 @@ class Begun(work.Begun, frozen=True, kw_only=True):
     """
 
     created: str
-    command: tuple[str, ...]
+    command: tuple[str, ...] = ()
     identity: dict[str, Any]
     tags: tuple[str, ...]
     latency: Latency
-    versions: dict[str, str]
+    versions: dict[str, str] = msgspec.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "settings", formats.upgraded(self.settings))
+        msgspec.structs.force_setattr(self, "identity", formats.identity(self.identity))
+        msgspec.structs.force_setattr(self, "versions", formats.versions(self.versions))
 
     def facts(self) -> dict[str, Any]:
         """Return what must be the same in all shards of a run, by the name that an error gives it."""
@@ -95,9 +97,15 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> Begun | None:
     """Return the record of a stopped run in a folder, or None. Raises UserError if it is another run."""
     begun = work.begun(out, Begun)
     if begun:
-        now = {**_comparable(spec.settings()), "shard": shard}
-        work.same(out, now, {**_comparable(begun.settings), "shard": begun.shard})
+        now = {**_comparable(spec.settings()), "shard": shard, **_rules(versions())}
+        stored = {**_comparable(begun.settings), "shard": begun.shard, **_rules(begun.versions)}
+        work.same(out, now, stored)
     return begun
+
+
+def _rules(versions: Mapping[str, str]) -> dict[str, str]:
+    """Return the versions of the rules that make decisions of answers: parts of a run have the same."""
+    return {f"version of {name}": versions[name] for name in formats.VERSIONS}
 
 
 def resumable(spec: Spec, out: Path) -> bool:
@@ -138,4 +146,4 @@ def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
     of = settings.get("world")
     table = of if isinstance(of, Mapping) else {"kind": of}
     world = {f"{key} of the world": value for key, value in table.items() if key != "path"}
-    return {**ABSENT, **{key: value for key, value in settings.items() if key != "world"}, **world}
+    return {**{key: value for key, value in settings.items() if key != "world"}, **world}

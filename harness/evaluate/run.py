@@ -20,7 +20,7 @@ from harness.backends.swarm import open_each, together
 from harness.core import shards, work
 from harness.core.errors import Unanswered, UserError
 from harness.core.files import write_whole
-from harness.core.formats import FORMAT, WORK
+from harness.core.formats import WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
 from harness.core.shards import Shard
@@ -48,6 +48,7 @@ from harness.evaluate.walk import of_all_seeds, table, walk
 from harness.runs import folder
 from harness.runs import sources as kept_sources
 from harness.runs.decisions import Decisions
+from harness.runs.formats import FORMAT
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Manifest
 from harness.runs.summary import Figures, counted

@@ -310,9 +310,6 @@ class Spec:
         """Return, as plain values, the settings that must not change when a stopped run resumes."""
         return {
             **self.ego.settings(),
-            "letters": self.ego.letters,
-            "sums": self.ego.sums,
-            "flip": self.ego.flip,
             "helpers": [agent.settings() for agent in self.helpers],
             "world": msgspec.to_builtins(self.source.record()),
             "actions": list(self.actions),

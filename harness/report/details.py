@@ -63,7 +63,7 @@ def prompts_of(run: Run) -> Sent | None:
         try:
             letter = agent["answer"] == "readout"
             rendered = prompt.render(graph, run.actions, heard, words, letter)
-            messages = shown(agent.get("image", "own"), rendered)
+            messages = shown(agent["image"], rendered)
             return in_mode(agent["answer"], prompt, messages, graph.role, run.actions)
         except UserError:  # a stranger's, which no run can have used
             failed.add(prompt.version)

@@ -1,5 +1,6 @@
 """The table of decisions, `decisions.parquet`: one row for each decision point, condition and seed."""
 
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,6 +16,7 @@ import pyarrow.parquet as pq
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.files import bytes_of, replacing
+from harness.runs import formats
 from harness.runs.records import Decision, Message
 
 if TYPE_CHECKING:
@@ -253,8 +255,9 @@ class Decisions:
             there = source.schema_arrow.names
             helpers = _helpers(there)
             expected = schema(actions, helpers)
-            if missing := [name for name in expected.names if name not in there and name not in OPTIONAL]:
-                raise ValueError(f"it lacks {', '.join(missing)}")
+            missing = [name for name in expected.names if name not in there]
+            if lacking := [name for name in missing if re.sub(r"_\d+$", "", name) not in formats.COLUMNS]:
+                raise ValueError(f"it lacks {', '.join(lacking)}")
             wanted = [name for name in expected.names if name in there]
             if (
                 _bytes(source.metadata, set(wanted))
@@ -262,9 +265,8 @@ class Decisions:
             ):
                 raise ValueError("it holds more bytes than decisions need")
             table = source.read(columns=wanted)
-        for name in OPTIONAL:
-            if name not in table.column_names:
-                table = table.append_column(name, pa.nulls(len(table), NUMBER))
+        for name in missing:
+            table = table.append_column(name, pa.nulls(len(table), expected.field(name).type))
         for name in NEVER_UNKNOWN:
             if table[name].null_count:
                 raise ValueError(f"{name} is unknown in some rows")

@@ -26,11 +26,11 @@ from msgspec.structs import asdict
 from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.files import bytes_of, replacing, text_of, write_whole
-from harness.core.formats import FORMAT, READ_BY, SUITE
+from harness.core.formats import SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
 from harness.dataset.verify import read_manifest
-from harness.runs import attribution
+from harness.runs import attribution, formats
 from harness.runs.answers import Answered, Answers
 from harness.runs.attribution import Attribution
 from harness.runs.decisions import DecisionFiles, Decisions, arrow_file
@@ -235,7 +235,20 @@ class Run:
         return decisions
 
     def _read(self, name: str, reader: Callable[[Path], T]) -> T:
-        return whole(self.path / name, reader)
+        try:
+            return whole(self.path / name, reader)
+        except UserError as error:
+            if name == "answers.jsonl" or self.world != "frozen" or not self._has_answers:
+                raise
+            raise UserError(
+                f"{error}: --model replay:{printable(self.path)} asks its model nothing"
+            ) from None
+
+    @property
+    def _has_answers(self) -> bool:
+        with suppress(UserError):
+            return len(self.answers) > 0
+        return False
 
 
 def read(path: Path) -> Run:
@@ -255,15 +268,8 @@ def read(path: Path) -> Run:
             "give a folder made by `harness eval` or `harness drive`"
         )
     stated: Any = whole(file, lambda file: msgspec.json.decode(text_of(file, "record")))
-    version = stated.get("format") if isinstance(stated, dict) else None
-    if version != FORMAT:
-        old = READ_BY.get(version) if isinstance(version, str) else None
-        raise UserError(
-            f"{printable(file)} has format {printable(version)!r}, not {FORMAT!r}; "
-            + (f"harness {old} reads it: run again, or install that version" if old
-               else "give a folder made by `harness eval` or `harness drive`")
-        )  # fmt: skip
-    return Run(path, whole(file, lambda file: msgspec.convert(stated, Manifest)))
+    formats.checked(stated.get("format") if isinstance(stated, dict) else None, file)
+    return Run(path, whole(file, lambda file: msgspec.convert(formats.upgraded(stated), Manifest)))
 
 
 def write(

@@ -13,7 +13,8 @@ from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, text_of
-from harness.core.formats import CONFIG, FORMAT, READ_BY, SOURCES, SUITE, WORK
+from harness.core.formats import CONFIG, SOURCES, SUITE, WORK
+from harness.runs import formats
 
 DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
@@ -152,9 +153,9 @@ def _finished_entry(path: str, has_summary: bool, written: datetime) -> Listed:
     listed = Listed("", "run", "broken", written, "run.json")
     try:
         config = _json(path, "run.json")
-        if config["format"] in READ_BY:
-            return replace(listed, why=f"run.json: format of harness {READ_BY[config['format']]}")
-        if config["format"] != FORMAT:
+        if config["format"] in formats.READ_BY:
+            return replace(listed, why=f"run.json: format of harness {formats.READ_BY[config['format']]}")
+        if config["format"] != formats.FORMAT:
             return listed
         listed = replace(listed, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
         listed = replace(_with_config(listed, config), why="summary.csv")

@@ -257,7 +257,7 @@ class Message(Struct, frozen=True, rename={"sender": "from"}):
         arrival_ms: when it arrived, from the start of the decision; None if lost.
         weight: its weight in the policy; None if a fusion call answered.
         trust: how far the consensus rule trusted it, from 0 to 1; None if the rule rates no trust.
-        attacker: whether the sender attacks under this condition.
+        attacker: whether the sender attacks under this condition; None in runs older than attacks.
     """
 
     sender: str
@@ -266,7 +266,7 @@ class Message(Struct, frozen=True, rename={"sender": "from"}):
     arrival_ms: float | None
     weight: float | None
     trust: float | None
-    attacker: bool
+    attacker: bool | None
 
 
 class Decision(Struct, frozen=True, kw_only=True):
@@ -565,29 +565,29 @@ class Manifest(Struct, frozen=True, kw_only=True):
     tags: tuple[str, ...]
     model: dict[str, Any]
     prompt: dict[str, Any]
-    helpers: tuple[dict[str, Any], ...] = ()
+    helpers: tuple[dict[str, Any], ...]
     world: FrozenScenes | ClosedLoop
     actions: tuple[str, ...]
     conditions: tuple[dict[str, Any], ...]
-    channels: dict[str, ChannelRecord] = {}
-    networks: dict[str, dict[str, Any]] = {}
-    schedules: dict[str, str] = {}
+    channels: dict[str, ChannelRecord]
+    networks: dict[str, dict[str, Any]]
+    schedules: dict[str, str]
     seeds: tuple[int, ...]
-    ask: Literal["used", "all"] = "all"
-    ties: Literal["drawn", "first"] = "first"
+    ask: Literal["used", "all"]
+    ties: Literal["drawn", "first"]
     thinking: bool
     answer: str
-    image: str = "own"
-    letters: Literal["raw", "cyclic"] = "raw"
-    sums: Literal["refuse", "divide"] = "refuse"
-    flip: bool = False
+    image: str
+    letters: Literal["raw", "cyclic"]
+    sums: Literal["refuse", "divide"]
+    flip: bool
     batch_size: int
     dtype: str | None
-    temperature: float = 0.0
-    sampling_seed: int = 0
+    temperature: float
+    sampling_seed: int
     latency_source: str | None
-    device_profile: Device | None = None
-    device_model: str | None = None
+    device_profile: Device | None
+    device_model: str | None
     latency: Latency
     answer_times: dict[str, Times] = field(default_factory=dict)
     identity: dict[str, Any]
@@ -630,8 +630,6 @@ class Manifest(Struct, frozen=True, kw_only=True):
     def agent(self, place: int) -> dict[str, Any]:
         """Return the agent of a scene's viewer at this place, in the form of `helpers`; the ego is at 0."""
         if place and self.helpers:
-            helper = self.helpers[(place - 1) % len(self.helpers)]
-            absent = {"image": "own", "letters": "raw", "sums": "refuse", "flip": False, "thinking": False}
-            return {**absent, **helper}
+            return self.helpers[(place - 1) % len(self.helpers)]
         names = ("model", "prompt", "answer", "thinking", "image", "letters", "sums", "flip")
         return {name: getattr(self, name) for name in names}

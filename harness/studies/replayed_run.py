@@ -344,8 +344,8 @@ class ReplayedRun:
         prompt = versions.load(version)
         return Agent(
             card, prompt, cast("AnswerMode", stated["answer"]), stated["thinking"],
-            cast("ImageMode", stated.get("image", "own")), cast("Letters", stated.get("letters", "raw")),
-            cast("Sums", stated.get("sums", "refuse")),
+            cast("ImageMode", stated["image"]), cast("Letters", stated["letters"]),
+            cast("Sums", stated["sums"]),
         )  # fmt: skip
 
     def _restore(self, stated: Mapping[str, Any]) -> str:

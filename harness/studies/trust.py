@@ -20,13 +20,13 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import digest
-from harness.core.kept import code_sha256
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate, negative_log_likelihood, resampled, resampled_estimate
 from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.walk import Decided, walk
+from harness.radio.profiles import CHANNELS
 from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Cells, refuse_other
@@ -266,8 +266,8 @@ def run_bench(
         *product(dict.fromkeys([BASE, *rules]), attacks, shares),
     ]
     depends_on = [
-        run.manifest(), str(run.run.manifest.identity), asdict(point), list(seeds), versions(),
-        code_sha256("**/*.py"),
+        run.manifest(), str(run.run.manifest.identity), asdict(point), list(seeds),
+        point.profile and CHANNELS.record(point.profile), versions(),
     ]  # fmt: skip
     kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[Key, Cell]()
 

@@ -15,11 +15,11 @@ from killed_drive import EPISODES, EPISODES_AT_ONCE
 
 from harness.backends.driver import DriverBackend
 from harness.core.errors import UserError
-from harness.core.formats import FORMAT
 from harness.core.work import tidy
 from harness.evaluate import live_world
 from harness.evaluate.live_world import LiveWorld
 from harness.evaluate.run import evaluate
+from harness.runs.formats import FORMAT
 
 HERE = Path(__file__).parent
 

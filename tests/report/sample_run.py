@@ -7,12 +7,11 @@ import msgspec
 from evaluating import all_scenes, says, spec_of
 
 from harness.backends.base import Completion
-from harness.core.formats import FORMAT
 from harness.evaluate.asking import Asker, answer_of, requests
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.walk import table, walk
-from harness.runs import folder
+from harness.runs import folder, formats
 from harness.runs.metrics import Grid
 from harness.runs.records import Manifest
 from harness.runs.summary import Figures, counted
@@ -33,7 +32,7 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
     grid = Grid(tuple(point.name for point in spec.points), SEEDS, dataset.episodes)
     episodes = counted(grid, decisions, world.episodes())
     manifest = {
-        "format": FORMAT, "name": out.name, "created": "2025-01-01T00:00:00+00:00",
+        "format": formats.FORMAT, "name": out.name, "created": "2025-01-01T00:00:00+00:00",
         "command": "harness eval --model rule-of-thumb", "tags": [], **spec.settings(),
         "model": {"name": model, "engine": "rule", "description": "brakes for what it sees"},
         "prompt": {"version": "v2", "sha256": "00" * 32, "released": True},
@@ -42,7 +41,7 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
     }  # fmt: skip
     folder.write(
         out,
-        msgspec.convert(msgspec.to_builtins({**manifest, **stated}), Manifest),
+        msgspec.convert(formats.upgraded(msgspec.to_builtins({**manifest, **stated})), Manifest),
         decisions.rounded(),
         episodes,
         [folder.lines(folder.ordered(answers, decisions))],

@@ -15,6 +15,7 @@ from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp.context import LlamaContext, Logits
 from harness.backends.llama_cpp.model import LlamaModel, build, most_sequences
 from harness.backends.llama_cpp.projector import Projector
+from harness.backends.registry import BUILT_IN
 from harness.backends.weights import hub_commit
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
@@ -156,6 +157,7 @@ class LlamaEngine:
         commit = hub_commit(self._file.parent)
         return {
             "engine": "llama-cpp",
+            "answers": BUILT_IN["llama-cpp"].answers,
             **build(),
             "weights": self._card.weights,
             "file": self._card.file,

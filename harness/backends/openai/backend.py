@@ -20,6 +20,7 @@ from harness.backends.openai.prompt_check import PromptCheck
 from harness.backends.openai.shapes import answering_model, body, digest_url, read
 from harness.backends.openai.stream import ASKED, BROKE_OFF
 from harness.backends.orders import average_orders
+from harness.backends.registry import BUILT_IN
 from harness.backends.servers import Fields, Server
 from harness.core.errors import printable
 from harness.core.files import canonical_json
@@ -84,7 +85,8 @@ class OpenAIBackend:
         where = {} if self._server.any_may_answer else {"base_url": self._server.base_url}
         states = {"states": dict(model.states)} if model.states else {}
         named = {"model": self._card.weights, "listed": model.listed}
-        return {"engine": "openai", "server": self._server.kind, **where, **named, **version, **states}
+        ours = {"engine": "openai", "answers": BUILT_IN["openai"].answers, "server": self._server.kind}
+        return {**ours, **where, **named, **version, **states}
 
     @property
     def doubt(self) -> str | None:

@@ -12,6 +12,7 @@ from harness.backends.card import Card, Dtype
 from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.engine import Session
 from harness.backends.language_model import LanguageModel
+from harness.backends.registry import BUILT_IN
 from harness.backends.weights import check_digest, fetching, find_checkpoint, find_gguf, hub_commit, is_gguf
 from harness.core.cores import threads
 from harness.core.errors import UserError, one_line, printable
@@ -171,6 +172,7 @@ class TransformersEngine:
         commit = hub_commit(self.where)
         return {
             "engine": "transformers",
+            "answers": BUILT_IN["transformers"].answers,
             "transformers": version("transformers"),
             "torch": version("torch"),
             "weights": self.card.weights,

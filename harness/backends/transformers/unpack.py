@@ -16,6 +16,7 @@ from warnings import catch_warnings, simplefilter
 
 from harness.backends.card import Card
 from harness.backends.gguf import read_metadata
+from harness.backends.registry import BUILT_IN
 from harness.backends.tokens import tokenizer
 from harness.core import kept
 from harness.core.errors import UserError, one_line, printable
@@ -29,7 +30,7 @@ def unpack_checkpoint(card: Card, file: Path) -> Path:
     """Return the checkpoint of a GGUF file, made if it is not kept. Raises UserError if it cannot be."""
     from transformers import __version__
 
-    made_by = [__version__, kept.code_sha256("backends/transformers/unpack.py", "backends/tokens.py")]
+    made_by = [__version__, BUILT_IN["transformers"].answers]
     to = kept.folder() / "checkpoints" / digest([sha256_file(file), *made_by])[:16]
     shown = f"{card.shown} in {printable(file)}"
     try:

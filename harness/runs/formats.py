@@ -1,0 +1,169 @@
+"""What the runs of earlier versions lack, and how it is read: the one place that knows of them.
+
+A format's number goes up only when an earlier harness would misread a run. Otherwise files grow: whoever
+adds a setting or a column adds an entry here, which says what a run without it did; whoever renames one maps
+the old name. `tests/test_records.py` reads kept runs of earlier commits and fails without the entry.
+"""
+
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from msgspec import UNSET
+
+from harness.core.errors import UserError, printable
+
+NUMBER = 2
+FORMAT = f"swarmdrive-run/{NUMBER}"
+# Older formats, and the version of the harness that reads each.
+READ_BY = {"swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1"}
+
+
+class Added(NamedTuple):
+    """What a run without a setting or a column did.
+
+    Attributes:
+        since: the day that added it.
+        absent: its value in a run without it.
+        why: what was added, and why older runs have that value.
+    """
+
+    since: str
+    absent: Any
+    why: str
+
+
+SETTINGS: Mapping[str, Added] = {
+    "channels": Added("2026-11-23", {}, "channel profiles became files; older runs used those that ship"),
+    "networks": Added("2026-11-23", {}, "a cloud behind a measured network"),
+    "schedules": Added("2026-11-23", {}, "learnt schedules, by the digest of their file"),
+    "helpers": Added("2026-11-23", (), "agents of their own for helpers; the ego's answered for all"),
+    "temperature": Added("2026-11-23", 0.0, "sampling; all answers were greedy"),
+    "sampling_seed": Added("2026-11-23", 0, "sampling"),
+    "device_profile": Added("2026-11-23", None, "on-board computers that time answers by their tokens"),
+    "device_model": Added("2026-11-23", None, "the row of such a computer"),
+    "ask": Added("2026-11-26", "all", "asking only helpers whose answer counts; all were asked"),
+    "ties": Added("2026-11-26", "first", "drawing between the likeliest actions; the first was taken"),
+}
+# Of the ego's agent, in run.json itself, and of each of `helpers`.
+AGENT: Mapping[str, Added] = {
+    "thinking": Added("2026-11-23", False, "helpers that think"),
+    "image": Added("2026-11-23", "own", "pictures in prompts, and controls of them"),
+    "letters": Added("2026-11-26", "raw", "read-outs over several orders of letters; there was one"),
+    "sums": Added("2026-11-26", "refuse", "dividing a sum that is off 1; such an answer failed"),
+    "flip": Added("2026-11-26", False, "asking with the list of actions reversed"),
+}
+MODEL: Mapping[str, Added] = {
+    "vision": Added("2026-11-23", None, "models that take pictures"),
+    "projector": Added("2026-11-23", None, "the file that turns pictures into tokens"),
+    "system": Added("2026-11-25", None, "chat templates without a place for the system text"),
+}
+CONDITION: Mapping[str, Added] = {
+    "radio": Added("2026-11-23", "", "any setting of a channel in a condition"),
+    "schedule": Added("2026-11-23", "entropy", "schedules beside the paper's trigger"),
+    "threshold": Added("2026-11-23", None, "a schedule's threshold"),
+    "round_trip": Added("2026-11-23", "", "a cloud behind a measured network"),
+    "round_trip_s": Added("2026-11-23", None, "a cloud behind a constant round trip"),
+    "edge": Added("2026-11-23", "none", "roadside units with a place; see `_condition` for `roadside_edge`"),
+    "edge_delay_s": Added("2026-11-23", 0.0, "roadside units with a place"),
+    "edge_x_m": Added("2026-11-23", 0.0, "roadside units with a place"),
+    "edge_y_m": Added("2026-11-23", 0.0, "roadside units with a place"),
+    "edge_antenna_m": Added("2026-11-23", 5.0, "roadside units with a place"),
+    "attack": Added("2026-11-23", "", "attacks; all helpers were honest"),
+    "defence": Added("2026-11-23", "", "guarded fusion prompts"),
+    "weight_cap": Added("2026-11-23", 1.0, "a cap on one helper's weight"),
+}
+# Of `versions`, in run.json and in the record that a run begins with.
+VERSIONS: Mapping[str, Added] = {
+    "parser": Added("2026-11-26", "1", "the version of what answers are read as"),
+    "decisions": Added("2026-11-26", "1", "the version of what answers are decided to"),
+}
+# Of the record that a run begins with; `lifecycle.Begun` has the same defaults.
+START: Mapping[str, Added] = {
+    "command": Added("2026-11-23", (), "the command that repeats a run; the one that resumes it is stated"),
+    "versions": Added("2026-11-23", {}, "versions of packages; those that resume it are stated"),
+}
+# Of a line of answers.jsonl; `records.Answer` has the same defaults.
+ANSWER: Mapping[str, Added] = {
+    "first_token_s": Added("2026-11-23", None, "time to the first token"),
+    "token_s": Added("2026-11-23", None, "time per output token"),
+    "first": Added("2026-11-23", UNSET, "repair turns; also unset without one"),
+    "image_sha256": Added("2026-11-23", UNSET, "pictures in prompts; also unset without one"),
+    "agent": Added("2026-11-26", UNSET, "asking only helpers whose answer counts; the order of answers said"),
+    "letter_share": Added("2026-11-26", UNSET, "read-outs over several orders of letters"),
+    "follows_letter": Added("2026-11-26", UNSET, "read-outs over several orders of letters"),
+    "flipped": Added("2026-11-26", UNSET, "asking with the list of actions reversed"),
+    "faults": Added("2026-11-26", UNSET, "all faults of an answer; older ones have the status alone"),
+    "extension": Added("2026-11-26", UNSET, "what a prompt asks for beside the decision"),
+}
+# Columns of decisions.parquet, those of messages without their number; a missing one is null.
+COLUMNS: Mapping[str, Added] = {
+    "trust": Added("2026-11-23", None, "rules that judge helpers"),
+    "attacker": Added("2026-11-23", None, "attacks"),
+    **dict.fromkeys(("inference_j", "helpers_j", "radio_mj", "waiting_j"),
+                    Added("2026-11-23", None, "energy; also missing without a device profile")),
+    "busy_ratio": Added("2026-11-23", None, "load of the channel; also missing where it is not known"),
+}  # fmt: skip
+
+
+def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of run.json, or the settings that a run began with, as this version states them.
+
+    What is no table is left as it is, for the reader to refuse.
+    """
+    settings = _agent(_with(SETTINGS, stated))
+    if isinstance(model := settings.get("identity"), dict):
+        settings["identity"] = identity(model)
+    for name, upgrade in (("helpers", _agent), ("conditions", _condition)):
+        if isinstance(tables := settings.get(name), list | tuple):
+            settings[name] = [upgrade(table) if isinstance(table, dict) else table for table in tables]
+    return settings
+
+
+def versions(stated: Mapping[str, str]) -> dict[str, str]:
+    """Return the versions that a run states, with those that an older one lacks."""
+    return _with(VERSIONS, stated)
+
+
+def identity(stated: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the identity of a run's models with their answer versions.
+
+    2026-11-26: `answers` replaced what engines without weights said of their version. All older answers are
+    of version 1.
+    """
+    kept = {name: value for name, value in stated.items() if name not in ("proxy_model_version", "harness")}
+    if isinstance(helpers := stated.get("helpers"), list):
+        kept["helpers"] = [identity(helper) if isinstance(helper, dict) else helper for helper in helpers]
+    return {"answers": 1, **kept}
+
+
+def _with(added: Mapping[str, Added], stated: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is stated, then what it lacks."""
+    return {**stated, **{name: entry.absent for name, entry in added.items() if name not in stated}}
+
+
+def _agent(stated: Mapping[str, Any]) -> dict[str, Any]:
+    agent = _with(AGENT, stated)
+    if isinstance(model := agent.get("model"), dict):
+        agent["model"] = _with(MODEL, model)
+    return agent
+
+
+def _condition(stated: Mapping[str, Any]) -> dict[str, Any]:
+    """2026-11-23: `edge` replaced `roadside_edge`, which sent replies once more, as `relay` does."""
+    renamed = {name: value for name, value in stated.items() if name != "roadside_edge"}
+    return _with(CONDITION, {**renamed, "edge": "relay"} if stated.get("roadside_edge") is True else renamed)
+
+
+def checked(version: object, file: object) -> None:
+    """Raise UserError for a run.json of another format than `FORMAT`."""
+    if version == FORMAT:
+        return
+    old = READ_BY.get(version) if isinstance(version, str) else None
+    newer = re.fullmatch(r"swarmdrive-run/(\d{1,6})", str(version), re.ASCII)
+    raise UserError(
+        f"{printable(file)} has format {printable(version)!r}, not {FORMAT!r}; "
+        + (f"harness {old} reads it: run again, or install that version" if old
+           else "a newer harness made it: install that" if newer and int(newer[1]) > NUMBER
+           else "give a folder made by `harness eval` or `harness drive`")
+    )  # fmt: skip

@@ -1,0 +1,142 @@
+"""What answers and decisions depend on has versions: whoever changes a result raises the version with it.
+
+The golden file has the version of each engine, of the parser and of the decisions, and what they gave. After
+a wanted change raise the version, then `UPDATE_GOLDEN=1`; an update without a new version is refused.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from evaluating import run, scenes_of, spec_of
+from misbehaving import serving
+from test_every_backend import answered
+from test_real_answers import FILE as REAL_ANSWERS
+
+from harness.backends import cards
+from harness.backends.base import AnswerMode, Completion
+from harness.backends.card import Card
+from harness.backends.registry import BUILT_IN, missing, open_backend
+from harness.coordination.attacks import ATTACKS
+from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.rules import RULES
+from harness.coordination.scheduling import FORMULAS
+from harness.core import versions
+from harness.core.files import sha256_bytes
+from harness.core.resources import DATASET
+from harness.dataset.load import Dataset, find, load
+from harness.evaluate.asking import requests
+from harness.runs import folder
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "versions.json"
+ASKED = 3  # questions to each engine
+TOLERANCE = 0.02  # of a probability: float32 is summed in another order on another processor
+CARDS = {
+    "proxy": ("proxy", ("json",)),
+    "proxy-faulty": ("proxy", ("json",)),
+    **{name: ("driver", ("json",)) for name in cards.names() if cards.load(name).engine == "driver"},
+    "openai-example": ("openai", get_args(AnswerMode)),
+    "swarm-tiny": ("llama-cpp", get_args(AnswerMode)),
+    "swarm-tiny:transformers": ("transformers", get_args(AnswerMode)),
+}
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Dataset:
+    return load(find(DATASET), limit=2)
+
+
+def held(name: str, version: int, result: Any, same: Any = lambda now, then: now == then) -> None:
+    """Compare a result with the golden one under its version."""
+    golden = json.loads(GOLDEN.read_text()) if GOLDEN.exists() else {}
+    then = golden.get(name)
+    moved = then is None or not same(result, then["result"])
+    if moved and os.environ.get("UPDATE_GOLDEN") and (then is None or then["version"] < version):
+        golden[name] = {"version": version, "result": result}
+        GOLDEN.write_text(json.dumps(dict(sorted(golden.items())), indent=1) + "\n")
+        return
+    assert not moved, f"{name} gives other results: raise its version, now {version}, then UPDATE_GOLDEN=1"
+    assert then["version"] == version
+
+
+def near(now: list[str], then: list[str]) -> bool:
+    """Whether texts are equal, but for the last digits of their numbers."""
+    return len(now) == len(then) and all(map(_near, now, then))
+
+
+def _near(now: str, then: str) -> bool:
+    try:
+        pair = [json.loads(text) for text in (now, then)]
+        p, q = (np.array(list(each["action_distribution"].values())) for each in pair)
+    except (ValueError, KeyError, TypeError):
+        return now == then
+    rest = [{k: v for k, v in each.items() if k != "action_distribution"} for each in pair]
+    return rest[0] == rest[1] and bool(np.abs(p - q).max() <= TOLERANCE)
+
+
+@contextmanager
+def served(name: str) -> Iterator[Card]:
+    """A model's card; that of a served one is answered by a server of ours."""
+    card = cards.load(name)
+    if card.server is None:
+        yield card
+        return
+    with serving(answered) as there:
+        yield replace(card, server=replace(card.server, base_url=there.url))
+
+
+@pytest.mark.parametrize(
+    ("name", "answer"), [(name, answer) for name, (_, modes) in CARDS.items() for answer in modes]
+)
+def test_an_engine_answers_as_its_version_did(name: str, answer: AnswerMode, shipped: Dataset) -> None:
+    engine, _ = CARDS[name]
+    with served(name) as card:
+        if lacking := missing(card):
+            pytest.skip(f"needs {lacking}")
+        spec = spec_of(shipped, name, answer=answer)
+        asked = list(requests(spec, scenes_of(shipped)))[:ASKED]
+        device = "cpu" if BUILT_IN[engine].capabilities.has_weights else None
+        backend = open_backend(card, batch_size=1, device=device)
+        completions: list[Completion] = backend.complete(asked)
+    assert backend.identity()["answers"] == BUILT_IN[engine].answers
+    held(f"{name} {answer}", BUILT_IN[engine].answers, [c.text for c in completions], near)
+
+
+def test_every_engine_but_a_replay_is_pinned() -> None:
+    """A replay's answers are those of its run, by their digest."""
+    assert {engine for engine, _ in CARDS.values()} | {"replay"} == set(BUILT_IN)
+
+
+def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Path) -> None:
+    """Every operating point, rule, attack and schedule, with the answers of the proxy."""
+    changes = [
+        *(f"consensus={rule}" for rule in RULES.built_in),
+        *(
+            f"consensus=trust,attack={attack}:share=2/3"
+            for attack in ATTACKS.built_in
+            if attack != "injection"
+        ),
+        *(f"schedule={schedule}" for schedule in FORMULAS),
+    ]
+    points = (*POINTS.values(), *(named_point(f"6g:{change}") for change in changes))
+    done = run(spec_of(shipped, "proxy", points=points, seeds=(0, 1)), tmp_path / "run")
+    decisions = folder.read(done.out).decisions
+    condition = np.array(decisions.labels("condition"))
+    rows = np.column_stack([
+        decisions.codes("action", decisions.actions), decisions.of_actions("fused").round(4),
+        decisions["latency_ms"].round(1), decisions["messages"],
+    ])  # fmt: skip
+    known = np.nan_to_num(rows + 0.0, nan=-1)  # and no zero has a sign
+    result = {point.name: sha256_bytes(known[condition == point.name].tobytes())[:16] for point in points}
+    held("decisions", versions.DECISIONS, result)
+
+
+def test_answers_are_read_as_their_version_did() -> None:
+    """`test_real_answers` says what each answer is read as; here its file is held to the version."""
+    held("parser", versions.PARSER, sha256_bytes(REAL_ANSWERS.read_bytes()))

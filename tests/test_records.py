@@ -1,0 +1,244 @@
+"""Runs of earlier commits, kept under `records/`, are read by every command, or one line says why not.
+
+`records/make.py` made them, each with the program of its commit.
+"""
+
+import csv
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import msgspec
+import pyarrow.parquet as pq
+import pytest
+from starlette.testclient import TestClient
+
+import harness as package
+from harness.backends.card import Card
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.errors import UserError
+from harness.evaluate.lifecycle import Begun
+from harness.report.view.access import cookie
+from harness.report.view.app import app
+from harness.runs import folder, formats, records
+from harness.runs.decisions import schema
+
+HERE = Path(__file__).parent / "records"
+COMMITS = ("356ad2b", "8cccefb", "0103f23")
+RUNS = sorted(path.parent.relative_to(HERE).as_posix() for path in HERE.glob("*/*/run.json"))
+STUDIED = ("356ad2b/proxy", "8cccefb/mixed", "0103f23/attack")
+Typed = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Callable[[str], Path]:
+    """A kept run, or all of a commit, in a folder that a command may write to."""
+    return lambda name: Path(shutil.copytree(HERE / name, tmp_path / "kept" / name, dirs_exist_ok=True))
+
+
+def test_records_are_of_three_commits_and_small() -> None:
+    assert {run.split("/")[0] for run in RUNS} == set(COMMITS)
+    assert sum(path.stat().st_size for path in HERE.rglob("*")) < 2_000_000
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_tables_load(run: str) -> None:
+    tables = package.load(HERE / run)
+    assert all(map(len, (tables.decisions, tables.answers, tables.episodes, tables.summary)))
+
+
+READERS = {
+    "report": "report {run} --out page.html",
+    "csv": "run export {run} --csv --out out",
+    "jsonl": "run export {run} --jsonl --out out",
+    "junit": "run export {run} --junit out.xml",
+    "compare": "compare {run} {run}",
+}
+
+
+@pytest.mark.parametrize("command", READERS)
+@pytest.mark.parametrize("run", RUNS)
+def test_commands_read_every_run(run: str, command: str, harness: Typed) -> None:
+    code, _, error = harness(*READERS[command].format(run=HERE / run).split())
+    assert (code, error) == (0, "")
+
+
+STUDIES = {
+    "sft": "run export {run} --sft out.jsonl --report-seeds-too",
+    "sweep": "study sweep {run} --over loss --grid 0,0.5 --seeds 0 --no-model --quiet",
+    "trust": "study trust {run} --attacks liar --rules median --share 1/3 --seeds 0 --no-model --quiet",
+    "schedule": "study schedule compare {run} --schedule random --seeds 0 --quiet",
+    "attribute": "study attribute {run} --sample 1 --quiet",
+    "replay": "eval --model replay:{run} {same} --quiet --out replayed",
+}
+SAME = {
+    "356ad2b/proxy": "--limit 2 --seeds 0,1 --condition single-local --condition v2x --condition 6g",
+    "8cccefb/mixed": "--limit 2 --seeds 0 --condition 6g --helper-model replay:{run}",
+    "0103f23/attack": "--limit 2 --seeds 0,1 --condition 6g --condition 6g:consensus=trust --attack liar",
+}
+
+
+@pytest.mark.parametrize("command", STUDIES)
+@pytest.mark.parametrize("run", STUDIED)
+def test_studies_read_frozen_runs(
+    run: str, command: str, kept: Callable[[str], Path], harness: Typed
+) -> None:
+    path = kept(run)
+    code, _, error = harness(*STUDIES[command].format(run=path, same=SAME[run].format(run=path)).split())
+    assert (code, error) == (0, "")
+
+
+@pytest.mark.parametrize("run", ["356ad2b/proxy", "0103f23/attack"])
+def test_a_replay_decides_as_the_run_did(run: str, kept: Callable[[str], Path], harness: Typed) -> None:
+    harness(*f"eval --model replay:{kept(run)} {SAME[run]} --ties first --quiet --out again".split())
+    old, new = (folder.read(path).decisions for path in (HERE / run, Path("again")))
+    assert old.labels("action") == new.labels("action")
+
+
+def opened(reports: Path) -> TestClient:
+    """A browser that may see a folder of runs."""
+    return TestClient(
+        app(reports, "token"), base_url="http://127.0.0.1:7654", cookies={cookie(7654): "token"}
+    )
+
+
+@pytest.mark.parametrize("commit", COMMITS)
+def test_folders_of_runs_are_listed_shown_and_compared(commit: str, harness: Typed) -> None:
+    runs = [run for run in RUNS if run.startswith(commit)]
+    code, out, error = harness("run", "ls", HERE / commit, "--json")
+    states = {entry["name"]: entry["state"] for entry in json.loads(out)}
+    assert (code, error, states.pop("begun")) == (0, "", "unfinished")
+    assert set(states.values()) == {"finished"}
+    assert {f"{commit}/{name}" for name in states} >= set(runs)
+    assert harness("run", "history", HERE / commit)[::2] == (0, "")
+    browser = opened(HERE / commit)
+    assert all(name in browser.get("/").text for name in states)
+    assert browser.get("/run?path=sweep").status_code == 200
+
+
+def test_runs_of_different_days_are_compared(harness: Typed) -> None:
+    code, out, error = harness("compare", HERE / "356ad2b/proxy", HERE / "0103f23/proxy")
+    assert (code, error) == (0, "")
+    assert "success" in out
+    assert opened(HERE).get("/compare?path=356ad2b/proxy&path=0103f23/proxy").status_code == 200
+    pages = [HERE / commit / "proxy" for commit in COMMITS]
+    assert harness("report", *pages, "--out", "page.html")[::2] == (0, "")
+
+
+@pytest.mark.parametrize("commit", ["356ad2b", "0103f23"])
+def test_driven_runs_are_held_against_frozen_ones(commit: str, harness: Typed) -> None:
+    run = HERE / commit
+    code, _, error = harness("study", "fidelity", run / "proxy", run / "drive", "--out", "fidelity")
+    assert (code, error) == (0, "")
+
+
+@pytest.mark.slow
+def test_a_driven_run_is_drawn(harness: Typed) -> None:
+    code, _, error = harness("run", "video", HERE / "356ad2b/drive", "0", "--out", "episode.gif")
+    assert code == 0, error
+
+
+@pytest.mark.parametrize("commit", COMMITS)
+def test_what_a_run_cannot_have_is_one_line(commit: str, harness: Typed) -> None:
+    for words, why in {
+        "study sweep {run}/drive": "was driven",
+        "run video {run}/proxy 0": "give a folder made by `harness drive`",
+        "run merge {run}/proxy {run}/drive --out merged": "is no shard",
+        "eval --model replay:{run}/begun": "is no finished run",
+    }.items():
+        code, _, error = harness(*words.format(run=HERE / commit).split())
+        assert (code, error.count("\n")) == (2, 1)
+        assert why in error
+
+
+BEGUN = "drive --model local-view --episodes 40 --seeds 0 --workers 1 --condition single-local --quiet"
+
+
+@pytest.mark.parametrize("commit", ["8cccefb", "0103f23"])
+def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: Typed) -> None:
+    """The part that it had is taken as it is."""
+    begun = kept(f"{commit}/begun")
+    [part] = begun.glob(".work/episodes-*/answers.jsonl")
+    answers = part.read_bytes()
+    code, _, error = harness(*BEGUN.split(), "--ask", "all", "--ties", "first", "--out", begun)
+    assert (code, error) == (0, "")
+    assert len(folder.read(begun).episodes) == 40
+    assert (begun / "answers.jsonl").read_bytes().startswith(answers)
+
+
+def test_a_begun_run_of_the_first_commit_is_refused(kept: Callable[[str], Path], harness: Typed) -> None:
+    """It has a digest of its model's identity, and its parts are single episodes."""
+    code, _, error = harness(*BEGUN.split(), "--out", kept("356ad2b/begun"))
+    assert (code, error.count("\n")) == (2, 1)
+    assert "start again" in error
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_what_a_run_lacks_has_an_entry(run: str) -> None:
+    """Whoever adds a field or a column says in `formats` what it is in older runs."""
+    stated = json.loads((HERE / run / "run.json").read_text())
+    columns = pq.read_schema(HERE / run / "decisions.parquet").names
+    helpers = sum(name.startswith("helper_") for name in columns)
+    with (HERE / run / "episodes.csv").open() as file:
+        head = next(csv.reader(file))
+    condition = {field.name for field in fields(OperatingPoint)}
+    card = {field.name for field in fields(Card)} - {"letters"}  # a setting of the agent
+    lacks = {
+        "SETTINGS": set(records.Manifest.__struct_fields__) - {*stated, *formats.AGENT},
+        "AGENT": set(formats.AGENT) - {*stated},
+        "MODEL": card - {*stated["model"]},
+        "CONDITION": set.union(*(condition - {*point} for point in stated["conditions"])),
+        "COLUMNS": {
+            re.sub(r"_\d+$", "", name) for name in set(schema(stated["actions"], helpers).names) - {*columns}
+        },
+    }
+    for table, names in lacks.items():
+        assert names <= getattr(formats, table).keys(), f"add an entry to formats.{table}"
+    assert {*records.Episode.__struct_fields__} <= {*head}
+    with (HERE / run / "answers.jsonl").open() as lines:
+        assert {*records.Answer.__struct_fields__} <= {*json.loads(next(lines)), "heard", *formats.ANSWER}
+
+
+@pytest.mark.parametrize(("kind", "added"), [(records.Answer, formats.ANSWER), (Begun, formats.START)])
+def test_a_struct_has_the_defaults_that_the_table_states(kind: type, added: dict) -> None:
+    stated = {field.name: field for field in msgspec.structs.fields(kind)}
+    for name, entry in added.items():
+        field = stated[name]
+        default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        assert default == entry.absent
+
+
+def test_renamed_settings_are_mapped() -> None:
+    point = {"name": "6g", "roadside_edge": True}
+    [read] = formats.upgraded({"conditions": [point]})["conditions"]
+    assert read["edge"] == "relay"
+    assert OperatingPoint.from_dict({**read, "profile": "6g"}).edge == "relay"
+
+
+@pytest.mark.parametrize(
+    ("version", "why"),
+    [
+        ("swarmdrive-run/1", "harness 0.1 reads it"),
+        ("swarmdrive-run/3", "a newer harness made it: install that"),
+        ("mine/1", "give a folder made by"),
+        (None, "give a folder made by"),
+    ],
+)
+def test_another_format_is_one_line(version: str, why: str) -> None:
+    with pytest.raises(UserError, match=re.escape(why)):
+        formats.checked(version, "run.json")
+
+
+def test_a_run_whose_tables_cannot_be_read_is_made_again_from_its_answers(
+    kept: Callable[[str], Path], harness: Typed
+) -> None:
+    run = kept("0103f23/proxy")
+    (run / "decisions.parquet").write_bytes(b"of another program")
+    code, _, error = harness("report", run)
+    assert code == 2
+    assert f"--model replay:{run}" in error
+    again = "--limit 2 --seeds 0,1 --condition single-local --condition v2x --condition 6g --quiet"
+    assert harness("eval", "--model", f"replay:{run}", *again.split(), "--out", "again")[0] == 0
