@@ -90,12 +90,9 @@ def compare(
     answers.
     """
     from harness.coordination.schedules import SCHEDULES
-    from harness.studies.learning import layouts
     from harness.studies.replayed_run import ReplayedRun
     from harness.studies.schedule_study import schedule_study
-    from harness.studies.schedules import compare as compared_on
-    from harness.studies.study import refuse_other
-    from harness.studies.sweep import point_of
+    from harness.studies.schedules import run_schedules
 
     extras.need("harness study schedule compare", "matplotlib")
     names = list(dict.fromkeys(schedule or SCHEDULES.usable()))
@@ -112,26 +109,16 @@ def compare(
         )
     with bar("schedules", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
-        stored = [
-            ReplayedRun(run, latency, progress.more, progress, models=own, say=progress.say)
-            for run in (*runs, *tune)
-        ]
-        for other in stored[len(runs) :]:
-            layouts(other, "tune")
-        draws = options.parse_seeds(seeds) if seeds else stored[0].seeds
+        replayed, tuned = (
+            [
+                ReplayedRun(run, latency, progress.more, progress, models=own, say=progress.say)
+                for run in folders
+            ]
+            for folders in (runs, tune)
+        )
+        draws = options.parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or runs[0] / "schedules"
-        refuse_other(where, "schedule", {
-            "sources": [each.manifest() for each in stored], "condition": condition, "schedules": names,
-            "budget": budget, "seeds": list(draws),
-        })  # fmt: skip
-        steps = sum(each.dataset.scenario.parameters.decisions for each in stored)
-        progress.more(steps + len(runs) * len(names))
-        apart: list[ReplayedRun | None] = [*stored[len(runs) :]] if tune else [None] * len(runs)
-        found = [
-            compared_on(run, other, point_of([run], condition), names, draws, budget, progress)
-            for run, other in zip(stored, apart, strict=False)
-        ]
-        for each in stored:
-            each.settle()
-    caveats = [caveat for source in stored for caveat in source.caveats]
-    finish(schedule_study(found, [each.manifest() for each in stored], draws, caveats), where, as_json, quiet)
+        compared = run_schedules(
+            replayed, tuned, condition, names, draws, budget, where, progress, progress.more
+        )
+    finish(schedule_study(compared, [*replayed, *tuned], draws), where, as_json, quiet)

@@ -29,6 +29,7 @@ KEY = (*WHO, "condition", "seed", "layout_seed")
 COMPARED = ("frozen", "closed", "difference", "agreement")
 ENDS = ("", "_low", "_high")  # of the columns of an estimate
 LEAST_RANKED = 5  # four in the same order are chance in 1 of 12, five in 1 of 60, both ways round
+PLACE = "model · prompt · answers, condition"
 SHOWN = 20  # ways to disagree that the page lists
 
 
@@ -130,20 +131,8 @@ def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> Study:
     """Declare the study of a comparison."""
     rows: list[dict[Any, Any]] = result.table.to_dict("records")
     other = disagreements(result.episodes).head(SHOWN).to_dict("records")
-    heads = (
-        "model · prompt · answers, condition",
-        "frozen %",
-        "closed loop %",
-        "difference, points",
-        "same %",
-        "n",
-    )
-    ends_heads = (
-        "model · prompt · answers, condition",
-        "end on frozen scenes",
-        "end in closed loop",
-        "episodes × seeds",
-    )
+    heads = (PLACE, "frozen %", "closed loop %", "difference, points", "same %", "n")
+    ends_heads = (PLACE, "end on frozen scenes", "end in closed loop", "episodes × seeds")
     return Study(
         "fidelity", "Frozen and closed loop compared", headline(result),
         [

@@ -8,6 +8,7 @@ from harness.core.statistics import Estimate
 from harness.core.versions import versions
 from harness.report.drawing.colours import COLOURS, INK, MARKERS
 from harness.studies.figures.points import Steps, fronts
+from harness.studies.replayed_run import ReplayedRun
 from harness.studies.schedules import NEVER, Chosen, Compared, Play
 from harness.studies.study import Study, Table, p_cell
 
@@ -23,11 +24,8 @@ HEADS = (
 JOULES = ("J", "area over joules, %")
 
 
-def schedule_study(
-    compared: Sequence[Compared], sources: Sequence[dict[str, Any]], seeds: Sequence[int],
-    caveats: Sequence[str] = (),
-) -> Study:  # fmt: skip
-    """Declare the study of schedules on one or several runs; `sources` and `caveats` are the runs'."""
+def schedule_study(compared: Sequence[Compared], runs: Sequence[ReplayedRun], seeds: Sequence[int]) -> Study:
+    """Declare the study of schedules on one or several runs; `runs` are these and those on tune layouts."""
     first, data = compared[0], tables(compared)
     tuned = bool(first.tune)
     panels = [
@@ -56,10 +54,11 @@ def schedule_study(
         ],
         [_table(run) for run in compared], data,
         {
-            "sources": list(sources), "condition": first.point.name, "schedules": first.names,
-            "budget": first.budget, "seeds": list(seeds), "versions": versions(),
+            "sources": [run.manifest() for run in runs], "condition": first.point.name,
+            "schedules": first.names, "budget": first.budget, "seeds": list(seeds), "versions": versions(),
         },
-        data["schedules"], {"fronts": fronts(panels)}, caveats,
+        data["schedules"], {"fronts": fronts(panels)},
+        [caveat for run in runs for caveat in run.caveats],
     )  # fmt: skip
 
 

@@ -8,6 +8,8 @@ on tune layouts, where a run on such is given, and reported on others.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
+from pathlib import Path
 
 import numpy as np
 
@@ -20,8 +22,10 @@ from harness.core.errors import UserError, printable
 from harness.core.statistics import Estimate, resampled, resampled_estimate
 from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
 from harness.studies.choices import COSTS, Choices, choices
+from harness.studies.learning import layouts
 from harness.studies.replayed_run import ReplayedRun
-from harness.studies.study import corrected
+from harness.studies.study import corrected, refuse_other
+from harness.studies.sweep import point_of
 
 RESAMPLES = 2000
 SHARES = np.arange(0.0, 1.0, 0.1)  # of decision points that ask nobody, at the thresholds that are tried
@@ -279,6 +283,34 @@ def compare(
         progress(1)
     bound = Play(Setting(ORACLE, None, point.max_helpers), *run.oracle())
     return Compared(stored.name, point, tuple(names), of_run, of_tune, bound, budget)
+
+
+def run_schedules(
+    runs: Sequence[ReplayedRun], tune: Sequence[ReplayedRun], condition: str, names: Sequence[str],
+    seeds: Sequence[int], budget: float, out: Path, progress: Callable[[int], None],
+    more: Callable[[int], None],
+) -> list[Compared]:  # fmt: skip
+    """Compare schedules on runs, each with its run on tune layouts, or with none.
+
+    Raises:
+        UserError: as `compare` does, or the folder has another comparison, or a run is on other layouts.
+        Unanswered: too many questions got no answer; the runs keep all others.
+    """
+    every = [*runs, *tune]
+    for run in tune:
+        layouts(run, "tune")
+    refuse_other(out, "schedule", {
+        "sources": [run.manifest() for run in every], "condition": condition, "schedules": list(names),
+        "budget": budget, "seeds": list(seeds),
+    })  # fmt: skip
+    more(sum(run.dataset.scenario.parameters.decisions for run in every) + len(runs) * len(names))
+    compared = [
+        compare(run, other, point_of([run], condition), names, seeds, budget, progress)
+        for run, other in zip_longest(runs, tune)
+    ]
+    for run in every:
+        run.settle()
+    return compared
 
 
 def _at(plays: Sequence[Play], setting: Setting) -> Play:
