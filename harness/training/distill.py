@@ -84,11 +84,11 @@ def distill(
     if begun := work.begun(out, work.Begun):
         work.same(out, settings, begun.settings)
     with work.working(out, begun or work.Begun(settings=settings)) as place:
+        layouts, seed, folder = curriculum.layouts, curriculum.seed, place / "lessons"
         lessons = [
-            draw(scenario, prompts, curriculum.layouts, curriculum.seed, place / "lessons" / scenario.name,
-                 workers, drawing)
+            draw(scenario, prompts, layouts, seed, folder / scenario.name, workers, drawing)
             for scenario, prompts in curriculum.prompts.items()
-        ]  # fmt: skip
+        ]
         student = Student(lessons, plan, place, device, curriculum.base)
         facts = _trained(learnt, student, out, progress)
         work.tidy(out)

@@ -117,10 +117,8 @@ def run_stage(
             losses = []
             if time.monotonic() - kept_s > KEEP_S:
                 kept_s = time.monotonic()
-                save(
-                    {"model": model.state_dict(), "opts": [o.state_dict() for o in opts], "step": step + 1,
-                     "curve": curve}, going,
-                )  # fmt: skip
+                states = [opt.state_dict() for opt in opts]
+                save({"model": model.state_dict(), "opts": states, "step": step + 1, "curve": curve}, going)
     return curve
 
 

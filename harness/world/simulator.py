@@ -262,10 +262,7 @@ def state_of(
 ) -> VehicleState:
     """Return a vehicle's state, rounded to the micrometre, since the last bits depend on the machine."""
     s = v.spawn
-    x_m, y_m, heading_rad, speed_mps = (
-        round(float(number), DECIMALS) + 0.0 for number in (*(v.position - origin_m), v.heading, v.speed)
-    )
-    return VehicleState(
-        s.id, s.kind, s.part, x_m, y_m, heading_rad, speed_mps, s.approach, s.route, bool(v.crashed),
-        lamps and bool(v.braking),
-    )  # fmt: skip
+    numbers = (*(v.position - origin_m), v.heading, v.speed)
+    x_m, y_m, heading_rad, speed_mps = (round(float(number), DECIMALS) + 0.0 for number in numbers)
+    pose, lit = (x_m, y_m, heading_rad, speed_mps), lamps and bool(v.braking)
+    return VehicleState(s.id, s.kind, s.part, *pose, s.approach, s.route, bool(v.crashed), lit)
