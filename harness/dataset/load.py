@@ -46,14 +46,10 @@ TREES_AT_ONCE = 256  # how many trees become arrays at a time, in a pass over al
 
 @dataclass(frozen=True)
 class Scene:
-    """One decision point, frozen.
+    """One decision point, frozen."""
 
-    Attributes:
-        record: its record in the dataset.
-        notes: results computed from it, by name, kept so that they are computed once.
-    """
-
-    record: Record
+    record: Record  # its record in the dataset
+    # results computed from it, by name, kept so that they are computed once
     notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -115,21 +111,13 @@ class Trees(Sequence[Tree]):
 
 @dataclass(frozen=True)
 class Dataset:
-    """A verified dataset; its trees and scenes are read and verified on use.
+    """A verified dataset; its trees and scenes are read and verified on use."""
 
-    Attributes:
-        path: the dataset's folder.
-        manifest: its manifest.
-        sha256: digest of the manifest, which pins every file.
-        trees: the decision trees of its layouts, in the order of the episodes.
-        trusted: whether it is a released dataset, whose digests vouch for its scenes.
-    """
-
-    path: Path
-    manifest: Manifest
-    sha256: str
-    trees: Trees
-    trusted: bool = False
+    path: Path  # the dataset's folder
+    manifest: Manifest  # its manifest
+    sha256: str  # digest of the manifest, which pins every file
+    trees: Trees  # the decision trees of its layouts, in the order of the episodes
+    trusted: bool = False  # whether it is a released dataset, whose digests vouch for its scenes
     _scenes: dict[str, Scene] = field(default_factory=dict, repr=False, compare=False)
     _checked: set[str] = field(default_factory=set, repr=False, compare=False)
 

@@ -36,33 +36,20 @@ _NUMBERS = ((5, 3), (9, 2), (8, 1), (7, 4))
 
 
 class Question(msgspec.Struct, frozen=True):
-    """A decision point of a tune layout.
+    """A decision point of a tune layout."""
 
-    Attributes:
-        layout_seed: seed of the layout.
-        step: number of the decision point in its episode.
-        graphs: what the ego and a helper see, by role.
-    """
-
-    layout_seed: int
-    step: int
-    graphs: Mapping[Role, SceneGraph]
+    layout_seed: int  # seed of the layout
+    step: int  # number of the decision point in its episode
+    graphs: Mapping[Role, SceneGraph]  # what the ego and a helper see, by role
 
 
 class Pair(NamedTuple):
-    """Two requests that differ in one fact.
+    """Two requests that differ in one fact."""
 
-    Attributes:
-        fact: the kind of fact.
-        expected: the action that should be likelier with the fact.
-        present: the request with the fact.
-        absent: the request without.
-    """
-
-    fact: Fact
-    expected: str
-    present: Request
-    absent: Request
+    fact: Fact  # the kind of fact
+    expected: str  # the action that should be likelier with the fact
+    present: Request  # the request with the fact
+    absent: Request  # the request without
 
 
 @cache

@@ -26,45 +26,30 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class Hunk:
-    """A change with the words around it.
+    """A change with the words around it."""
 
-    Attributes:
-        line_a: line of A in which it begins, from 1.
-        line_b: line of B.
-        pieces: parts that both texts have, that only A has and that only B has, in reading order.
-    """
-
-    line_a: int
-    line_b: int
+    line_a: int  # line of A in which it begins, from 1
+    line_b: int  # line of B
+    # parts that both texts have, that only A has and that only B has, in reading order
     pieces: tuple[tuple[Kind, str], ...]
 
 
 @dataclass(frozen=True)
 class TextChange:
-    """Differences between two texts.
+    """Differences between two texts."""
 
-    Attributes:
-        hunks: changes in order; empty if the texts are the same.
-        removed: number of words that only A has.
-        added: number of words that only B has.
-    """
-
-    hunks: tuple[Hunk, ...]
-    removed: int
-    added: int
+    hunks: tuple[Hunk, ...]  # changes in order; empty if the texts are the same
+    removed: int  # number of words that only A has
+    added: int  # number of words that only B has
 
 
 @dataclass(frozen=True)
 class PromptChange:
-    """Differences between two versions.
+    """Differences between two versions."""
 
-    Attributes:
-        settings: name, A's value and B's value of each setting that differs; descriptions are left out.
-        texts: change of each template by the name of its file.
-    """
-
+    # name, A's value and B's value of each setting that differs; descriptions are left out
     settings: tuple[tuple[str, Any, Any], ...]
-    texts: Mapping[str, TextChange]
+    texts: Mapping[str, TextChange]  # change of each template by the name of its file
 
     def __bool__(self) -> bool:
         return bool(self.settings) or any(text.hunks for text in self.texts.values())
@@ -72,20 +57,13 @@ class PromptChange:
 
 @dataclass(frozen=True)
 class Sent:
-    """The messages about one scene as versions A and B render them, before any chat template.
+    """The messages about one scene as versions A and B render them, before any chat template."""
 
-    Attributes:
-        viewer: id of the vehicle that is asked.
-        role: `ego`, `helper`, or `fusion` for the ego with messages.
-        words: number of words in A's and in B's.
-        tokens: number of tokens in A's and in B's; None without a tokenizer.
-        parts: differences in the system message, in the examples if there are any, and in the user's message.
-    """
-
-    viewer: str
-    role: str
-    words: tuple[int, int]
-    tokens: tuple[int, int] | None
+    viewer: str  # id of the vehicle that is asked
+    role: str  # `ego`, `helper`, or `fusion` for the ego with messages
+    words: tuple[int, int]  # number of words in A's and in B's
+    tokens: tuple[int, int] | None  # number of tokens in A's and in B's; None without a tokenizer
+    # differences in the system message, in the examples if there are any, and in the user's message
     parts: Mapping[str, TextChange]
 
 

@@ -19,34 +19,21 @@ EXAMPLES = "examples.json"
 
 
 class Example(Struct, frozen=True):
-    """One earlier turn.
+    """One earlier turn."""
 
-    Attributes:
-        layout_seed: seed of the layout that it comes from.
-        graph: the viewer's scene graph, which the version's template renders.
-        answer: the answer that the model should have given.
-    """
-
-    layout_seed: int
-    graph: SceneGraph
-    answer: str
+    layout_seed: int  # seed of the layout that it comes from
+    graph: SceneGraph  # the viewer's scene graph, which the version's template renders
+    answer: str  # the answer that the model should have given
 
 
 class Examples(Struct, frozen=True):
-    """The examples of a version by role, in the order in which they are shown.
+    """The examples of a version by role, in the order in which they are shown."""
 
-    Attributes:
-        scenario: the scenario that they come from, and the only one in which they may be shown, unless
-            `everywhere`.
-        ego: examples with a question to the ego.
-        helper: examples with a question to a helper.
-        everywhere: whether they may be shown in every scenario, since neither their text nor their answers
-            depend on it.
-    """
-
+    # the scenario that they come from, and the only one in which they may be shown, unless `everywhere`
     scenario: str
-    ego: tuple[Example, ...] = ()
-    helper: tuple[Example, ...] = ()
+    ego: tuple[Example, ...] = ()  # examples with a question to the ego
+    helper: tuple[Example, ...] = ()  # examples with a question to a helper
+    # whether they may be shown in every scenario, since neither their text nor their answers depend on it
     everywhere: bool = False
 
     def of(self, role: str) -> tuple[Example, ...]:

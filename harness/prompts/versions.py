@@ -42,47 +42,34 @@ OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})  # shipped versions
 
 @dataclass(frozen=True)
 class Prompt:
-    """One prompt version.
+    """One prompt version."""
 
-    Attributes:
-        version: name of its folder.
-        sha256: digest of its files.
-        released: whether it is pinned; a draft may still change.
-        description: one line for people.
-        helper_answer: what a helper is asked for: `distribution`, or `recommendation` with a confidence.
-        max_objects: most objects that are listed, one fewer if there are messages; those in conflict come
-            first, then the nearest.
-        token_budget: least and most tokens a rendered prompt may have.
-        max_answer_tokens: most tokens an answer may have, by role.
-        changed: what is new in this version.
-        known_failures: failures that it is known to provoke.
-        max_conflicts: most conflicts in the variable `conflicts`, the soonest first; None for all.
-        reasons_first: roles that are asked for reasons before the answer; the parser then allows such text.
-        ego_answer: what the ego is asked for: `distribution`, or `maneuver`, one action and a confidence.
-        texts: template text by role.
-        examples: earlier turns of the chat, from one scenario; None without any.
-        extension: further members of a role's answer, as `Shape` takes them; roles without any are not there.
-        image: picture before the user's text: what the viewer's `camera` sees; None if there is none.
-        files: the text of each of its files by name, as they were read.
-    """
-
-    version: str
-    sha256: str
-    released: bool
-    description: str
+    version: str  # name of its folder
+    sha256: str  # digest of its files
+    released: bool  # whether it is pinned; a draft may still change
+    description: str  # one line for people
+    # what a helper is asked for: `distribution`, or `recommendation` with a confidence
     helper_answer: Literal["distribution", "recommendation"]
+    # most objects that are listed, one fewer if there are messages; those in conflict come first, then the
+    # nearest
     max_objects: Count
-    token_budget: tuple[Count, Count]
-    max_answer_tokens: Mapping[str, Count]
-    changed: str
-    known_failures: str
-    texts: Mapping[str, str]
+    token_budget: tuple[Count, Count]  # least and most tokens a rendered prompt may have
+    max_answer_tokens: Mapping[str, Count]  # most tokens an answer may have, by role
+    changed: str  # what is new in this version
+    known_failures: str  # failures that it is known to provoke
+    texts: Mapping[str, str]  # template text by role
+    # roles that are asked for reasons before the answer; the parser then allows such text
     reasons_first: tuple[Literal["ego", "helper"], ...] = ()
+    # what the ego is asked for: `distribution`, or `maneuver`, one action and a confidence
     ego_answer: Literal["distribution", "maneuver"] = "distribution"
+    # most conflicts in the variable `conflicts`, the soonest first; None for all
     max_conflicts: Count | None = None
-    examples: Examples | None = None
+    examples: Examples | None = None  # earlier turns of the chat, from one scenario; None without any
+    # further members of a role's answer, as `Shape` takes them; roles without any are not there
     extension: Mapping[str, str] = field(default_factory=dict)
+    # picture before the user's text: what the viewer's `camera` sees; None if there is none
     image: Literal["camera"] | None = None
+    # the text of each of its files by name, as they were read
     files: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """What is learnt from, stage by stage, and the model that learns it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -150,10 +150,10 @@ class Student:
             self.model.load_state_dict(state["model"])
             return [tuple(point) for point in state["curve"]]
         going = self.work / f"{name}.going.pt"
+        count, show = self.plan.samples[name], partial(progress, name)
         curve = run_stage(
-            self.model, self.samples(name), self.letters, self.digits, self.plan.samples[name], self.plan,
-            lambda n, loss: progress(name, n, loss), going,
-        )  # fmt: skip
+            self.model, self.samples(name), self.letters, self.digits, count, self.plan, show, going
+        )
         save({"model": self.model.state_dict(), "curve": curve}, done)
         going.unlink(missing_ok=True)
         return curve

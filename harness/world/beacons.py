@@ -143,11 +143,9 @@ def _sent(
 
     def sent(number: int, frame: int, heard_by: tuple[str, ...] = ()) -> Beacon:
         x, y, heading, speed = (poses[frame - first_frame] + errors[number]).tolist()
+        pose = round(x, 2), round(y, 2), round(heading, 3), max(round(speed, 2), 0.0)
         time_s = frame / p.simulation_hz
-        return Beacon(
-            sender, time_s, time_s + p.beacon_delay_s, round(x, 2), round(y, 2), round(heading, 3),
-            max(round(speed, 2), 0.0), target_mps, heard_by,
-        )  # fmt: skip
+        return Beacon(sender, time_s, time_s + p.beacon_delay_s, *pose, target_mps, heard_by)
 
     def hear(number: int, frame: int) -> tuple[str, ...]:
         """Return the receivers that receive it."""

@@ -1,4 +1,4 @@
-"""Records of a scene: vehicles, buildings, beacons, and the state of the whole world at one moment."""
+"""Records of a scene: vehicles, buildings, beacons, and the state of the whole world at one time."""
 
 from functools import lru_cache
 from typing import Annotated, Literal
@@ -33,33 +33,19 @@ class Closed(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class VehicleState(Closed, frozen=True, omit_defaults=True):
-    """One vehicle at one moment, in the frame of `harness.world.road`.
+    """One vehicle at one moment, in the frame of `harness.world.road`."""
 
-    Attributes:
-        id: `v1`, `v2`, … by spawn order; the ego is `v1`.
-        kind: class of vehicle, which fixes its size.
-        part: `ego`, `helper` (takes part in cooperation) or `other`.
-        x_m: position of the centre, m to the east.
-        y_m: position of the centre, m to the south.
-        heading_rad: from +x towards +y.
-        speed_mps: speed along the heading.
-        approach: where its path comes from.
-        route: what its path does, such as `straight` or `left`.
-        crashed: whether it has collided.
-        braking: whether its brake lamps are on; always false if the scenario has none.
-    """
-
-    id: VehicleId
-    kind: Kind
-    part: Part
-    x_m: Number
-    y_m: Number
-    heading_rad: Number
-    speed_mps: Number
-    approach: str
-    route: str
-    crashed: bool
-    braking: bool = False
+    id: VehicleId  # `v1`, `v2`, … by spawn order; the ego is `v1`
+    kind: Kind  # class of vehicle, which fixes its size
+    part: Part  # `ego`, `helper` (takes part in cooperation) or `other`
+    x_m: Number  # position of the centre, m to the east
+    y_m: Number  # position of the centre, m to the south
+    heading_rad: Number  # from +x towards +y
+    speed_mps: Number  # speed along the heading
+    approach: str  # where its path comes from
+    route: str  # what its path does, such as `straight` or `left`
+    crashed: bool  # whether it has collided
+    braking: bool = False  # whether its brake lamps are on; always false if the scenario has none
 
     @property
     def indicator(self) -> str:
@@ -142,59 +128,37 @@ class Building(Closed, frozen=True):
 
 
 class Beacon(Closed, frozen=True, omit_defaults=True):
-    """A vehicle's message about itself, with its errors: see `harness.world.beacons`.
+    """A vehicle's message about itself, with its errors: see `harness.world.beacons`."""
 
-    Attributes:
-        sender: id of the vehicle.
-        time_s: when it was sent, since the start of the episode; negative before the start.
-        arrives_s: when receivers have it.
-        x_m: position of the centre, m to the east.
-        y_m: position of the centre, m to the south.
-        heading_rad: from +x towards +y.
-        speed_mps: speed along the heading.
-        target_speed_mps: target of the ego's speed controller; None for other senders.
-        heard_by: ids of the receivers that receive it.
-        interval_s: under the rule `cam`, the interval until the next one if the vehicle does not move enough
-            to send earlier; else None.
-        unmoved: number of consecutive beacons that were sent because that interval was over; None where there
-            is none.
-    """
-
-    sender: VehicleId
-    time_s: Number
-    arrives_s: Number
-    x_m: Number
-    y_m: Number
-    heading_rad: Number
-    speed_mps: Number
-    target_speed_mps: Number | None
-    heard_by: tuple[VehicleId, ...]
+    sender: VehicleId  # id of the vehicle
+    time_s: Number  # when it was sent, since the start of the episode; negative before the start
+    arrives_s: Number  # when receivers have it
+    x_m: Number  # position of the centre, m to the east
+    y_m: Number  # position of the centre, m to the south
+    heading_rad: Number  # from +x towards +y
+    speed_mps: Number  # speed along the heading
+    target_speed_mps: Number | None  # target of the ego's speed controller; None for other senders
+    heard_by: tuple[VehicleId, ...]  # ids of the receivers that receive it
+    # under the rule `cam`, the interval until the next one if the vehicle does not move enough to send
+    # earlier; else None
     interval_s: Number | None = None
+    # number of consecutive beacons that were sent because that interval was over; None where there is none
     unmoved: Count | None = None
 
 
 class WorldState(Closed, frozen=True):
-    """The state of everything, seen or not.
+    """The state of everything, seen or not."""
 
-    Attributes:
-        scenario: name of the scenario.
-        episode_seed: seed of the episode's layout.
-        step: index of the decision about to be taken; equals the number of actions taken so far.
-        time_s: simulated time since the start of the episode.
-        target_speed_mps: target of the ego's speed controller.
-        vehicles: vehicles in spawn order, the ego first.
-        buildings: obstacles to sight besides vehicles.
-        beacons: the last one that each receiver has, and those under way, by sender and time; empty under
-            perfect knowledge.
-    """
-
-    scenario: str
-    episode_seed: Seed
-    step: Count
-    time_s: Number
-    target_speed_mps: Number
+    scenario: str  # name of the scenario
+    episode_seed: Seed  # seed of the episode's layout
+    step: Count  # index of the decision about to be taken; equals the number of actions taken so far
+    time_s: Number  # simulated time since the start of the episode
+    target_speed_mps: Number  # target of the ego's speed controller
+    # vehicles in spawn order, the ego first
     vehicles: Annotated[tuple[VehicleState, ...], Meta(min_length=1)]
-    buildings: tuple[Building, ...]
+    buildings: tuple[Building, ...]  # obstacles to sight besides vehicles
+    # the last one that each receiver has, and those under way, by sender and time; empty under perfect
+    # knowledge
     beacons: tuple[Beacon, ...] = ()
 
     @property

@@ -122,12 +122,11 @@ class World:
 
     def state(self) -> WorldState:
         """Return the present state."""
-        vehicles = self.vehicles
+        name, states = self.scenario.name, tuple(map(self._state_of, self.vehicles))
+        target_mps, buildings = float(self.vehicles[0].target_speed), self.layout.buildings
         return WorldState(
-            self.scenario.name, self.seed, self.step, self.time_s, float(vehicles[0].target_speed),
-            tuple(map(self._state_of, vehicles)), self.layout.buildings,
-            self.beacons,
-        )  # fmt: skip
+            name, self.seed, self.step, self.time_s, target_mps, states, buildings, self.beacons
+        )
 
     def _state_of(self, v: Any) -> VehicleState:
         return state_of(v, self.scenario.brake_lamps, self.scenario.road().origin_m)
@@ -207,15 +206,13 @@ class World:
 
     def _broadcast(self, poses: Floats, first_frame: int) -> None:
         """Add the beacons of the ego and the helpers in some frames, whose poses are (F, V, 4)."""
-        p, radios = (
-            self.scenario.parameters,
-            [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"],
-        )
+        p, target_mps = self.scenario.parameters, float(self.vehicles[0].target_speed)
+        radios = [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"]
         ids = [self.vehicles[n].spawn.id for n in radios]
+        loss = beacons.losses(p, self.state, ids, poses)
         self.beacons = beacons.broadcast(
-            p, self.seed, self.beacons, ids, float(self.vehicles[0].target_speed), poses[:, radios],
-            first_frame, beacons.losses(p, self.state, ids, poses),
-        )  # fmt: skip
+            p, self.seed, self.beacons, ids, target_mps, poses[:, radios], first_frame, loss
+        )
 
     def _move(self) -> None:
         self.road.time_s = self.time_s

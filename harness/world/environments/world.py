@@ -110,10 +110,8 @@ class EnvironmentWorld(World):
 
     def branch(self) -> "EnvironmentWorld":
         network = self.road.network
-        shared = (
-            self.scenario, self.layout, self.here, self.beacons, self.constants, self.taken, network,
-            *network.lanes_list(),
-        )  # fmt: skip
+        fixed = (self.scenario, self.layout, self.here, self.beacons, self.constants, self.taken)
+        shared = (*fixed, network, *network.lanes_list())
         return copy.deepcopy(self, {id(thing): thing for thing in shared})
 
     def snapshot(self) -> ActionsTaken:

@@ -39,15 +39,11 @@ class Seat:
 
 @dataclass(frozen=True)
 class Place:
-    """Where on the road a vehicle is.
+    """Where on the road a vehicle is."""
 
-    Attributes:
-        near: arc length, and heading there, on each path to which it is nearer than ON_PATH_M.
-        key: the path that it seems to follow; None if none.
-    """
-
+    # arc length, and heading there, on each path to which it is nearer than ON_PATH_M
     near: Mapping[PathKey, tuple[float, float]]
-    key: PathKey | None
+    key: PathKey | None  # the path that it seems to follow; None if none
 
     @property
     def arc_m(self) -> float:
@@ -58,23 +54,14 @@ class Place:
 
 @dataclass(frozen=True)
 class Known:
-    """A vehicle on a path, as a viewer knows it, beside the ego as that viewer knows it.
+    """A vehicle on a path, as a viewer knows it, beside the ego as that viewer knows it."""
 
-    Attributes:
-        seat: the viewer's.
-        d: the vehicle.
-        place: where it is; it follows a path.
-        ego: the ego.
-        ego_arc_m: arc length on the ego's path.
-        has_lamps: whether vehicles have brake lamps.
-    """
-
-    seat: Seat
-    d: Detection
-    place: Place
-    ego: VehicleState
-    ego_arc_m: float
-    has_lamps: bool
+    seat: Seat  # the viewer's
+    d: Detection  # the vehicle
+    place: Place  # where it is; it follows a path
+    ego: VehicleState  # the ego
+    ego_arc_m: float  # arc length on the ego's path
+    has_lamps: bool  # whether vehicles have brake lamps
 
     def arrival(self, arc_m: float, time_s: float | None) -> Arrival:
         """Return how far the vehicle is from a conflict, with its speed and its brake lamps."""

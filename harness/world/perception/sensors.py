@@ -35,31 +35,18 @@ SENSORS = {
 
 @dataclass(frozen=True)
 class Detection:
-    """One object as all of a vehicle's sensors together report it, in the world frame.
+    """One object as all of a vehicle's sensors together report it, in the world frame."""
 
-    Attributes:
-        id: the object's id (association across vehicles is assumed to be perfect).
-        sensors: those of `camera`, `lidar` and `radar` that reported it.
-        kind: class from the camera; None without one.
-        indicator: turn indicator from the camera: `left`, `right` or `off`; None without one.
-        x_m: estimated position of the centre.
-        y_m: estimated position of the centre.
-        heading_rad: estimated heading; None if only the radar saw it.
-        speed_mps: estimated speed.
-        range_rate_mps: range rate from the radar, negative when closing; None without one.
-        braking: whether it is seen to brake, from the camera; None without one.
-    """
-
-    id: str
-    sensors: tuple[str, ...]
-    kind: Kind | None
-    indicator: str | None
-    x_m: float
-    y_m: float
-    heading_rad: float | None
-    speed_mps: float
-    range_rate_mps: float | None
-    braking: bool | None = None
+    id: str  # the object's id (association across vehicles is assumed to be perfect)
+    sensors: tuple[str, ...]  # those of `camera`, `lidar` and `radar` that reported it
+    kind: Kind | None  # class from the camera; None without one
+    indicator: str | None  # turn indicator from the camera: `left`, `right` or `off`; None without one
+    x_m: float  # estimated position of the centre
+    y_m: float  # estimated position of the centre
+    heading_rad: float | None  # estimated heading; None if only the radar saw it
+    speed_mps: float  # estimated speed
+    range_rate_mps: float | None  # range rate from the radar, negative when closing; None without one
+    braking: bool | None = None  # whether it is seen to brake, from the camera; None without one
 
 
 def detect(
