@@ -18,31 +18,25 @@ ImageMode = Literal["own", "blank", "another", "none"]
 
 @dataclass(frozen=True)
 class Agent:
-    """Answers for a vehicle: a model, its prompt and how it answers.
+    """Answers for a vehicle: a model, its prompt and how it answers."""
 
-    Attributes:
-        card: the model.
-        prompt: the prompt version.
-        answer: how the model answers: free `json`, `constrained` to the schema, or a `readout` of letters.
-        thinking: whether the model thinks before it answers.
-        letters: how a read-out's letters are read: `raw`, once, or `cyclic`, averaged over as many orders of
-            the list as there are actions; None takes the card's, or else cyclic. Always raw for what is no
-            read-out of a language model.
-        flip: whether each read-out is asked once more with the list of actions reversed, to see whether its
-            likeliest action changes (`harness.evaluate.flip`); the answer is that of the list as it stands.
-        image: the picture that an image prompt shows: the viewer's `own`, a `blank` one, one of `another`
-            scene, or `none`, which leaves only the text.
-        sums: what becomes of an answer in `json` whose only fault is that its numbers do not sum to 1:
-            `refuse` counts it as failed, `divide` divides them by their sum.
-    """
-
-    card: Card
-    prompt: Prompt
+    card: Card  # the model
+    prompt: Prompt  # the prompt version
+    # how the model answers: free `json`, `constrained` to the schema, or a `readout` of letters
     answer: AnswerMode = "json"
-    thinking: bool = False
+    thinking: bool = False  # whether the model thinks before it answers
+    # the picture that an image prompt shows: the viewer's `own`, a `blank` one, one of `another` scene,
+    # or `none`, which leaves only the text
     image: ImageMode = "own"
+    # how a read-out's letters are read: `raw`, once, or `cyclic`, averaged over as many orders of the
+    # list as there are actions; None takes the card's, or else cyclic. Always raw for what is no
+    # read-out of a language model.
     letters: Letters | None = None
+    # what becomes of an answer in `json` whose only fault is that its numbers do not sum to 1: `refuse`
+    # counts it as failed, `divide` divides them by their sum
     sums: Sums = "refuse"
+    # whether each read-out is asked once more with the list of actions reversed, to see whether its
+    # likeliest action changes (`harness.evaluate.flip`); the answer is that of the list as it stands
     flip: bool = False
 
     def __post_init__(self) -> None:

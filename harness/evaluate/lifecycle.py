@@ -20,22 +20,14 @@ from harness.runs.records import Latency, Manifest, Score
 
 
 class Begun(work.Begun, frozen=True, kw_only=True):
-    """The record that a run begins with, and keeps when it resumes.
+    """The record that a run begins with, and keeps when it resumes."""
 
-    Attributes:
-        created: when the run began, UTC, ISO 8601.
-        command: words of the command that repeats the run.
-        identity: identity of the models.
-        tags: the user's tags.
-        latency: how long the run's answers take.
-        versions: versions of the packages and of the code that the run may depend on.
-    """
-
-    created: str
-    command: tuple[str, ...] = ()
-    identity: dict[str, Any]
-    tags: tuple[str, ...]
-    latency: Latency
+    created: str  # when the run began, UTC, ISO 8601
+    command: tuple[str, ...] = ()  # words of the command that repeats the run
+    identity: dict[str, Any]  # identity of the models
+    tags: tuple[str, ...]  # the user's tags
+    latency: Latency  # how long the run's answers take
+    # versions of the packages and of the code that the run may depend on
     versions: dict[str, str] = msgspec.field(default_factory=dict)
 
     def __post_init__(self) -> None:

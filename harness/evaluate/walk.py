@@ -37,19 +37,12 @@ AskedMoment = TypeVar("AskedMoment", contravariant=True)
 
 @dataclass(frozen=True)
 class Due:
-    """The decisions that are due now under one condition.
+    """The decisions that are due now under one condition."""
 
-    Attributes:
-        at: the moment of each decision, as an index into the moments that the world shows, (n,).
-        episode: the episode's number of each, (n,).
-        seed: the seed of the channel's draws for each, (n,).
-        draws: those draws, (n, ...).
-    """
-
-    at: Ints
-    episode: Ints
-    seed: Ints
-    draws: Draws
+    at: Ints  # the moment of each decision, as an index into the moments that the world shows, (n,)
+    episode: Ints  # the episode's number of each, (n,)
+    seed: Ints  # the seed of the channel's draws for each, (n,)
+    draws: Draws  # those draws, (n, ...)
 
     @property
     def episodes(self) -> list[tuple[int, int]]:
@@ -59,21 +52,13 @@ class Due:
 
 @dataclass(frozen=True)
 class Decided(Generic[Moment]):
-    """Decisions made under one condition.
+    """Decisions made under one condition."""
 
-    Attributes:
-        point: the condition.
-        moments: the moments that the world showed.
-        due: the decisions that were due.
-        result: what was decided, (n, ...).
-        said: what vehicles said to the channel, as the attacks leave it.
-    """
-
-    point: OperatingPoint
-    moments: Sequence[Moment]
-    due: Due
-    result: Coordination
-    said: Said
+    point: OperatingPoint  # the condition
+    moments: Sequence[Moment]  # the moments that the world showed
+    due: Due  # the decisions that were due
+    result: Coordination  # what was decided, (n, ...)
+    said: Said  # what vehicles said to the channel, as the attacks leave it
 
 
 class World(Protocol[Moment]):
@@ -105,15 +90,10 @@ class World(Protocol[Moment]):
 
 
 class Placed:
-    """A world whose moments are scenes.
+    """A world whose moments are scenes."""
 
-    Attributes:
-        scenario: the scenario of the scenes.
-        scenes: the scenes just shown.
-    """
-
-    scenario: Scenario
-    scenes: Sequence[Scene]
+    scenario: Scenario  # the scenario of the scenes
+    scenes: Sequence[Scene]  # the scenes just shown
 
     def site(self, units: Collection[Unit]) -> Site:
         """Return where the vehicles of each scene and these roadside units are."""

@@ -84,17 +84,11 @@ class Labels:
 
 @dataclass(frozen=True)
 class Decisions:
-    """Decisions as columns (n,).
+    """Decisions as columns (n,)."""
 
-    Attributes:
-        table: the columns of `schema`.
-        actions: the meta-actions, in the order of every distribution.
-        helpers: the most helpers of any decision point.
-    """
-
-    table: pa.Table
-    actions: tuple[str, ...]
-    helpers: int
+    table: pa.Table  # the columns of `schema`
+    actions: tuple[str, ...]  # the meta-actions, in the order of every distribution
+    helpers: int  # the most helpers of any decision point
     _arrays: dict[str, Floats] = field(default_factory=dict, repr=False, compare=False)
     _rows: dict[int, list[dict[str, Any]]] = field(default_factory=dict, repr=False, compare=False)
 
@@ -281,15 +275,10 @@ class Decisions:
 
 @dataclass(frozen=True)
 class DecisionFiles:
-    """Decisions in Parquet files, in order, which need not all fit into memory.
+    """Decisions in Parquet files, in order, which need not all fit into memory."""
 
-    Attributes:
-        files: what `Decisions.write` wrote.
-        actions: the meta-actions of all of them.
-    """
-
-    files: Sequence[Path]
-    actions: tuple[str, ...]
+    files: Sequence[Path]  # what `Decisions.write` wrote
+    actions: tuple[str, ...]  # the meta-actions of all of them
 
     def write(self, path: Path) -> None:
         """Write one Parquet file. Raises what `Decisions.read` raises."""

@@ -69,15 +69,10 @@ DEEPEST = 8  # folders of a dataset's stated path that are looked for above a ru
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run; each table is read on first use, and raises UserError if it is broken.
+    """A finished run; each table is read on first use, and raises UserError if it is broken."""
 
-    Attributes:
-        path: the run's folder.
-        manifest: the content of `run.json`.
-    """
-
-    path: Path
-    manifest: Manifest
+    path: Path  # the run's folder
+    manifest: Manifest  # the content of `run.json`
 
     @property
     def world(self) -> World:

@@ -20,17 +20,11 @@ READ_BY = {"swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1"}
 
 
 class Added(NamedTuple):
-    """What a run without a setting or a column did.
+    """What a run without a setting or a column did."""
 
-    Attributes:
-        since: the day that added it.
-        absent: its value in a run without it.
-        why: what was added, and why older runs have that value.
-    """
-
-    since: str
-    absent: Any
-    why: str
+    since: str  # the day that added it
+    absent: Any  # its value in a run without it
+    why: str  # what was added, and why older runs have that value
 
 
 SETTINGS: Mapping[str, Added] = {

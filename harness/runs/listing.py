@@ -44,41 +44,26 @@ _BROKEN = (
 
 @dataclass(frozen=True)
 class Listed:
-    """One run or study.
+    """One run or study."""
 
-    Attributes:
-        name: its folder, relative to the folder that is listed.
-        kind: `eval`, `drive`, `suite`, or one of `STUDIES`; `run` if it is broken and does not say.
-        state: `finished`, `unfinished` or `broken`.
-        date: when it began. For a suite, when the last of its runs began; for a study or a broken run, when
-            it was last written.
-        why: for an unfinished run, how to continue it; for a broken one, the file at fault, and the version
-            of the harness if the file has an older format.
-        model: name of its card; the sources of a sweep.
-        prompt: the prompt version; those of all families for a suite.
-        answer: the answer mode.
-        tags: words by which to find it.
-        condition: the condition with the highest success rate; the first of several.
-        success: that rate, 0 to 1, over episodes; for a suite, the mean over families.
-        low: lower end of its 95 % interval; None if the data cannot bound it.
-        high: its upper end.
-        unread: share of the ego's answers that could not be parsed.
-    """
-
-    name: str
-    kind: str
-    state: Literal["finished", "unfinished", "broken"]
+    name: str  # its folder, relative to the folder that is listed
+    kind: str  # `eval`, `drive`, `suite`, or one of `STUDIES`; `run` if it is broken and does not say
+    state: Literal["finished", "unfinished", "broken"]  # `finished`, `unfinished` or `broken`
+    # when it began. For a suite, when the last of its runs began; for a study or a broken run, when it
+    # was last written.
     date: datetime
+    # for an unfinished run, how to continue it; for a broken one, the file at fault, and the version of
+    # the harness if the file has an older format
     why: str | None = None
-    model: str | None = None
-    prompt: str | None = None
-    answer: str | None = None
-    tags: tuple[str, ...] = ()
-    condition: str | None = None
-    success: float | None = None
-    low: float | None = None
-    high: float | None = None
-    unread: float | None = None
+    model: str | None = None  # name of its card; the sources of a sweep
+    prompt: str | None = None  # the prompt version; those of all families for a suite
+    answer: str | None = None  # the answer mode
+    tags: tuple[str, ...] = ()  # words by which to find it
+    condition: str | None = None  # the condition with the highest success rate; the first of several
+    success: float | None = None  # that rate, 0 to 1, over episodes; for a suite, the mean over families
+    low: float | None = None  # lower end of its 95 % interval; None if the data cannot bound it
+    high: float | None = None  # its upper end
+    unread: float | None = None  # share of the ego's answers that could not be parsed
 
 
 def runs(folder: Path) -> list[Listed]:

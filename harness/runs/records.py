@@ -29,79 +29,53 @@ class FirstTurn(Struct, frozen=True, kw_only=True):
 
 
 class Answer(Struct, frozen=True, kw_only=True):
-    """One answer of a model: a line of `answers.jsonl`; tokens and times include those of a repair turn.
+    """One answer of a model: a line of `answers.jsonl`; tokens and times include those of a repair turn."""
 
-    Attributes:
-        scene: id of the decision point.
-        viewer: id of the vehicle that answered.
-        heard: keys of the helpers' answers whose messages were in the prompt of a fusion call.
-        role: `ego`, `helper`, `merge` for the ego's fusion call, or `blind` for a helper shown nothing.
-        raw: the completion as it came, except for lone surrogates, which no file can hold.
-        finish_reason: `stop`, `length` or `error`.
-        error: the engine's message; None if it answered.
-        prompt_tokens: tokens in; None if the engine has no tokenizer.
-        completion_tokens: tokens out; None if the engine has no tokenizer.
-        seconds: time of this answer if its request was alone in the engine; None otherwise.
-        batch_size: how many requests went through the engine together.
-        label_mass: probability of all letters together in a read-out; None otherwise.
-        retries: failed attempts before this one.
-        cached: whether it comes from the completion cache.
-        slow_s: declared seconds that it takes beyond its card's latency.
-        first_token_s: time to the first token, prefill included; None if `seconds` is None, if it is unknown,
-            or after a repair turn.
-        token_s: time of each token after the first; None if `first_token_s` is None or no token follows.
-        prompt_sha256: digest of the chat messages.
-        status: the outcome of parsing (`harness.parsing.status`).
-        verdict: the status in three classes: `strict`, `recovered` or `failed`.
-        repairs: corrections before parsing; empty unless recovered.
-        intent: probabilities in the order of the actions; None if failed.
-        mass: their sum as written; None if none were written.
-        message: the rest of a helper's answer; None if there is none.
-        detail: one sentence for people.
-        first: the answer before a repair turn; unset without one.
-        image_sha256: digest of the pixels of the picture in its prompt; unset without one.
-        letter_share: how much of a read-out over several orders of its letters follows the letter, 0 to 1;
-            unset where the letters were read once, like the next.
-        follows_letter: whether one letter is the likeliest in every order.
-        flipped: whether the likeliest action changed when the list of actions was reversed; unset where that
-            was not asked, or got no answer.
-        agent: which of several helper models answered, from 1; unset where the place among all answers says.
-        faults: all that is wrong with a failed answer, the status first; unset where that is the only fault.
-        extension: what a prompt's `answer.json` asks for beside the decision; unset where there is none.
-    """
-
-    scene: str
-    viewer: str
+    scene: str  # id of the decision point
+    viewer: str  # id of the vehicle that answered
+    # keys of the helpers' answers whose messages were in the prompt of a fusion call
     heard: tuple[str, ...] = ()
-    role: Role
-    raw: str
-    finish_reason: str
-    error: str | None
-    prompt_tokens: int | None
-    completion_tokens: int | None
-    seconds: float | None
-    batch_size: int
-    label_mass: float | None
-    retries: int
-    cached: bool
-    slow_s: float
-    prompt_sha256: str
-    status: str
+    role: Role  # `ego`, `helper`, `merge` for the ego's fusion call, or `blind` for a helper shown nothing
+    raw: str  # the completion as it came, except for lone surrogates, which no file can hold
+    finish_reason: str  # `stop`, `length` or `error`
+    error: str | None  # the engine's message; None if it answered
+    prompt_tokens: int | None  # tokens in; None if the engine has no tokenizer
+    completion_tokens: int | None  # tokens out; None if the engine has no tokenizer
+    seconds: float | None  # time of this answer if its request was alone in the engine; None otherwise
+    batch_size: int  # how many requests went through the engine together
+    label_mass: float | None  # probability of all letters together in a read-out; None otherwise
+    retries: int  # failed attempts before this one
+    cached: bool  # whether it comes from the completion cache
+    slow_s: float  # declared seconds that it takes beyond its card's latency
+    prompt_sha256: str  # digest of the chat messages
+    status: str  # the outcome of parsing (`harness.parsing.status`)
+    # the status in three classes: `strict`, `recovered` or `failed`
     verdict: Literal["strict", "recovered", "failed"]
-    repairs: tuple[str, ...]
-    intent: tuple[float, ...] | None
-    mass: float | None
-    message: dict[str, Any] | None
-    detail: str
+    repairs: tuple[str, ...]  # corrections before parsing; empty unless recovered
+    intent: tuple[float, ...] | None  # probabilities in the order of the actions; None if failed
+    mass: float | None  # their sum as written; None if none were written
+    message: dict[str, Any] | None  # the rest of a helper's answer; None if there is none
+    detail: str  # one sentence for people
+    # time to the first token, prefill included; None if `seconds` is None, if it is unknown, or after a
+    # repair turn
     first_token_s: float | None = None
+    # time of each token after the first; None if `first_token_s` is None or no token follows
     token_s: float | None = None
-    first: FirstTurn | UnsetType = UNSET
+    first: FirstTurn | UnsetType = UNSET  # the answer before a repair turn; unset without one
+    # digest of the pixels of the picture in its prompt; unset without one
     image_sha256: str | UnsetType = UNSET
+    # how much of a read-out over several orders of its letters follows the letter, 0 to 1; unset where
+    # the letters were read once, like the next
     letter_share: float | UnsetType = UNSET
-    follows_letter: bool | UnsetType = UNSET
+    follows_letter: bool | UnsetType = UNSET  # whether one letter is the likeliest in every order
+    # whether the likeliest action changed when the list of actions was reversed; unset where that was
+    # not asked, or got no answer
     flipped: bool | UnsetType = UNSET
+    # which of several helper models answered, from 1; unset where the place among all answers says
     agent: int | UnsetType = UNSET
+    # all that is wrong with a failed answer, the status first; unset where that is the only fault
     faults: tuple[str, ...] | UnsetType = UNSET
+    # what a prompt's `answer.json` asks for beside the decision; unset where there is none
     extension: dict[str, Any] | UnsetType = UNSET
 
     @property
@@ -167,69 +141,45 @@ class AnswerFacts(Struct, frozen=True):
 
 
 class Times(Struct, frozen=True, omit_defaults=True):
-    """How long some answers took, each asked alone: their number, and percentiles in seconds.
+    """How long some answers took, each asked alone: their number, and percentiles in seconds."""
 
-    Attributes:
-        n: number of answers.
-        median_s: the median.
-        p5_s: the 5th percentile.
-        p95_s: the 95th percentile.
-        median_ci_s: 95 % interval of the median, over episodes; None if they cannot bound it.
-        p95_ci_s: 95 % interval of the 95th percentile.
-        first_token: times to the first token, if the engine reports them.
-        token: times per output token, if the engine reports them.
-    """
-
-    n: int
-    median_s: float
-    p5_s: float
-    p95_s: float
+    n: int  # number of answers
+    median_s: float  # the median
+    p5_s: float  # the 5th percentile
+    p95_s: float  # the 95th percentile
+    # 95 % interval of the median, over episodes; None if they cannot bound it
     median_ci_s: tuple[float, float] | None = None
-    p95_ci_s: tuple[float, float] | None = None
-    first_token: "Times | None" = None
-    token: "Times | None" = None
+    p95_ci_s: tuple[float, float] | None = None  # 95 % interval of the 95th percentile
+    first_token: "Times | None" = None  # times to the first token, if the engine reports them
+    token: "Times | None" = None  # times per output token, if the engine reports them
 
 
 class Speed(Struct, frozen=True):
-    """How fast a computer answers one request with a model, and the energy of a token; None if unknown.
+    """How fast a computer answers one request with a model, and the energy of a token; None if unknown."""
 
-    Attributes:
-        model: the model of the row in the device profile.
-        prefill_tokens_per_s: prompt tokens read in a second.
-        decode_tokens_per_s: output tokens written in a second.
-        joules_per_prompt_token: energy to read one token.
-        joules_per_output_token: energy to write one token.
-    """
-
-    model: str
-    prefill_tokens_per_s: Rate | None
-    decode_tokens_per_s: Rate | None
-    joules_per_prompt_token: Rate | None = None
-    joules_per_output_token: Rate | None = None
+    model: str  # the model of the row in the device profile
+    prefill_tokens_per_s: Rate | None  # prompt tokens read in a second
+    decode_tokens_per_s: Rate | None  # output tokens written in a second
+    joules_per_prompt_token: Rate | None = None  # energy to read one token
+    joules_per_output_token: Rate | None = None  # energy to write one token
 
 
 class Latency(Struct, frozen=True, omit_defaults=True):
-    """How long inference takes; it is fixed before a run and decides who is heard in time.
+    """How long inference takes; it is fixed before a run and decides who is heard in time."""
 
-    Attributes:
-        source: `card`, `paper`, `declared` (by the user), `measured`, or `device`: the time of an answer
-            follows from its own tokens on a declared computer.
-        basis: where the numbers come from.
-        ego_s: seconds of one inference of the ego; None if the source is `device`, like the next two.
-        helper_s: seconds of one inference of a helper; of the first of several helper models.
-        fusion_s: seconds of the ego's fusion call.
-        sample: times of the answers behind a measured latency, by role.
-        helpers_s: seconds of each of several helper models; empty if there is only one.
-        speeds: the speed of each agent, the ego's first, if the source is `device`; else empty.
-    """
-
+    # `card`, `paper`, `declared` (by the user), `measured`, or `device`: the time of an answer follows
+    # from its own tokens on a declared computer
     source: Literal["card", "paper", "declared", "measured", "device"]
-    basis: str
+    basis: str  # where the numbers come from
+    # seconds of one inference of the ego; None if the source is `device`, like the next two
     ego_s: Seconds | None = None
+    # seconds of one inference of a helper; of the first of several helper models
     helper_s: Seconds | None = None
-    fusion_s: Seconds | None = None
-    sample: dict[str, Times] = {}
+    fusion_s: Seconds | None = None  # seconds of the ego's fusion call
+    sample: dict[str, Times] = {}  # times of the answers behind a measured latency, by role
+    # seconds of each of several helper models; empty if there is only one
     helpers_s: tuple[Seconds, ...] = ()
+    # the speed of each agent, the ego's first, if the source is `device`; else empty
     speeds: tuple[Speed, ...] = ()
 
     def __post_init__(self) -> None:
@@ -248,147 +198,80 @@ class Latency(Struct, frozen=True, omit_defaults=True):
 
 
 class Message(Struct, frozen=True, rename={"sender": "from"}):
-    """A helper's reply: whether and when it arrived, and its weight in the policy.
+    """A helper's reply: whether and when it arrived, and its weight in the policy."""
 
-    Attributes:
-        sender: the helper.
-        delivered: whether it arrived.
-        on_time: whether it arrived within the decision window.
-        arrival_ms: when it arrived, from the start of the decision; None if lost.
-        weight: its weight in the policy; None if a fusion call answered.
-        trust: how far the consensus rule trusted it, from 0 to 1; None if the rule rates no trust.
-        attacker: whether the sender attacks under this condition; None in runs older than attacks.
-    """
-
-    sender: str
-    delivered: bool
-    on_time: bool
-    arrival_ms: float | None
-    weight: float | None
-    trust: float | None
-    attacker: bool | None
+    sender: str  # the helper
+    delivered: bool  # whether it arrived
+    on_time: bool  # whether it arrived within the decision window
+    arrival_ms: float | None  # when it arrived, from the start of the decision; None if lost
+    weight: float | None  # its weight in the policy; None if a fusion call answered
+    trust: float | None  # how far the consensus rule trusted it, from 0 to 1; None if the rule rates no trust
+    attacker: bool | None  # whether the sender attacks under this condition; None in runs older than attacks
 
 
 class Decision(Struct, frozen=True, kw_only=True):
-    """One decision, a row of `decisions.parquet` as reports use it; None where unknown.
+    """One decision, a row of `decisions.parquet` as reports use it; None where unknown."""
 
-    Attributes:
-        scene: id of the decision point.
-        episode: the episode's number.
-        step: its number in the episode.
-        danger: where the hidden danger comes from; None without one.
-        condition: name of the operating point.
-        seed: seed of the channel's draws.
-        action: the meta-action that was taken.
-        fused: the policy, in the order of the actions.
-        entropy_nats: entropy of the ego's own intent.
-        triggered: whether the ego asked.
-        own_failed: whether the ego's own answer could not be parsed.
-        own_weight: weight of its intent in the policy; None if a fusion call answered.
-        latency_ms: time from seeing to acting.
-        fusion_ms: the part of it that fusion takes.
-        deadline_missed: whether it took longer than the window.
-        messages: the replies that were scheduled.
-        value: whether success was still possible; frozen scenes only, like the next four.
-        safe: whether success is still possible after the action.
-        regret: whether the action gave success away; None if it was not possible before.
-        delay_s: by how much the action puts off the earliest success.
-        off_lag: whether the decision took longer or shorter than the dataset's lag, in whole frames.
-        acts_at_s: when the action takes effect; closed loop only.
-        acted: whether the episode lasted until then; closed loop only.
-    """
-
-    scene: str
-    episode: int
-    step: int
-    danger: str | None
-    condition: str
-    seed: int
-    action: str
-    fused: tuple[float, ...]
-    entropy_nats: float | None
-    triggered: bool
-    own_failed: bool
-    own_weight: float | None
-    latency_ms: float | None
-    fusion_ms: float | None
-    deadline_missed: bool | None
-    messages: tuple[Message, ...]
-    value: bool | None
-    safe: bool | None
-    regret: bool | None
-    delay_s: float | None
+    scene: str  # id of the decision point
+    episode: int  # the episode's number
+    step: int  # its number in the episode
+    danger: str | None  # where the hidden danger comes from; None without one
+    condition: str  # name of the operating point
+    seed: int  # seed of the channel's draws
+    action: str  # the meta-action that was taken
+    fused: tuple[float, ...]  # the policy, in the order of the actions
+    entropy_nats: float | None  # entropy of the ego's own intent
+    triggered: bool  # whether the ego asked
+    own_failed: bool  # whether the ego's own answer could not be parsed
+    own_weight: float | None  # weight of its intent in the policy; None if a fusion call answered
+    latency_ms: float | None  # time from seeing to acting
+    fusion_ms: float | None  # the part of it that fusion takes
+    deadline_missed: bool | None  # whether it took longer than the window
+    messages: tuple[Message, ...]  # the replies that were scheduled
+    value: bool | None  # whether success was still possible; frozen scenes only, like the next four
+    safe: bool | None  # whether success is still possible after the action
+    regret: bool | None  # whether the action gave success away; None if it was not possible before
+    delay_s: float | None  # by how much the action puts off the earliest success
+    # whether the decision took longer or shorter than the dataset's lag, in whole frames
     off_lag: bool | None
-    acts_at_s: float | None
-    acted: bool | None
+    acts_at_s: float | None  # when the action takes effect; closed loop only
+    acted: bool | None  # whether the episode lasted until then; closed loop only
 
 
 class Episode(Struct, frozen=True, kw_only=True):
-    """How one layout ended under one condition and seed: a line of `episodes.csv`.
+    """How one layout ended under one condition and seed: a line of `episodes.csv`."""
 
-    Attributes:
-        condition: name of the operating point.
-        seed: seed of the channel's draws.
-        episode: the episode's number.
-        layout_seed: seed of the layout.
-        danger: where the hidden danger comes from; `none` without one.
-        success: whether it succeeded.
-        failure: how it failed; empty if it did not.
-        delay_s: total needless delay.
-        messages: replies scheduled.
-        trigger_rate: share of its decisions in which the ego asked.
-        latency_ms: mean latency of its decisions.
-        deadline_misses: decisions that outlasted the window.
-        time_s: when the outcome was decided.
-        partner: the vehicle that the ego collided with.
-        striker: the vehicle whose front hit.
-        fault: the vehicle that should have given way.
-        least_gap_m: smallest distance to another vehicle's outline.
-        hard_brakings: times the ego began to brake harder than 4 m/s².
-        other_crashes: vehicles that crashed without the ego.
-        decisions: decisions begun.
-        skipped: decisions not begun, since one was still open.
-        never_acted: decisions that were not ready before the end.
-    """
-
-    condition: str
-    seed: int
-    episode: int
-    layout_seed: int
-    danger: str
-    success: bool
-    failure: str
-    delay_s: float | None = None
-    messages: int = 0
-    trigger_rate: float | None = None
-    latency_ms: float | None = None
-    deadline_misses: int = 0
-    time_s: float | None = None
-    partner: str | None = None
-    striker: str | None = None
-    fault: str | None = None
-    least_gap_m: float | None = None
-    hard_brakings: int | None = None
-    other_crashes: int | None = None
-    decisions: int | None = None
-    skipped: int | None = None
-    never_acted: int | None = None
+    condition: str  # name of the operating point
+    seed: int  # seed of the channel's draws
+    episode: int  # the episode's number
+    layout_seed: int  # seed of the layout
+    danger: str  # where the hidden danger comes from; `none` without one
+    success: bool  # whether it succeeded
+    failure: str  # how it failed; empty if it did not
+    delay_s: float | None = None  # total needless delay
+    messages: int = 0  # replies scheduled
+    trigger_rate: float | None = None  # share of its decisions in which the ego asked
+    latency_ms: float | None = None  # mean latency of its decisions
+    deadline_misses: int = 0  # decisions that outlasted the window
+    time_s: float | None = None  # when the outcome was decided
+    partner: str | None = None  # the vehicle that the ego collided with
+    striker: str | None = None  # the vehicle whose front hit
+    fault: str | None = None  # the vehicle that should have given way
+    least_gap_m: float | None = None  # smallest distance to another vehicle's outline
+    hard_brakings: int | None = None  # times the ego began to brake harder than 4 m/s²
+    other_crashes: int | None = None  # vehicles that crashed without the ego
+    decisions: int | None = None  # decisions begun
+    skipped: int | None = None  # decisions not begun, since one was still open
+    never_acted: int | None = None  # decisions that were not ready before the end
 
 
 class Variant(Struct, frozen=True):
-    """The agents of a run, in words: the first columns of every line of its CSV files.
+    """The agents of a run, in words: the first columns of every line of its CSV files."""
 
-    Attributes:
-        model: name of the card.
-        prompt: the prompt version.
-        answer: the answer mode.
-        helpers: the same for the helpers' agents; empty if the ego's agent answers for them.
-    """
-
-    model: str
-    prompt: str
-    answer: str
-    helpers: str = ""
+    model: str  # name of the card
+    prompt: str  # the prompt version
+    answer: str  # the answer mode
+    helpers: str = ""  # the same for the helpers' agents; empty if the ego's agent answers for them
 
     def __str__(self) -> str:
         return f"{self.model} · {self.prompt} · {self.answer}{self.mix}"
@@ -400,27 +283,16 @@ class Variant(Struct, frozen=True):
 
 
 class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
-    """An estimate of a metric: a line of `summary.csv`.
+    """An estimate of a metric: a line of `summary.csv`."""
 
-    Attributes:
-        condition: name of the operating point, or `all` for what is the same in all.
-        metric: name of the metric, its unit at the end.
-        value: the mean; None if there was nothing to average.
-        low: lower end of the 95 % interval; None if the data cannot bound it.
-        high: its upper end.
-        n: number of units.
-        n_excluded: units without a value.
-        interval: what the units are: `episodes`, `seed means` or `answers`.
-    """
-
-    condition: str
-    metric: str
-    value: float | None
-    low: float | None
-    high: float | None
-    n: int
-    n_excluded: int
-    interval: str
+    condition: str  # name of the operating point, or `all` for what is the same in all
+    metric: str  # name of the metric, its unit at the end
+    value: float | None  # the mean; None if there was nothing to average
+    low: float | None  # lower end of the 95 % interval; None if the data cannot bound it
+    high: float | None  # its upper end
+    n: int  # number of units
+    n_excluded: int  # units without a value
+    interval: str  # what the units are: `episodes`, `seed means` or `answers`
 
     @classmethod
     def of(cls, condition: str, metric: str, e: Estimate, interval: str) -> "Score":
@@ -491,56 +363,37 @@ class Constant(Struct, frozen=True):
 
 
 class DeviceRow(Struct, frozen=True, kw_only=True):
-    """The rates of a device with one model; None where no source states them.
+    """The rates of a device with one model; None where no source states them."""
 
-    Attributes:
-        model: the model's name; that of a card, if there is one.
-        billions: billions of weights.
-        precision: number format of the weights.
-        batch_size: requests that went through the device together when it was timed.
-        prefill_tokens_per_s: prompt tokens read in a second.
-        decode_tokens_per_s: output tokens written in a second for one request.
-        joules_per_prompt_token: energy to read one token, the device's idle draw included.
-        joules_per_output_token: energy to write one token, the device's idle draw included.
-    """
-
-    model: str
-    billions: Annotated[float, Meta(gt=0, description="billions of weights, above 0")]
-    precision: str
-    batch_size: Count
-    prefill_tokens_per_s: Constant | None = None
-    decode_tokens_per_s: Constant | None = None
+    model: str  # the model's name; that of a card, if there is one
+    billions: Annotated[float, Meta(gt=0, description="billions of weights, above 0")]  # billions of weights
+    precision: str  # number format of the weights
+    batch_size: Count  # requests that went through the device together when it was timed
+    prefill_tokens_per_s: Constant | None = None  # prompt tokens read in a second
+    decode_tokens_per_s: Constant | None = None  # output tokens written in a second for one request
+    # energy to read one token, the device's idle draw included
     joules_per_prompt_token: Constant | None = None
+    # energy to write one token, the device's idle draw included
     joules_per_output_token: Constant | None = None
 
 
 class Device(Struct, frozen=True, kw_only=True):
-    """A file of `devices/`: a computer that vehicles may have.
+    """A file of `devices/`: a computer that vehicles may have."""
 
-    Attributes:
-        name: the file's name.
-        description: one sentence for lists.
-        power_mode: the power mode in which it was timed.
-        rows: one row for each model.
-        scaling: how a model without a row is timed: `weights` scales the nearest row inversely to the number
-            of weights; None refuses the model.
-        load_watts: its draw while it infers; a row without joules per token gets them from this.
-        idle_watts: its draw while it waits.
-        transmit_dbm: radiated power of its radio, if the channel states none.
-        amplifier_efficiency: the share of the radio amplifier's draw that is radiated.
-        frame_ms: least time on air of a message under a channel that states bits and bandwidth alone; None
-            counts only these.
-    """
-
-    name: str
-    description: str
-    power_mode: str
-    rows: tuple[DeviceRow, ...]
+    name: str  # the file's name
+    description: str  # one sentence for lists
+    power_mode: str  # the power mode in which it was timed
+    rows: tuple[DeviceRow, ...]  # one row for each model
+    # how a model without a row is timed: `weights` scales the nearest row inversely to the number of
+    # weights; None refuses the model
     scaling: Literal["weights"] | None = None
+    # its draw while it infers; a row without joules per token gets them from this
     load_watts: Constant | None = None
-    idle_watts: Constant | None = None
-    transmit_dbm: Constant | None = None
-    amplifier_efficiency: Constant | None = None
+    idle_watts: Constant | None = None  # its draw while it waits
+    transmit_dbm: Constant | None = None  # radiated power of its radio, if the channel states none
+    amplifier_efficiency: Constant | None = None  # the share of the radio amplifier's draw that is radiated
+    # least time on air of a message under a channel that states bits and bandwidth alone; None counts
+    # only these
     frame_ms: Constant | None = None
 
     def __post_init__(self) -> None:
