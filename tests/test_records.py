@@ -20,7 +20,7 @@ import harness as package
 from harness.backends.card import Card
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
-from harness.evaluate.lifecycle import Begun
+from harness.evaluate.lifecycle import RunStart
 from harness.report.view.access import cookie
 from harness.report.view.app import app
 from harness.runs import folder, formats, records
@@ -202,7 +202,7 @@ def test_what_a_run_lacks_has_an_entry(run: str) -> None:
         assert {*records.Answer.__struct_fields__} <= {*json.loads(next(lines)), "heard", *formats.ANSWER}
 
 
-@pytest.mark.parametrize(("kind", "added"), [(records.Answer, formats.ANSWER), (Begun, formats.START)])
+@pytest.mark.parametrize(("kind", "added"), [(records.Answer, formats.ANSWER), (RunStart, formats.START)])
 def test_a_struct_has_the_defaults_that_the_table_states(kind: type, added: dict) -> None:
     stated = {field.name: field for field in msgspec.structs.fields(kind)}
     for name, entry in added.items():

@@ -110,7 +110,8 @@ def test_merged_shards_are_the_run_that_was_not_split(split: Path, harness: Type
         k: v for k, v in theirs.items() if k not in TIMES
     }
     assert shlex.split(ours["command"])[:-1] == shlex.split(theirs["command"])[:-1]
-    assert {path.name for path in merged.iterdir()} == {*FILES, "run.json", "report.html", "sources"}
+    written = {*FILES, "run.json", "run.toml", "report.html", "sources"}
+    assert {path.name for path in merged.iterdir()} == written
     assert read_sources(merged) == read_sources(whole) != {}
     code, _, said = harness("run", "merge", *shards, "--out", "merged")
     assert (code, "already holds a finished run" in said) == (2, True)

@@ -12,7 +12,7 @@ from harness.core import work
 from harness.core.errors import UserError
 from harness.core.files import alone, replacing, write_whole
 
-BEGUN = work.Begun(settings={"seed": 1})
+BEGUN = work.WorkStart(settings={"seed": 1})
 
 
 def test_what_a_killed_process_left_half_written_goes_and_what_another_writes_stays(tmp_path: Path) -> None:
@@ -62,13 +62,13 @@ def test_an_error_before_anything_is_done_leaves_nothing_and_one_after_keeps_it(
         with pytest.raises(UserError, match="the engine died"), work.working(out, BEGUN) as place:
             fail(place / "answers.jsonl" if done else None)
         assert out.parent.exists() == done
-    assert work.begun(out, work.Begun) == BEGUN
+    assert work.begun(out, work.WorkStart) == BEGUN
     with work.working(out, BEGUN) as place:
         assert (place / "answers.jsonl").read_text() == "128 answers"
 
 
 def test_what_another_process_began_since_is_not_touched(tmp_path: Path) -> None:
-    with work.working(tmp_path, work.Begun(settings={"seed": 2})):
+    with work.working(tmp_path, work.WorkStart(settings={"seed": 2})):
         pass
     with pytest.raises(UserError, match="being written by another process"), work.working(tmp_path, BEGUN):
         pass
@@ -100,7 +100,7 @@ def test_a_damaged_beginning_is_one_line(text: str, tmp_path: Path) -> None:
     (tmp_path / ".work").mkdir()
     (tmp_path / ".work" / "config.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(UserError, match=r"config\.json is damaged .*; delete .* and start again") as raised:
-        work.begun(tmp_path, work.Begun)
+        work.begun(tmp_path, work.WorkStart)
     assert str(raised.value).isprintable()
 
 

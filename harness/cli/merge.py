@@ -28,7 +28,7 @@ def command(
     from harness.core.shards import read
 
     who, silent = options.workers_of(workers), as_json or quiet
-    if "world" not in read(folders, work.Begun)[0].settings:
+    if "world" not in read(folders, work.WorkStart)[0].settings:
         from harness.dataset.build import merge as merge_dataset
 
         with bar("layouts", quiet=silent) as progress:

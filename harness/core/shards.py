@@ -69,10 +69,10 @@ def shard_of(text: str, environment: Mapping[str, str] = os.environ) -> Shard:
     return Shard(int(number), int(total))
 
 
-Begun = TypeVar("Begun", bound=work.Begun)
+Start = TypeVar("Start", bound=work.WorkStart)
 
 
-def read(folders: Sequence[Path], kind: type[Begun]) -> list[Begun]:
+def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
     """Read what the shards in some folders began with, and check that they make up one work.
 
     Raises:
@@ -100,7 +100,7 @@ def read(folders: Sequence[Path], kind: type[Begun]) -> list[Begun]:
     return configs
 
 
-def _read(folder: Path, kind: type[Begun]) -> Begun:
+def _read(folder: Path, kind: type[Start]) -> Start:
     file = folder / WORK / CONFIG
     try:
         config = msgspec.json.decode(text_of(file, "record"), type=kind)
@@ -117,7 +117,10 @@ def _read(folder: Path, kind: type[Begun]) -> Begun:
 
 
 def owners(
-    folders: Sequence[Path], configs: Sequence[work.Begun], parts: Sequence[str], label: Callable[[str], str]
+    folders: Sequence[Path],
+    configs: Sequence[work.WorkStart],
+    parts: Sequence[str],
+    label: Callable[[str], str],
 ) -> dict[str, Path]:
     """Locate every part of a work in the shards' folders.
 

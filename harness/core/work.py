@@ -24,7 +24,7 @@ GONE_S = 3.0  # seconds until the processes of a killed command are gone
 SHORT = 30  # most characters of a setting's value that a message has
 
 
-class Begun(msgspec.Struct, frozen=True, kw_only=True):
+class WorkStart(msgspec.Struct, frozen=True, kw_only=True):
     """The settings that a piece of work began with."""
 
     settings: dict[str, Any]  # plain values that must be the same for the work to be resumed
@@ -35,7 +35,7 @@ class Begun(msgspec.Struct, frozen=True, kw_only=True):
         return self.settings
 
 
-Kind = TypeVar("Kind", bound=Begun)
+Kind = TypeVar("Kind", bound=WorkStart)
 
 
 def begun(out: Path, kind: type[Kind]) -> Kind | None:
@@ -107,7 +107,7 @@ def held(out: Path) -> bool:
 
 
 @contextmanager
-def working(out: Path, begin: Begun, last: str | None = None) -> Iterator[Path]:
+def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Path]:
     """Lock the working folder, an existing one or a new one that begins with `begin`, and yield it.
 
     If a UserError or OSError ends the work before anything is done, the folders created here are deleted; but

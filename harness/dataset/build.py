@@ -106,11 +106,11 @@ def build(
         return finished
     part = str(shard or "")
     own_episodes = shard.part(range(episodes)) if shard else range(episodes)
-    if begun := work.begun(out, work.Begun):
+    if begun := work.begun(out, work.WorkStart):
         work.same(out, {**config, "shard": part}, {**begun.settings, "shard": begun.shard})
     elif scenario.is_environment:
         examine(scenario, seed)
-    with work.working(out, begun or work.Begun(settings=config, shard=part)) as place:
+    with work.working(out, begun or work.WorkStart(settings=config, shard=part)) as place:
         _freeze_missing(scenario, place, seed, own_episodes, workers, progress)
         if shard:
             return config
@@ -129,13 +129,13 @@ def merge(
         UserError: as in `build`; or the folders are not all the shards of one build, a shard is unfinished,
             or two hold different bytes for the same layout.
     """
-    begun = shards.read(folders, work.Begun)
+    begun = shards.read(folders, work.WorkStart)
     config = begun[0].settings
     episodes = {part_of(e): e for e in range(config["episodes"])}
     parts = shards.owners(folders, begun, list(episodes), lambda part: named(episodes[part]))
     if not (out / "manifest.json").exists():
-        whole = work.Begun(settings=config)
-        if stopped := work.begun(out, work.Begun):
+        whole = work.WorkStart(settings=config)
+        if stopped := work.begun(out, work.WorkStart):
             work.same(out, whole.settings, stopped.settings)
         with work.working(out, whole) as place:
             shards.collect(parts, place)

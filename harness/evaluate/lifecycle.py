@@ -19,7 +19,7 @@ from harness.runs import folder, formats
 from harness.runs.records import Latency, Manifest, Score
 
 
-class Begun(work.Begun, frozen=True, kw_only=True):
+class RunStart(work.WorkStart, frozen=True, kw_only=True):
     """The record that a run begins with, and keeps when it resumes."""
 
     created: str  # when the run began, UTC, ISO 8601
@@ -52,11 +52,11 @@ class Evaluated:
 
 
 def begin(
-    spec: Spec, out: Path, begun: Begun | None, identity: dict[str, Any], latency: Latency, shard: str = ""
-) -> Begun:
+    spec: Spec, out: Path, begun: RunStart | None, identity: dict[str, Any], latency: Latency, shard: str = ""
+) -> RunStart:
     """Return `begun`, or a new record. Raises UserError if the run began with another model."""
     if begun is None:
-        return Begun(
+        return RunStart(
             settings=spec.settings(), shard=shard, created=datetime.now(UTC).isoformat(timespec="seconds"),
             command=words(spec.stated()), identity=identity, tags=spec.tags, latency=latency,
             versions=versions(),
@@ -75,7 +75,7 @@ def another_model(spec: Spec) -> str:
     return f"another model behind {names} (its files, package versions or device differ)"
 
 
-def as_finished(spec: Spec, begun: Begun) -> Begun:
+def as_finished(spec: Spec, begun: RunStart) -> RunStart:
     """Return the record of a run that finishes: tags of both commands, and where its dataset is now."""
     spec = replace(spec, tags=tuple(dict.fromkeys((*begun.tags, *spec.tags))))
     if spec.latency == latencies.MEASURED:  # a repeat must not measure: other times would make other rows
@@ -85,9 +85,9 @@ def as_finished(spec: Spec, begun: Begun) -> Begun:
     )
 
 
-def unfinished(spec: Spec, out: Path, shard: str = "") -> Begun | None:
+def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
     """Return the record of a stopped run in a folder, or None. Raises UserError if it is another run."""
-    begun = work.begun(out, Begun)
+    begun = work.begun(out, RunStart)
     if begun:
         now = {**_comparable(spec.settings()), "shard": shard, **_rules(versions())}
         stored = {**_comparable(begun.settings), "shard": begun.shard, **_rules(begun.versions)}

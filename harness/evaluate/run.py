@@ -31,8 +31,8 @@ from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker, read_kept
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.lifecycle import (
-    Begun,
     Evaluated,
+    RunStart,
     another_model,
     as_finished,
     begin,
@@ -155,7 +155,7 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
         UserError: the folders are not all the shards of one run, a shard is unfinished, two hold different
             bytes for the same part, or `out` holds something else.
     """
-    begun = shards.read(folders, Begun)
+    begun = shards.read(folders, RunStart)
     chunks = _chunks_of(begun[0].settings)
     chunk_by_folder = {_folder_name(chunk): chunk for chunk in chunks}
     parts = shards.owners(folders, begun, list(chunk_by_folder), lambda part: _label(chunk_by_folder[part]))
@@ -165,7 +165,7 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     tags = tuple(dict.fromkeys(tag for each in begun for tag in each.tags))
     created = min(each.created for each in begun)
     whole = msgspec.structs.replace(begun[0], shard="", tags=tags, created=created)
-    if stopped := work.begun(out, Begun):
+    if stopped := work.begun(out, RunStart):
         work.same(out, {**whole.facts(), "shard": ""}, {**stopped.facts(), "shard": stopped.shard})
     with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)
@@ -210,7 +210,7 @@ def _walk(
 
 
 def _frozen(
-    spec: Spec, source: FrozenSource, out: Path, begun: Begun | None, progress: Callable[[int], None],
+    spec: Spec, source: FrozenSource, out: Path, begun: RunStart | None, progress: Callable[[int], None],
     cache: Path | None, more: Callable[[int], None], opens: Opens, given: Mapping[str, Answer],
     workers: Workers,
 ) -> Evaluated:  # fmt: skip
@@ -259,8 +259,8 @@ def _frozen(
 
 
 def _begin_driving(
-    spec: Spec, out: Path, begun: Begun | None, workers: Workers, shard: str = ""
-) -> tuple[Begun, list[Sequence[int]]]:
+    spec: Spec, out: Path, begun: RunStart | None, workers: Workers, shard: str = ""
+) -> tuple[RunStart, list[Sequence[int]]]:
     """Return the record that a closed-loop run begins with, and the chunks of its episodes."""
     if spec.latency == latencies.MEASURED and (shard or not isinstance(workers, int)):
         raise UserError(
@@ -325,7 +325,7 @@ def _label(chunk: Sequence[int]) -> str:
 
 
 def _drive(
-    spec: Spec, begun: Begun, chunks: Sequence[Sequence[int]], place: Path,
+    spec: Spec, begun: RunStart, chunks: Sequence[Sequence[int]], place: Path,
     progress: Callable[[int], None], cache: Path | None, workers: Workers,
 ) -> None:  # fmt: skip
     """Drive the chunks that are not kept yet, and keep each as soon as it is done."""
@@ -350,7 +350,7 @@ def _reproducible(spec: Spec) -> bool:
 
 
 def _walk_chunk(
-    spec: Spec, begun: Begun, cache: Path | None, place: Path | None, chunk: Sequence[int]
+    spec: Spec, begun: RunStart, cache: Path | None, place: Path | None, chunk: Sequence[int]
 ) -> dict[str, bytes]:  # fmt: skip
     """Walk a chunk in a worker process and return its files by name; `place` keeps its answers until then."""
     kept = place and _answered_file(place, chunk)
@@ -378,7 +378,7 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
 
 
 def _gather(
-    out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes],
+    out: Path, begun: RunStart, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes],
     others: Sequence[Path] = (),
 ) -> Evaluated:  # fmt: skip
     """Score the chunks in a working folder and write the files of the finished run, with its sources.
@@ -431,7 +431,7 @@ def _gather(
     return Evaluated(out, manifest, summary)
 
 
-def _identity_and_latency(spec: Spec, begun: Begun | None) -> tuple[dict[str, Any], Latency]:
+def _identity_and_latency(spec: Spec, begun: RunStart | None) -> tuple[dict[str, Any], Latency]:
     """Open a closed-loop run's models; return their identity and the latency of their decisions."""
     models, source = _open_all(spec), cast("LiveSource", spec.source)
     latency = _latency(spec, begun, models, lambda: source.trial(timing.SCENES, spec.ego_alone))
@@ -439,7 +439,7 @@ def _identity_and_latency(spec: Spec, begun: Begun | None) -> tuple[dict[str, An
 
 
 def _latency(
-    spec: Spec, begun: Begun | None, models: Sequence[Backend], trial: Callable[[], Sequence[Scene]]
+    spec: Spec, begun: RunStart | None, models: Sequence[Backend], trial: Callable[[], Sequence[Scene]]
 ) -> Latency:
     """Return the latency that a resumed run began with, or that of a new run.
 

@@ -72,7 +72,7 @@ VERSIONS: Mapping[str, Added] = {
     "parser": Added("2026-11-26", "1", "the version of what answers are read as"),
     "decisions": Added("2026-11-26", "1", "the version of what answers are decided to"),
 }
-# Of the record that a run begins with; `lifecycle.Begun` has the same defaults.
+# Of the record that a run begins with; `lifecycle.RunStart` has the same defaults.
 START: Mapping[str, Added] = {
     "command": Added("2026-11-23", (), "the command that repeats a run; the one that resumes it is stated"),
     "versions": Added("2026-11-23", {}, "versions of packages; those that resume it are stated"),

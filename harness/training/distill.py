@@ -81,9 +81,9 @@ def distill(
         )
     learnt = curriculum.settings()  # once: the base's file may change while this learns from it
     settings = {**learnt, **asdict(plan)}
-    if begun := work.begun(out, work.Begun):
+    if begun := work.begun(out, work.WorkStart):
         work.same(out, settings, begun.settings)
-    with work.working(out, begun or work.Begun(settings=settings)) as place:
+    with work.working(out, begun or work.WorkStart(settings=settings)) as place:
         layouts, seed, folder = curriculum.layouts, curriculum.seed, place / "lessons"
         lessons = [
             draw(scenario, prompts, layouts, seed, folder / scenario.name, workers, drawing)

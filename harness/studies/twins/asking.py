@@ -78,15 +78,15 @@ class Questions:
         """Return how many decision points were drawn."""
         return sum(map(len, self.points().values()))
 
-    def begin(self, identity: str) -> work.Begun:
+    def begin(self, identity: str) -> work.WorkStart:
         """Return what the work begins with; `identity` is the digest of the model's."""
         settings = {**self.spec.settings(), "twins": self.twins, "seed": self.seed, "identity": identity}
-        return work.Begun(settings=msgspec.json.decode(msgspec.json.encode(settings)))
+        return work.WorkStart(settings=msgspec.json.decode(msgspec.json.encode(settings)))
 
     def goes_on(self, out: Path) -> bool:
         """Whether this was begun in a folder, stopped there, and nobody is at it."""
         try:
-            left = work.begun(out, work.Begun)
+            left = work.begun(out, work.WorkStart)
             if work.idle(out):
                 return not work.held(out)
             if left is None or (out / RESULT).exists() or work.held(out):
@@ -138,7 +138,7 @@ def ask(
     name = f"the model {questions.spec.ego.card.name}"
     [identity] = spread(_identity, [questions.spec], workers, lambda done: None, lambda spec: name, False)
     begun = questions.begin(identity)
-    if left := work.begun(out, work.Begun):
+    if left := work.begun(out, work.WorkStart):
         work.same(out, begun.settings, left.settings)
     with work.working(out, begun, RESULT) as place:
         points = [
