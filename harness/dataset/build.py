@@ -161,7 +161,6 @@ def _write_dataset(
     scenario: Scenario, out: Path, place: Path, config: dict[str, Any], workers: Workers,
     progress: Callable[[int], None], audits: bool, more: Callable[[int], None],
 ) -> dict[str, Any]:  # fmt: skip
-    """Write the dataset's files from the frozen layouts, the manifest last."""
     episodes, seed = config["episodes"], config["seed"]
     texts = _join_layouts(place, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
@@ -192,7 +191,6 @@ def _write_dataset(
 
 
 def _freeze_layout(scenario: Scenario, seed: int, episode: int) -> bytes:
-    """Freeze a layout and return its file in the working folder."""
     levels, scenes = freeze(scenario, seed + episode, episode)
     texts = [
         "".join(canonical_json(msgspec.to_builtins(record)) + "\n" for record in level).encode()
@@ -254,7 +252,6 @@ def _pretty(value: Any) -> bytes:
 
 
 def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
-    """Return the command that builds the same dataset again."""
     default, p = scenarios.get(scenario.name).parameters, scenario.parameters
     dials = [
         f"{dial}={canonical_json(getattr(p, dial))}"

@@ -40,7 +40,6 @@ class Forest:
 
     @classmethod
     def of(cls, trees: Sequence[Tree], actions: tuple[str, ...], allowance_s: float) -> "Forest":
-        """Make a forest of the trees of a dataset with these actions."""
         action_index = {action: n for n, action in enumerate(actions)}
         starts, total = [], 0  # the first index of each level of each tree
         for tree in trees:
@@ -160,7 +159,6 @@ class Forest:
         return np.asarray(np.isfinite(goal_s) & (goal_s <= limit_s))
 
     def end(self, edge: int) -> End:
-        """Return how an episode ends at this edge."""
         end = self.edges[edge].end
         assert end is not None
         return end

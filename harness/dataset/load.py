@@ -59,7 +59,6 @@ class Scene:
 
     @property
     def state(self) -> WorldState:
-        """The whole state."""
         return self.record.state
 
     @cached_property
@@ -127,7 +126,6 @@ class Dataset:
 
     @property
     def name(self) -> str:
-        """The name in the manifest."""
         return self.manifest.name
 
     @cached_property
@@ -142,12 +140,10 @@ class Dataset:
 
     @property
     def episodes(self) -> tuple[int, ...]:
-        """The episodes' numbers."""
         return self.trees.numbers
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """The layout seeds of the episodes."""
         return tuple(self.manifest.seed + number for number in self.episodes)
 
     @cached_property
@@ -159,7 +155,6 @@ class Dataset:
 
     @cached_property
     def forest(self) -> Forest:
-        """The trees as arrays."""
         return Forest.of(tuple(self.trees), self.actions, self.scenario.parameters.delay_allowance_s)
 
     @property
@@ -172,7 +167,6 @@ class Dataset:
         )
 
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
-        """Return the dataset with only these episodes."""
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
         return replace(self, trees=trees)
 
@@ -210,7 +204,6 @@ class Dataset:
         return scenes
 
     def __contains__(self, name: str) -> bool:
-        """Whether this is the id of one of its decision points."""
         try:
             self._place(name)
         except KeyError:

@@ -1,7 +1,7 @@
 """The schema of a frozen dataset: the types of its manifest, trees and decision points.
 
-The types are enforced when a dataset is built and read. They are published beside it as JSON Schema, their
-docstrings included, and released datasets pin those files: a docstring here is part of the format.
+The types are enforced when a dataset is built and read; states and scene graphs have theirs in
+`harness.world`. They are published beside it as JSON Schema, with their docstrings.
 """
 
 import re
@@ -51,33 +51,20 @@ class Danger(Closed, frozen=True):
 
 
 class Record(Closed, frozen=True):
-    """A decision point: a line of `<episode>/<step>.jsonl`. `record_type` has a scenario's own names.
+    """A decision point: a line of `<episode>/<step>.jsonl`. `record_type` has a scenario's own names."""
 
-    Attributes:
-        scene: `<episode>-<step>-<digest>`.
-        episode: number of the episode.
-        episode_seed: seed of its layout.
-        step: index of the decision about to be taken.
-        danger: the vehicle that the layout sends against the ego, if any.
-        state: the state of everything, seen or not.
-        graphs: what each viewer knows, by its id.
-        distance_m: distance of each viewer to the conflict zone, as the ego knows it.
-        range_m: distance of each helper to the ego, as the ego knows it.
-        road: what the scenario says of its road; like the next, in datasets only.
-        snapshot: what the simulator needs beyond the state to go on from here.
-    """
-
-    scene: SceneId
-    episode: Episode
-    episode_seed: Seed
-    step: Count
-    danger: Danger
-    state: WorldState
-    graphs: dict[VehicleId, SceneGraph]
-    distance_m: dict[VehicleId, Number]
-    range_m: dict[VehicleId, Number]
+    scene: SceneId  # `<episode>-<step>-<digest>`
+    episode: Episode  # number of the episode
+    episode_seed: Seed  # seed of its layout
+    step: Count  # index of the decision about to be taken
+    danger: Danger  # the vehicle that the layout sends against the ego, if any
+    state: WorldState  # the state of everything, seen or not
+    graphs: dict[VehicleId, SceneGraph]  # what each viewer knows, by its id
+    distance_m: dict[VehicleId, Number]  # distance of each viewer to the conflict zone, as the ego knows it
+    range_m: dict[VehicleId, Number]  # distance of each helper to the ego, as the ego knows it
+    # what the scenario says of its road; like the next, in datasets only
     road: dict[str, str | Number] | UnsetType = UNSET
-    snapshot: Snapshot | UnsetType = UNSET
+    snapshot: Snapshot | UnsetType = UNSET  # what the simulator needs beyond the state to go on from here
 
 
 class EnvironmentRecord(Record, frozen=True):

@@ -31,7 +31,6 @@ class Shape(NamedTuple):
 
     @property
     def forms(self) -> tuple[str, ...]:
-        """The forms that the answer may have."""
         return FORMS[self.role] if self.form is None else (self.form,)
 
     @property

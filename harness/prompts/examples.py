@@ -37,12 +37,10 @@ class Examples(Struct, frozen=True):
     everywhere: bool = False
 
     def of(self, role: str) -> tuple[Example, ...]:
-        """Return the examples of a role."""
         return self.ego if role == "ego" else self.helper
 
     @property
     def seeds(self) -> frozenset[int]:
-        """Layout seeds of all examples."""
         return frozenset(example.layout_seed for example in (*self.ego, *self.helper))
 
     def __str__(self) -> str:

@@ -104,11 +104,9 @@ class Prompt:
         return tuple(role for role in ROLES if "repair" in self._templates[role].blocks)
 
     def form(self, role: str) -> str:
-        """Return the form of a role's answer, one of its `FORMS`."""
         return self.ego_answer if role == "ego" else self.helper_answer
 
     def shape(self, role: str, actions: Sequence[str]) -> Shape:
-        """Return what decides the JSON of a role's answer."""
         return Shape(role, tuple(actions), self.form(role), self.extension.get(role, ""))
 
     def most_answer_tokens(self, role: str) -> int:
