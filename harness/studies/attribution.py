@@ -43,7 +43,7 @@ KINDS = (
     *(("ego", kind) for kind in (SEEN, OTHER)),
     *(("helper", kind) for kind in (HIDDEN, SEEN, OTHER)),
     *(("fusion", kind) for kind in (SIGHT, NO_SIGHT)),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)

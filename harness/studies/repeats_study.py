@@ -63,7 +63,8 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
         return [shown(repeats.estimate(condition, metric)) for metric in metrics]
 
     yield Table(
-        "Decisions", ("condition", "decisions flip, %", "same in all, %", "n", "variance between %"),
+        "Decisions",
+        ("condition", "decisions flip, %", "same in all, %", "n", "variance between %"),
         [
             (c, *cells(c, FLIPS, STABLE), str(repeats.estimate(c, FLIPS).n), *cells(c, BETWEEN))
             for c in repeats.conditions
@@ -75,7 +76,7 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
         "ICC(1): 100 % if repeats change nothing, about 0 if knowing the episode does not help to predict "
         f"its repeats, a dash if all outcomes are the same; n is {episodes} episodes.",
         terminal=range(5),
-    )  # fmt: skip
+    )
     passes, anys = ([f"{name}{j}" for j in range(2, k + 1)] for name in ("pass^", "any@"))
     heads = ("condition", "episodes succeed, %", *passes, *anys)
     yield Table(

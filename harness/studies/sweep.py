@@ -159,8 +159,9 @@ def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
     """Return how many episodes and seeds each source has, in words."""
     of_sources = (
         f"{source.name}: {source.episodes} episodes × {len(seeds)} seeds"
-        + (" of their own" if not source.same_episodes else "") for source in sources
-    )  # fmt: skip
+        + (" of their own" if not source.same_episodes else "")
+        for source in sources
+    )
     return f"{'; '.join(of_sources)} (channel seeds {', '.join(map(str, seeds))})"
 
 

@@ -208,8 +208,9 @@ class Bench:
         """P of no difference to the linear pool under the same attack, by Holm's method over the grid."""
         p_values = {
             key: p_value(SUCCESS, cell.success.T, self.at(BASE, *key[1:]).success.T)
-            for key, cell in self.cells.items() if cell.rule != BASE and cell.attack not in (PEACE, EXCLUDED)
-        }  # fmt: skip
+            for key, cell in self.cells.items()
+            if cell.rule != BASE and cell.attack not in (PEACE, EXCLUDED)
+        }
         known = {key: p for key, p in p_values.items() if p is not None}
         return dict(zip(known, holm(list(known.values())), strict=True))
 

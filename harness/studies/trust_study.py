@@ -73,10 +73,11 @@ def headline(bench: Bench) -> list[str]:
     ]
     if "liar+spoof" in bench.attacks:
         robust = [
-            rule for rule in bench.rules
+            rule
+            for rule in bench.rules
             if 100 * bench.price(rule).value >= -COSTS
             and 100 * bench.loss(rule, "liar+spoof", share).value >= -LOSES
-        ]  # fmt: skip
+        ]
         sentences.append(
             f"Rules that lose {LOSES:g} points or less to a liar at a spoofed place, and cost {COSTS:g} "
             f"point or less in peace: {', '.join(robust) or 'none'}."

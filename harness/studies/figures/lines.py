@@ -63,8 +63,9 @@ def _along(axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None") -> No
             mean, low, high = (100 * at[k].to_numpy(dtype=float) for k in ("mean", "ci_low", "ci_high"))
             look: dict[str, Any] = {
                 "color": COLOURS[n % len(COLOURS)] if where is axes else GREY,
-                "marker": MARKERS[n % len(MARKERS)], "label": f"{label}, {name}",
-            }  # fmt: skip
+                "marker": MARKERS[n % len(MARKERS)],
+                "label": f"{label}, {name}",
+            }
             if ticks:
                 x = [ticks.index(value) + 0.12 * n for value in at.value]
                 spread = [mean - low, high - mean]
