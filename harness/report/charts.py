@@ -5,7 +5,7 @@ from typing import Any
 
 from harness.report import statistics
 from harness.report.drawing import colours
-from harness.report.drawing.colours import BAD, GOOD, GREY, LATE, PALE, ROLES
+from harness.report.drawing.colours import BAD, FAILURES, GOOD, GREY, LATE, PALE, ROLES
 from harness.report.layers import (
     BASE,
     NUMBER,
@@ -27,11 +27,10 @@ from harness.report.layers import (
 )
 
 REACTION_MS = (150, 250)  # the paper's reaction window in an urban intersection
-# Kinds of failure are shades of one colour.
 VERDICTS = {
     "strict": [GOOD],
     "recovered": [LATE],
-    "failed": [BAD, "#E2685A", "#9C2416", "#F0988D", "#6E160B", "#F7C4BD"],
+    "failed": FAILURES,
 }
 REPLIES = {"on time": GOOD, "late": LATE, "lost": BAD}
 ENERGIES = dict(zip(statistics.ENERGIES, (ROLES["ego"], ROLES["helper"], BAD), strict=True))

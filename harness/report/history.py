@@ -11,7 +11,6 @@ from markupsafe import Markup
 from harness.core.errors import UserError, printable, unknown
 from harness.report.compare.page import Place, beside
 from harness.report.compare.pair import scenes_of, where
-from harness.report.drawing import colours
 from harness.report.page import environment, save
 from harness.runs.folder import Run, read
 from harness.runs.listing import runs as listed
@@ -110,7 +109,6 @@ def render(groups: Sequence[Group], metric: str, place: Place) -> str:
     """The page; `place` gives the link to a run's own."""
     return environment().get_template("history.html.j2").render(
         groups=[(group, _picture(group)) for group in groups], metric=entry(metric).label, place=place,
-        palette=Markup(colours.variables()),
     )  # fmt: skip
 
 

@@ -135,7 +135,6 @@ def _pieces(
         size=contents.size(runs),
         headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),
         key_figures=[*words.figures(runs.runs[0]), *tile(runs.runs[0])] if alone else matrix.figures(lines),
-        palette=Markup(colours.variables()),
         actions=_actions(runs),
         lines=lines,
         grids=matrix.grids(lines),
@@ -205,7 +204,7 @@ def _actions(runs: Runs) -> dict[str, tuple[str, str]]:
     """The colour of each action, and of text on it."""
     every = colours.actions(runs.actions)
     return {
-        name: (c, colours.INK if 5 * n < 3 * len(every) else "#FFFFFF")
+        name: (c, colours.INK if 5 * n < 3 * len(every) else colours.WHITE)
         for n, (name, c) in enumerate(every.items())
     }
 
@@ -220,6 +219,7 @@ def environment(*more: Path) -> Environment:
         lstrip_blocks=True,
         finalize=visible,
     )
+    templates.globals["palette"] = Markup(colours.variables())
     templates.filters |= {
         "number": lambda value, decimals: Unit(decimals=decimals).number(value),
         "facts": words.facts, "shown": words.shown, "p_value": words.p_value,

@@ -117,7 +117,6 @@ def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> s
     ]
     return environment().get_template("suite.html.j2").render(
         parts=parts, place=place, picture=_picture, seeds_of=seeds_of, baseline=BASELINE,
-        palette=Markup(colours.variables()),
     )  # fmt: skip
 
 

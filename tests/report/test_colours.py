@@ -1,6 +1,7 @@
 """The palette: a colour has one meaning, and is seen on white and on dark paper, by the colour-blind too."""
 
 import csv
+import re
 from importlib.resources import files
 from itertools import combinations
 
@@ -47,6 +48,17 @@ def lab(rgb):
 def test_no_colour_has_two_meanings():
     every = [colour for family in FAMILIES for colour in family.values()]
     assert len(set(every)) == len(every)
+
+
+def test_no_colour_stands_outside_the_palette():
+    """Pages, charts, figures and pictures name their colours."""
+    room = files("harness") / "report"
+    places = [p for folder in (room, files("harness") / "studies") for p in folder.rglob("*") if p.is_file()]
+    written = {
+        str(p) for p in places
+        if p.suffix in (".py", ".css", ".j2", ".js") and re.search(r"#[0-9A-Fa-f]{3,6}\b", p.read_text())
+    }  # fmt: skip
+    assert written == {str(room / "drawing" / "colours.py")}
 
 
 @pytest.mark.parametrize("paper", PAPERS)

@@ -15,7 +15,6 @@ from harness.report.compare.difference import Comparison, Difference, Flip
 from harness.report.compare.flips import DecisionFlip
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Side
-from harness.report.drawing import colours
 from harness.report.page import environment
 from harness.runs.folder import Run
 from harness.runs.metrics import entry
@@ -48,7 +47,7 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
 
     return environment(TEMPLATES).get_template("compare.html.j2").render(
         found=comparison, pair=pair, verdicts=verdicts, most=most, words=words, links=links, decided=decided,
-        marked=marked, forest=_forest(comparison), palette=Markup(colours.variables()),
+        marked=marked, forest=_forest(comparison),
     )  # fmt: skip
 
 

@@ -10,35 +10,38 @@ from matplotlib.path import Path
 
 from harness.core.arrays import Floats
 from harness.core.errors import printable
+from harness.report.drawing.colours import LIGHT
 from harness.report.drawing.geometry import VIEW_M, ground_of, north_up, shadows
 from harness.report.drawing.view import View
 from harness.world.scenario import Scenario
 from harness.world.state import Building, VehicleState, WorldState
 
 TEXT_PT = 6.5
-ROAD, WALL, PAPER = "#C9CCD1", "#EAE4D6", "#F7F7F4"
-BUILDING, SHADE = "#877E68", "#3A4047"
 FAR_M = 4 * VIEW_M  # from an eye to the end of what is in shadow
 
 
 def roads(scenario: Scenario) -> Iterator[Artist]:
     """Roads with their lane marks."""
     surface = ground_of(scenario)
-    yield PathPatch(_closed(surface.outlines), facecolor=ROAD, edgecolor="#8A8F98", linewidth=0.8)
+    yield PathPatch(
+        _closed(surface.outlines), facecolor=LIGHT["road"], edgecolor=LIGHT["kerb"], linewidth=0.8
+    )
     yield LineCollection(surface.marks, colors="white", linewidths=1.0, linestyles=[(0, (5, 4))])
     yield LineCollection(surface.stops, colors="white", linewidths=2.0, capstyle="butt")
 
 
 def shade(state: WorldState, eye: VehicleState) -> Artist:
     """All that walls and vehicles hide from one."""
-    return PathPatch(_closed(shadows(state, eye, FAR_M)), facecolor=SHADE, edgecolor="none", alpha=0.22)
+    return PathPatch(
+        _closed(shadows(state, eye, FAR_M)), facecolor=LIGHT["shade"], edgecolor="none", alpha=0.22
+    )
 
 
 def walls(buildings: Iterable[Building]) -> Iterator[Artist]:
     """Buildings; of those that overlap the outline of the whole."""
     outlines = _closed([north_up(building.corners()) for building in buildings])
-    yield PathPatch(outlines, facecolor="none", edgecolor="#A79F8A", linewidth=1.6)
-    yield PathPatch(outlines, facecolor=WALL, edgecolor="none")
+    yield PathPatch(outlines, facecolor="none", edgecolor=LIGHT["wall"], linewidth=1.6)
+    yield PathPatch(outlines, facecolor=LIGHT["building"], edgecolor="none")
 
 
 def named(buildings: Iterable[Building], view: View, tall_m: float) -> Iterator[tuple[str, float, float]]:

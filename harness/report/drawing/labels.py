@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from harness.core.arrays import Floats
+from harness.report.drawing.colours import INK
 from harness.report.drawing.view import View
 
 DIRECTIONS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
@@ -85,7 +86,7 @@ class Labels:
         radius_m: float,
         text: str,
         bold: bool = False,
-        colour: str = "#222222",
+        colour: str = INK,
         toward: Floats = NOWHERE,
     ) -> None:
         """A label for what lies at (2,) m and reaches radius_m, best on the side `toward` (2,) points to."""

@@ -14,9 +14,9 @@ from matplotlib.patches import Patch, Polygon
 
 from harness.core.errors import printable, unknown
 from harness.dataset.load import Scene
-from harness.report.drawing.colours import GREY, INK, ROLES
+from harness.report.drawing.colours import BUILDING_NAME, GREY, HATCHED, INK, LIGHT, ROLES
 from harness.report.drawing.geometry import conflict_points, north_up, shape_of
-from harness.report.drawing.ground import BUILDING, PAPER, TEXT_PT, named, roads, scale_m, shade, walls
+from harness.report.drawing.ground import TEXT_PT, named, roads, scale_m, shade, walls
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import Format, save, styled
 from harness.report.drawing.view import View, spots, view_of
@@ -29,7 +29,12 @@ RING_M = 4.6  # from the middle of the dangerous vehicle to the corners of its d
 
 LOOKS: dict[str, dict[str, Any]] = {
     "ego": {"facecolor": ROLES["ego"], "edgecolor": INK, "linewidth": 1.0},
-    "helper": {"facecolor": "#E3CCEB", "edgecolor": "#6A3D80", "hatch": "//////", "linewidth": 0.8},
+    "helper": {
+        "facecolor": HATCHED[0],
+        "edgecolor": HATCHED[1],
+        "hatch": "//////",
+        "linewidth": 0.8,
+    },
     "danger": {"facecolor": ROLES["danger"], "edgecolor": INK, "hatch": "xxxxxx", "linewidth": 0.8},
     "other": {"facecolor": "white", "edgecolor": INK, "linewidth": 0.8},
 }
@@ -38,7 +43,6 @@ DIAMOND: dict[str, Any] = {
     "marker": "D", "markerfacecolor": "none", "markeredgecolor": ROLES["danger"], "markeredgewidth": 1.4,
 }  # fmt: skip
 CROSS: dict[str, Any] = {"marker": "X", "color": INK, "markeredgecolor": INK, "markersize": 7}
-SIGHT = "#8A8F98"
 NAMES = {"ego": "ego", "helper": "helper", "danger": "dangerous vehicle", "other": "other vehicle"}
 
 
@@ -70,7 +74,7 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     place = 0.1 / (SIDE_IN + 0.2), 0.5 / height, SIDE_IN / (SIDE_IN + 0.2), SIDE_IN * shape / height
     low, high = view.edges
     axes = figure.add_axes(place)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xticks=[], yticks=[], facecolor=PAPER)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xticks=[], yticks=[], facecolor=LIGHT["ground"])
     axes.set_autoscale_on(False)
     # All of it lies under what is plotted, whatever its kind.
     hidden = shade(state, state.vehicle(viewer))
@@ -105,7 +109,7 @@ def _sight_lines(axes: Axes, scene: Scene, viewer: str, seen: set[str]) -> None:
     eye = scene.state.vehicle(viewer)
     for v in scene.state.vehicles:
         if v.id in seen - {viewer}:
-            axes.plot([eye.x_m, v.x_m], [-eye.y_m, -v.y_m], color=SIGHT, linewidth=0.7, alpha=0.75)
+            axes.plot([eye.x_m, v.x_m], [-eye.y_m, -v.y_m], color=LIGHT["kerb"], linewidth=0.7, alpha=0.75)
 
 
 def _vehicle(axes: Axes, labels: Labels, view: View, vehicle: VehicleState, look: str, hidden: bool) -> None:
@@ -190,7 +194,7 @@ def _signs(axes: Axes, labels: Labels, view: View, scene: Scene) -> None:
     arrow = {"arrowstyle": "-|>", "color": INK}
     axes.annotate("N", (x, top), (x, y + 2 * one), size=8, ha="center", va="center", arrowprops=arrow)
     for name, left, up in named(scene.state.buildings, view, TEXT_PT / labels.pt_per_m):
-        axes.text(left + one, up - one, name, color=BUILDING, size=TEXT_PT, ha="left", va="top")
+        axes.text(left + one, up - one, name, color=BUILDING_NAME, size=TEXT_PT, ha="left", va="top")
 
 
 def _when(arrival: EgoArrival) -> str:
@@ -217,7 +221,7 @@ def _words(figure: Figure, scene: Scene, viewer: str, seen: set[str]) -> None:
         Line2D([], [], linestyle="none", markersize=7, label=NAMES["danger"], **DIAMOND),
         Patch(**LOOKS["other"], label=NAMES["other"]),
         Patch(**HIDDEN, edgecolor=INK, label=f"hidden from {printable(viewer)}"),
-        Line2D([], [], color=SIGHT, linewidth=0.9, label="sight line"),
+        Line2D([], [], color=LIGHT["kerb"], linewidth=0.9, label="sight line"),
         Line2D([], [], linestyle="none", label="conflict point, time to it", **CROSS),
         Line2D([], [], color=INK, marker=">", markersize=3, linewidth=0.8, label="way in 1 s"),
     ]

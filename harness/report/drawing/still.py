@@ -20,10 +20,10 @@ from harness.core.arrays import Floats
 from harness.core.errors import printable
 from harness.core.image import Pixels
 from harness.evaluate.replay import Played, Still
-from harness.report.drawing.colours import BAD, GOOD, GREY, INK, LATE, ROLES
+from harness.report.drawing.colours import BAD, BUILDING_NAME, GOOD, GREY, INK, LATE, LIGHT, ROLES
 from harness.report.drawing.colours import actions as colours_of
 from harness.report.drawing.geometry import north_up, shape_of
-from harness.report.drawing.ground import BUILDING, PAPER, named, roads, scale_m, shade, walls
+from harness.report.drawing.ground import named, roads, scale_m, shade, walls
 from harness.report.drawing.labels import covered, cut
 from harness.report.drawing.scene import style_of
 from harness.report.drawing.view import View
@@ -48,7 +48,7 @@ class Canvas:
         above = SIDE_IN * shape_of(played.scenario)
         below = self.below = height - above
         self.axes = self.figure.add_axes((0.0, below / height, SIDE_IN / width, above / height))
-        self.axes.set(xticks=[], yticks=[], facecolor=PAPER, autoscale_on=False)
+        self.axes.set(xticks=[], yticks=[], facecolor=LIGHT["ground"], autoscale_on=False)
         self.roads, self.walls = list(roads(played.scenario)), list(walls(buildings))
         for artist in (*self.roads, *self.walls):
             self.axes.add_artist(artist)
@@ -217,7 +217,7 @@ def _buildings(buildings: Iterable[Building], view: View, pt_per_m: float) -> Ar
     names = named(buildings, view, NAME_PT / pt_per_m)
     moved = [_moved(_outline(name), inside + at, 1 / pt_per_m) for name, *at in names]
     every = Outline.make_compound_path(*moved) if moved else Outline(np.empty((0, 2)))
-    return PathPatch(every, facecolor=BUILDING, edgecolor="none")
+    return PathPatch(every, facecolor=BUILDING_NAME, edgecolor="none")
 
 
 def _moved(outline: Outline, to: Floats, scale: float) -> Outline:

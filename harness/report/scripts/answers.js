@@ -11,13 +11,13 @@ function highlighted(raw, spans) {
   return h("pre", {}, pieces, characters.slice(at).join(""));
 }
 
-const distribution = (actions, p) => (p ? actions.map((a, n) => `${a} ${p[n].toFixed(2)}`).join(", ") : "none");
+const distribution = (actions, p) => (p ? actions.map((a, n) => `${a} ${number(p[n], 2)}`).join(", ") : "none");
 
 const sender = (answer) => answer.viewer.replace("~blind", "");
 const who = (answer) =>
   answer.role === "blind" ? `${sender(answer)}, blind helper` : `${answer.viewer}, ${answer.role}`;
 
-const signed = (value) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}`;
+const signed = (value) => `${value < 0 ? "−" : "+"}${number(Math.abs(value), 2)}`;
 
 // What moved an answer or a policy, a bar for each thing left out; those that moved it most come first.
 function moved(leftOut, said) {
@@ -40,8 +40,8 @@ function answerSection(answer, detail, actions, meanings, leftOut) {
     answer.error ? `engine: ${answer.error}` : null,
     answer.prompt_tokens ? `${answer.prompt_tokens} tokens in` : null,
     answer.completion_tokens ? `${answer.completion_tokens} out` : null,
-    answer.seconds ? `${answer.seconds.toFixed(3)} s` : null,
-    answer.label_mass != null ? `${(100 * answer.label_mass).toFixed(2)} % of the probability on the letters` : null,
+    answer.seconds ? number(answer.seconds, 3, "s") : null,
+    answer.label_mass != null ? `${number(100 * answer.label_mass, 2, "%")} of the probability on the letters` : null,
     answer.retries ? `${answer.retries} failed attempts before` : null,
     answer.cached ? "from the cache" : null,
   ].filter(Boolean).join("; ");
@@ -59,7 +59,7 @@ function answerSection(answer, detail, actions, meanings, leftOut) {
       h("div", {},
         h("small", {}, "as parsed"), h("p", {}, distribution(actions, answer.intent)),
         answer.mass != null && Math.abs(answer.mass - 1) > 1e-3
-          ? h("p", { class: "quiet" }, `the model's numbers sum to ${answer.mass.toFixed(3)}`) : null,
+          ? h("p", { class: "quiet" }, `the model's numbers sum to ${number(answer.mass, 3)}`) : null,
         message.length ? h("dl", {}, message.map(([name, text]) => [h("dt", {}, name), h("dd", {}, text)])) : null,
         moved(leftOut, "effect of leaving out one object of the prompt at a time"))),
     sent

@@ -7,8 +7,8 @@ function outcomes(actions) {
   const rows = actions.map((o) => [
     o.action,
     [h("span", { class: o.safe ? "good" : "bad" }, o.safe ? "✓ safe" : "✗ unsafe"), h("small", {}, outcome(o))],
-    o.delay_s == null ? "–" : `${o.delay_s.toFixed(2)} s`,
-    `${number(o.time_s, 2)} s`,
+    number(o.delay_s, 2, "s"),
+    number(o.time_s, 2, "s"),
   ]);
   return [
     h("h3", {}, "What each action leads to"),
@@ -19,15 +19,15 @@ function outcomes(actions) {
 }
 
 function endings(ends) {
-  const late = (e) => (e.delay_s == null ? "" : `; ${e.delay_s.toFixed(2)} s after the full-view driver`);
+  const late = (e) => (e.delay_s == null ? "" : `; ${number(e.delay_s, 2, "s")} after the full-view driver`);
   const rows = ends.map((e) => [
     e.condition,
     [
       h("span", { class: e.result === "cleared" ? "good" : "bad" }, outcome(e)),
       h("small", {}, `hard brakings: ${number(e.hard_brakings, 0)}${late(e)}`),
     ],
-    `${number(e.time_s, 2)} s`,
-    `${number(e.least_gap_m, 1)} m`,
+    number(e.time_s, 2, "s"),
+    number(e.least_gap_m, 1, "m"),
   ]);
   return [
     h("h3", {}, "How the episode ended"),
@@ -38,13 +38,13 @@ function endings(ends) {
 function reply(m) {
   const who = m.attacker ? `${m.from} (attacker)` : m.from;
   if (!m.delivered) return `${who}: lost`;
-  const worth = [m.weight == null ? "on time" : `weight ${m.weight.toFixed(3)}`];
-  if (m.trust != null) worth.push(`trust ${m.trust.toFixed(2)}`);
-  return `${who}: ${m.arrival_ms.toFixed(1)} ms, ${m.on_time ? worth.join(", ") : "too late"}`;
+  const worth = [m.weight == null ? "on time" : `weight ${number(m.weight, 3)}`];
+  if (m.trust != null) worth.push(`trust ${number(m.trust, 2)}`);
+  return `${who}: ${number(m.arrival_ms, 1, "ms")}, ${m.on_time ? worth.join(", ") : "too late"}`;
 }
 
 const acted = (d) => d.acts_at_s != null
-  && h("small", {}, d.acted ? `acts at ${d.acts_at_s.toFixed(2)} s` : "not ready before the episode ended");
+  && h("small", {}, d.acted ? `acts at ${number(d.acts_at_s, 2, "s")}` : "not ready before the episode ended");
 
 // Second answers of the ego are in the fused policy. Under some conditions helpers are heard who were shown nothing.
 const first = (answers, point) => answers.filter((a) =>
@@ -56,7 +56,7 @@ function policyRows(told, chosen, actions, run) {
   for (const a of first(told.answers, run.points[chosen.condition])) {
     const message = chosen.messages.find((m) => m.from === sender(a));
     const weight = a.role === "ego" ? chosen.own_weight : message?.weight;
-    const before = weight == null ? "before fusion" : `before fusion; weight ${weight.toFixed(3)}`;
+    const before = weight == null ? "before fusion" : `before fusion; weight ${number(weight, 3)}`;
     const what = message?.attacker ? "what it intends; the attack changed what it sent" : before;
     if (a.intent) add(who(a), what, a.intent);
   }
@@ -224,7 +224,7 @@ class DecisionPage {
       d.messages.length ? d.messages.map((m) => h("div", {}, reply(m))) : "none",
       distribution(this.index.actions, d.fused),
       [d.action, " ", mark(d.end, this.index.live), acted(d)],
-      `${number(d.latency_ms, 1)} ms${d.deadline_missed ? ", longer than the window" : ""}`,
+      `${number(d.latency_ms, 1, "ms")}${d.deadline_missed ? ", longer than the window" : ""}`,
     ]));
   }
 

@@ -40,7 +40,9 @@ function block(n) {
   return blocks.get(n);
 }
 
-const number = (value, digits) => (value == null ? "–" : value.toFixed(digits));
+// The one way to write a number: with so many decimals and its unit; a dash where it is not known.
+const number = (value, digits, unit = "") =>
+  value == null ? "–" : value.toFixed(digits) + (unit && ` ${unit}`);
 
 function download(name, content) {
   const url = URL.createObjectURL(content);

@@ -91,7 +91,7 @@ function birdsEye(world, ground, viewer, messages, zoom) {
       v.speed > 0.5 ? line(nose, tip, "speed") : null,
       v.part === "danger" && svg("path", { d: `M${v.x} ${-v.y - 4.6}l4.6 4.6l-4.6 4.6l-4.6 -4.6z`, class: "ring" })));
   }
-  const when = (s) => (s == null ? "stands" : s < 0 ? "past" : `${s.toFixed(1)} s`);
+  const when = (s) => (s == null ? "stands" : s < 0 ? "past" : number(s, 1, "s"));
   const both = (c) => `${ego.id} ${when(c.ego)}, ${c.with} ${when(c.other)}`;
   for (const c of sees.conflicts) {
     picture.append(svg("path", { d: `M${c.x - 1.3} ${-c.y - 1.3}l2.6 2.6m0 -2.6l-2.6 2.6`, class: "conflict" },
@@ -104,9 +104,9 @@ function birdsEye(world, ground, viewer, messages, zoom) {
   }
   for (const v of world.vehicles.filter(within)) {
     const fate = messages.find((m) => m.from === v.id);
-    const arrived = !fate ? "" : fate.delivered ? `, ${fate.arrival_ms.toFixed(0)} ms${fate.on_time ? "" : " late"}` : ", lost";
+    const arrived = !fate ? "" : fate.delivered ? `, ${number(fate.arrival_ms, 0, "ms")}${fate.on_time ? "" : " late"}` : ", lost";
     const said = fate?.attacker ? `${arrived}, attacks` : arrived;
-    label(`${v.id} ${v.speed.toFixed(0)} m/s${v.crashed ? ", crashed" : ""}${said}`, v.x, -v.y, v.width / 2 + 1, v.part);
+    label(`${v.id} ${number(v.speed, 0, "m/s")}${v.crashed ? ", crashed" : ""}${said}`, v.x, -v.y, v.width / 2 + 1, v.part);
   }
   for (const c of sees.conflicts) label(both(c), c.x, -c.y, 1.6, "crossing");
   const bar = side > 100 ? 20 : 10, [left, foot] = [west + side * 0.03, view[3] - side * 0.03];

@@ -11,7 +11,6 @@ from harness.report import suite as suites
 from harness.report.compare import page as comparison
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
-from harness.report.page import TEMPLATES as REPORT_TEMPLATES
 from harness.report.page import environment, render
 from harness.report.runs import gather
 from harness.runs.folder import Run
@@ -89,7 +88,7 @@ def wrong(said: str) -> str:
 
 def style() -> str:
     """The report's style, and the list's own."""
-    return text_of(REPORT_TEMPLATES / "style.css") + text_of(TEMPLATES / "list.css")
+    return environment().get_template("style.css").render() + text_of(TEMPLATES / "list.css")
 
 
 def _page(template: str, **values: Any) -> str:

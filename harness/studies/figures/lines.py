@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.core.arrays import Floats
-from harness.report.drawing.colours import COLOURS, GREY, INK, MARKERS
+from harness.report.drawing.colours import COLOURS, FAINT, GREY, INK, MARKERS
 from harness.report.drawing.pictures import styled
 from harness.studies.axes import axis_of
 from harness.studies.figures.axes import cross, interval_of, lettered, paper_values, plain
@@ -84,7 +84,7 @@ def _along(axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None") -> No
         if metric == "trigger_rate":
             where.set_yticks(range(0, 101, 20))
     if variable == "tau" and paper is not None:
-        axes.axvspan(*BEST_BAND, color="#ECECEC", zorder=0, label="best band of the paper")
+        axes.axvspan(*BEST_BAND, color=FAINT, zorder=0, label="best band of the paper")
     axes.set(xlabel=axis_of(variable).label, ylabel="success, %")
     plain(axes, "y")
 
