@@ -4,6 +4,7 @@ import csv
 import re
 from importlib.resources import files
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,8 +53,8 @@ def test_no_colour_has_two_meanings():
 
 def test_no_colour_stands_outside_the_palette():
     """Pages, charts, figures and pictures name their colours."""
-    room = files("harness") / "report"
-    places = [p for folder in (room, files("harness") / "studies") for p in folder.rglob("*") if p.is_file()]
+    room = Path(colours.__file__).parents[1]
+    places = [p for name in ("report", "studies") for p in (room.parent / name).rglob("*") if p.is_file()]
     written = {
         str(p) for p in places
         if p.suffix in (".py", ".css", ".j2", ".js") and re.search(r"#[0-9A-Fa-f]{3,6}\b", p.read_text())
