@@ -106,8 +106,8 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     text, m = console(), done.variant
     text.print(f"{printable(m.model, 30)} · prompt {m.prompt} · {m.answer} · suite {printable(done.name)}")
     for said in (
-        *caveats.said(done.runs, lambda run: caveats.unread(run.scores)),
-        *caveats.said(done.runs, ignores_input),
+        *caveats.merged(done.runs, lambda run: caveats.unread(run.scores)),
+        *caveats.merged(done.runs, ignores_input),
         *caveats.no_prompt(run.manifest for run in done.runs.values()),
     ):
         text.print(said)

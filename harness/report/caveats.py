@@ -39,7 +39,7 @@ def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
     return [*first, *beyond_sources(manifest), *on_device(manifest)]
 
 
-def said(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
+def merged(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
     """What is to be said of runs, each sentence once; of several with the names of those it is about."""
     about: dict[str, list[str]] = {}
     for name, run in runs.items():
@@ -77,8 +77,8 @@ def causes(run: Run) -> Iterator[str]:
 
 def unanswered(run: Run) -> Iterator[str]:
     """What the questions said that got no answer, where a run cannot do without."""
-    if (found := tally(run)).missing:
-        yield f"{found}: the model could not be asked, so that this is no result."
+    if (tallied := tally(run)).missing:
+        yield f"{tallied}: the model could not be asked, so that this is no result."
 
 
 def of_run(run: Run) -> Iterator[str]:
@@ -103,8 +103,8 @@ def of_run(run: Run) -> Iterator[str]:
                 "likeliest action when the list of actions is reversed."
             )
     retries = sum(answer.retries for answer in run.answers)
-    if (found := tally(run)).words and not found.missing:
-        yield f"{found}: each counts as a lost message."
+    if (tallied := tally(run)).words and not tallied.missing:
+        yield f"{tallied}: each counts as a lost message."
     if retries:
         yield f"The engine had errors: {retries} attempts were repeated."
     for control, heard in _CONTROLS.items():
@@ -130,8 +130,8 @@ def findings_of(manifest: Manifest) -> Iterator[str]:
     identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
     agents = [manifest.agent(0), *manifest.helpers]
     for agent, identity in zip(agents, identities, strict=False):
-        if isinstance(identity, Mapping) and (found := findings.recall(identity)):
-            for sentence in found.sentences(agent["answer"] == "readout"):
+        if isinstance(identity, Mapping) and (model_findings := findings.recall(identity)):
+            for sentence in model_findings.sentences(agent["answer"] == "readout"):
                 yield f"{printable(str(agent['model']['name']), 30)}: {sentence}"
 
 

@@ -1,4 +1,8 @@
-"""The report's charts, as Vega-Lite specifications: https://vega.github.io/vega-lite/docs/spec.html."""
+"""The report's charts, as Vega-Lite specifications: https://vega.github.io/vega-lite/docs/spec.html.
+
+Colours are those of the palette (`drawing/colours.py`), and shape or place says the same again. What is drawn
+in `currentColor` is light on dark and dark on light.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -6,26 +10,27 @@ from typing import Any
 from harness.report import statistics
 from harness.report.drawing import colours
 from harness.report.drawing.colours import BAD, FAILURES, GOOD, GREY, LATE, PALE, ROLES
-from harness.report.layers import (
-    BASE,
-    NUMBER,
-    RULE,
-    Rows,
-    Spec,
-    band,
-    colour,
-    condition_colours,
-    interval,
-    layered,
-    names_axis,
-    point,
-    rules_at,
-    shapes_of,
-    share_axis,
-    tooltip,
-    x_axis,
-)
 
+Spec = dict[str, Any]
+Rows = Sequence[Mapping[str, Any]]
+
+# Vega keeps some groups by name in JavaScript objects, in which these are there from the start.
+TAKEN = {
+    "__proto__", "constructor", "hasOwnProperty", "isPrototypeOf", "propertyIsEnumerable", "toLocaleString",
+    "toString", "valueOf", "__defineGetter__", "__defineSetter__", "__lookupGetter__", "__lookupSetter__",
+}  # fmt: skip
+RULE: Spec = {"type": "rule", "color": "currentColor", "strokeDash": [4, 3]}
+NAME: Spec = {
+    "type": "text", "align": "left", "dx": 4, "dy": -8, "color": "currentColor", "opacity": 0.8,
+    "fontSize": 10.5,
+}  # fmt: skip
+FOOT: Spec = {"y": {"value": "height"}}
+RUN = "run"  # name of the parameter that chooses one of several runs
+NUMBER: Spec = {"type": "quantitative"}
+BASE: Spec = {
+    "$schema": "https://vega.github.io/schema/vega-lite/v5.json",
+    "width": "container",
+}
 REACTION_MS = (150, 250)  # the paper's reaction window in an urban intersection
 VERDICTS = {
     "strict": [GOOD],
@@ -83,12 +88,12 @@ def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
         "opacity": 0.8,
         "fontSize": 10.5,
     }
-    said = {"tooltip": [{"field": name} for name in ("paper", "latency_ms", "success")]}
+    tip = {"tooltip": [{"field": name} for name in ("paper", "latency_ms", "success")]}
     return [
         {
             "data": {"values": values},
             "layer": [
-                {"mark": ring, "encoding": {"x": x, "y": y, **said}},
+                {"mark": ring, "encoding": {"x": x, "y": y, **tip}},
                 {"mark": text, "encoding": {"x": x, "y": y, "text": {"field": "paper"}}},
             ],
         }
@@ -106,10 +111,10 @@ def _references(success: Mapping[str, float], y: Spec) -> Spec:
         else:
             names.append({"named": name, "success": value})
     text = {"type": "text", "align": "right", "dy": -5, "dx": -4, "color": "currentColor"}
-    said = {"tooltip": [{"field": name} for name in ("reference", "success")]}
+    tip = {"tooltip": [{"field": name} for name in ("reference", "success")]}
     return {
         "layer": [
-            {"data": {"values": lines}, "mark": {**RULE, "opacity": 0.6}, "encoding": {"y": y, **said}},
+            {"data": {"values": lines}, "mark": {**RULE, "opacity": 0.6}, "encoding": {"y": y, **tip}},
             {
                 "data": {"values": names}, "mark": text,
                 "encoding": {"y": y, "x": {"value": "width"}, "text": {"field": "named"}},
@@ -123,53 +128,13 @@ def statuses(rows: Rows) -> Spec:
     # A run's file may say anything; what is no verdict is no answer.
     verdicts = [str(row["verdict"]) if row["verdict"] in VERDICTS else "failed" for row in rows]
     met = list(dict.fromkeys((v, str(row["status"])) for v, row in zip(verdicts, rows, strict=True)))
-    met.sort(key=lambda one: list(VERDICTS).index(one[0]))
+    met.sort(key=lambda status: list(VERDICTS).index(status[0]))
     taken = dict.fromkeys(VERDICTS, 0)
     colours = {}
     for verdict, status in met:
         colours[status] = VERDICTS[verdict][taken[verdict] % len(VERDICTS[verdict])]
         taken[verdict] += 1
-    return _stacked(rows, "role", "status", colours, "answers")
-
-
-def replies(rows: Rows) -> Spec:
-    """On time, late and lost replies, a stacked bar a run and condition."""
-    return _stacked(rows, "condition", "reply", REPLIES, "replies")
-
-
-def energies(rows: Rows) -> Spec:
-    """What a decision takes, a stacked bar a run and condition."""
-    return _stacked(rows, "condition", "part", ENERGIES, "J per decision", amount="joules")
-
-
-def reliability(rows: Rows) -> Spec:
-    """How often the action taken was safe over how probable it was held; on the diagonal the two agree."""
-    return _shares(rows, "certainty", "fused probability of the action taken", "share safe", diagonal=True)
-
-
-def errors(rows: Rows, tau_nats: Sequence[float]) -> Spec:
-    """Unsafe decisions over the entropy of the ego's own intent."""
-    return _shares(
-        rows, "entropy_nats", "entropy of the ego's own intent, nats", "share unsafe", rules=tau_nats
-    )
-
-
-def entropies(rows: Rows, tau_nats: Sequence[float], width: float) -> Spec:
-    """How uncertain the ego's own answers are, and above which entropy it asks."""
-    return _bars(
-        rows, "entropy_nats", "entropy of the ego's own intent, nats", "answers", width, rules=tau_nats
-    )
-
-
-def tokens(rows: Rows, budget: tuple[float, float], width: float) -> Spec:
-    """Lengths of prompts and the budget for them."""
-    return _bars(rows, "tokens", "tokens in the prompt", "prompts", width, series="role", within=budget)
-
-
-def arrivals(rows: Rows, window_ms: Sequence[float], width: float) -> Spec:
-    """When replies arrive, and when the decision window closes."""
-    title = "arrival, ms from the start of the decision"
-    return _bars(rows, "arrival_ms", title, "replies", width, series="condition", rules=window_ms)
+    return stacked(rows, "role", "status", colours, "answers")
 
 
 def policies(actions: Sequence[str]) -> Spec:
@@ -214,7 +179,7 @@ def timeline() -> Spec:
     )
 
 
-def _stacked(
+def stacked(
     rows: Rows, by: str, field: str, colours: Mapping[str, str], what: str, amount: str = "share"
 ) -> Spec:
     """A bar a run and `by`, in parts of the values of a field, in the order of their colours.
@@ -248,9 +213,10 @@ def _stacked(
     }
 
 
-def _shares(
+def shares(
     rows: Rows, field: str, title: str, what: str, diagonal: bool = False, rules: Sequence[float] = ()
 ) -> Spec:
+    """Shares over a field, a line a condition; on the `diagonal` the two agree."""
     x, y = x_axis(field, title), share_axis("share", what)
     condition, shape = condition_colours(rows), shapes_of(rows, "condition")
     if not diagonal:
@@ -267,10 +233,11 @@ def _shares(
     return layered(*rules_at(field, rules), *layers, rows=rows, choose=True)
 
 
-def _bars(
+def bars(
     rows: Rows, field: str, title: str, what: str, width: float, *,
     series: str = "", rules: Sequence[float] = (), within: tuple[float, float] | None = None,
 ) -> Spec:  # fmt: skip
+    """Counts over a field in bins of one width, with a shaded budget to be `within`."""
     bars = [{**row, "to": row[field] + width} for row in rows]
     met = {row[series] for row in rows} if series else set()
     encoding: Spec = {
@@ -288,3 +255,111 @@ def _bars(
     if within:
         layers.insert(0, band(*within, f"budget, {within[0]} to {within[1]} tokens"))
     return layered(*layers, *rules_at(field, rules), rows=bars, choose=True)
+
+
+def named(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row in which no text is one that Vega stumbles over; what is added is not to be seen."""
+    return {key: f"{value} " if value in TAKEN else value for key, value in row.items()}
+
+
+def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) -> Spec:
+    """Layers over one table, one run of which is chosen where there are several."""
+    runs = list(dict.fromkeys(str(row["run"]) for row in rows if "run" in row))
+    chart: Spec = {
+        **BASE,
+        "height": height,
+        "data": {"name": "values", "values": list(rows)},
+        "layer": [*layers],
+    }
+    if choose and len(runs) > 1:
+        chart["params"] = [
+            {"name": RUN, "value": runs[0], "bind": {"input": "select", "options": runs, "name": "run "}}
+        ]
+        chart["transform"] = [{"filter": f"!isValid(datum.run) || datum.run === {RUN}"}]
+    return chart
+
+
+def x_axis(field: str, title: str) -> Spec:
+    """A field along x, where its values are."""
+    axis = {"labelOverlap": True, "tickCount": 8}
+    return {"field": field, **NUMBER, "title": title, "axis": axis, "scale": {"zero": False, "nice": True}}
+
+
+def share_axis(field: str, title: str) -> Spec:
+    """A share along y, from 0 to 100 %."""
+    return {"field": field, **NUMBER, "title": title, "axis": {"format": "%"}, "scale": {"domain": [0, 1]}}
+
+
+def colour(field: str, colours: Mapping[str, str]) -> Spec:
+    """A colour for each value of a field, whose name the legend leaves out."""
+    return {
+        "field": field, "type": "nominal",
+        "scale": {"domain": list(colours), "range": list(colours.values())},
+        "legend": {"orient": "top", "title": None},
+    }  # fmt: skip
+
+
+def condition_colours(rows: Rows) -> Spec:
+    """The colour of each row's condition."""
+    shapes = shapes_of(rows, "condition")
+    by_name = colours.conditions(shapes["scale"]["domain"])
+    return {**shapes, "scale": {**shapes["scale"], "range": list(by_name.values())}}
+
+
+def shapes_of(rows: Rows, field: str) -> Spec:
+    """A shape where `condition_colours` has a colour; of one field, both have one legend."""
+    domain = list(dict.fromkeys(str(row[field]) for row in rows))
+    return {"field": field, "type": "nominal", "scale": {"domain": domain}, "legend": {"orient": "top"}}
+
+
+def names_axis(field: str) -> Spec:
+    """A name a line along y, in the order in which they come."""
+    return {"field": field, "type": "nominal", "sort": None, "title": None}
+
+
+def point(size: int, **encoding: Spec | list[Spec]) -> Spec:
+    """A filled point for each row."""
+    return {"mark": {"type": "point", "filled": True, "size": size, "opacity": 1}, "encoding": encoding}
+
+
+def tooltip(rows: Rows) -> list[Spec]:
+    """Every field of a table in its tooltip."""
+    return [
+        {"field": name, "format": ".3~f"} if isinstance(value, float) else {"field": name}
+        for name, value in (rows[0] if rows else {}).items()
+    ]
+
+
+def interval(**encoding: Spec) -> Spec:
+    """A line from one end of an interval, along x or y, to the other, which is the channel x2 or y2."""
+    return {"mark": {"type": "rule", "strokeWidth": 1.4}, "encoding": encoding}
+
+
+def band(start: float, end: float, what: str, named: bool = False) -> Spec:
+    """A shaded range of x, named at its top or by its tooltip alone."""
+    x: Spec = {"x": {"field": "from", **NUMBER}}
+    shade: Spec = {
+        "mark": {"type": "rect", "color": GREY, "opacity": 0.14},
+        "encoding": {**x, "x2": {"field": "to"}, "tooltip": {"field": "what"}},
+    }
+    return (
+        {
+            "data": {"values": [{"from": start, "to": end, "what": what}]},
+            "layer": [shade, {"mark": NAME, "encoding": {**x, **FOOT, "text": {"field": "what"}}}],
+        }
+        if named
+        else {"data": {"values": [{"from": start, "to": end, "what": what}]}, **shade}
+    )
+
+
+def rules_at(field: str, at: Sequence[float], what: str = "") -> list[Spec]:
+    """Vertical lines, named at their top where `what` they are is given, in ms."""
+    values = [{field: value, "what": f"{what}, {value:g} ms"} for value in at]
+    x: Spec = {"x": {"field": field, **NUMBER}}
+    line: Spec = {"mark": RULE, "encoding": x}
+    if not values:
+        return []
+    if not what:
+        return [{"data": {"values": values}, **line}]
+    name = {"mark": {**NAME, "dy": -24}, "encoding": {**x, **FOOT, "text": {"field": "what"}}}
+    return [{"data": {"values": values}, "layer": [line, name]}]

@@ -54,19 +54,19 @@ def commonest(run: Run) -> Commonest | None:
 
 def ignores_input(run: Run) -> Iterator[str]:
     """Yield the sentence on an ego whose likeliest action is nearly always the same one (`CONSTANT`)."""
-    found = commonest(run)
-    if found is None or not found.constant:
+    common = commonest(run)
+    if common is None or not common.constant:
         return
-    said = f" Without messages it drives as {_like(run, found)}." if found.all_read else ""
+    like = f" Without messages it drives as {_like(run, common)}." if common.all_read else ""
     yield (
-        f"The model ignores its input: {found.likeliest} in {found.count} of the ego's {found.n} readable "
-        f"answers, and its probability moves by {found.moves:.3f} (standard deviation) between them.{said}"
+        f"The model ignores its input: {common.likeliest} in {common.count} of the ego's {common.n} readable "
+        f"answers, and its probability moves by {common.moves:.3f} (standard deviation) between them.{like}"
     )
 
 
-def _like(run: Run, found: Commonest) -> str:
+def _like(run: Run, common: Commonest) -> str:
     """Return like whom an ego drives that always answers so."""
-    taken = found.actions[:1] if run.manifest.ties == "first" else found.actions
+    taken = common.actions[:1] if run.manifest.ties == "first" else common.actions
     if len(taken) == len(run.actions):
         return "the driver `uniform`, which needs no model"
     if len(taken) > 1:
@@ -78,18 +78,19 @@ def _like(run: Run, found: Commonest) -> str:
 
 def in_a_line(run: Run) -> Iterator[str]:
     """Yield what a language model's ego answers most often, where `ignores_input` has not said it."""
-    found = commonest(run)
-    if found and not found.constant:
+    common = commonest(run)
+    if common and not common.constant:
         yield (
-            f"ego answers: {found.likeliest} in {100 * found.count / found.n:.0f} % of {found.n}; its "
-            f"probability moves by {found.moves:.2f} (standard deviation)"
+            f"ego answers: {common.likeliest} in {100 * common.count / common.n:.0f} % of {common.n}; its "
+            f"probability moves by {common.moves:.2f} (standard deviation)"
         )
 
 
 def tile(run: Run) -> list[dict[str, str]]:
     """Return the same as a figure of a page's first screen; none without a language model."""
-    found = commonest(run)
-    return [] if found is None else [{
-        "what": f"ego's answers in which {found.likeliest}", "value": f"{100 * found.count / found.n:.0f} %",
-        "interval": f"its probability moves by {found.moves:.2f}", "n": f"n = {found.n} readable answers",
+    common = commonest(run)
+    return [] if common is None else [{
+        "what": f"ego's answers in which {common.likeliest}",
+        "value": f"{100 * common.count / common.n:.0f} %",
+        "interval": f"its probability moves by {common.moves:.2f}", "n": f"n = {common.n} readable answers",
     }]  # fmt: skip

@@ -19,8 +19,8 @@ def size(runs: Runs) -> str:
     episodes, seeds = (sorted({len(of) for of in each}) for each in (
         [run.grid.episodes for run in runs.runs], [run.grid.seeds for run in runs.runs],
     ))  # fmt: skip
-    told = " or ".join(map(str, episodes)), " or ".join(map(str, seeds))
-    return f"{told[0]} episodes × {told[1]} channel seeds of {first.source}; 95 % intervals over episodes"
+    counts = " or ".join(map(str, episodes)), " or ".join(map(str, seeds))
+    return f"{counts[0]} episodes × {counts[1]} channel seeds of {first.source}; 95 % intervals over episodes"
 
 
 def summary(run: Run) -> list[dict[str, Any]]:
@@ -57,13 +57,13 @@ def examples(runs: Runs) -> list[dict[str, Any]]:
 
 def attributions(runs: Runs) -> list[dict[str, Any]]:
     """Of each run whose decision points `harness study attribute` drew: how many, and where most moved."""
-    found = []
+    entries = []
     for n, run in enumerate(runs.runs):
         if a := run.attribution:
             by_shift = sorted(a.left_out, key=lambda each: -(each.shift or 0.0))
             scenes = list(dict.fromkeys(each.scene for each in by_shift))[:MOVED]
-            found.append({"run": n, "condition": a.condition, "n": a.decision_points, "scenes": scenes})
-    return found
+            entries.append({"run": n, "condition": a.condition, "n": a.decision_points, "scenes": scenes})
+    return entries
 
 
 def sweeps(run: Run) -> list[dict[str, str]]:

@@ -6,18 +6,15 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
-from markupsafe import Markup
-
 from harness.core.errors import UserError, printable, unknown
 from harness.report.compare.page import Place, beside
 from harness.report.compare.pair import scenes_of, where
+from harness.report.forest import forest, reach
 from harness.report.page import environment, save
 from harness.runs.folder import Run, read
 from harness.runs.listing import runs as listed
 from harness.runs.metrics import ALL, entry
 from harness.runs.records import Score
-
-WIDTH, HEIGHT = 240, 22  # of the picture of a line
 
 
 @dataclass(frozen=True)
@@ -58,15 +55,15 @@ def history(
         UserError: there is no such folder, metric, condition or dataset.
     """
     lines: dict[object, list[Line]] = {}
-    for one in reversed(listed(folder)):
-        if one.state == "finished" and one.kind in ("eval", "drive"):
+    for listing in reversed(listed(folder)):
+        if listing.state == "finished" and listing.kind in ("eval", "drive"):
             try:
-                run = read(folder / one.name)
+                run = read(folder / listing.name)
                 assert run.scores is not None  # they are read from a file of their own
             except UserError as error:
-                wrong(one.name, error)
+                wrong(listing.name, error)
                 continue
-            lines.setdefault(repr(scenes_of(run)), []).append(Line(one.name, one.date, run, None))
+            lines.setdefault(repr(scenes_of(run)), []).append(Line(listing.name, listing.date, run, None))
     if not lines:
         raise UserError(f"no finished runs in {printable(folder)}; `harness eval` makes one")
     runs = [line.run for of in lines.values() for line in of]
@@ -87,9 +84,9 @@ def _scenes(run: Run) -> str:
 
 def _group(lines: Sequence[Line], metric: str, condition: str | None) -> Group:
     if condition is None:
-        had = Counter(name for line in lines for name in line.run.conditions)
-        most = max(had.values())
-        condition = next(name for name in reversed(list(had)) if had[name] == most)
+        count = Counter(name for line in lines for name in line.run.conditions)
+        most = max(count.values())
+        condition = next(name for name in reversed(list(count)) if count[name] == most)
 
     scored = tuple(
         replace(line, score=line.run.score(condition, metric) or line.run.score(ALL, metric))
@@ -108,27 +105,6 @@ def write(groups: Sequence[Group], metric: str, out: Path) -> None:
 def render(groups: Sequence[Group], metric: str, place: Place) -> str:
     """The page; `place` gives the link to a run's own."""
     return environment().get_template("history.html.j2").render(
-        groups=[(group, _picture(group)) for group in groups], metric=entry(metric).label, place=place,
+        groups=[(group, reach(line.score for line in group.lines if line.score)) for group in groups],
+        forest=forest, metric=entry(metric).label, place=place,
     )  # fmt: skip
-
-
-def _picture(group: Group) -> Callable[[Score], Markup]:
-    """Draws a value and its interval, on one scale for the whole group."""
-    scores = [line.score for line in group.lines if line.score]
-    ends = [x for s in scores for x in (s.value, s.low, s.high) if x is not None]
-    least, most = min(ends, default=0.0), max(ends, default=1.0)
-
-    def x(value: float) -> float:
-        return round(8 + (value - least) / ((most - least) or 1.0) * (WIDTH - 16), 1)
-
-    def draw(score: Score) -> Markup:
-        y, value = HEIGHT / 2, score.value or 0.0
-        spread = ""
-        if score.low is not None and score.high is not None:
-            spread = f'<path d="M{x(score.low)} {y}H{x(score.high)}"/>'
-        return Markup(
-            f'<svg class="forest" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" '
-            f'aria-hidden="true">{spread}<circle cx="{x(value)}" cy="{y}" r="4"/></svg>'
-        )
-
-    return draw

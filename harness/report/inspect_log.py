@@ -146,8 +146,8 @@ def _kept(run: Run, condition: Any, regret: Any) -> dict[str, Score]:
     for n, name in enumerate(run.conditions):
         known = regret[(condition == n) & ~np.isnan(regret)]
         if len(known):
-            said = f"{int(known.sum())} of {len(known)} seeds decide so that success is given away"
-            scores[f"regret {name}"] = Score(value=float(known.mean()), explanation=said)
+            explanation = f"{int(known.sum())} of {len(known)} seeds decide so that success is given away"
+            scores[f"regret {name}"] = Score(value=float(known.mean()), explanation=explanation)
     return scores
 
 

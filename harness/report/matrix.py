@@ -84,11 +84,11 @@ def lines(runs: Runs) -> list[Line]:
     return rows
 
 
-def grids(found: Sequence[Line]) -> list[Grid]:
+def grids(results: Sequence[Line]) -> list[Grid]:
     """The lines as a table a condition, with the models and prompts that were run under it."""
-    modes = {line.answer for line in found}
+    modes = {line.answer for line in results}
     tables: dict[str, dict[tuple[str, str], list[Line]]] = {}
-    for line in found:
+    for line in results:
         asked = line.prompt if len(modes) == 1 else f"{line.prompt} · {line.answer}"
         tables.setdefault(line.condition, {}).setdefault((line.model, asked), []).append(line)
     grids = []
@@ -127,17 +127,17 @@ def marked(conditions: Sequence[Sequence[Successes]]) -> list[list[tuple[str, Be
     Args:
         conditions: of each, the successes of every run; empty for one that was not made under it.
     """
-    found = [_behind_best(ended) for ended in conditions]
-    every = [(n, run) for n, (_, behind) in enumerate(found) for run in behind]
-    p_values = [found[n][1][run].p_value for n, run in every]
+    results = [_behind_best(ended) for ended in conditions]
+    every = [(n, run) for n, (_, behind) in enumerate(results) for run in behind]
+    p_values = [results[n][1][run].p_value for n, run in every]
     pairs = sum(len(list(combinations(filter(None, ended), 2))) for ended in conditions)
     corrected = dict(zip(every, holm(p_values, pairs), strict=True))
     marks: list[list[tuple[str, Behind | None]]] = []
-    for n, (ended, (best, behind)) in enumerate(zip(conditions, found, strict=True)):
+    for n, (ended, (best, behind)) in enumerate(zip(conditions, results, strict=True)):
         of_runs: list[tuple[str, Behind | None]] = [("", None)] * len(ended)
-        for run, one in behind.items():
-            one = replace(one, p_value=corrected[n, run])
-            of_runs[run] = (CLOSE if one.undecided else WORSE, one)
+        for run, standing in behind.items():
+            standing = replace(standing, p_value=corrected[n, run])
+            of_runs[run] = (CLOSE if standing.undecided else WORSE, standing)
         if best is not None:
             of_runs[best] = (BEST, None)
         marks.append(of_runs)
@@ -158,12 +158,12 @@ def _behind_best(ended: Sequence[Successes]) -> tuple[int | None, dict[int, Behi
     return None, {}
 
 
-def _shared(one: Successes, other: Successes) -> tuple[Floats, Floats]:
+def _shared(first: Successes, second: Successes) -> tuple[Floats, Floats]:
     """Successes of the episodes and seeds that both have, each (E, S); empty where there are none."""
-    both = sorted(one.keys() & other.keys())
+    both = sorted(first.keys() & second.keys())
     episodes = {episode for episode, _ in both}
     a, b = (np.array([of[key] for key in both]).reshape(len(episodes), -1) if both else np.empty((0, 0))
-            for of in (one, other))  # fmt: skip
+            for of in (first, second))  # fmt: skip
     return a, b
 
 
@@ -187,20 +187,20 @@ def uneven(runs: Runs) -> str | None:
     )
 
 
-def figures(found: Sequence[Line]) -> list[dict[str, str]]:
+def figures(results: Sequence[Line]) -> list[dict[str, str]]:
     """The best run's success under each condition, with what it is and its interval."""
-    bests = [(line, success) for line in found if line.mark == BEST and (success := line.scores[SUCCESS])]
+    bests = [(line, success) for line in results if line.mark == BEST and (success := line.scores[SUCCESS])]
     return [
         {"what": f"success with {line.condition}, best: {line.name}", **shown(success)}
         for line, success in bests
     ]
 
 
-def headline(found: Sequence[Line]) -> str:
+def headline(results: Sequence[Line]) -> str:
     """What came out of several runs: under each condition the best, and which cannot be told from it."""
     outcomes = []
-    for condition in dict.fromkeys(line.condition for line in found):
-        of_condition = [line for line in found if line.condition == condition]
+    for condition in dict.fromkeys(line.condition for line in results):
+        of_condition = [line for line in results if line.condition == condition]
         best = next((line for line in of_condition if line.mark == BEST), None)
         if best is not None and (success := best.scores[SUCCESS]):
             close = [line.name for line in of_condition if line.mark == CLOSE]

@@ -117,13 +117,13 @@ def _pieces(
     alone = len(runs.names) == 1
     by_name = dict(zip(runs.names, runs.runs, strict=True))
     unread = [
-        *caveats.said(by_name, caveats.unanswered),
-        *caveats.said(by_name, lambda run: caveats.unread(run.scores)),
+        *caveats.merged(by_name, caveats.unanswered),
+        *caveats.merged(by_name, lambda run: caveats.unread(run.scores)),
     ]
     others = [
         sentence
         for of in (ignores_input, caveats.causes, caveats.of_run)
-        for sentence in caveats.said(by_name, of)
+        for sentence in caveats.merged(by_name, of)
     ]
     return environment().get_template("page.html.j2").generate(
         runs=runs,
@@ -188,7 +188,7 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
             }
             for run, latency in ((run, run.manifest.latency) for run in runs.runs)
         ],
-        "meanings": {str(one): one.meaning for one in (*Status, *Repair)},
+        "meanings": {str(member): member.meaning for member in (*Status, *Repair)},
         "ground": {
             "view_m": VIEW_M, "outlines": [o.round(2).tolist() for o in surface.outlines],
             "marks": [m.tolist() for m in surface.marks], "stops": [s.tolist() for s in surface.stops],

@@ -4,13 +4,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from harness.report import charts, layers, statistics
+from harness.report import charts, statistics
 from harness.report.references import driven, in_trees, label, sentences
 from harness.report.runs import Runs
 from harness.runs.folder import Run
 from harness.runs.records import Score
 
 Part = Literal["overview", "answers", "communication"]
+ENTROPY = "entropy of the ego's own intent, nats"
 BUDGET = (200, 400)  # tokens of a prompt: the paper's
 
 
@@ -30,7 +31,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
 
     def joined(of: Callable[[Run], statistics.Table]) -> statistics.Table:
         return [
-            layers.named({"run": name, **row})
+            charts.named({"run": name, **row})
             for name, run in zip(runs.names, runs.runs, strict=True)
             for row in of(run)
         ]
@@ -64,14 +65,18 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "above it the policy is less sure than it could be. A probability spread over two safe actions "
             "is no mistake, so this is not the calibration of a single label. All seeds; decisions without "
             "a safe action are left out; 95 % intervals over episodes.",
-            charts.reliability(rows),
+            charts.shares(
+                rows, "certainty", "fused probability of the action taken", "share safe", diagonal=True
+            ),
         )  # fmt: skip
     if rows := joined(statistics.entropies):
         yield Panel(
             "entropy", "answers", "Entropy of the ego's own answers",
             "Number of the ego's own answers by entropy, for those that could be read. Dashed: τ, above "
             "which the ego asks helpers.",
-            charts.entropies(rows, tau_nats, statistics.ENTROPY_NATS),
+            charts.bars(
+                rows, "entropy_nats", ENTROPY, "answers", statistics.ENTROPY_NATS, rules=tau_nats
+            ),
         )  # fmt: skip
     if rows := joined(statistics.errors):
         yield Panel(
@@ -80,21 +85,24 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "fusion. If high entropy predicts errors, the line of the condition without V2V rises to the "
             "right. How far the other lines lie below it is what the helpers correct. All seeds; 95 % "
             "intervals over episodes.",
-            charts.errors(rows, tau_nats),
+            charts.shares(rows, "entropy_nats", ENTROPY, "share unsafe", rules=tau_nats),
         )  # fmt: skip
     if rows := joined(statistics.tokens):
         yield Panel(
             "tokens", "answers", "Length of prompts",
             "Number of prompts by length, in tokens as the engine counted them. Shaded: the paper's budget "
             "of 200 to 400 tokens.",
-            charts.tokens(rows, BUDGET, statistics.TOKENS),
+            charts.bars(
+                rows, "tokens", "tokens in the prompt", "prompts", statistics.TOKENS, series="role",
+                within=BUDGET,
+            ),
         )  # fmt: skip
     if rows := joined(statistics.replies):
         yield Panel(
             "replies", "communication", "Replies on time, late and lost",
             "Scheduled replies, all seeds. On time: the reply arrived within the decision window and was "
             "fused. Late: it arrived after the window. Lost: the request or the reply was lost.",
-            charts.replies(rows),
+            charts.stacked(rows, "condition", "reply", charts.REPLIES, "replies"),
         )  # fmt: skip
     if rows := joined(statistics.energies):
         yield Panel(
@@ -103,14 +111,19 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "interval is that of the total, over episodes. All helpers in the radius infer from the start, "
             "asked or not; with on_demand=true those alone that are asked. If the radios' part is too small "
             "to see, cooperation costs energy because helpers infer, not because they transmit.",
-            charts.energies(rows),
+            charts.stacked(
+                rows, "condition", "part", charts.ENERGIES, "J per decision", amount="joules"
+            ),
         )  # fmt: skip
     if rows := joined(statistics.arrivals):
         yield Panel(
             "arrivals", "communication", "When replies arrive",
             "Number of replies by arrival time, for those that were not lost; all seeds. Dashed: the end of "
             "the decision window.",
-            charts.arrivals(rows, windows_ms, statistics.ARRIVAL_MS),
+            charts.bars(
+                rows, "arrival_ms", "arrival, ms from the start of the decision", "replies",
+                statistics.ARRIVAL_MS, series="condition", rules=windows_ms,
+            ),
         )  # fmt: skip
 
 

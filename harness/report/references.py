@@ -54,5 +54,5 @@ def sentences(references: Mapping[str, Score], scenario: str) -> str:
         for name, cell in ((name, shown(score)) for name, score in best_first)
     ]
     n = next(iter(references.values())).n
-    said = f" Dashed: references that need no model, in the same episodes: {', '.join(rates)}; n = {n}."
-    return " ".join([said, *(f"{meaning(name)}." for name in BESIDE if name in references)])
+    text = f" Dashed: references that need no model, in the same episodes: {', '.join(rates)}; n = {n}."
+    return " ".join([text, *(f"{meaning(name)}." for name in BESIDE if name in references)])

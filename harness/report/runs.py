@@ -69,8 +69,7 @@ def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs
     runs = [read(path) for path in dict.fromkeys(paths)]
     first, *others = runs
     for other in others:
-        one, two = _scenes(first), _scenes(other)
-        if one != two:
+        if _scenes(first) != _scenes(other):
             raise UserError(
                 f"{printable(first.path)} and {printable(other.path)} are not of the same scenes "
                 f"({_shown(first)} and {_shown(other)}); report them apart"
@@ -81,12 +80,12 @@ def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs
             raise UserError(
                 f"--dataset {printable(dataset)}: {printable(first.path)} was driven; leave it out"
             )
-        found = None
+        own = None
     elif isinstance(dataset, Dataset) and dataset.sha256 == world.sha256:
-        found = dataset
+        own = dataset
     else:
-        found = dataset_of(first, dataset if isinstance(dataset, Path) else None)
-    return Runs(tuple(runs), _names(runs), found)
+        own = dataset_of(first, dataset if isinstance(dataset, Path) else None)
+    return Runs(tuple(runs), _names(runs), own)
 
 
 def _scenes(run: Run) -> Any:

@@ -66,12 +66,12 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
     }
 
     def cells(name: str, of: Run | SuiteRun) -> dict[str, Cell]:
-        found = {}
+        by_condition = {}
         for c in suite.conditions:
             gain, p = of.score(c, GAIN), corrected.get((name, c), 1.0)
             better = "better" if gain and (gain.value or 0.0) > 0 else "worse"
-            found[c] = Cell(of.score(c, SUCCESS), gain, better if p <= LEVEL else "")
-        return found
+            by_condition[c] = Cell(of.score(c, SUCCESS), gain, better if p <= LEVEL else "")
+        return by_condition
 
     names = [name for name in next(iter(drivers.values())) if all(name in of for of in drivers.values())]
     means = {name: mean([of[name] for of in drivers.values()]) for name in names}
@@ -98,22 +98,22 @@ def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> s
     parts = [
         {
             "suite": suite,
-            "lines": found,
+            "lines": rows,
             "unread": [
-                *caveats.said(suite.runs, caveats.unanswered),
-                *caveats.said(suite.runs, lambda run: caveats.unread(run.scores)),
+                *caveats.merged(suite.runs, caveats.unanswered),
+                *caveats.merged(suite.runs, lambda run: caveats.unread(run.scores)),
             ],
             "warnings": [
                 *caveats.no_prompt(run.manifest for run in suite.runs.values()),
-                *caveats.said(suite.runs, ignores_input),
-                *caveats.said(suite.runs, caveats.of_run),
+                *caveats.merged(suite.runs, ignores_input),
+                *caveats.merged(suite.runs, caveats.of_run),
             ],
             "headline": words.headline(suite),
             "figures": _figures(suite),
             "metrics": _metrics(suite),
             "colours": colours.conditions(suite.conditions),
         }
-        for suite, found in suites
+        for suite, rows in suites
     ]
     return environment().get_template("suite.html.j2").render(
         parts=parts, place=place, picture=_picture, seeds_of=seeds_of, baseline=BASELINE,
@@ -123,9 +123,9 @@ def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> s
 def _figures(suite: SuiteRun) -> list[dict[str, str]]:
     """Success under each condition, and the gain of the best."""
     best, base = words.compared(suite)
-    found = {f"success with {c}": suite.score(c, SUCCESS) for c in suite.conditions}
-    found[f"more with {best} than with {base}"] = suite.score(best, GAIN) if base == BASELINE else None
-    return [{"what": what, **words.shown(score)} for what, score in found.items() if score]
+    scores = {f"success with {c}": suite.score(c, SUCCESS) for c in suite.conditions}
+    scores[f"more with {best} than with {base}"] = suite.score(best, GAIN) if base == BASELINE else None
+    return [{"what": what, **words.shown(score)} for what, score in scores.items() if score]
 
 
 def _metrics(suite: SuiteRun) -> list[tuple[str, str, list[Score | None]]]:

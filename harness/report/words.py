@@ -1,7 +1,6 @@
 """Numbers and findings in the words of the report."""
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from harness.core import multiplicity
 from harness.core.errors import printable
 from harness.core.figures import PLAIN, Unit
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import Estimate, mean_of
+from harness.core.statistics import mean_of
 from harness.runs import metrics
 from harness.runs.folder import Run
 from harness.runs.metrics import BASELINE, GAIN, LATENCY, SUCCESS, entry
@@ -75,16 +74,20 @@ def figures(run: Run) -> list[dict[str, str]]:
 
 
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
-    """Of the gain in success of each other condition over one of them; of a suite the mean gain's."""
+    """Return p of each other condition's gain in success over `base`; of a suite the mean gain's."""
     runs = run.runs.values() if isinstance(run, SuiteRun) else (run,)
-    ended = [np.array([e.success for e in one.episodes], dtype=float).reshape(one.grid.shape) for one in runs]
+    successes = [
+        np.array([e.success for e in each.episodes], dtype=float).reshape(each.grid.shape) for each in runs
+    ]
 
-    def gain(condition: str, level: float) -> Estimate:
+    def p_of(condition: str) -> float:
         a, b = (run.conditions.index(name) for name in (condition, base))
-        return mean_of([metrics.difference(SUCCESS, each[a].T, each[b].T, level) for each in ended])
+        p = multiplicity.p_value(lambda level: mean_of([
+            metrics.difference(SUCCESS, success[a].T, success[b].T, level) for success in successes
+        ]))  # fmt: skip
+        return 1.0 if p is None else p
 
-    found = {c: multiplicity.p_value(partial(gain, c)) for c in run.conditions if c != base}
-    return {c: 1.0 if p is None else p for c, p in found.items()}
+    return {condition: p_of(condition) for condition in run.conditions if condition != base}
 
 
 def p_value(p: float) -> str:
@@ -135,11 +138,11 @@ def energy(m: Manifest, score: Callable[[str, str], Score | None]) -> Iterator[s
 
 def answer_times(times: Mapping[str, Times]) -> str:
     """How long a run's own answers took."""
-    told = []
+    parts = []
     for role, took in times.items():
         low, half, high = (f"{1000 * s:.0f}" for s in (took.p5_s, took.median_s, took.p95_s))
-        told.append(f"{role} {half} ms (5 to 95 %: {low} to {high}; n = {took.n})")
-    return ", ".join(told) or "unknown, since no answer was asked alone"
+        parts.append(f"{role} {half} ms (5 to 95 %: {low} to {high}; n = {took.n})")
+    return ", ".join(parts) or "unknown, since no answer was asked alone"
 
 
 def pace(m: Manifest) -> Iterator[str]:
@@ -155,8 +158,8 @@ def pace(m: Manifest) -> Iterator[str]:
             continue
         if first.n == took.n and took.median_s:
             share = 100 * first.median_s / took.median_s
-            said = f"{share:.0f} % of the median answer is prefill"
-            yield f"{printable(role)}: {said} (batch 1, measured where it ran)"
+            text = f"{share:.0f} % of the median answer is prefill"
+            yield f"{printable(role)}: {text} (batch 1, measured where it ran)"
         for what, of in (("TTFT", first), ("TPOT", took.token)):
             if of:
                 half, high = _milliseconds(of.median_s, of.median_ci_s), _milliseconds(of.p95_s, of.p95_ci_s)

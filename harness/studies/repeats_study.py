@@ -9,7 +9,7 @@ from markupsafe import Markup
 from harness.core.figures import Unit, shown
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
-from harness.report.caveats import caveats, said
+from harness.report.caveats import caveats, merged
 from harness.report.compare.page import beside
 from harness.runs.metrics import ALL, SUCCESS
 from harness.studies.repeats import BETWEEN, DOUBT, FLIPS, SAMPLED, STABLE, STATED, Repeats
@@ -49,7 +49,7 @@ def repeats_study(repeats: Repeats) -> Study:
             "repeats": str(repeats.path), "runs": [str(run.path) for run in repeats.runs],
             "temperature": first.temperature, "figures": rows,
         },
-        caveats=said(
+        caveats=merged(
             {run.path.name: run for run in repeats.runs}, lambda run: caveats(run.manifest, run.scores)
         ),
         more=Markup("\n").join(links),

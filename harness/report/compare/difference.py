@@ -121,13 +121,13 @@ def _prompts(pair: Pair) -> PromptChange | str | None:
     here = []
     sides = (("A", pair.a, a), ("B", pair.b, b))
     for name, side, prompt in ((name, side, each) for name, side, of in sides for each in of):
-        found = prompt_of(side.run, prompt)
-        if found is None:
+        version = prompt_of(side.run, prompt)
+        if version is None:
             return (
                 f"what differs between the prompts is not known: {name}'s {printable(prompt['version'], 40)} "
                 f"with sha256 {printable(prompt['sha256'], 13)} is not here"
             )
-        here.append(found)
+        here.append(version)
     return change(of_swarm(*here[:2]), of_swarm(*here[2:]))
 
 

@@ -9,18 +9,19 @@ import numpy as np
 from markupsafe import Markup
 
 from harness.core.errors import printable
+from harness.core.statistics import Estimate
 from harness.prompts.difference import marked
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip
 from harness.report.compare.flips import DecisionFlip
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Side
+from harness.report.forest import forest, reach
 from harness.report.page import environment
 from harness.runs.folder import Run
 from harness.runs.metrics import entry
 
 TEMPLATES = Path(__file__).parent / "templates"
-WIDTH, HEIGHT = 240, 22  # of one line of the forest plot
 RAW = 300  # characters of an answer
 Place = Callable[[Run], str | None]  # where the page of a run is, as a link
 
@@ -46,8 +47,8 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
             yield name, printable(raw, RAW), where and f"{where}#{urlencode(asked)}"
 
     return environment(TEMPLATES).get_template("compare.html.j2").render(
-        found=comparison, pair=pair, verdicts=verdicts, most=most, words=words, links=links, decided=decided,
-        marked=marked, forest=_forest(comparison),
+        comparison=comparison, pair=pair, verdicts=verdicts, most=most, words=words, links=links,
+        decided=decided, marked=marked, forest=_forest(comparison),
     )  # fmt: skip
 
 
@@ -84,31 +85,18 @@ def _lost(side: Side) -> dict[tuple[str, int, int], str]:
 
 
 def _forest(comparison: Comparison) -> Callable[[Difference], Markup]:
-    """Draws a line of the forest plot: rates on one scale, any other metric on its own in all conditions."""
+    """Return what draws a difference: rates on one scale, any other metric on its own in all conditions."""
 
     def scale(metric: str) -> str:
         return "rate" if entry(metric).interval == "rate" else metric
 
-    reach: dict[str, float] = {}
+    by_scale: dict[str, list[Estimate]] = {}
     for d in (d for c in comparison.conditions for d in c.differences):
-        ends = [abs(x) for x in (d.change.value, d.change.low, d.change.high) if x == x]
-        reach[scale(d.metric)] = max(reach.get(scale(d.metric), 0.0), *ends)
+        by_scale.setdefault(scale(d.metric), []).append(d.change)
+    farthest = {name: max(map(abs, reach(changes))) or 1.0 for name, changes in by_scale.items()}
 
     def draw(d: Difference) -> Markup:
-        most = reach[scale(d.metric)] or 1.0
-        middle, y = WIDTH / 2, HEIGHT / 2
-
-        def x(value: float) -> float:
-            return round(middle + value / most * (middle - 8), 1)
-
-        verdict, e = words.verdict(d), d.change
-        spread = ""
-        if e.low == e.low:
-            spread = f'<path d="M{x(e.low)} {y}H{x(e.high)}M{x(e.low)} {y - 3}v6M{x(e.high)} {y - 3}v6"/>'
-        point = f'<rect x="{x(e.value) - 3.5}" y="{y - 3.5}" width="7" height="7"/>'
-        return Markup(
-            f'<svg class="forest {verdict}" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" '
-            f'aria-hidden="true"><path class="zero" d="M{middle} 0V{HEIGHT}"/>{spread}{point}</svg>'
-        )
+        most = farthest[scale(d.metric)]
+        return forest(d.change, -most, most, words.verdict(d))
 
     return draw

@@ -96,26 +96,26 @@ def pair(a: Path, b: Path) -> Pair:
         UserError: a folder is no finished run, or the two have not the same scenes and seeds, or no condition
             or episode in common.
     """
-    one, other = read(a), read(b)
+    first, second = read(a), read(b)
     shown = f"{printable(a)} and {printable(b)}"
-    if one.world != other.world:
+    if first.world != second.world:
         raise UserError(
             f"{shown}: one was made by `harness eval` and one by `harness drive`; give two of a kind, or "
             "see `harness study fidelity`"
         )
-    side_a, side_b = _side(one), _side(other)
-    if scenes_of(one) != scenes_of(other):
-        scenes = " and ".join(printable(where(run), 60) for run in (one, other))
+    side_a, side_b = _side(first), _side(second)
+    if scenes_of(first) != scenes_of(second):
+        scenes = " and ".join(printable(where(run), 60) for run in (first, second))
         raise UserError(f"{shown} are not of the same scenes ({scenes}); make both on the same")
-    seeds_a, seeds_b = (sorted(run.manifest.seeds) for run in (one, other))
+    seeds_a, seeds_b = (sorted(run.manifest.seeds) for run in (first, second))
     if seeds_a != seeds_b:
         seeds = " and ".join(printable(each, 40) for each in (seeds_a, seeds_b))
         raise UserError(f"{shown} have different seeds ({seeds}); make both with the same --seeds")
-    conditions = tuple(name for name in one.conditions if name in other.conditions)
+    conditions = tuple(name for name in first.conditions if name in second.conditions)
     if not conditions:
-        names = " and ".join(printable(", ".join(run.conditions), 60) for run in (one, other))
+        names = " and ".join(printable(", ".join(run.conditions), 60) for run in (first, second))
         raise UserError(f"{shown} have no condition in common ({names}); make both with the same --condition")
-    episodes = set(one.grid.episodes) & set(other.grid.episodes)
+    episodes = set(first.grid.episodes) & set(second.grid.episodes)
     if not episodes:
         raise UserError(f"{shown} have no episode in common; make both on the same episodes")
     return Pair(side_a, side_b, conditions, tuple(seeds_a), tuple(sorted(episodes)))

@@ -87,24 +87,27 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int, who
     """GitHub's Markdown, in which a run's text is code: no link, no picture, no mention."""
     pair = comparison.pair
     failed = sum(bool(verdict.failed) for verdict in verdicts)
-    said = [f"### {failed} of {len(verdicts)} gates failed" if verdicts else "### Comparison of two runs", ""]
-    said += [f"- {'❌' if v.failed else '✅'} {code(words.judged(v))}" for v in verdicts]
-    said += [f"- {name}: {code(side)}" for name, side in words.sides(pair)]
-    said += [f"- {code(caveat)}" for caveat in words.caveats(pair)]
-    said += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(comparison)}", ""]
+    lines = [
+        f"### {failed} of {len(verdicts)} gates failed" if verdicts else "### Comparison of two runs",
+        "",
+    ]
+    lines += [f"- {'❌' if v.failed else '✅'} {code(words.judged(v))}" for v in verdicts]
+    lines += [f"- {name}: {code(side)}" for name, side in words.sides(pair)]
+    lines += [f"- {code(caveat)}" for caveat in words.caveats(pair)]
+    lines += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(comparison)}", ""]
     for c in comparison.conditions:
-        said += [f"#### {code(c.condition)}", "", *_table(c, whole), "", words.success(c, pair), ""]
-        said += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
-        said += ["", words.decisions(c, pair), ""]
-        said += [f"- {how}: {code(scenes)}" for how, scenes in words.given_away(c, pair, most)]
-        said += [""]
-    said += [f"{words.many(comparison)}.", ""]
-    said += ["<details><summary>Answers and settings</summary>", ""]
-    said += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(comparison, most)]
-    said += [] if comparison.answers else ["- no answer changed its verdict"]
-    said += [f"- {code(setting)}" for setting in words.settings(comparison)]
-    said += [f"- {code(line.strip())}" for line in (*words.prompts(comparison), *words.paces(pair))]
-    return "\n".join([*said, "", "</details>"])
+        lines += [f"#### {code(c.condition)}", "", *_table(c, whole), "", words.success(c, pair), ""]
+        lines += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
+        lines += ["", words.decisions(c, pair), ""]
+        lines += [f"- {how}: {code(scenes)}" for how, scenes in words.given_away(c, pair, most)]
+        lines += [""]
+    lines += [f"{words.many(comparison)}.", ""]
+    lines += ["<details><summary>Answers and settings</summary>", ""]
+    lines += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(comparison, most)]
+    lines += [] if comparison.answers else ["- no answer changed its verdict"]
+    lines += [f"- {code(setting)}" for setting in words.settings(comparison)]
+    lines += [f"- {code(line.strip())}" for line in (*words.prompts(comparison), *words.paces(pair))]
+    return "\n".join([*lines, "", "</details>"])
 
 
 def _table(c: InCondition, whole: bool) -> list[str]:
@@ -126,9 +129,9 @@ def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
     return test_suite("harness compare", cases)
 
 
-def junit_of_none(gates: Sequence[str], said: str) -> str:
+def junit_of_none(gates: Sequence[str], reason: str) -> str:
     """The gates as test cases where they cannot be judged, since a model could not be asked."""
-    return test_suite("harness compare", [Case("harness compare", gate, error=said) for gate in gates])
+    return test_suite("harness compare", [Case("harness compare", gate, error=reason) for gate in gates])
 
 
 def code(text: str) -> str:

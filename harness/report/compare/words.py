@@ -95,18 +95,18 @@ def rest(c: InCondition) -> list[Difference]:
 
 
 def findings(comparison: Comparison) -> list[tuple[str, str]]:
-    """Of each condition, what became of success: a sentence and its verdict."""
-    told = []
-    for c in comparison.conditions:
-        for d in c.differences:
-            if d.metric == SUCCESS:
-                one = line(d)
-                how = one.verdict or "may be chance"
-                said = f"{c.condition}: success {one.change} points {one.interval}: {how}"
-                told.append(
-                    (said + (f", Holm's p {one.p}" if d.p_corrected is not None else ""), one.verdict)
-                )
-    return told
+    """Return what became of success in each condition: a sentence and its verdict."""
+    rows = [
+        (c.condition, d, line(d)) for c in comparison.conditions for d in c.differences if d.metric == SUCCESS
+    ]
+    return [
+        (
+            f"{condition}: success {row.change} points {row.interval}: {row.verdict or 'may be chance'}"
+            + ("" if d.p_corrected is None else f", Holm's p {row.p}"),
+            row.verdict,
+        )
+        for condition, d, row in rows
+    ]
 
 
 def who(side: Side) -> str:
@@ -133,22 +133,22 @@ def caveats(pair: Pair) -> list[str]:
     """What must be said of the runs before their numbers, with the run's letter where it is of one."""
     sides = (("A", pair.a.run), ("B", pair.b.run))
     return [
-        *(f"{name}: {said}" for name, run in sides for said in (*unanswered(run), *unread(run.scores))),
+        *(f"{name}: {text}" for name, run in sides for text in (*unanswered(run), *unread(run.scores))),
         *no_prompt(run.manifest for _, run in sides),
     ]
 
 
 def paired(pair: Pair) -> str:
     """What is paired, and what only one of the runs has."""
-    said = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {where(pair.a.run)}"
+    text = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {where(pair.a.run)}"
     for name, side in (("A", pair.a), ("B", pair.b)):
         conditions = [c for c in side.run.conditions if c not in pair.conditions]
         episodes = len(side.run.grid.episodes) - len(pair.episodes)
         if conditions:
-            said += f"; only {name} has {', '.join(conditions)}"
+            text += f"; only {name} has {', '.join(conditions)}"
         if episodes:
-            said += f"; {name} has {episodes} more episodes"
-    return said
+            text += f"; {name} has {episodes} more episodes"
+    return text
 
 
 def differing(comparison: Comparison) -> str:
@@ -161,13 +161,13 @@ def success(c: InCondition, pair: Pair) -> str:
     """How many successes were gained and lost, and what the test says."""
     gained, lost = (sum(len(t.seeds) for t in flips) for flips in (c.gained, c.lost))
     of = f"{len(pair.episodes) * len(pair.seeds)} episodes" + (" × seeds" if len(pair.seeds) > 1 else "")
-    said = f"success: {gained} gained, {lost} lost of {of}"
+    text = f"success: {gained} gained, {lost} lost of {of}"
     if c.test is None:
-        return said
+        return text
     if c.test.p_value is not None:
-        return f"{said}; McNemar's exact test over episodes p {p_value(c.test.p_value)}"
+        return f"{text}; McNemar's exact test over episodes p {p_value(c.test.p_value)}"
     ends = " to ".join(f"{100 * (end or 0.0):+z.1f}" for end in (c.test.low, c.test.high))
-    return f"{said}; 95 % interval over episodes {ends} points"
+    return f"{text}; 95 % interval over episodes {ends} points"
 
 
 def many(comparison: Comparison) -> str:
@@ -194,20 +194,20 @@ def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
 
 def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     """Up to so many episodes, each with how it failed; seeds where it is not all of them."""
-    said = []
+    episodes = []
     for t in some[:most]:
         how = t.a if t.b == "success" else t.b
-        said.append(f"{t.episode} {how}{_seeds(t.seeds, pair)}")
-    return _listed(said, len(some), most)
+        episodes.append(f"{t.episode} {how}{_seeds(t.seeds, pair)}")
+    return _listed(episodes, len(some), most)
 
 
 def decisions(c: InCondition, pair: Pair) -> str:
     """How many decisions flipped, and in how many one run alone gave success away."""
     n = {by: sum(len(flip.seeds) for flip in c.flips if flip.lost_by == by) for by in LOST_BY}
-    said = f"decisions: {sum(n.values())} flipped of the {c.decisions} that both runs have"
+    text = f"decisions: {sum(n.values())} flipped of the {c.decisions} that both runs have"
     if not c.flips or pair.a.run.world == "closed-loop":  # which knows no regret
-        return said
-    return f"{said}; B alone gave success away in {n['B']}, A alone in {n['A']}"
+        return text
+    return f"{text}; B alone gave success away in {n['B']}, A alone in {n['A']}"
 
 
 def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
@@ -248,20 +248,20 @@ def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
         f"{file} {t.removed} words removed, {t.added} added" if t.hunks else f"{file} the same"
         for file, t in change.texts.items()
     ]
-    said = [f"{who}: {', '.join(counts)}"]
-    said += [f"  {name}: {'none' if x is None else x} → {y}" for name, x, y in change.settings]
+    lines = [f"{who}: {', '.join(counts)}"]
+    lines += [f"  {name}: {'none' if x is None else x} → {y}" for name, x, y in change.settings]
     hunks = [(file, hunk) for file, text in change.texts.items() for hunk in text.hunks]
     for file, hunk in hunks[:most]:
-        said.append(f"  {file} line {hunk.line_a} → {hunk.line_b}")
+        lines.append(f"  {file} line {hunk.line_a} → {hunk.line_b}")
         text = "".join(piece for _, piece in marked(hunk))
-        said += [f"    {line.strip()}" for line in text.split("\n") if line.strip()]
+        lines += [f"    {line.strip()}" for line in text.split("\n") if line.strip()]
     if len(hunks) > most:
         stated = [side.run.manifest.agent(place)["prompt"] for side in (pair.a, pair.b) for place in (0, 1)]
         here = all(as_it_was(prompt["version"], prompt["sha256"]) for prompt in stated)
         seen = dict.fromkeys(f"`harness prompt compare {a} {b}`" for a, b in (ego, helper) if a != b)
         shown = " and ".join(seen) if here and seen else "the page of --html has them"
-        said.append(f"  {len(hunks) - most} more changes: {shown}")
-    return said
+        lines.append(f"  {len(hunks) - most} more changes: {shown}")
+    return lines
 
 
 def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:

@@ -44,13 +44,13 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 def conditions(names: Iterable[str]) -> dict[str, str]:
     """A colour for each operating point: the paper's have their own, a change of one has another."""
-    found: dict[str, str] = {}
+    chosen: dict[str, str] = {}
     for name in dict.fromkeys(names):
         free = [
-            c for c in (CONDITIONS.get(name), *_MORE, *CONDITIONS.values()) if c and c not in found.values()
+            c for c in (CONDITIONS.get(name), *_MORE, *CONDITIONS.values()) if c and c not in chosen.values()
         ]
-        found[name] = free[0] if free else GREY
-    return found
+        chosen[name] = free[0] if free else GREY
+    return chosen
 
 
 def actions(names: Iterable[str]) -> dict[str, str]:

@@ -56,6 +56,6 @@ def shadows(state: WorldState, eye: VehicleState, far_m: float) -> Floats:
     b, at = np.roll(a, -1, axis=1).reshape(-1, 2), north_up(np.array([eye.x_m, eye.y_m]))
     a = a.reshape(-1, 2)
     beyond = [at + (p - at) * far_m / np.maximum(np.hypot(*(p - at).T), 1e-9)[:, None] for p in (b, a)]
-    found = np.stack([a, b, *beyond], axis=1)
+    quads = np.stack([a, b, *beyond], axis=1)
     across = (b - a)[:, 0] * (at - a)[:, 1] - (b - a)[:, 1] * (at - a)[:, 0]
-    return np.where((across > 0)[:, None, None], found[:, ::-1], found)
+    return np.where((across > 0)[:, None, None], quads[:, ::-1], quads)

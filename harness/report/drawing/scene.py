@@ -119,16 +119,16 @@ def _vehicle(axes: Axes, labels: Labels, view: View, vehicle: VehicleState, look
     marks += ["crashed"] if vehicle.crashed else []
     text = f"{printable(vehicle.id)} {vehicle.kind}\n{', '.join(marks)}"
     centre, (low, high) = north_up(np.array([vehicle.x_m, vehicle.y_m])), view.edges
-    one, half = view.scale, (high - low) / 2
+    unit, half = view.scale, (high - low) / 2
     away = centre - (low + half)
-    beyond_m = float((np.abs(away) - half).max()) + 3.0 * one
+    beyond_m = float((np.abs(away) - half).max()) + 3.0 * unit
     if beyond_m > 0:
-        edge = centre.clip(low + 1.5 * one, high - 1.5 * one)
+        edge = centre.clip(low + 1.5 * unit, high - 1.5 * unit)
         east, north = away / half
         horizontal, vertical = "<" if east < 0 else ">", "v" if north < 0 else "^"
         marker = horizontal if abs(east) > abs(north) else vertical
         axes.plot(*edge, marker=marker, color=ROLES["danger"] if look == "danger" else GREY, markersize=5)
-        labels.add(edge, 1.5 * one, f"{text}\n{beyond_m:.0f} m farther", bold=look == "danger")
+        labels.add(edge, 1.5 * unit, f"{text}\n{beyond_m:.0f} m farther", bold=look == "danger")
         return
     corners = north_up(vehicle.corners())
     style = style_of(look, hidden)
@@ -177,24 +177,26 @@ def _conflicts(axes: Axes, labels: Labels, view: View, scene: Scene, viewer: str
 def _signs(axes: Axes, labels: Labels, view: View, scene: Scene) -> None:
     """The scale and where north is, each in a corner that no vehicle is in, and the names of buildings."""
     (west, south), (east, north) = view.edges
-    one = view.scale
-    long_m, pad, wide, high, half = scale_m(view), 4 * one, 24 * one, 6 * one, 3 * one
+    unit = view.scale
+    long_m, pad, wide, high, half = scale_m(view), 4 * unit, 24 * unit, 6 * unit, 3 * unit
     low, up, left, right = south + pad, north - pad - high, west + pad, east - pad - wide
     box = labels.free([np.array([[x, y], [x + wide, y + high]]) for x in (left, right) for y in (low, up)])
     start, foot = box[0]
     bar = [start, start + long_m]
     axes.plot(bar, [foot, foot], color=INK, linewidth=1.5, solid_capstyle="butt", zorder=5)
-    axes.text(start + long_m / 2, foot + one, f"{long_m} m", size=TEXT_PT, ha="center", va="bottom", zorder=5)
-    tall = 13 * one
+    axes.text(
+        start + long_m / 2, foot + unit, f"{long_m} m", size=TEXT_PT, ha="center", va="bottom", zorder=5
+    )
+    tall = 13 * unit
     low, up, left, right = south + half, north - half - tall, west + half, east - half - 2 * half
     box = labels.free(
         [np.array([[x, y], [x + 2 * half, y + tall]]) for x, y in ((right, up), (left, up), (right, low))]
     )
     x, (y, top) = box[:, 0].mean(), box[:, 1]
     arrow = {"arrowstyle": "-|>", "color": INK}
-    axes.annotate("N", (x, top), (x, y + 2 * one), size=8, ha="center", va="center", arrowprops=arrow)
+    axes.annotate("N", (x, top), (x, y + 2 * unit), size=8, ha="center", va="center", arrowprops=arrow)
     for name, left, up in named(scene.state.buildings, view, TEXT_PT / labels.pt_per_m):
-        axes.text(left + one, up - one, name, color=BUILDING_NAME, size=TEXT_PT, ha="left", va="top")
+        axes.text(left + unit, up - unit, name, color=BUILDING_NAME, size=TEXT_PT, ha="left", va="top")
 
 
 def _when(arrival: EgoArrival) -> str:

@@ -87,8 +87,8 @@ class Canvas:
     def _words(self, still: Still, viewers: Sequence[str]) -> None:
         """The policy and what is said of it, drawn again if it is not as in the last still; and the time."""
         decision, ego = still.decision, still.state.ego
-        said = still.outcome or f"decision {decision.action} at {decision.acts_at_s:.2f} s"
-        words = (decision.step, still.open, said, *viewers)
+        ending = still.outcome or f"decision {decision.action} at {decision.acts_at_s:.2f} s"
+        words = (decision.step, still.open, ending, *viewers)
         if words != self.words:
             self.words = words
             self.canvas.restore_region(self.fixed)  # type: ignore[no-untyped-call]
@@ -96,7 +96,7 @@ class Canvas:
                 self.bars.add_artist(bar)
                 self.bars.draw_artist(bar)
                 bar.remove()
-            self.lines[3].set(text=said, weight="bold" if still.outcome else "normal")
+            self.lines[3].set(text=ending, weight="bold" if still.outcome else "normal")
             for viewer, caption in zip(viewers, self.captions, strict=False):
                 whose = "ego" if viewer == ego.id else "helper"
                 caption.set_text(f"cameras of {printable(viewer)}, {whose}: front above, rear below")

@@ -97,12 +97,12 @@ def _pictures(played: Played, progress: Callable[[int], None]) -> Iterator[Pixel
 
 def _graphs(scenario: Scenario, listed: Iterable[Still]) -> Iterator[dict[str, SceneGraph]]:
     """What each viewer saw when each still's decision began."""
-    moment, found = None, dict[str, SceneGraph]()
+    moment, graphs = None, dict[str, SceneGraph]()
     for still in listed:
         if still.seen != moment:
             moment = still.seen
-            found = {v.id: scene_graph(scenario, moment, v.id) for v in (moment.ego, *moment.helpers)}
-        yield found
+            graphs = {v.id: scene_graph(scenario, moment, v.id) for v in (moment.ego, *moment.helpers)}
+        yield graphs
 
 
 def _views(

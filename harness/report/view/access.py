@@ -61,5 +61,5 @@ def _of_another_site(request: Request) -> bool:
     )
 
 
-def _refused(said: str) -> Response:
-    return HTMLResponse(pages.wrong(said), 403)
+def _refused(reason: str) -> Response:
+    return HTMLResponse(pages.wrong(reason), 403)

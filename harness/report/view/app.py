@@ -117,27 +117,27 @@ class View:
 
     async def run(self, request: Request) -> Response:
         """The page of one run or study."""
-        [one] = await run_in_threadpool(self._found, [request.query_params.get("path", "")])
-        if one.state != "finished":
+        [run] = await run_in_threadpool(self._found, [request.query_params.get("path", "")])
+        if run.state != "finished":
             raise UserError(
-                f"{printable(one.name)} is {one.state} ({printable(one.why)}); it has no page yet"
+                f"{printable(run.name)} is {run.state} ({printable(run.why)}); it has no page yet"
             )
-        if one.kind == "suite":
-            return await self._drawn(request, partial(self._suite, one))
-        if one.kind not in pages.RUNS:
-            return await run_in_threadpool(self._study, one)
-        written, made = (own_file(self.folder, one.name, name) for name in ("report.html", "run.json"))
-        if written and made and written.stat().st_mtime >= made.stat().st_mtime:
+        if run.kind == "suite":
+            return await self._drawn(request, partial(self._suite, run))
+        if run.kind not in pages.RUNS:
+            return await run_in_threadpool(self._study, run)
+        written, drawn = (own_file(self.folder, run.name, name) for name in ("report.html", "run.json"))
+        if written and drawn and written.stat().st_mtime >= drawn.stat().st_mtime:
             return await run_in_threadpool(_shown, written)
-        return await self._drawn(request, partial(pages.report, self._whole([one])))
+        return await self._drawn(request, partial(pages.report, self._whole([run])))
 
     def picture(self, request: Request) -> Response:
         """A picture of a study."""
-        [one] = self._found([request.query_params.get("path", "")])
+        [run] = self._found([request.query_params.get("path", "")])
         name = request.query_params.get("name", "")
-        file = own_file(self.folder, one.name, name) if name in pictures(self.folder, one.name) else None
+        file = own_file(self.folder, run.name, name) if name in pictures(self.folder, run.name) else None
         if file is None:
-            raise HTTPException(404, f"{printable(one.name)} has no picture {printable(name)}; see its page")
+            raise HTTPException(404, f"{printable(run.name)} has no picture {printable(name)}; see its page")
         policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox",
                   "Cross-Origin-Opener-Policy": "unsafe-none"}  # fmt: skip
         return FileResponse(file, headers=policy, media_type=PICTURES[file.suffix])
@@ -159,9 +159,11 @@ class View:
 
     def wrong(self, request: Request, error: Exception) -> Response:
         """A page of one line about a request that cannot be answered."""
-        status, said = (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, error)
+        status, reason = (
+            (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, error)
+        )
         headers = error.headers if isinstance(error, HTTPException) else None
-        return HTMLResponse(pages.wrong(str(said)), status, headers)
+        return HTMLResponse(pages.wrong(str(reason)), status, headers)
 
     def bug(self, request: Request, error: Exception) -> Response:
         """The same for a bug, of which the terminal has the traceback."""
@@ -169,7 +171,7 @@ class View:
         return HTMLResponse(pages.wrong("this page cannot be made; the terminal says why"), 500)
 
     def _found(self, names: Sequence[str]) -> Sequence[Listed]:
-        by_name = {one.name: one for one in runs(self.folder)}
+        by_name = {run.name: run for run in runs(self.folder)}
         for name in names:
             if name not in by_name:
                 raise HTTPException(
@@ -178,43 +180,43 @@ class View:
         return [by_name[name] for name in names]
 
     def _picked(self, request: Request) -> Sequence[Listed]:
-        found = self._found(list(dict.fromkeys(request.query_params.getlist("path"))))
-        for one in found:
-            if one.state != "finished" or one.kind not in pages.RUNS:
-                raise UserError(f"{printable(one.name)} is no finished run of a model; pick others")
-        return found
+        listed = self._found(list(dict.fromkeys(request.query_params.getlist("path"))))
+        for run in listed:
+            if run.state != "finished" or run.kind not in pages.RUNS:
+                raise UserError(f"{printable(run.name)} is no finished run of a model; pick others")
+        return listed
 
     def _whole(self, picked: Sequence[Listed]) -> Sequence[Path]:
-        return [whole(self.folder, one.name) for one in picked]
+        return [whole(self.folder, run.name) for run in picked]
 
-    def _suite(self, one: Listed) -> str:
-        path = self.folder / one.name
+    def _suite(self, run: Listed) -> str:
+        path = self.folder / run.name
         for name in contents_of(path).families.values():
-            whole(self.folder, f"{one.name}/{name}")
+            whole(self.folder, f"{run.name}/{name}")
         return pages.suite(self.folder, path)
 
-    def _study(self, one: Listed) -> Response:
-        page = own_file(self.folder, one.name, "index.html")
+    def _study(self, run: Listed) -> Response:
+        page = own_file(self.folder, run.name, "index.html")
         if page:
             return _shown(page)
-        return HTMLResponse(pages.study(one, pictures(self.folder, one.name)))
+        return HTMLResponse(pages.study(run, pictures(self.folder, run.name)))
 
     async def _drawn(self, request: Request, page: Callable[[], str]) -> Response:
-        made: Future[str] = Future()
-        made.set_running_or_notify_cancel()
+        drawn: Future[str] = Future()
+        drawn.set_running_or_notify_cancel()
 
         def make() -> None:
             try:
-                made.set_result(page())
+                drawn.set_result(page())
             except BaseException as error:
-                made.set_exception(error)
+                drawn.set_exception(error)
 
         async with self._drawing:
             if await request.is_disconnected():  # while others' pages were drawn
                 return Response(status_code=204)
             # No pool: Ctrl-C would wait for the threads of one.
             Thread(target=make, daemon=True).start()
-            return _with_way_back(await asyncio.wrap_future(made))
+            return _with_way_back(await asyncio.wrap_future(drawn))
 
 
 def _shown(page: Path) -> Response:

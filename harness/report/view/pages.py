@@ -22,12 +22,12 @@ TEMPLATES = Path(__file__).parent / "templates"
 LISTED_OF_EACH = 10  # episodes and requests, in a comparison
 NEWEST = "-date"
 COLUMNS: dict[str, Callable[[Listed], Any]] = {
-    "name": lambda one: one.name,
-    "kind": lambda one: one.kind,
-    "model": lambda one: one.model,
-    "prompt": lambda one: one.prompt,
-    "success": lambda one: one.success,
-    "date": lambda one: one.date,
+    "name": lambda run: run.name,
+    "kind": lambda run: run.kind,
+    "model": lambda run: run.model,
+    "prompt": lambda run: run.prompt,
+    "success": lambda run: run.success,
+    "date": lambda run: run.date,
 }
 
 
@@ -43,8 +43,8 @@ def compared(folder: Path, a: Path, b: Path) -> str:
 
 def suite(folder: Path, path: Path) -> str:
     """The page of a suite's runs, in a folder of it."""
-    found = read(path)
-    return suites.render([(found, suites.lines(found))], partial(_place, folder))
+    done = read(path)
+    return suites.render([(done, suites.lines(done))], partial(_place, folder))
 
 
 def _place(folder: Path, run: Run) -> str:
@@ -55,7 +55,7 @@ def listed(folder: Path, words: str, order: str) -> str:
     """The runs that have all of these words somewhere, sorted by a column; `-` before it turns it around."""
     every = runs(folder)
     order = order if order.removeprefix("-") in COLUMNS else NEWEST
-    shown = sort([one for one in every if _has(one, words)], order)
+    shown = sort([run for run in every if _has(run, words)], order)
     links = {
         column: urlencode({"sort": _next(column, order), **({"q": words} if words else {})})
         for column in COLUMNS
@@ -66,24 +66,24 @@ def listed(folder: Path, words: str, order: str) -> str:
     )  # fmt: skip
 
 
-def sort(found: Sequence[Listed], order: str) -> list[Listed]:
+def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
     """Sorted by a column, those that have nothing there last."""
     of = COLUMNS[order.removeprefix("-")]
-    known = [one for one in found if of(one) is not None]
+    known = [run for run in runs if of(run) is not None]
     return [
         *sorted(known, key=of, reverse=order.startswith("-")),
-        *(one for one in found if of(one) is None),
+        *(run for run in runs if of(run) is None),
     ]
 
 
-def study(one: Listed, pictures: Sequence[str]) -> str:
+def study(run: Listed, pictures: Sequence[str]) -> str:
     """The pictures of a study that has no page of its own."""
-    return _page("study.html.j2", one=one, pictures=pictures)
+    return _page("study.html.j2", run=run, pictures=pictures)
 
 
-def wrong(said: str) -> str:
+def wrong(reason: str) -> str:
     """One line about a request that cannot be answered."""
-    return _page("wrong.html.j2", said=said)
+    return _page("wrong.html.j2", reason=reason)
 
 
 def style() -> str:
@@ -95,9 +95,9 @@ def _page(template: str, **values: Any) -> str:
     return environment(TEMPLATES).get_template(template).render(**values)
 
 
-def _has(one: Listed, words: str) -> bool:
-    said = (one.name, one.kind, one.state, one.model, one.prompt, one.answer, one.condition, *one.tags)
-    text = " ".join(part for part in said if part is not None).casefold()
+def _has(run: Listed, words: str) -> bool:
+    reason = (run.name, run.kind, run.state, run.model, run.prompt, run.answer, run.condition, *run.tags)
+    text = " ".join(part for part in reason if part is not None).casefold()
     return all(word in text for word in words.casefold().split())
 
 
