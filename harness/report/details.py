@@ -81,19 +81,12 @@ def as_shown(scene: Scene, answer: Answer) -> Scene:
 
 @dataclass(frozen=True)
 class Details:
-    """The details of scenes.
+    """The details of scenes."""
 
-    Attributes:
-        runs: the runs.
-        replayed: of closed-loop runs, the scenes that could be replayed.
-        framed: scenes that have their cameras' pictures.
-        prompts: as in `harness.report.page.write_report`.
-    """
-
-    runs: Runs
-    replayed: Mapping[str, Scene]
-    framed: frozenset[str]
-    prompts: Prompts
+    runs: Runs  # the runs
+    replayed: Mapping[str, Scene]  # of closed-loop runs, the scenes that could be replayed
+    framed: frozenset[str]  # scenes that have their cameras' pictures
+    prompts: Prompts  # as in `harness.report.page.write_report`
 
     def of_scenes(self, ids: Sequence[str]) -> "Details":
         """Return the same with no more of the runs than these scenes need."""
