@@ -45,13 +45,8 @@ class Attackers:
     def said(self, truth: Intents, draws: Draws, episodes: Sequence[tuple[int, int]]) -> Said:
         """Return what is said in decisions (n,), given what the vehicles intend.
 
-        Args:
-            truth: what every vehicle intends, of H helpers.
-            draws: the channel's draws.
-            episodes: number and seed of each decision's episode.
-
-        Raises:
-            UserError: the world has no layouts to draw attackers for.
+        `truth` is what every vehicle intends, of H helpers; `episodes` has the number and seed of each
+        decision's episode. Raises UserError if the world has no layouts to draw attackers for.
         """
         none_attack = np.zeros(truth.valid.shape, dtype=bool)
         if not self._attacks:

@@ -83,11 +83,6 @@ def vehicles_j(latency: Latency, scenes: "Sequence[Scene]", answers: Mapping[str
     """Return the joules of each vehicle's own answer, (n, 1+H), the ego first.
 
     It is NaN for an answer that is missing or that no tokens are known of, and 0 where there is no vehicle.
-
-    Args:
-        latency: the latency of a run with a device profile.
-        scenes: decision points.
-        answers: answers by request id.
     """
     joules = np.zeros((len(scenes), max(len(scene.viewers) for scene in scenes)))
     for n, scene in enumerate(scenes):
@@ -100,10 +95,8 @@ def vehicles_j(latency: Latency, scenes: "Sequence[Scene]", answers: Mapping[str
 def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
     """Return the joules of the helpers that infer, (n,).
 
-    Args:
-        infers: who does, (n, H): `Exchange.infers`. An attacker's further voices, behind the H vehicles, run
-            no model.
-        vehicles: joules of each vehicle's answer, (n, 1+H), the ego first: `vehicles_j`.
+    `infers` (n, H) says who does; an attacker's further voices, behind the H vehicles, run no model.
+    `vehicles` (n, 1+H) has the joules of each vehicle's answer, the ego first.
     """
     count = min(infers.shape[1], vehicles.shape[1] - 1)
     own = vehicles[:, 1 : 1 + count]
@@ -145,17 +138,9 @@ def energy(
 ) -> dict[str, Floats]:  # fmt: skip
     """Return the energy of each decision as columns (n,) by name; NaN where a part of it is unknown.
 
-    Args:
-        device: the computer that every vehicle has.
-        latency: the run's latency.
-        points: the run's conditions.
-        decisions: the run's decisions, with `helpers_j` (`decided_helpers_j`).
-        answers: all answers of the run, by request id.
-
-    Returns:
-        `inference_j`, joules of the ego, of the helpers that infer, and of a fusion call; `radio_mj`,
-        millijoules to send the request and the replies; `waiting_j`, joules of the ego's computer while it
-        waits for messages and does not infer.
+    `inference_j` has joules of the ego, of the helpers that infer, and of a fusion call; `radio_mj`
+    millijoules to send the request and the replies; `waiting_j` joules of the ego's computer while it waits
+    for messages and does not infer. The decisions have `helpers_j` (`decided_helpers_j`).
     """
     ego_j, ego_s, call_j = _inference(latency, points, decisions, answers)
     sent_mj, idle_watts = np.full(len(decisions), np.nan), np.nan

@@ -56,9 +56,7 @@ def examine(
 def moved(pairs: Sequence[Pair], completions: Iterator[Completion]) -> tuple[Moved, ...]:
     """Return by fact how the answers to some pairs moved, of the pairs of which both halves can be read.
 
-    Args:
-        pairs: the pairs.
-        completions: the answers, two a pair: with the fact, and without.
+    A pair has two completions: with the fact, and without.
     """
     changes: dict[Fact, list[float]] = {}
     for pair in pairs:

@@ -26,9 +26,7 @@ def asked(request: Request) -> Request:
 def compared(answer: Answer, other: Answer) -> Answer:
     """Return an answer that says whether no action is the likeliest in both lists.
 
-    Args:
-        answer: to the list as it stands.
-        other: to the reversed one; if it got no answer, nothing is known.
+    Nothing is known if the reversed list, `other`, got no answer.
     """
     if answer.intent is None or other.intent is None:
         return answer

@@ -32,10 +32,7 @@ def known(choice: str | None, agents: Sequence[Agent], backends: Sequence[Backen
 
     Without a choice it is each agent's own: the replayed run's, else the card's, else the paper's.
 
-    Args:
-        choice: the option's value, or None.
-        agents: the ego's agent, then those of the helpers if they have their own.
-        backends: the backend of each agent.
+    The agents are the ego's, then those of the helpers if they have their own.
     """
     if choice not in (None, *NAMES):
         return declared(choice)

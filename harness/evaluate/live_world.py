@@ -107,13 +107,8 @@ class LiveWorld(Placed):
     ) -> None:  # fmt: skip
         """Start the episodes.
 
-        Args:
-            scenario: the scenario that is driven.
-            first_seed: layout seed of episode 0.
-            numbers: the episodes' numbers.
-            points: the conditions.
-            seeds: seeds of the channel's draws.
-            ego_alone: whether helpers are never asked, so that no scene graphs of theirs are needed.
+        Episode 0 has layout seed `first_seed`. With `ego_alone` helpers are never asked, and no scene graphs
+        of theirs are made.
         """
         self.scenario, self._p = scenario, scenario.parameters
         self._first_seed, self._ego_alone = first_seed, ego_alone

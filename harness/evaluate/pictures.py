@@ -18,15 +18,8 @@ GREY = 127
 def picture(spec: Spec, index: int, scene: Scene, viewer: str, blind: bool = False) -> Image | None:
     """Return the picture that a viewer's agent is shown; None if its prompts show none.
 
-    Args:
-        spec: the evaluation.
-        index: which of its agents answers.
-        scene: the decision point.
-        viewer: id of the vehicle that answers.
-        blind: whether the viewer is shown nothing, so that its picture is blank.
-
-    Raises:
-        UserError: there is no other scene to take a picture from.
+    `index` says which agent answers. A `blind` viewer is shown nothing, and its picture is blank. Raises
+    UserError if there is no other scene to take a picture from.
     """
     agent = spec.agents[index]
     vision = agent.card.vision

@@ -121,19 +121,9 @@ def evaluate_shard(
 ) -> int:  # fmt: skip
     """Drive one shard of a closed-loop run, which `harness run merge` combines; a stopped shard resumes.
 
-    Args:
-        spec: the whole run.
-        out: the shard's folder.
-        shard: the part of the run.
-        progress: called with the number of episodes just driven, those kept by a stopped shard included.
-        more: called with the number of episodes that the shard has.
-        workers: processes or a cluster.
-
-    Returns:
-        The number of episodes of the shard.
-
-    Raises:
-        UserError: as in `evaluate`, or the latency is to be measured.
+    `progress` is called with the number of episodes just driven, those that a stopped shard kept included;
+    `more` with the number that the shard has, which is returned. Raises UserError as `evaluate`, or if the
+    latency is to be measured.
     """
     refuse_finished(out)
     made_of = sources(spec)
@@ -299,12 +289,7 @@ def _answered_file(place: Path, chunk: Sequence[int]) -> Path:
 
 
 def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> None:
-    """Raise Unanswered if a run cannot do without the answers that it lacks; its parts lose what lacks them.
-
-    Args:
-        parts: folders of the chunks.
-        answers: all that is in them.
-    """
+    """Raise Unanswered if a run needs answers that it lacks; its parts lose what lacks them."""
     found = Tally(answers)
     if not found.missing:
         return
@@ -383,13 +368,8 @@ def _gather(
 ) -> Evaluated:  # fmt: skip
     """Score the chunks in a working folder and write the files of the finished run, with its sources.
 
-    Args:
-        out: the run's folder.
-        begun: what the work began with.
-        chunks: the episodes of each part.
-        place: the working folder.
-        made_of: the run's sources, by name.
-        others: folders that the run is merged from.
+    `place` is the working folder, `made_of` has the sources by name, `others` are folders that the run is
+    merged from.
     """
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
@@ -443,11 +423,7 @@ def _latency(
 ) -> Latency:
     """Return the latency that a resumed run began with, or that of a new run.
 
-    Args:
-        spec: the evaluation.
-        begun: what the run began with; None if it is new.
-        models: the backends of its agents.
-        trial: returns the scenes in which to measure the latency.
+    `trial` returns the scenes to measure it in.
     """
     if begun:
         return begun.latency

@@ -49,10 +49,7 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
 
     A role in which no answer can be timed gets the ego's time.
 
-    Args:
-        spec: the evaluation.
-        backend: the model itself; a cache would answer in no time.
-        scenes: the scenes that the model is asked about.
+    The backend is the model itself; a cache would answer in no time.
 
     Raises:
         UserError: no answer of the ego can be timed.

@@ -373,10 +373,7 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
 def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]) -> Decisions:
     """Return the table of decisions, sorted by episode, step, moment, condition and seed.
 
-    Args:
-        decided: the decisions, in any order.
-        more: further columns (n,), in the order of `decided`.
-        actions: meta-actions.
+    The decisions may be in any order; further columns (n,), `more`, are in that order.
     """
     moments_by_id = {id(part.moments): part.moments for part in decided}
     starts = np.cumsum([0, *map(len, moments_by_id.values())]).tolist()

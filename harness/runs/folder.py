@@ -273,13 +273,7 @@ def write(
 ) -> None:  # fmt: skip
     """Write a run's files, the manifest last.
 
-    Args:
-        out: the run's folder.
-        manifest: the content of `run.json`.
-        decisions: the decisions, already rounded.
-        episodes: one for each condition, seed and episode.
-        answers: the lines of `answers.jsonl`, some at a time.
-        scores: the rows of `summary.csv`.
+    The decisions are already rounded; the lines of `answers.jsonl` come some at a time.
     """
     with replacing(out / "answers.jsonl") as part, part.open("wb") as file:
         file.writelines(answers)
@@ -384,12 +378,8 @@ def dataset_of(run: Run, given: Path | None = None) -> Dataset:
     It is looked for where the run states, at that path seen from each folder above the run's, and by its
     name; only a dataset with the run's digest is taken.
 
-    Args:
-        run: the run.
-        given: the dataset's folder, if the user names it; it is looked for nowhere else then.
-
-    Raises:
-        UserError: it is not found, or what is there has another digest or is damaged.
+    If the user names its folder, `given`, it is looked for nowhere else. Raises UserError if it is not found,
+    or if what is there has another digest or is damaged.
     """
     stated = run.manifest.world
     assert isinstance(stated, FrozenScenes)

@@ -27,11 +27,6 @@ def differences(
 
     A run's percentile is the mean over its seeds. In a seed, an episode without values in either run is left
     out.
-
-    Args:
-        a: the decisions of run A, for each seed.
-        b: those of run B, for the same seeds.
-        episodes: the number of episodes.
     """
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), episodes, RESAMPLES)
     common = [_common(of_a, of_b) for of_a, of_b in zip(a, b, strict=True)]
