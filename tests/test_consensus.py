@@ -94,7 +94,6 @@ def heard(draw: Any) -> tuple[Any, Any]:
     return p, raw / raw.sum(axis=-1, keepdims=True)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rule", POOLS)
 @given(case=heard())
 def test_whatever_the_rule_a_policy_is_a_distribution_and_lies_between_those_heard(rule: str, case: Any):
@@ -106,7 +105,6 @@ def test_whatever_the_rule_a_policy_is_a_distribution_and_lies_between_those_hea
     assert fused[alone] == pytest.approx(p[alone, 0])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rule", POOLS)
 @given(case=heard(), data=st.data())
 def test_the_order_of_helpers_changes_no_policy(rule: str, case: Any, data: Any):
@@ -115,7 +113,6 @@ def test_the_order_of_helpers_changes_no_policy(rule: str, case: Any, data: Any)
     assert POOLS[rule](p[:, order], weights[:, order]) == pytest.approx(POOLS[rule](p, weights))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rule", POOLS)
 @given(case=heard())
 def test_many_decisions_at_once_are_each_of_them_alone(rule: str, case: Any):

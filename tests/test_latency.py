@@ -176,6 +176,7 @@ def test_a_model_that_fails_has_no_times(small: Dataset) -> None:
 # -- and what answers took decides nothing ----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_no_seconds_retries_or_batches_move_a_row(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -296,6 +297,7 @@ def engine() -> str:
     return pytest.skip("needs the llama-cpp or the transformers extra")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command", [("eval", "--limit", "1"), ("drive", "--episodes", "1", "--workers", "1")]
 )

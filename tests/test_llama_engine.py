@@ -101,6 +101,7 @@ TOKENS = st.lists(st.integers(0, VOCABULARY - 1), max_size=5)
 # -- what goes in -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prompt", ["v1", "v2"])
 def test_every_prompt_of_a_dataset_is_the_same_text_and_the_same_tokens(
     engine: LlamaEngine, theirs: Any, small: Dataset, prompt: str
@@ -162,6 +163,7 @@ def test_argmax_is_of_all_tokens_or_of_those_listed_and_the_lowest_id_wins_a_tie
     session.close()
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(st.data())
 def test_whatever_way_sequences_go_it_is_as_if_each_were_read_from_scratch(
@@ -427,6 +429,7 @@ def test_a_file_of_ones_own_is_known_by_its_content_and_by_what_reads_it(
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_nothing_is_said_on_stderr(tiny: Path, capfd: pytest.CaptureFixture[str]) -> None:
     opened = open_gguf(tiny / "F32.gguf")
     assert opened.complete([ask(0)])[0].error is None

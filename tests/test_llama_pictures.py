@@ -132,6 +132,7 @@ def test_two_pictures_and_one_twice_in_a_prompt(engine: LlamaEngine, theirs: Any
     np.testing.assert_allclose(begin(engine, *asked).log_probs(), expected, atol=ROUNDED)
 
 
+@pytest.mark.slow
 def test_a_batch_says_what_each_prompt_alone_would(engine: LlamaEngine, tiny: Path) -> None:
     asked = [prompt(A, 80), prompt(B, 80, 81), [*SYSTEM, 70], prompt(A, 82)]
     together = begin(engine, *asked).log_probs()
@@ -149,6 +150,7 @@ SHOWN = st.sampled_from([A, B, C]).map(lambda image: [START, image, END])
 PROMPT = st.lists(TEXT | SHOWN, min_size=1, max_size=4).map(lambda parts: [t for part in parts for t in part])
 
 
+@pytest.mark.slow
 @settings(max_examples=12)
 @given(st.lists(PROMPT, min_size=1, max_size=3), st.lists(PROMPT, max_size=2))
 def test_texts_and_pictures_in_any_order_in_any_company(
@@ -174,6 +176,7 @@ def question(n: int, image: Image | None, answer: Any, text: str = "Scene") -> R
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["json", "constrained", "readout"])
 def test_a_backend_answers_what_its_picture_shows(
     tiny: Path, theirs: Any, answer: str, capfd: pytest.CaptureFixture[str]
@@ -196,6 +199,7 @@ def test_a_backend_answers_what_its_picture_shows(
     assert capfd.readouterr() == ("", ""), "llama.cpp has much to say of a projector"
 
 
+@pytest.mark.slow
 def test_parity_is_measured_with_pictures_too(tiny: Path, theirs: Any) -> None:
     asked, letters = (
         [question(n, image, how) for n, image in enumerate((A, B))] for how in ("json", "readout")
@@ -322,6 +326,7 @@ def test_a_projector_that_is_not_there_is_named(tiny: Path) -> None:
     assert missing(card) == "weights"
 
 
+@pytest.mark.slow
 def test_a_file_that_is_no_projector_is_named(tiny: Path) -> None:
     assert "with projector" in str(opened(card_of(tiny, projector="F32.gguf")))
     assert "config.json does not load" in str(opened(card_of(tiny, projector="config.json")))

@@ -130,6 +130,7 @@ def test_times_of_several_helper_models_are_declared_in_turn(small: Dataset) -> 
         declared("ego=0.1:0.2")
 
 
+@pytest.mark.slow
 def test_a_mix_drives_as_well(tmp_path: Path) -> None:
     def driven(workers: int) -> Path:
         from harness.core.work import tidy

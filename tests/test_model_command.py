@@ -101,6 +101,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
 def test_a_check_shows_prompt_tokens_thinking_and_a_decision_in_each_way_of_answering(
     engine: str, tiny: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -320,6 +321,7 @@ def test_a_model_of_texts_is_asked_no_picture(
     assert len(there.asked) == 2 * 3 + examined
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_sees_is_shown_a_picture_and_a_blank_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -111,6 +111,7 @@ def test_the_papers_study_has_no_layouts_to_draw_by():
         coordinate(point, intents, Draws(np.zeros((1, 0, 2)), one))
 
 
+@pytest.mark.slow
 def test_a_run_records_its_network_and_a_sweep_refuses_another(
     harness: Callable[..., Said], mine: Path, small: Dataset, tmp_path: Path
 ) -> None:

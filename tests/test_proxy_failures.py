@@ -54,7 +54,6 @@ def questions(dataset: Dataset, form: str) -> list[Request]:
     ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("form", ["distribution", "recommendation"])
 @pytest.mark.parametrize("how", [how for how in STATUS if how])
 def test_every_failure_has_its_status_whatever_was_answered(how: str, form: str, small: Dataset) -> None:

@@ -65,6 +65,7 @@ def evaluated(project: Harness, made: Path) -> Harness:
     return project
 
 
+@pytest.mark.slow
 def test_a_suite_is_a_run_of_each_dataset_their_means_and_a_page(project: Harness) -> None:
     code, out, err = project(*EVAL)
     assert (code, err) == (0, "")
@@ -80,6 +81,7 @@ def test_a_suite_is_a_run_of_each_dataset_their_means_and_a_page(project: Harnes
     assert (DONE / "exits/report.html").is_file()
 
 
+@pytest.mark.slow
 def test_a_run_of_a_suite_is_what_it_is_alone(evaluated: Harness) -> None:
     code, _, err = evaluated("eval", "--dataset", "exits", "--seeds", "0:2", "--out", "alone")
     assert (code, err) == (0, "")
@@ -101,6 +103,7 @@ def test_means_weight_families_alike_and_join_their_intervals(evaluated: Harness
     assert found.n == 6, "four layouts and two"
 
 
+@pytest.mark.slow
 def test_json_has_every_family_and_the_means(project: Harness) -> None:
     code, out, err = project(*EVAL, "--json", "--limit", "1")
     told: dict[str, Any] = json.loads(out, parse_constant=pytest.fail)
@@ -116,6 +119,7 @@ def test_json_has_every_family_and_the_means(project: Harness) -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on_and_a_finished_suite_is_refused(evaluated: Harness) -> None:
     before = (DONE / "summary.csv").read_text()
     kept = (DONE / "small/answers.jsonl").stat().st_mtime_ns
@@ -209,6 +213,7 @@ def test_the_page_has_families_by_conditions_and_leads_to_each(evaluated: Harnes
     assert Path("again.html").read_text() == page.replace('href="', f'href="{DONE}/')
 
 
+@pytest.mark.slow
 def test_a_loss_has_one_minus_on_the_page(project: Harness) -> None:
     code, _, err = project(*EVAL, "--control", "shuffled-messages")
     assert (code, err) == (0, "")
@@ -219,6 +224,7 @@ def test_a_loss_has_one_minus_on_the_page(project: Harness) -> None:
     assert f"{100 * min(gains):.1f} points" in shown
 
 
+@pytest.mark.slow
 def test_suites_are_reported_side_by_side_and_not_with_runs(evaluated: Harness) -> None:
     code, _, err = evaluated(*EVAL, "--model", "local-view", "--condition", "single-local", "--limit", "1")
     assert (code, err) == (0, "")

@@ -75,6 +75,7 @@ def test_where_sums_need_no_declaration_it_is_refused() -> None:
         Agent(cards.resolve("proxy"), versions.load("v2"), sums="halve")  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_run_says_how_many_were_divided_and_is_no_run_that_refuses_them(
     harness: Callable[..., tuple[int, str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

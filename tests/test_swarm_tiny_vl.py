@@ -48,6 +48,7 @@ def intents(engine: str, questions: list[Request]) -> Floats:
     return np.array([list(json.loads(c.text)["action_distribution"].values()) for c in completions])
 
 
+@pytest.mark.slow
 def test_its_picture_tokens_see(shipped: Dataset) -> None:
     """What each token of a picture is read as, on report layouts; its decisions make no use of it yet."""
     backend: Any = open_backend(cards.resolve(MODEL, "transformers"), device="cpu")
@@ -70,6 +71,7 @@ def test_its_picture_tokens_see(shipped: Dataset) -> None:
     assert (np.abs(told - true)[somebody] <= 1).mean() >= 0.9
 
 
+@pytest.mark.slow
 def test_both_engines_answer_its_image_prompts_alike(shipped: Dataset) -> None:
     questions = asked(shipped, "own")[:12]
     one, other = (intents(engine, questions) for engine in ("transformers", "llama-cpp"))

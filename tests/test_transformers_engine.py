@@ -313,7 +313,6 @@ def test_no_code_of_a_checkpoint_is_run(
     assert not (tmp_path / "caught").exists()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "what"),
     [

@@ -537,7 +537,6 @@ def test_workers_change_nothing(harness: Callable[..., tuple[int, str, str]], tm
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("typed", "said"),
     [

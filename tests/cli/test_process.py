@@ -76,7 +76,6 @@ def test_a_signal_at_any_moment_of_a_command(tmp_path: Path) -> None:
 # -- consoles and streams -------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "env",
     [

@@ -44,7 +44,6 @@ def test_tags_are_recorded_listed_and_repeated_by_the_command(
     ] * 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("tag", ["", " ", "a ", "\x1b[31mred", "two\nlines", "x" * 41])
 def test_a_tag_is_short_printable_text(tag: str, harness: Callable[..., Said]) -> None:
     for command in ("eval", "drive"):

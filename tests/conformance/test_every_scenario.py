@@ -115,7 +115,6 @@ def test_a_driver_who_sees_everything_reaches_the_goal_and_one_who_waits_does_no
     assert {drive(scenario, "brake", seed).result for seed in SEEDS} - {"cleared"}
 
 
-@pytest.mark.slow
 def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenario) -> None:
     """All that could speak against a helper is what it claims: everybody is undecided."""
     rule = Trust()
@@ -141,7 +140,6 @@ def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenar
             state = fused.state
 
 
-@pytest.mark.slow
 def test_many_viewers_see_together_what_each_sees_alone(scenario: Scenario) -> None:
     states = []
     for seed in SEEDS:

@@ -129,7 +129,6 @@ def test_an_episode_that_ends_while_a_decision_is_open_records_it_and_never_acts
     assert (episode.partner is not None, episode.fault, episode.least_gap_m) == (True, "ego", 0.0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("seed", [NO_DANGER, FROM_LEFT, ONCOMING])
 def test_a_driver_that_takes_the_lag_drives_as_the_reference_does(driver, seed):

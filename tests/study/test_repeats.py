@@ -273,7 +273,6 @@ def test_the_command_prints_tables_and_json(
     assert {f["metric"] for f in made["figures"]} >= {"flip_rate", "pass^2", "any@2", "stated_entropy_nats"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "said"),
     [

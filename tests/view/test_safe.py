@@ -78,6 +78,7 @@ def test_no_address_is_a_path(path: str, browser: TestClient) -> None:
     assert SECRET not in answer.text
 
 
+@pytest.mark.slow
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(
     parts=st.lists(
@@ -111,6 +112,7 @@ def hiding_once(hiding: Path) -> Path:
     return hiding
 
 
+@pytest.mark.slow
 def test_links_that_lead_out_are_not_followed(browser: TestClient, reports: Path) -> None:
     outside = reports.parent / "secret"
     (reports / "lent").symlink_to(outside)
@@ -186,6 +188,7 @@ def test_every_page_of_the_list_has_the_strict_policy(page: str, status: int, br
         common(answer.headers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "page",
     ["/run?path=first", "/run?path=second", "/report?path=first", "/compare?path=first&path=second",

@@ -76,6 +76,7 @@ def test_a_click_on_a_head_turns_the_order_around_and_keeps_the_filter(browser: 
     assert page.count('aria-sort="ascending"') == 1
 
 
+@pytest.mark.slow
 def test_a_run_opens_with_its_report_unless_that_is_older(browser: TestClient, reports: Path) -> None:
     report = reports / "first/report.html"
     assert browser.get("/run?path=first").text.replace(f"{WAY_BACK}\n", "") == report.read_text()
@@ -145,6 +146,7 @@ def test_nothing_is_drawn_for_who_left_while_others_pages_were_drawn(
     assert drawn == [2]
 
 
+@pytest.mark.slow
 def test_a_report_is_of_what_is_picked(browser: TestClient) -> None:
     assert "<h1>cruise · v2</h1>" in browser.get("/report?path=second").text
     assert "<h1>2 runs</h1>" in browser.get("/report?path=second&path=first").text
@@ -196,6 +198,7 @@ def test_a_bug_is_a_page_too_and_the_terminal_has_its_trace(
     assert "ZeroDivisionError" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_hostile_text_stays_text(browser: TestClient, reports: Path) -> None:
     name = '<img src=x onerror="a()"> & ?#%2e'
     (reports / "second").rename(reports / name)
