@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
@@ -9,9 +10,11 @@ import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
 
+from harness.cli.docstrings import attributes
 from harness.coordination.operating_point import named_point
 from harness.dataset.load import Dataset
 from harness.radio.channel import Physical
+from harness.radio.its_g5 import ItsG5
 from harness.radio.profiles import CHANNELS
 
 Said = tuple[int, str, str]
@@ -184,3 +187,25 @@ def test_no_messages_is_a_control_of_a_physical_radio_too(harness: Callable[...,
     alone = run[(run.condition == "single-local") & (run.metric == "success_rate")].value
     row = next(row for row in json.loads(out) if row["metric"] == "success_rate")
     assert row["mean"] == pytest.approx(alone.iloc[0])
+
+
+@dataclass(frozen=True)
+class OfAPackage(ItsG5):
+    """A radio that is described as packages did before 0.3.
+
+    Attributes:
+        header_bytes: none, since
+            nothing lies below.
+    """
+
+    header_bytes: int = 0
+    curve: str = "11p-goubet"
+
+
+def test_what_a_field_means_is_said_beside_it_above_it_or_in_the_docstring():
+    shipped, package = attributes(ItsG5), attributes(OfAPackage)
+    assert shipped["packet_bytes"] == "size of a background packet."
+    assert shipped["header_bytes"] == "bytes that the layers below add to a packet and to a message."
+    assert package["header_bytes"] == "none, since nothing lies below."
+    assert package["curve"] == shipped["curve"]
+    assert "rate_hz" in shipped
