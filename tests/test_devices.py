@@ -26,7 +26,7 @@ from harness.evaluate import run as evaluation
 from harness.evaluate.device import answer_j, answer_s, transmit_watts
 from harness.radio.channel import Draws
 from harness.runs import folder
-from harness.runs.records import Constant, Device, DeviceRow, Speed
+from harness.runs.devices import Constant, Device, DeviceRow, Speed
 
 
 def known(value: float) -> Constant:

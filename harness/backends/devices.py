@@ -12,7 +12,7 @@ import msgspec
 from harness.core import resources
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
-from harness.runs.records import Constant, Device, DeviceRow, Speed
+from harness.runs.devices import Constant, Device, DeviceRow, Speed
 
 RATES = ("prefill_tokens_per_s", "decode_tokens_per_s")
 # Joules that a row lacks are derived from the power that the device draws, and the rate.

@@ -15,7 +15,7 @@ from harness.core.figures import Unit, as_mapping, known, shown
 
 if TYPE_CHECKING:
     from harness.core.statistics import Estimate
-    from harness.runs.records import Constant, Device, DeviceRow
+    from harness.runs.devices import Constant, Device, DeviceRow
 
 
 MOST_TOKENS = 1_000_000

@@ -17,7 +17,8 @@ from harness.evaluate.fusion import key_of
 from harness.radio.channel import Physical
 from harness.radio.wrapped import innermost
 from harness.runs.decisions import Decisions
-from harness.runs.records import Answer, Constant, Device, DeviceRow, Latency, Speed
+from harness.runs.devices import Constant, Device, DeviceRow, Speed
+from harness.runs.records import Answer, Latency
 
 if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint

@@ -19,8 +19,9 @@ from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.evaluate.settings import DriveSettings, FrozenSettings, HelperSettings, Settings
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
+from harness.runs.devices import Device
 from harness.runs.metrics import World
-from harness.runs.records import ClosedLoop, Device, FrozenScenes
+from harness.runs.records import ClosedLoop, FrozenScenes
 from harness.world.scenario import Scenario
 
 TAG_CHARACTERS = 40

@@ -34,6 +34,7 @@ from harness.runs import attribution, formats
 from harness.runs.answers import Answered, Answers
 from harness.runs.attribution import Attribution
 from harness.runs.decisions import DecisionFiles, Decisions, arrow_file
+from harness.runs.devices import Speed
 from harness.runs.metrics import Grid, World
 from harness.runs.records import (
     Answer,
@@ -43,7 +44,6 @@ from harness.runs.records import (
     FrozenScenes,
     Manifest,
     Score,
-    Speed,
     Variant,
 )
 from harness.world.parameters import MOST_DECISIONS

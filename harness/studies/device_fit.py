@@ -11,8 +11,9 @@ from harness.core.errors import UserError, printable
 from harness.core.statistics import Estimate, episode_interval, rate_interval
 from harness.evaluate.device import tokens
 from harness.runs import percentiles
+from harness.runs.devices import Device, DeviceRow
 from harness.runs.folder import Run
-from harness.runs.records import Answer, Device, DeviceRow
+from harness.runs.records import Answer
 
 READOUT, WRITTEN = "readout", "written"
 
