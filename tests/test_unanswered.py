@@ -99,7 +99,7 @@ def ask(harness: Typed, play: Play, there: Server, small_path: Path, tmp_path: P
 
     def typed(command: str, *options: str | Path) -> tuple[int, str, str]:
         data = () if command == "drive" else ("--dataset", small_path)
-        return harness(command, "--model", "mine", *data, *options)
+        return harness(*command.split(), "--model", "mine", *data, *options)
 
     return typed
 
@@ -301,14 +301,14 @@ def test_every_study_ends_the_same_way_and_goes_on(
     command: str, options: tuple[str, ...], ask: Typed, play: Play, tmp_path: Path
 ) -> None:
     play.again(one_of(of_ego, 2))
-    code, out, err = ask(*command.split(), *options, "--no-cache", "--out", "study")
+    code, out, err = ask(command, *options, "--no-cache", "--out", "study")
     assert (code, out) == (3, "")
     assert err.startswith(f"harness: HTTP 404: {WORDS}")
     assert re.search(r"no answer to \d+ of \d+ questions to the ego", err)
     assert not list((tmp_path / "study").glob("*.html"))
     before, refuses = set(play.bodies), play.refuses
     play.again()
-    code, _, err = ask(*command.split(), *options, "--no-cache", "--out", "study")
+    code, _, err = ask(command, *options, "--no-cache", "--out", "study")
     assert (code, err) == (0, "")
     assert set() < set(play.bodies) & before <= refused(refuses, before)
 
