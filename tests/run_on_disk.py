@@ -1,7 +1,6 @@
 """Runs on disk: one made up, and any run changed by hand. All are written by the harness's one writer."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +82,7 @@ def made_up(
         "tags": [], "model": {"name": "made-up", "engine": "proxy"},
         "prompt": {"version": "v2", "sha256": "0" * 64, "released": True},
         "world": msgspec.to_builtins(world), "actions": ACTIONS,
-        "conditions": [asdict(point) for point in points], "seeds": seeds, "thinking": False,
+        "conditions": [point.record() for point in points], "seeds": seeds, "thinking": False,
         "answer": "json", "batch_size": 8, "dtype": None, "latency_source": None,
         "latency": Latency("card", "made up", 0.145, 0.145, 0.145), "identity": {"engine": "proxy"},
         "cached_answers": 0, "engine_errors": 0, "versions": {"harness": "0"},
@@ -162,7 +161,7 @@ def _decision(
     scene: str, episode: int, step: int, point: OperatingPoint, seed: int, viewers: Sequence[str],
     closed_loop: bool,
 ) -> Row:  # fmt: skip
-    asks = point.profile is not None
+    asks = point.radio.profile is not None
     share = 1 / len(viewers) if asks else 1.0
     latency_ms = 145.0 + 75.0 * asks
     row: Row = {

@@ -186,7 +186,7 @@ def test_who_attacks_is_drawn_for_a_seed_and_a_layout_and_stays():
     assert (abs(first.attackers.sum(axis=0) - 100) < 35).all()
     alone = Attackers(point).said(many(TRUTH, 1), drawn([217]), [(0, 217)])
     assert (alone.attackers[0] == first.attackers[217]).all()
-    other = Attackers(replace(point, attack="brake")).said(
+    other = Attackers(point.changed(attack="brake")).said(
         many(TRUTH, 300), drawn(seeds), [(0, s) for s in seeds]
     )
     assert (other.attackers == first.attackers).all()
@@ -253,9 +253,9 @@ def test_an_attack_that_is_none_is_one_line(text: str, said: str):
 
 def test_without_a_channel_nobody_can_attack():
     with pytest.raises(UserError, match="no channel"):
-        OperatingPoint("alone", None, attack="liar")
+        OperatingPoint.of("alone", None, attack="liar")
     with pytest.raises(UserError, match="adds no voices"):
-        OperatingPoint("fused", "6g", consensus="ego-prompt", attack="sybil")
+        OperatingPoint.of("fused", "6g", consensus="ego-prompt", attack="sybil")
 
 
 def answered(viewer: str, p: Any, evidence: str = "v9 comes fast", risk: str = "high") -> Answer:

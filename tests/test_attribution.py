@@ -339,7 +339,7 @@ def test_no_object_can_be_left_out_of_a_picture(small: Dataset, tmp_path: Path, 
 def test_typed_it_says_what_moves_most_in_eighty_columns(
     harness: Callable[..., Said], small: Dataset, tmp_path: Path
 ) -> None:
-    control = replace(SIXG, name="6g:messages=blind", messages="blind")
+    control = SIXG.changed(name="6g:messages=blind", messages="blind")
     run(spec_of(small, points=(control, SIXG)), tmp_path / "run")
     code, out, _ = harness("study", "attribute", "run", "--sample", "10")
     assert code == 0

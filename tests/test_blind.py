@@ -127,7 +127,7 @@ def test_each_helper_is_asked_once_where_a_blind_condition_asks(done: Evaluated)
 
 
 def test_other_conditions_are_the_same_without_it(done: Evaluated, small: Dataset, tmp_path: Path) -> None:
-    less = tuple(point for point in CONDITIONS if not point.asks_blind)
+    less = tuple(point for point in CONDITIONS if not point.blind_helpers)
     without = run(spec_of(small, points=less), tmp_path / "less")
     assert not [a for a in answers_of(without.out) if a.role == "blind"]
     for point in less:
@@ -163,7 +163,7 @@ def test_a_replay_has_its_blind_answers_and_asks_the_model_for_others(
     same = run(spec_of(small, f"replay:{done.out}", points=CONDITIONS), tmp_path / "same")
     assert same_scores(same, done)
     assert same_decisions(same.out, done.out)
-    less = tuple(point for point in CONDITIONS if not point.asks_blind)
+    less = tuple(point for point in CONDITIONS if not point.blind_helpers)
     without = run(spec_of(small, points=less), tmp_path / "less")
     more = run(spec_of(small, f"replay:{without.out}", points=CONDITIONS), tmp_path / "more")
     assert same_decisions(more.out, done.out)
@@ -174,7 +174,7 @@ def test_a_sweep_has_them_asks_for_them_or_says_that_it_lacks_them(
 ) -> None:
     less = run(spec_of(small, points=CONDITIONS[:2]), tmp_path / "less").out
     point = CONDITIONS[2]
-    assert point.asks_blind
+    assert point.blind_helpers
     blind = [Setting(point.name, point, 4)]
     with pytest.raises(UserError, match="lacks answers of helpers that are shown nothing, which messages=bl"):
         list(ReplayedRun(less, asks=False).walked(blind, (0, 1)))
@@ -244,6 +244,6 @@ def test_a_fusion_call_has_the_blind_helpers_messages(
 
 
 def test_only_a_point_with_a_channel_asks_the_blind() -> None:
-    assert not named_point("single-local:messages=blind").asks_blind
+    assert not named_point("single-local:messages=blind").blind_helpers
     with pytest.raises(UserError, match="messages is 'shuffled'; it must be own or blind where consensus is"):
         points(["6g:consensus=ego-prompt"], ["shuffled-messages"])

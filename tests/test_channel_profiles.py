@@ -1,6 +1,6 @@
 """Channel profiles as files: what ships, a project's own, their settings, and mistakes in them."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -43,10 +43,10 @@ def test_the_papers_profiles_are_files_that_say_what_they_rest_on():
 def test_a_projects_profile_is_a_condition_and_changes_with_its_file(project: Path):
     (project / "mine.toml").write_text(MINE)
     point = named_point("mine:access=parallel,window=300")
-    assert point.profile == "mine"
-    assert point.window_s == pytest.approx(0.3)
+    assert point.radio.profile == "mine"
+    assert point.fusion.window_s == pytest.approx(0.3)
     assert point.channel == Radio(0.01, 0.3, 6e6, "parallel")
-    assert point == OperatingPoint.from_dict(asdict(point)), "as a manifest has it"
+    assert point == OperatingPoint.from_dict(point.record()), "as a manifest has it"
     before = CHANNELS.record("mine")
     assert before["parameters"]["loss"] == 0.3
     (project / "mine.toml").write_text(MINE.replace("0.3", "0.25"))

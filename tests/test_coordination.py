@@ -5,7 +5,7 @@ One scene throughout. The ego is 20 m from the conflict zone and in doubt. Three
 145 ms. The request has 400 bits. Actions are SLOWER, IDLE, FASTER.
 """
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -60,10 +60,10 @@ def test_from_a_cloud_the_ego_has_its_intent_after_the_round_trip_and_asks_nobod
         assert decision.messages == 0
         assert decision.latency_s == 0.51
         assert decision.deadline_missed
-    sooner = replace(CLOUD, round_trip_s=0.15)
+    sooner = CLOUD.changed(round_trip_s=0.15)
     assert not play(sooner).deadline_missed
     # With a radio too, it asks once the cloud has answered.
-    assert play(replace(SIXG, round_trip_s=0.3)).arrival_s.min() > 0.3
+    assert play(SIXG.changed(round_trip_s=0.3)).arrival_s.min() > 0.3
 
 
 def test_over_v2x_the_third_reply_is_late_and_not_fused_but_waited_for():
@@ -115,12 +115,12 @@ def test_a_request_is_one_message_of_its_own_and_costs_bits_and_airtime():
     assert (decision.requests, decision.messages) == (1, 3)
     assert (decision.request_bits, decision.reply_bits) == (400, 3000)
     assert decision.airtime_s == pytest.approx(340e-6)
-    twice = play(replace(V2X, edge="relay"))
+    twice = play(V2X.changed(edge="relay"))
     assert (twice.requests, twice.reply_bits) == (1, 3000)
     assert twice.airtime_s == pytest.approx(640e-6), "replies go twice, the request once"
-    long = play(replace(V2X, request_bits=10_000.0))
+    long = play(V2X.changed(request_bits=10_000.0))
     assert long.arrival_s == pytest.approx([0.1711, 0.1962, 0.2213]), "a request of 1 ms holds up every reply"
-    slow = play(replace(SIXG, request_bits=2e6), inference_s=(0.145, 0.145, 0.150, 0.165), jitter=(0, 0, 0))
+    slow = play(SIXG.changed(request_bits=2e6), inference_s=(0.145, 0.145, 0.150, 0.165), jitter=(0, 0, 0))
     assert slow.arrival_s == pytest.approx([0.160005, 0.160005, 0.170005]), "none leaves before it is heard"
 
 
@@ -132,7 +132,7 @@ def test_who_asks_nobody_sends_nothing(quiet):
 
 
 def test_an_ego_that_hears_nobody_falls_back_to_its_own_intent():
-    decision = play(replace(SIXG, loss=1.0))
+    decision = play(SIXG.changed(loss=1.0))
     assert decision.triggered
     assert decision.lost == 3
     assert decision.fused.tolist() == list(DOUBT)
@@ -148,7 +148,7 @@ def test_without_helpers_the_ego_asks_nobody_and_acts_at_once():
 
 
 def test_an_unsure_ego_with_nobody_in_its_radius_asks_nobody():
-    decision = play(replace(SIXG, radius_m=1.0))
+    decision = play(SIXG.changed(radius_m=1.0))
     assert not decision.triggered
     assert (decision.requests, decision.messages) == (0, 0)
     assert decision.latency_s == 0.145
@@ -164,8 +164,8 @@ def test_a_sure_ego_does_not_ask():
 
 def test_an_entropy_equal_to_tau_does_not_ask():
     tau_nats = float(play(SIXG).entropy_nats)
-    assert not play(replace(SIXG, tau_nats=tau_nats)).triggered
-    assert play(replace(SIXG, tau_nats=tau_nats - 1e-12)).triggered
+    assert not play(SIXG.changed(tau_nats=tau_nats)).triggered
+    assert play(SIXG.changed(tau_nats=tau_nats - 1e-12)).triggered
 
 
 def test_an_invalid_helper_sends_nothing_and_takes_no_slot():
@@ -186,13 +186,13 @@ def test_an_invalid_helper_sends_nothing_and_takes_no_slot():
 
 
 def test_only_the_nearest_in_the_radius_are_asked():
-    assert play(replace(SIXG, max_helpers=2), range_m=(30.0, 10.0, 20.0)).asked.tolist() == [
+    assert play(SIXG.changed(max_helpers=2), range_m=(30.0, 10.0, 20.0)).asked.tolist() == [
         False,
         True,
         True,
     ]
-    assert play(replace(SIXG, radius_m=20.0)).asked.tolist() == [True, True, False]
-    assert play(replace(SIXG, max_helpers=0)).messages == 0
+    assert play(SIXG.changed(radius_m=20.0)).asked.tolist() == [True, True, False]
+    assert play(SIXG.changed(max_helpers=0)).messages == 0
 
 
 def test_a_reply_leaves_only_when_the_helper_has_its_own_answer():
@@ -204,7 +204,7 @@ def test_a_reply_leaves_only_when_the_helper_has_its_own_answer():
 
 def test_a_failed_ego_answer_becomes_the_fallback_and_says_so():
     failed = (np.nan, np.nan, np.nan)
-    uniform, brake = play(SIXG, own=failed), play(replace(SIXG, fallback="brake"), own=failed)
+    uniform, brake = play(SIXG, own=failed), play(SIXG.changed(fallback="brake"), own=failed)
     assert uniform.own_failed
     assert brake.own_failed
     assert not play(SIXG).own_failed
@@ -220,11 +220,11 @@ def test_a_tie_goes_to_the_earlier_action():
 
 
 def test_density_coupling_counts_valid_helpers_in_the_radius_whether_asked_or_not():
-    crowd = replace(SIXG, density_coupled=True)
+    crowd = SIXG.changed(density_coupled=True)
     assert play(crowd).loss == pytest.approx(0.066)
-    assert play(replace(crowd, max_helpers=1)).loss == pytest.approx(0.066)
+    assert play(crowd.changed(max_helpers=1)).loss == pytest.approx(0.066)
     assert play(crowd, valid=(True, False, True)).loss == pytest.approx(0.036)
-    assert play(replace(crowd, radius_m=15.0)).loss == pytest.approx(0.006)
+    assert play(crowd.changed(radius_m=15.0)).loss == pytest.approx(0.006)
     heard = play(crowd, link=((0.067, 0.9), (0.065, 0.9), (0.9, 0.065))).delivered
     assert heard.tolist() == [True, False, False]
 
@@ -232,26 +232,26 @@ def test_density_coupling_counts_valid_helpers_in_the_radius_whether_asked_or_no
 def test_a_points_own_loss_replaces_the_profiles():
     draws = ((0.05, 0.9), (0.9, 0.9), (0.9, 0.15))
     assert play(V2X, link=draws).delivered.tolist() == [False, True, True]
-    assert play(replace(V2X, loss=0.02), link=draws).delivered.tolist() == [True, True, True]
-    assert play(replace(V2X, loss=0.2), link=draws).delivered.tolist() == [False, True, False]
+    assert play(V2X.changed(loss=0.02), link=draws).delivered.tolist() == [True, True, True]
+    assert play(V2X.changed(loss=0.2), link=draws).delivered.tolist() == [False, True, False]
 
 
 def test_the_papers_proxy_stands_for_the_egos_distance_in_equation_2():
     """Over 6g everybody is heard. Weights are 1/3.5 : 1/10 : 1/20 : 1/5, the ego's .449 and not .125."""
-    near = play(replace(SIXG, ego_distance_m=3.5))
+    near = play(SIXG.changed(ego_distance_m=3.5))
     closeness = np.array([1 / 3.5, 1 / 10, 1 / 20, 1 / 5])
     assert near.weights == pytest.approx(closeness / closeness.sum())
     assert near.weights[0] == pytest.approx(0.449, abs=5e-4)
     assert play(SIXG).weights[0] == pytest.approx(0.125)
     assert near.fused[1] == pytest.approx(near.weights @ np.array([0.4, 0.1, 0.2, 0.0]))
-    assert play(replace(SIXG, ego_distance_m=0.5)).weights == pytest.approx(
-        play(replace(SIXG, ego_distance_m=1.0)).weights
+    assert play(SIXG.changed(ego_distance_m=0.5)).weights == pytest.approx(
+        play(SIXG.changed(ego_distance_m=1.0)).weights
     ), "min_distance_m bounds it as well"
 
 
 def test_a_roadside_edge_saves_a_lost_reply_and_takes_a_second_hop():
     draws = ((0.9, 0.05), (0.9, 0.9), (0.05, 0.9))
-    decision = play(replace(V2X, edge="relay"), link=draws)
+    decision = play(V2X.changed(edge="relay"), link=draws)
     assert decision.delivered.tolist() == [True, True, False]
     assert decision.arrival_s == pytest.approx([0.19524, 0.24544, np.inf])
     assert decision.on_time.tolist() == [True, False, False]
@@ -259,12 +259,12 @@ def test_a_roadside_edge_saves_a_lost_reply_and_takes_a_second_hop():
 
 def test_helpers_on_demand_begin_when_they_are_asked():
     """145 ms of the ego, 40 us of the request, 145 ms of each helper, then slots of 25.1 ms."""
-    wide = replace(V2X, on_demand=True, window_s=0.4)
+    wide = V2X.changed(on_demand=True, window_s=0.4)
     assert play(wide).arrival_s == pytest.approx([0.31514, 0.34024, 0.36534])
     slow = play(wide, inference_s=(0.145, 0.145, 0.100, 0.300))
     assert slow.arrival_s == pytest.approx([0.31514, 0.27014, 0.47014])
     assert slow.on_time.tolist() == [True, True, False]
-    assert play(replace(V2X, on_demand=True)).fused.tolist() == list(DOUBT), "nobody is on time"
+    assert play(V2X.changed(on_demand=True)).fused.tolist() == list(DOUBT), "nobody is on time"
 
 
 AGREED = (0.1, 0.2, 0.7)
@@ -282,7 +282,7 @@ def asked_again(*heard: bool, answer=AGREED, seconds=0.160):
 
 def test_ego_prompt_acts_on_the_models_second_answer_and_waits_for_it():
     """Over 6g the exchange ends at 151.907 ms; the second inference takes 160 ms more."""
-    decision = play(replace(SIXG, consensus="ego-prompt"), fusion_call=asked_again(True, True, True))
+    decision = play(SIXG.changed(consensus="ego-prompt"), fusion_call=asked_again(True, True, True))
     assert decision.fused == pytest.approx(AGREED)
     assert decision.action == 2
     assert decision.exchange_s == pytest.approx(0.151907)
@@ -293,15 +293,15 @@ def test_ego_prompt_acts_on_the_models_second_answer_and_waits_for_it():
 
 def test_ego_prompt_reads_only_what_came_in_time():
     """Over v2x the third reply ends at 220.34 ms: waited for, not read."""
-    decision = play(replace(V2X, consensus="ego-prompt"), fusion_call=asked_again(True, True, False))
+    decision = play(V2X.changed(consensus="ego-prompt"), fusion_call=asked_again(True, True, False))
     assert decision.latency_s == pytest.approx(0.38034)
     assert decision.late == 1
 
 
 def test_ego_prompt_is_not_asked_by_an_ego_that_hears_nobody():
     fusion_call = asked_again(False, False, False, answer=(np.nan,) * 3, seconds=np.nan)
-    for point, own in ((replace(SIXG, loss=1.0), DOUBT), (SIXG, (0.9, 0.05, 0.05))):
-        decision = play(replace(point, consensus="ego-prompt"), own=own, fusion_call=fusion_call)
+    for point, own in ((SIXG.changed(loss=1.0), DOUBT), (SIXG, (0.9, 0.05, 0.05))):
+        decision = play(point.changed(consensus="ego-prompt"), own=own, fusion_call=fusion_call)
         assert decision.fused.tolist() == list(own)
         assert decision.latency_s == decision.exchange_s
         assert decision.weights.tolist() == [1.0, 0.0, 0.0, 0.0]
@@ -310,7 +310,7 @@ def test_ego_prompt_is_not_asked_by_an_ego_that_hears_nobody():
 
 def test_a_second_answer_that_failed_leaves_the_ego_its_own_intent_but_not_the_time():
     failed = asked_again(True, True, True, answer=(np.nan,) * 3)
-    decision = play(replace(SIXG, consensus="ego-prompt"), fusion_call=failed)
+    decision = play(SIXG.changed(consensus="ego-prompt"), fusion_call=failed)
     assert decision.fusion_failed
     assert decision.fused.tolist() == list(DOUBT)
     assert decision.latency_s == pytest.approx(0.311907)
@@ -330,7 +330,7 @@ def test_a_second_answer_that_failed_leaves_the_ego_its_own_intent_but_not_the_t
 )
 def test_each_rule_makes_another_policy_of_the_same_messages(rule, policy):
     """Weights 1/8, 1/4, 1/8, 1/2 of DOUBT, (.8, .1, .1), (.6, .2, .2), (0, 0, 1). None takes time."""
-    decision = play(replace(SIXG, consensus=rule))
+    decision = play(SIXG.changed(consensus=rule))
     assert decision.fused == pytest.approx(policy, abs=2e-4)
     assert decision.latency_s == decision.exchange_s
 
@@ -342,7 +342,7 @@ def test_block_fading_is_one_draw_for_all_steps_of_an_episode():
     own, helpers = np.full((2, 6, 3), 1 / 3), rng.dirichlet(np.ones(3), (2, 6, 3))
     ones = np.ones((2, 6, 3))
     decisions = coordinate(
-        replace(SIXG, loss=0.4),
+        SIXG.changed(loss=0.4),
         Intents(own, helpers, ones > 0, np.ones((2, 6, 4)), ones, ones, np.full((2, 6, 4), 0.145)),
         Draws(link, rng.random((2, 6, 3))),
     )

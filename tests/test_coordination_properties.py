@@ -14,7 +14,7 @@ from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.coordination.rules import POOLS
 from harness.radio.channel import Draws
 
-COOPERATIVE = [POINTS["v2x"], POINTS["6g"], replace(POINTS["6g"], density_coupled=True)]
+COOPERATIVE = [POINTS["v2x"], POINTS["6g"], POINTS["6g"].changed(density_coupled=True)]
 Case = tuple[Intents, Draws]
 
 
@@ -39,7 +39,7 @@ def cases(draw: st.DrawFn) -> Case:
 
 
 points = st.builds(
-    replace,
+    OperatingPoint.changed,
     st.sampled_from(COOPERATIVE),
     tau_nats=st.floats(0, 1.2),
     max_helpers=st.integers(0, 5),
@@ -91,7 +91,7 @@ def test_every_scheduled_reply_is_on_time_late_or_lost(point, case):
     decision = coordinate(point, *case)
     heard = decision.on_time.sum(axis=-1)
     assert np.array_equal(decision.messages, heard + decision.late + decision.lost)
-    assert np.all(decision.messages <= point.max_helpers)
+    assert np.all(decision.messages <= point.ask.max_helpers)
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ def test_the_order_of_helpers_changes_nothing(point, case, data):
 @given(st.sampled_from(COOPERATIVE[:2]), cases(), st.floats(0, 1), st.floats(0, 1))
 def test_more_loss_never_hears_more_helpers_with_the_same_draws(point, case, one, other):
     low, high = sorted((one, other))
-    less, more = (coordinate(replace(point, loss=loss), *case) for loss in (low, high))
+    less, more = (coordinate(point.changed(loss=loss), *case) for loss in (low, high))
     assert np.all(more.on_time <= less.on_time)
     assert np.array_equal(more.latency_s, less.latency_s)
 
@@ -134,7 +134,7 @@ def test_a_single_decision_is_a_row_of_the_batch(point, case):
 @pytest.mark.slow
 @given(points, cases())
 def test_a_threshold_above_the_uniform_entropy_is_the_single_local_point(point, case):
-    never = replace(point, tau_nats=math.log(case[0].own.shape[-1]) + 1e-9)
+    never = point.changed(tau_nats=math.log(case[0].own.shape[-1]) + 1e-9)
     # Helpers who might be asked infer from the start.
     assert_same(coordinate(never, *case), coordinate(POINTS["single-local"], *case), "loss", "infers")
 
@@ -142,5 +142,5 @@ def test_a_threshold_above_the_uniform_entropy_is_the_single_local_point(point, 
 @given(cases(), st.floats(0, 1.2), st.floats(0, 1.2))
 def test_a_higher_threshold_never_asks_more(case, one, other):
     low, high = sorted((one, other))
-    eager, calm = (coordinate(OperatingPoint("x", "v2x", tau_nats=tau), *case) for tau in (low, high))
+    eager, calm = (coordinate(OperatingPoint.of("x", "v2x", tau_nats=tau), *case) for tau in (low, high))
     assert np.all(calm.messages <= eager.messages)

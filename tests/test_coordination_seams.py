@@ -56,7 +56,7 @@ def test_a_rule_with_memory_is_driven_step_by_step():
     The ego that hears nobody acts on its own intent, and the rule remembers that it did.
     A second episode in the same arrays hears (.5, .5) throughout and stays where it is.
     """
-    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smoothing")
+    point = OperatingPoint.of("x", "6g", tau_nats=0.5, consensus="smoothing")
     first = step(point, [(1.0, 0.0), (0.5, 0.5)], [True, True])
     assert first.fused.tolist() == [[0.75, 0.25], [0.5, 0.5]]
     second = step(point, [(1.0, 0.0), (0.5, 0.5)], [False, True], first.state)
@@ -69,7 +69,7 @@ def test_a_rule_with_memory_is_driven_step_by_step():
 
 
 def test_an_episode_takes_its_memory_along_wherever_its_row_is():
-    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smoothing")
+    point = OperatingPoint.of("x", "6g", tau_nats=0.5, consensus="smoothing")
     state = step(point, [(1.0, 0.0), (0.0, 1.0)], [True, True]).state
     alone = step(point, [(0.0, 1.0)], [True], state[[1]])
     assert alone.fused.tolist() == [[0.25, 0.75]]
@@ -79,7 +79,7 @@ def test_an_episode_takes_its_memory_along_wherever_its_row_is():
 
 def test_a_rule_with_memory_also_sees_the_steps_in_which_the_ego_asks_nobody():
     """Sure of the first action, it does not ask. The rule keeps half of (.9, .1) and half of (.25, .75)."""
-    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smoothing")
+    point = OperatingPoint.of("x", "6g", tau_nats=0.5, consensus="smoothing")
     doubt = step(point, (0.0, 1.0), True)
     sure = step(point, (0.0, 1.0), True, doubt.state, own=(0.9, 0.1))
     assert not sure.triggered
@@ -88,7 +88,7 @@ def test_a_rule_with_memory_also_sees_the_steps_in_which_the_ego_asks_nobody():
 
 
 def test_a_rule_without_memory_leaves_no_state():
-    assert step(OperatingPoint("x", "6g", tau_nats=0.5), [(1.0, 0.0)], [True]).state.shape == (1, 0)
+    assert step(OperatingPoint.of("x", "6g", tau_nats=0.5), [(1.0, 0.0)], [True]).state.shape == (1, 0)
 
 
 def three(range_m=(10.0, 30.0, 50.0), link=0.8) -> tuple[Intents, Draws]:
@@ -102,22 +102,22 @@ def three(range_m=(10.0, 30.0, 50.0), link=0.8) -> tuple[Intents, Draws]:
 
 def test_a_channel_may_lose_each_link_by_itself():
     """1 % a metre: where all draws are .35, the links of 10 and 30 m are up and that of 50 is not."""
-    point = OperatingPoint("x", "fog", tau_nats=0.5)
+    point = OperatingPoint.of("x", "fog", tau_nats=0.5)
     decision = coordinate(point, *three(link=0.35))
     assert decision.delivered.tolist() == [True, True, False]
     assert decision.arrival_s == pytest.approx([0.11, 0.11, np.inf])
     assert decision.loss == pytest.approx(0.3), "the mean over those asked"
-    assert coordinate(replace(point, max_helpers=2), *three()).loss == pytest.approx(0.2)
-    assert np.isnan(coordinate(replace(point, max_helpers=0), *three()).loss)
+    assert coordinate(point.changed(max_helpers=2), *three()).loss == pytest.approx(0.2)
+    assert np.isnan(coordinate(point.changed(max_helpers=0), *three()).loss)
 
 
 def test_a_points_overrides_are_fields_of_its_channel():
-    point = OperatingPoint("x", "fog", tau_nats=0.5, latency_s=0.05)
+    point = OperatingPoint.of("x", "fog", tau_nats=0.5, latency_s=0.05)
     assert point.channel == Fog(latency_s=0.05)
     assert coordinate(point, *three()).arrival_s == pytest.approx([0.15, 0.15, 0.15])
-    v2x = OperatingPoint("x", "v2x", loss=0.0, edge="relay")
+    v2x = OperatingPoint.of("x", "v2x", loss=0.0, edge="relay")
     assert v2x.channel == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
-    assert OperatingPoint("x", None, loss=0.5).channel == NO_CHANNEL
+    assert OperatingPoint.of("x", None, loss=0.5).channel == NO_CHANNEL
 
 
 @pytest.mark.parametrize("override", [{"loss": 0.0}, {"density_coupled": True}, {"edge": "relay"}])
@@ -126,7 +126,7 @@ def test_an_override_that_a_channel_does_not_have_is_refused(override):
     with pytest.raises(
         UserError, match=f"'x': {name} is .*; it must be left out: channel profile fog has no"
     ):
-        OperatingPoint("x", "fog", **override)
+        OperatingPoint.of("x", "fog", **override)
 
 
 # -- every plug-in, those of installed packages included ---------------------------------------------------
@@ -238,7 +238,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_package_adds_a_channel_and_replaces_none():
-    slow, v2x = (OperatingPoint("x", name).channel for name in ("slow-radio", "v2x"))
+    slow, v2x = (OperatingPoint.of("x", name).channel for name in ("slow-radio", "v2x"))
     assert isinstance(slow, Radio)
     assert isinstance(v2x, Radio)
     assert (slow.latency_s, v2x.latency_s) == (0.5, 0.025)
@@ -246,7 +246,7 @@ def test_a_package_adds_a_channel_and_replaces_none():
     with pytest.raises(
         UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, .*slow-radio, unmade, v2x"
     ):
-        OperatingPoint("x", "slowradio")
+        OperatingPoint.of("x", "slowradio")
 
 
 @pytest.mark.usefixtures("installed")
@@ -269,13 +269,13 @@ def test_a_package_adds_a_channel_and_replaces_none():
 )
 def test_a_package_that_does_not_work_is_one_line(name: str, says: str):
     with pytest.raises(UserError, match=says) as error:
-        OperatingPoint("x", name)
+        OperatingPoint.of("x", name)
     assert "\n" not in str(error.value)
 
 
 def test_what_is_built_in_needs_no_look_at_the_packages(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(Plugins, "_entries", lambda self: pytest.fail("looked"))
-    OperatingPoint("x", "6g", consensus="median")
+    OperatingPoint.of("x", "6g", consensus="median")
     assert isinstance(CHANNELS["6g"], Radio)
     assert isinstance(Radio(0.0, 0.0, 1.0, "serial", 0.0), Channel)
     assert isinstance(RULES["linear"], Rule)

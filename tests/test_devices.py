@@ -55,9 +55,9 @@ DESK = Device(
 
 # -- one decision by hand -------------------------------------------------------------------------------
 
-ALONE = OperatingPoint("single-local", None)
-CLEAR = OperatingPoint("clear", "v2x", loss=0.0, window_s=0.6)  # serial, 25 ms a slot, 10 Mbit/s
-AGAIN = replace(CLEAR, name="again", consensus="ego-prompt")
+ALONE = OperatingPoint.of("single-local", None)
+CLEAR = OperatingPoint.of("clear", "v2x", loss=0.0, window_s=0.6)  # serial, 25 ms a slot, 10 Mbit/s
+AGAIN = CLEAR.changed(name="again", consensus="ego-prompt")
 
 
 class Counted(Scripted):
@@ -117,9 +117,9 @@ def test_helpers_that_infer_before_they_are_asked_cost_energy_unasked(
     counted: Callable[..., folder.Run],
 ) -> None:
     """All in the radius think from the start; on demand only the one that is asked."""
-    one = replace(CLEAR, name="one", max_helpers=1)
-    demand, narrow = replace(one, name="demand", on_demand=True), replace(CLEAR, name="narrow", radius_m=0.5)
-    sure_ego = replace(CLEAR, name="sure", tau_nats=5.0)
+    one = CLEAR.changed(name="one", max_helpers=1)
+    demand, narrow = one.changed(name="demand", on_demand=True), CLEAR.changed(name="narrow", radius_m=0.5)
+    sure_ego = CLEAR.changed(name="sure", tau_nats=5.0)
     told = counted(ALONE, CLEAR, one, demand, narrow, sure_ego)
     d = told.decisions
     messages, helpers_j = (dict(zip(d.labels("condition"), d[name].tolist(), strict=True))
@@ -224,7 +224,7 @@ def test_a_faster_device_never_decides_later(
     profile: str, seconds: list[float], shares: list[float], on_demand: bool
 ) -> None:
     """Whoever of the vehicles is faster, and whoever comes first on the medium then."""
-    point = OperatingPoint("p", profile, loss=0.0, on_demand=on_demand)
+    point = OperatingPoint.of("p", profile, loss=0.0, on_demand=on_demand)
     unsure = np.full(3, 1 / 3)
 
     def latency_s(inference_s: Any) -> float:

@@ -37,7 +37,7 @@ def test_every_failure_on_purpose_is_documented() -> None:
 def test_every_setting_of_an_operating_point_is_documented_with_its_default(setting: str) -> None:
     text = (ROOT / "docs/operating-points.md").read_text()
     [line] = [line for line in text.splitlines() if line.startswith(f"| `{setting}` |")]
-    default = getattr(POINTS["v2x"], setting)
+    default = POINTS["v2x"].setting(setting)
     others = {"ego_distance_m": "its distance", "round_trip_s": "the model's", "threshold": "its own"}
     words = {"None": others.get(setting, "the profile's"), "False": "false", "": "none"}
     shown = words.get(str(default), default)

@@ -1,7 +1,6 @@
 """Round trips to a cloud, drawn from what others measured."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -102,7 +101,7 @@ def test_quantiles_that_are_none_are_refused(mine: Path, change: tuple[str, str]
 
 
 def test_the_papers_study_has_no_layouts_to_draw_by():
-    point = replace(named_point("single-local:round_trip=us-drive"), profile=None)
+    point = named_point("single-local:round_trip=us-drive").changed(profile=None)
     one = np.zeros((1, 0))
     intents = Intents(
         np.full((1, 2), 0.5), np.zeros((1, 0, 2)), one > 0, np.ones((1, 1)), one, one, np.ones((1, 1))

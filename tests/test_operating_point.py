@@ -1,7 +1,7 @@
 """What an operating point may hold, and what the user reads when it may not."""
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 
@@ -12,36 +12,36 @@ from harness.studies.axes import AXES
 
 
 def test_the_paper_has_three_operating_points_that_differ_only_in_the_channel():
-    assert {name: point.profile for name, point in POINTS.items()} == {
+    assert {name: point.radio.profile for name, point in POINTS.items()} == {
         "single-local": None,
         "v2x": "v2x",
         "6g": "6g",
     }
-    assert len({replace(point, name="x", profile=None) for point in POINTS.values()}) == 1
+    assert len({point.changed(name="x", profile=None) for point in POINTS.values()}) == 1
 
 
 def test_the_cloud_is_the_lone_ego_with_a_round_trip():
-    assert named_point("cloud") == replace(POINTS["single-local"], name="cloud", round_trip_s=0.51)
-    assert named_point("cloud:round_trip_s=0.3").round_trip_s == 0.3
-    assert named_point("6g:round_trip_s=0.3").round_trip_s == 0.3
+    assert named_point("cloud") == POINTS["single-local"].changed(name="cloud", round_trip_s=0.51)
+    assert named_point("cloud:round_trip_s=0.3").cloud.round_trip_s == 0.3
+    assert named_point("6g:round_trip_s=0.3").cloud.round_trip_s == 0.3
 
 
 @pytest.mark.parametrize("point", POINTS.values(), ids=POINTS)
 def test_a_point_survives_its_own_dictionary(point):
-    assert OperatingPoint.from_dict(asdict(point)) == point
+    assert OperatingPoint.from_dict(point.record()) == point
 
 
 def test_a_table_without_a_profile_disables_v2v():
-    assert OperatingPoint.from_dict({"name": "alone"}).profile is None
+    assert OperatingPoint.from_dict({"name": "alone"}).radio.profile is None
 
 
 def test_one_and_one_point_zero_are_the_same_setting():
-    assert repr(OperatingPoint("x", "6g", tau_nats=1)) == repr(OperatingPoint("x", "6g", tau_nats=1.0))
+    assert repr(OperatingPoint.of("x", "6g", tau_nats=1)) == repr(OperatingPoint.of("x", "6g", tau_nats=1.0))
 
 
 def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
-    point = OperatingPoint("x", "6g", tau_nats=0, loss=0, max_helpers=0)
-    assert (point.tau_nats, point.loss, point.max_helpers) == (0.0, 0.0, 0)
+    point = OperatingPoint.of("x", "6g", tau_nats=0, loss=0, max_helpers=0)
+    assert (point.ask.tau_nats, point.radio.loss, point.ask.max_helpers) == (0.0, 0.0, 0)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
     [
         ({"tau_nat": 0.7}, "unknown operating point setting 'tau_nat'; did you mean 'tau_nats'?"),
         ({"profile": "v2v"}, "unknown channel profile 'v2v'; did you mean 'v2x'? known: 6g, "),
-        ({"profile": ["v2x"]}, "unknown channel profile"),
+        ({"profile": ["v2x"]}, "profile is ['v2x']; it must be a text"),
         ({"fallback": "break"}, "unknown fallback 'break'; did you mean 'brake'?"),
         ({"consensus": "log"}, "unknown consensus 'log'"),
         ({"tau_nats": -0.1}, "tau_nats is -0.1; it must be a finite number of nats, 0 or more"),
@@ -107,8 +107,8 @@ def test_an_unknown_point_is_told_the_nearest():
 def test_every_other_channel_profile_is_a_point_of_its_own_name(monkeypatch):
     fog = replace(CHANNELS["6g"], loss=0.5)
     monkeypatch.setitem(CHANNELS._loaded, "fog", fog)
-    assert named_point("fog") == OperatingPoint("fog", "fog")
-    assert named_point("fog:loss=0.2") == OperatingPoint("fog:loss=0.2", "fog", loss=0.2)
+    assert named_point("fog") == OperatingPoint.of("fog", "fog")
+    assert named_point("fog:loss=0.2") == OperatingPoint.of("fog:loss=0.2", "fog", loss=0.2)
     assert named_point("fog:window_s=0.3").channel == fog
     with pytest.raises(
         UserError, match="setting of operating point fog 'windows_s'; did you mean 'window_s'"
@@ -118,11 +118,11 @@ def test_every_other_channel_profile_is_a_point_of_its_own_name(monkeypatch):
 
 def test_a_change_of_a_point_is_called_by_its_text():
     point = named_point("6g:consensus=median,window_s=0.4,max_helpers=2,on_demand=true,loss=0.1")
-    assert point == OperatingPoint(
+    assert point == OperatingPoint.of(
         "6g:consensus=median,window_s=0.4,max_helpers=2,on_demand=true,loss=0.1", "6g",
         consensus="median", window_s=0.4, max_helpers=2, on_demand=True, loss=0.1,
     )  # fmt: skip
-    assert named_point("single-local:fallback=brake").fallback == "brake"
+    assert named_point("single-local:fallback=brake").fusion.fallback == "brake"
 
 
 @pytest.mark.parametrize("name", SHORT)
@@ -159,9 +159,9 @@ def test_a_change_that_is_not_allowed_is_one_line(text, says):
 
 
 def test_only_a_point_with_a_channel_asks_again():
-    assert named_point("v2x:consensus=ego-prompt").asks_again
-    assert not named_point("v2x").asks_again
-    assert not named_point("single-local:consensus=ego-prompt").asks_again
+    assert named_point("v2x:consensus=ego-prompt").has_fusion_call
+    assert not named_point("v2x").has_fusion_call
+    assert not named_point("single-local:consensus=ego-prompt").has_fusion_call
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,7 @@ def test_a_run_counts_what_was_drawn_exactly(small: Dataset, tmp_path: Path) -> 
 
 def test_a_slow_answer_is_late_by_what_was_declared(small: Dataset, tmp_path: Path) -> None:
     """Alone, an ego decides after 145 ms, or 545 ms where its answer was drawn slow."""
-    asks = OperatingPoint("asks", "6g", tau_nats=0.0)  # at every step
+    asks = OperatingPoint.of("asks", "6g", tau_nats=0.0)  # at every step
     run(spec_of(small, "proxy-faulty", points=(POINTS["single-local"], asks)), tmp_path / "run")
     alone = decisions(tmp_path / "run", "single-local")
     expected = [145.0 + 1000 * draw_failure(FAULTY, f"{d.scene}/v1")[1] for d in alone]

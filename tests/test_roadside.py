@@ -49,7 +49,7 @@ def traced() -> Iterator[None]:
 
 def point(edge: str, **settings: Any) -> OperatingPoint:
     usual = {"profile": "traced", "edge_delay_s": 0.005, "window_s": 0.3}
-    return OperatingPoint("x", **{**usual, "edge": edge, **settings})
+    return OperatingPoint.of("x", **{**usual, "edge": edge, **settings})
 
 
 def places(*sight: int) -> Site:
@@ -156,7 +156,7 @@ def test_an_ego_whose_request_or_policy_is_lost_has_heard_nobody():
 
 def test_airtime_counts_both_hops_and_copies_that_nobody_needs():
     """Messages of 400, 800 and 1000 bits fit one block, 1 ms on air, and all cross."""
-    alike: dict[str, Any] = {"profile": "mode2", "loss": 0.0, "window_s": 0.5, "radio": "numerology=0"}
+    alike: dict[str, Any] = {"profile": "mode2", "loss": 0.0, "window_s": 0.5, "further": "numerology=0"}
     slot_s = 1e-3
     for edge, messages in (("none", 3), ("relay", 5), ("fusion", 5)):
         assert play(point(edge, **alike)).airtime_s == pytest.approx(messages * slot_s)
@@ -194,7 +194,7 @@ delays = st.sampled_from([0.0, 0.01])
 
 
 def over(name: str, **settings: Any) -> OperatingPoint:
-    return replace(named_point(name), **settings)
+    return named_point(name).changed(**settings)
 
 
 @pytest.mark.slow

@@ -268,7 +268,7 @@ def test_a_folder_in_use_is_refused_and_left_as_it_is(
 def test_an_empty_folder_is_a_fine_place(small: Dataset, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     run(spec_of(small, "cruise"), tmp_path / "empty")
-    assert {p.name for p in (tmp_path / "empty").iterdir()} == {*FILES, "run.json", "sources"}
+    assert {p.name for p in (tmp_path / "empty").iterdir()} == {*FILES, "run.json", "run.toml", "sources"}
 
 
 def test_a_model_that_cannot_be_had_leaves_nothing(small: Dataset, tmp_path: Path) -> None:
@@ -342,7 +342,7 @@ def test_conditions_share_their_luck_so_more_loss_never_lets_more_through(
 ) -> None:
     data = course(small)  # whatever is heard, all come to the same scenes
     losses = (0.0, 0.05, 0.3, 0.6, 1.0)
-    points = tuple(OperatingPoint(f"loss-{x}", "6g", loss=x, tau_nats=0.0) for x in losses)
+    points = tuple(OperatingPoint.of(f"loss-{x}", "6g", loss=x, tau_nats=0.0) for x in losses)
     run(spec_of(data, points=points, seeds=(0, 1, 2)), tmp_path / "run")
     heard = []
     for point in points:
@@ -359,7 +359,7 @@ def test_conditions_share_their_luck_so_more_loss_never_lets_more_through(
 def test_a_blocked_link_stays_blocked_for_its_episode_and_for_no_other(
     small: Dataset, tmp_path: Path
 ) -> None:
-    point = OperatingPoint("half", "6g", loss=0.3, tau_nats=0.0)
+    point = OperatingPoint.of("half", "6g", loss=0.3, tau_nats=0.0)
     run(spec_of(small, points=(point,), seeds=tuple(range(5))), tmp_path / "run")
     up: dict[tuple[int, int, str], set[bool]] = {}
     for d in decisions(tmp_path / "run"):
@@ -377,7 +377,7 @@ def test_a_blocked_link_stays_blocked_for_its_episode_and_for_no_other(
 def test_the_luck_is_the_same_for_every_prompt_and_model(small: Dataset, tmp_path: Path) -> None:
     """Asked by a proxy with v1 or v2, a helper's link is up or down alike."""
     data = course(small)  # whatever is decided, both come to the same scenes
-    point = OperatingPoint("half", "6g", loss=0.3, tau_nats=0.0)
+    point = OperatingPoint.of("half", "6g", loss=0.3, tau_nats=0.0)
     links = []
     for prompt in ("v1", "v2"):
         run(spec_of(data, prompt=prompt, points=(point,)), tmp_path / prompt)

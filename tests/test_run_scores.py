@@ -35,9 +35,9 @@ from harness.runs.folder import csv_text
 from harness.runs.metrics import METRICS, of_decisions
 from harness.runs.records import Answer, Latency, Score, Variant
 
-ALONE = OperatingPoint("single-local", None)
-CLEAR = OperatingPoint("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter
-DEAF = OperatingPoint("deaf", "v2x", loss=1.0)
+ALONE = OperatingPoint.of("single-local", None)
+CLEAR = OperatingPoint.of("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter
+DEAF = OperatingPoint.of("deaf", "v2x", loss=1.0)
 
 # Seconds until the intersection is cleared, or how it ends; what is not here leads to the next step.
 OUTCOMES: dict[str, dict[str, float | str]] = {
@@ -280,7 +280,7 @@ def test_a_consensus_weighs_those_heard_by_their_distance(told: Walked, played: 
 
 
 def test_intervals_of_what_hangs_on_the_seed(small: Dataset) -> None:
-    lossy = OperatingPoint("lossy", "6g", loss=0.3, tau_nats=0.0)
+    lossy = OperatingPoint.of("lossy", "6g", loss=0.3, tau_nats=0.0)
     seeds = (0, 1, 2, 3, 4)
     lines = {f"{s.id}/v1": says([0.3, 0.4, 0.3]) for s in all_scenes(small)}
     lines |= {f"{s.id}/v{n}": sure("SLOWER", "helper") for s in all_scenes(small) for n in (2, 3, 4)}
@@ -331,7 +331,7 @@ def test_a_failed_ego_answer_is_undecided_so_it_asks(played: Dataset) -> None:
 def test_alone_an_undecided_ego_takes_the_most_careful_action_where_ties_fall_to_the_first(
     played: Dataset,
 ) -> None:
-    brake = OperatingPoint("brake", None, fallback="brake")
+    brake = OperatingPoint.of("brake", None, fallback="brake")
     spec = spec_of(played, points=(ALONE, brake), seeds=(0,), ties="first")
     told = walked(spec, Scripted({"00001-0/v1": "{}"}))
     for point, p in ((ALONE, [1 / 3, 1 / 3, 1 / 3]), (brake, [1.0, 0.0, 0.0])):

@@ -117,10 +117,10 @@ def test_random_asks_in_its_share_of_decisions_whatever_the_channel_draws():
     lots = Draws(
         np.full((1200, 3, 2), 0.9), np.zeros((1200, 3)), Trips(places[:, 0], places[:, 1], places[:, 2], 6)
     )
-    point = replace(SIXG, schedule="random")
+    point = SIXG.changed(schedule="random")
 
     def asks(share, at=lots):
-        return exchange(replace(point, threshold=1 - share), wide(scene(), 1200), at).asked.any(axis=1)
+        return exchange(point.changed(threshold=1 - share), wide(scene(), 1200), at).asked.any(axis=1)
 
     for share in (0.2, 0.5, 1.0):
         assert asks(share).mean() == pytest.approx(share, abs=0.045)  # 3 standard errors
@@ -142,7 +142,7 @@ def test_what_the_deadline_expects_is_what_the_channel_does_on_average(profile, 
 
     monkeypatch.setitem(SCHEDULES._loaded, "deadline", Formula(spied, 0.0, ("in_time",)))
     uniforms = Draws(rng.random((4000, 3, 2)), rng.random((4000, 3)))
-    point = OperatingPoint("x", profile, window_s=0.196, schedule="deadline")
+    point = OperatingPoint.of("x", profile, window_s=0.196, schedule="deadline")
     share = exchange(point, wide(scene(), 4000), uniforms).on_time.mean(axis=0)
     assert expected[0][0] == pytest.approx(share, abs=0.08)  # of 8 imagined jitters
     assert (expected[0] == expected[0][0]).all()
@@ -211,9 +211,9 @@ def test_of_those_worth_it_the_most_worth_are_asked_and_of_equals_the_nearest(wo
 def test_always_is_entropy_at_a_threshold_of_0_where_there_is_any_entropy(shares, tau):
     intents = scene(own=tuple(shares / shares.sum()))
     everybody = exchange(named_point("6g:schedule=always"), intents, draws())
-    at_zero = exchange(replace(SIXG, tau_nats=0.0), intents, draws())
+    at_zero = exchange(SIXG.changed(tau_nats=0.0), intents, draws())
     assert same(everybody, at_zero)
-    paper = exchange(replace(SIXG, tau_nats=tau), intents, draws())
+    paper = exchange(SIXG.changed(tau_nats=tau), intents, draws())
     assert same(paper, everybody if paper.entropy_nats > tau else exchange(NEVER, intents, draws()))
 
 

@@ -46,7 +46,7 @@ def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset
         if danger and not seen and any(sector.occluded for sector in graph.sectors):
             hidden.append(decision.entropy_nats)
     assert len(hidden) >= 50
-    assert np.mean(hidden) > POINTS["6g"].tau_nats, "so that it asks for help"
+    assert np.mean(hidden) > POINTS["6g"].ask.tau_nats, "so that it asks for help"
 
 
 def test_its_helpers_messages_help(done: Evaluated) -> None:

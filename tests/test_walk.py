@@ -1,6 +1,6 @@
 """The walk through frozen scenes, step by step, against results that can be counted by hand."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ OUTCOMES = {
     for episode, steps in ((0, 3), (1, 2), (2, 3)) for step in range(steps)
 }  # fmt: skip
 EGO = says([0.5, 0.3, 0.2])  # 1.03 nats: it asks at every step
-POOLED = OperatingPoint("pooled", "6g", loss=0.0)
+POOLED = OperatingPoint.of("pooled", "6g", loss=0.0)
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,12 @@ def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def halves() -> OperatingPoint:
-    return replace(POOLED, name="halves", consensus="smooth")
+    return POOLED.changed(name="halves", consensus="smooth")
 
 
 @pytest.fixture
 def lossy() -> OperatingPoint:
-    return replace(POOLED, name="lossy", consensus="smooth", loss=0.3)
+    return POOLED.changed(name="lossy", consensus="smooth", loss=0.3)
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def test_shuffled_messages_are_those_of_the_next_layout_that_decides(played: Dat
     for scene in all_scenes(played):
         intent = sure(played.actions[scene.record.episode], "helper")
         lines |= {f"{scene.id}/{viewer}": intent for viewer in scene.viewers[1:]}
-    control = replace(POOLED, name="control", messages="shuffled")
+    control = POOLED.changed(name="control", messages="shuffled")
     told = walked(spec_of(played, points=(control,), seeds=(0, 1)), Scripted(lines))
     braking, keeping, faster = (tuple(p) for p in np.array([0.125, 0.075, 0.05]) + 0.75 * np.eye(3))
     expected = {

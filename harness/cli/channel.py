@@ -297,6 +297,6 @@ def _of(text: str) -> "tuple[str, Channel]":
     from harness.radio.wrapped import innermost
 
     point = named_point(text)
-    if point.profile is None:
+    if point.radio.profile is None:
         raise UserError(f"{printable(text)} has no channel; `harness radio list` shows those there are")
-    return point.profile, innermost(point.channel)
+    return point.radio.profile, innermost(point.channel)

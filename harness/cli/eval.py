@@ -171,8 +171,8 @@ def _counted(spec: "Spec", dataset: "Frozen", tokenizer: Path | None) -> dict[st
     count = counter(tokenizer, spec.ego.card)
     sizes: dict[str, list[int]] = {}
     asked, scenes = Counter[str](), dataset.scenes(dataset.courses())
-    sighted = spec.asks_all or any(point.asks and not point.asks_blind for point in spec.points)
-    blind = any(point.asks_blind and (spec.asks_all or point.asks) for point in spec.points)
+    sighted = spec.asks_all or any(point.asks and not point.blind_helpers for point in spec.points)
+    blind = any(point.blind_helpers and (spec.asks_all or point.asks) for point in spec.points)
     own = requests(spec, scenes, places=None if sighted else [EGO] * len(scenes))
     for request in chain(own, requests(spec, scenes, blind=True) if blind else ()):
         asked[request.role] += 1

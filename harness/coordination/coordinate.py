@@ -81,19 +81,19 @@ def fuse(
     fusion = fusion or Fusion()
     p = np.concatenate([heard.own[..., None, :], intents.helpers], axis=-2)
     distance_m = intents.distance_m
-    if point.ego_distance_m is not None:
-        distance_m = np.insert(distance_m[..., 1:], 0, point.ego_distance_m, axis=-1)
-    weights = inverse_distance_weights(distance_m, heard.on_time, point.min_distance_m)
-    if point.weight_cap < 1:
-        weights = capped(weights, point.weight_cap)
+    if point.fusion.ego_distance_m is not None:
+        distance_m = np.insert(distance_m[..., 1:], 0, point.fusion.ego_distance_m, axis=-1)
+    weights = inverse_distance_weights(distance_m, heard.on_time, point.fusion.min_distance_m)
+    if point.fusion.weight_cap < 1:
+        weights = capped(weights, point.fusion.weight_cap)
     heard_any = any_of(heard.on_time)
     trust = np.full(heard.on_time.shape, np.nan)
     latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)
-    if point.consensus == EGO_PROMPT:
+    if point.fusion.consensus == EGO_PROMPT:
         if fusion.call is None:
-            raise ValueError(f"consensus {point.consensus} needs a fusion call")
+            raise ValueError(f"consensus {point.fusion.consensus} needs a fusion call")
         fused, seconds = fusion.call(heard.on_time)
-        if "majority" in point.guards:
+        if "majority" in point.guard.defences:
             voices = np.insert(heard.on_time, 0, True, axis=-1)
             fused = outvoted(fused, p, voices, np.sum(voices, axis=-1) // 2 + 1)
         failed = heard_any & np.any(np.isnan(fused), axis=-1)
@@ -101,7 +101,7 @@ def fuse(
         latency_s = latency_s + np.where(heard_any, seconds, 0.0)
         state = np.zeros((*failed.shape, 0))
     else:
-        rule, (*batch, vehicles, actions) = RULES[point.consensus], p.shape
+        rule, (*batch, vehicles, actions) = RULES[point.fusion.consensus], p.shape
         messages = Messages(
             p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, intents.claims
         )
@@ -109,7 +109,7 @@ def fuse(
         fused, weights, state, rule_trust = rule.fuse(messages, state)
         trust = trust if rule_trust is None else np.where(heard.on_time, rule_trust, np.nan)
     fused = np.where((heard_any & ~failed)[..., None], fused, heard.own)
-    unknown = np.isnan(intents.inference_s[..., 0]) & (point.round_trip_s is None)
+    unknown = np.isnan(intents.inference_s[..., 0]) & (point.cloud.round_trip_s is None)
     return Coordination(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},
         weights=weights,
@@ -117,7 +117,7 @@ def fuse(
         action=_likeliest(fused, fusion.ties),
         fusion_failed=failed,
         latency_s=np.where(unknown, np.nan, latency_s),
-        deadline_missed=latency_s > point.window_s,
+        deadline_missed=latency_s > point.fusion.window_s,
         state=state,
         trust=trust,
     )

@@ -27,7 +27,8 @@ from functools import cached_property
 import numpy as np
 
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import FUSION, OperatingPoint
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.parts import FUSION
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import Known, chosen
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
@@ -105,11 +106,11 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
     """
     own_failed, known = _base_knowledge(point, intents)
     in_radius = known.may_ask
-    if point.profile is None:
+    if point.radio.profile is None:
         asked = np.zeros_like(in_radius)
     elif asked is None:
         worth = _worth(point, known, intents, draws)
-        asked = chosen(worth, point.asks_above, in_radius, intents.range_m, point.max_helpers)
+        asked = chosen(worth, point.ask.above, in_radius, intents.range_m, point.ask.max_helpers)
     else:
         asked = asked & in_radius
     request_s, outcome, waits_until_s = _ask_helpers(point, intents, asked, in_radius, draws)
@@ -130,7 +131,7 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         loss=loss[..., 0] if one_loss else known_mean(np.where(outcome.asked, loss, np.nan), axis=-1),
         delivered=delivered,
         arrival_s=arrival_s,
-        on_time=outcome.fused & (arrival_s <= point.window_s),
+        on_time=outcome.fused & (arrival_s <= point.fusion.window_s),
         exchange_s=np.minimum(request_s[..., 0] + outcome.acts_s, waits_until_s),
     )
 
@@ -145,43 +146,49 @@ def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
     nobody = np.zeros(intents.range_m.shape, dtype=bool)
     if not point.asks:
         return nobody
-    if point.attack:
+    if point.guard.attack:
         return nobody | np.isfinite(intents.range_m)
     known = _base_knowledge(point, intents)[1]
-    if getattr(SCHEDULES[point.schedule], "by_presence", True):
+    if getattr(SCHEDULES[point.ask.schedule], "by_presence", True):
         return known.may_ask
     worth = _worth(point, known, intents, draws)
-    asked = chosen(worth, point.asks_above, known.may_ask, intents.range_m, point.max_helpers)
+    asked = chosen(worth, point.ask.above, known.may_ask, intents.range_m, point.ask.max_helpers)
     channel = innermost(point.channel)
-    loaded = getattr(channel, "density_coupled", not isinstance(channel, Physical)) or point.helper_rounds
+    loaded = (
+        getattr(channel, "density_coupled", not isinstance(channel, Physical)) or point.radio.helper_rounds
+    )
     return any_of(asked)[..., None] & known.may_ask if loaded else asked
 
 
 def _infers(point: OperatingPoint, intents: Intents, asked: Bools) -> Bools:
-    if point.profile is None or point.on_demand:
+    if point.radio.profile is None or point.ask.on_demand:
         return asked
-    return np.asarray(intents.range_m <= point.radius_m)  # before they know who is asked
+    return np.asarray(intents.range_m <= point.ask.radius_m)  # before they know who is asked
 
 
 def _ask_helpers(
     point: OperatingPoint, intents: Intents, asked: Bools, in_radius: Bools, draws: Draws
 ) -> tuple[Floats, Consulted, Floats]:
     """Return when the ego asks, `(..., 1)`, the outcome, and until when it waits at most, `(...)`."""
-    opens_round = triggered(intents.helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(asked)
+    opens_round = (
+        triggered(intents.helpers, point.ask.tau_nats) if point.radio.helper_rounds else np.zeros_like(asked)
+    )
     inference_s = np.nan_to_num(inferred_s(point, intents, draws))
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
 
     def ready(heard_s: Floats | float) -> Floats:
-        return heard_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, heard_s)
+        return heard_s + helpers_s if point.ask.on_demand else np.maximum(helpers_s - request_s, heard_s)
 
     links = Links(
         asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & opens_round,
-        point.request_bits, intents.site,
+        point.ask.request_bits, intents.site,
     )  # fmt: skip
-    if point.edge == FUSION and point.unit and isinstance(point.channel, Physical):
-        until_s = np.maximum(point.window_s, request_s[..., 0])
+    if point.radio.edge == FUSION and point.unit and isinstance(point.channel, Physical):
+        until_s = np.maximum(point.fusion.window_s, request_s[..., 0])
         remaining_s = until_s - request_s[..., 0]
-        outcome = by_unit(point.channel, point.unit, point.edge_delay_s, links, draws, ready, remaining_s)
+        outcome = by_unit(
+            point.channel, point.unit, point.radio.edge_delay_s, links, draws, ready, remaining_s
+        )
         return request_s, outcome, until_s
     return request_s, _ask_directly(point.channel, links, draws, ready), np.array(np.inf)
 
@@ -189,7 +196,7 @@ def _ask_helpers(
 def own_intent(point: OperatingPoint, intents: Intents) -> tuple[Bools, Floats]:
     """Return whether the ego's answer failed, `(...)`, and its intent after the fallback, `(..., A)`."""
     failed = any_of(np.isnan(intents.own))
-    fallback = fallback_intent(point.fallback, intents.own.shape[-1])
+    fallback = fallback_intent(point.fusion.fallback, intents.own.shape[-1])
     return failed, np.where(failed[..., None], fallback, intents.own)
 
 
@@ -199,7 +206,7 @@ def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
 
 
 def _worth(point: OperatingPoint, known: Known, intents: Intents, draws: Draws) -> Floats:
-    return SCHEDULES[point.schedule].worth(_with_schedule_needs(point, known, intents, draws))
+    return SCHEDULES[point.ask.schedule].worth(_with_schedule_needs(point, known, intents, draws))
 
 
 def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Known:
@@ -210,13 +217,13 @@ def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Known:
 def _base_knowledge(point: OperatingPoint, intents: Intents) -> tuple[Bools, Known]:
     """Return whether the ego's answer failed, `(...)`, and what it knows under any schedule."""
     failed, own = own_intent(point, intents)
-    in_radius = intents.valid & (intents.range_m <= point.radius_m)
+    in_radius = intents.valid & (intents.range_m <= point.ask.radius_m)
     return failed, Known(own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m)
 
 
 def _with_schedule_needs(point: OperatingPoint, known: Known, intents: Intents, draws: Draws) -> Known:
     if (point.needs("outlook") and intents.outlook is None) or (point.needs("lot") and draws.trips is None):
-        raise UserError(NO_SCENE.format(printable(point.schedule)))
+        raise UserError(NO_SCENE.format(printable(point.ask.schedule)))
     return replace(
         known,
         in_time=_in_time(point, intents, known.may_ask, draws) if point.needs("in_time") else None,
@@ -243,7 +250,7 @@ def _in_time(point: OperatingPoint, intents: Intents, may_ask: Bools, draws: Dra
         own_draws = draws.of(f".imagined-{n}") if draws.trips else draws
         imagined = replace(own_draws, jitter=np.full_like(draws.jitter, (n + 0.5) / IMAGINED))
         request_s, outcome, _ = _ask_helpers(point, intents, may_ask, may_ask, imagined)
-        total += (1.0 - outcome.loss) ** 2 * (request_s + outcome.end_s <= point.window_s)
+        total += (1.0 - outcome.loss) ** 2 * (request_s + outcome.end_s <= point.fusion.window_s)
     return total / IMAGINED
 
 
@@ -273,8 +280,8 @@ def _ask_directly(
 def inferred_s(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
     """Return the seconds until each vehicle has its intent, `(..., 1+H)`; the ego's may come from a cloud."""
     ego_s: Floats | float = intents.inference_s[..., 0]
-    if point.round_trip_s is not None:
-        ego_s = point.round_trip_s
+    if point.cloud.round_trip_s is not None:
+        ego_s = point.cloud.round_trip_s
     elif point.network:
         if draws.trips is None:
             raise UserError("round_trip needs layouts, and the paper's study has none; give round_trip_s")

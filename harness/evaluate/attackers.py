@@ -38,7 +38,7 @@ class Attackers:
     """The attackers under one condition; they remember what helpers intended in each episode and seed."""
 
     def __init__(self, point: OperatingPoint) -> None:
-        self._attacks = attacks_of(point.attack)
+        self._attacks = attacks_of(point.guard.attack)
         self._steps = max((attack.steps for attack in self._attacks), default=0)
         self._intended: dict[tuple[int, int], list[Floats]] = {}
 

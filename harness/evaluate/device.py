@@ -150,7 +150,7 @@ def energy(
     for place, point in enumerate(points):
         here = condition == place
         sent_mj[here] = 1000 * radio_j(device, point, decisions["airtime_ms"][here] / 1000, sent[here])
-        if point.round_trip_s is not None or point.round_trip:  # the ego's model is in a cloud
+        if point.cloud.round_trip_s is not None or point.cloud.round_trip:  # the ego's model is in a cloud
             ego_j[condition == place], ego_s[condition == place] = np.nan, 0.0
     if device.idle_watts:
         idle_watts = device.idle_watts.value
@@ -188,7 +188,7 @@ def _inference(
     egos = {answer.scene: answer for answer in answers.values() if answer.role == "ego"}
     calls = {(a.scene, a.heard): a for a in answers.values() if a.role == "merge"}
     n, condition = len(decisions), decisions.codes("condition", [point.name for point in points])
-    fusing = {place: point.rewrites for place, point in enumerate(points) if point.asks_again}
+    fusing = {place: point.rewrites for place, point in enumerate(points) if point.has_fusion_call}
     senders = [decisions.labels(f"helper_{place}") for place in range(1, decisions.helpers + 1)]
     on_time, attackers = (decisions.of_messages(name) == 1.0 for name in ("on_time", "attacker"))
     ego_j, ego_s, call_j = np.zeros((3, n))

@@ -85,6 +85,6 @@ def points(
     derived = [
         named_point(point.name + ("," if ":" in point.name else ":") + setting)
         for setting in beside for point in named
-        if point.profile and setting.partition("=")[0] not in point.name
+        if point.radio.profile and setting.partition("=")[0] not in point.name
     ]  # fmt: skip
     return tuple(dict.fromkeys((*named, *derived)))

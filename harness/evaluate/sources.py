@@ -31,12 +31,12 @@ def sources(spec: Spec) -> dict[str, bytes]:
         if card in cards.names() and cards.load(agent.card.name) == agent.card:
             paths[f"models/{card}.toml"] = resources.find("models", f"{card}.toml")
     for point in spec.points:
-        if point.profile:
-            paths |= {f"channels/{name}": path for name, path in CHANNELS.files(point.profile).items()}
+        if point.radio.profile:
+            paths |= {f"channels/{name}": path for name, path in CHANNELS.files(point.radio.profile).items()}
         if point.network:
-            file = f"{point.round_trip}.toml"
+            file = f"{point.cloud.round_trip}.toml"
             paths[f"networks/{file}"] = resources.find("networks", file)
-        paths[f"schedules/{point.schedule}.toml"] = SCHEDULES.file(point.schedule)
+        paths[f"schedules/{point.ask.schedule}.toml"] = SCHEDULES.file(point.ask.schedule)
     device = spec.device_profile
     if device and device.name in resources.names("devices") and devices.load(device.name) == device:
         paths[f"devices/{device.name}.toml"] = resources.find("devices", f"{device.name}.toml")

@@ -245,9 +245,9 @@ class Spec:
 
     def _check_point(self, point: OperatingPoint) -> None:
         shown, ego = f"condition {printable(point.name)}", self.ego
-        if point.messages == "shuffled" and self.source.kind != "frozen":
-            raise UserError(f"{shown}: messages={point.messages} is for frozen scenes; use harness eval")
-        if not point.asks_again:
+        if point.ask.messages == "shuffled" and self.source.kind != "frozen":
+            raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
+        if not point.has_fusion_call:
             return
         reason = self.unmergeable
         if not ego.can.language_model:
@@ -314,12 +314,16 @@ class Spec:
             "helpers": [agent.settings() for agent in self.helpers],
             "world": msgspec.to_builtins(self.source.record()),
             "actions": list(self.actions),
-            "conditions": [asdict(point) for point in self.points],
-            "channels": {name: CHANNELS.record(name) for point in self.points if (name := point.profile)},
-            "networks": {point.round_trip: asdict(point.network) for point in self.points if point.network},
+            "conditions": [point.record() for point in self.points],
+            "channels": {
+                name: CHANNELS.record(name) for point in self.points if (name := point.radio.profile)
+            },
+            "networks": {
+                point.cloud.round_trip: asdict(point.network) for point in self.points if point.network
+            },
             "schedules": {
                 name: sha256
-                for name in (point.schedule for point in self.points)
+                for name in (point.ask.schedule for point in self.points)
                 if (sha256 := SCHEDULES.file_sha256(name))
             },
             "seeds": list(self.seeds),

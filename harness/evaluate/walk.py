@@ -156,14 +156,14 @@ def walk(
             intents = replace(intents, outlook=world.outlook())
         if any(point.needs("claims") for point in due):
             intents = replace(intents, claims=world.claims())
-        asked_blind = [of_point.at for point, of_point in due.items() if point.asks_blind]
+        asked_blind = [of_point.at for point, of_point in due.items() if point.blind_helpers]
         blind = ask.blind(moments, np.unique(np.concatenate(asked_blind))) if asked_blind else None
         intents, blind = _asked(ask, moments, due, intents, blind)
         said = {
             point: attackers[point].said(
                 heard(point, intents, blind, of_point),
                 of_point.draws,
-                of_point.episodes if point.attack else (),
+                of_point.episodes if point.guard.attack else (),
             )
             for point, of_point in due.items()
         }
@@ -172,7 +172,9 @@ def walk(
         decided = []
         for point, due_here in due.items():
             said_here = said[point]
-            call = calls[point.rewrites](due_here.at, shown(point, said_here)) if point.asks_again else None
+            call = (
+                calls[point.rewrites](due_here.at, shown(point, said_here)) if point.has_fusion_call else None
+            )
             fusion = Fusion(call, memories[point].recall(due_here), tie_draws(due_here.draws, ties))
             result = fuse(point, sent[point], said_here.intents, fusion)
             decided.append(Decided(point, moments, due_here, result, said_here))
@@ -197,7 +199,7 @@ def _asked(
             if here.unasked is not None and here.unasked.any():
                 decision, helper = np.nonzero(here.unasked & needed(point, here, due_here.draws))
                 moment = due_here.at[_sources(point, due_here)[decision]]
-                wanted[point.asks_blind][moment, helper] = True
+                wanted[point.blind_helpers][moment, helper] = True
         if not (wanted[False].any() or wanted[True].any()):
             return intents, blind
         if wanted[False].any():
@@ -218,11 +220,11 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
     """
     every = np.array_equal(due.at, np.arange(len(intents.own)))
     own = intents if every else intents.take(due.at)
-    if point.asks_blind:
+    if point.blind_helpers:
         assert blind is not None
         said = blind.take(due.at)
         return _saying(own, said, said.valid)
-    if point.messages != "shuffled":
+    if point.ask.messages != "shuffled":
         return own
     other = _sources(point, due)
     said, alone = own.take(other), other == np.arange(len(other))
@@ -237,7 +239,7 @@ def _saying(own: Intents, said: Intents, valid: Bools) -> Intents:
 
 def _sources(point: OperatingPoint, due: Due) -> Ints:
     """Return the decision whose helpers each decision hears, (n,): its own, but where they are shuffled."""
-    if point.messages != "shuffled":
+    if point.ask.messages != "shuffled":
         return np.arange(len(due.at))
     order = np.lexsort((due.episode, due.seed))
     following = np.roll(order, -1)
@@ -273,7 +275,7 @@ def _fusion_calls(
     This can happen before any decision, since who is heard does not depend on the fusion.
     """
     calls = {}
-    for rewrites in dict.fromkeys(point.rewrites for point in due if point.asks_again):
+    for rewrites in dict.fromkeys(point.rewrites for point in due if point.has_fusion_call):
         alike = {point: due_here for point, due_here in due.items() if point.rewrites == rewrites}
         calls[rewrites] = ask.fusion_call(moments, heard_codes(alike, said, sent), rewrites)
     return calls
@@ -286,7 +288,7 @@ def heard_codes(
     """Return the sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
     codes = [np.empty(0, dtype=int)]
     for point, due_here in due.items():
-        if point.asks_again:
+        if point.has_fusion_call:
             on_time = sent[point].on_time
             codes.append(codes_of(on_time, due_here.at, shown(point, said[point]))[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
@@ -365,7 +367,7 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
         "own_weight": c.weights[..., 0], "latency_ms": c.latency_s * 1000,
         "deadline_missed": np.where(np.isnan(c.latency_s), np.nan, c.deadline_missed),
         "fusion_ms": c.fusion_s * 1000,
-        "fusion_failed": np.where(anybody & point.asks_again, c.fusion_failed, np.nan),
+        "fusion_failed": np.where(anybody & point.has_fusion_call, c.fusion_failed, np.nan),
         "effective_loss": np.where(c.triggered, c.loss, np.nan), "observed_loss": c.observed_loss,
     }  # fmt: skip
 

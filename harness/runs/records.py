@@ -1,6 +1,6 @@
 """Define the typed records of a run's files; docs/files.md has the meaning of each name."""
 
-from typing import Any, Literal, get_type_hints
+from typing import Any, Literal
 
 from msgspec import UNSET, Struct, UnsetType, defstruct, field
 
@@ -343,7 +343,7 @@ class ChannelRecord(Struct, frozen=True, kw_only=True):
 
 # The settings of an operating point as a file states them; a run of another version has fewer or more.
 _CONDITION = defstruct(
-    "Condition", [(name, kind | UnsetType, UNSET) for name, kind in get_type_hints(OperatingPoint).items()]
+    "Condition", [(name, kind | UnsetType, UNSET) for name, kind in OperatingPoint.types().items()]
 )
 
 

@@ -174,7 +174,7 @@ def _messages(
     whole, at = _taken(part.result, decisions), due.at[decisions]
     rest = whole.on_time & (np.arange(whole.on_time.shape[1]) != helpers[:, None])
     call = None
-    if point.asks_again:
+    if point.has_fusion_call:
         attackers = shown(point, said)
         codes = np.unique(codes_of(rest, at, attackers)[rest.any(axis=1)])
         call = stored.fusion_call(moments, codes, point.rewrites)(at, attackers)

@@ -1,7 +1,7 @@
 """What can be swept, any setting of the operating point or the number of vehicles, and the grid points."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -50,11 +50,11 @@ class Axis:
             setting = "" if self.field == "attack" and value == NONE else setting_of(self.field, value)
         else:
             setting = scaled = value * self.scale
-            if isinstance(getattr(point, self.field), int) and scaled == int(scaled):
+            if isinstance(point.setting(self.field), int) and scaled == int(scaled):
                 setting = int(scaled)
         # A given loss stands in place of one that follows the number of vehicles.
-        freed = replace(point, density_coupled=False) if self.field == "loss" else point
-        return replace(freed, **{self.field: setting})  # type: ignore[arg-type]
+        freed = point.changed(density_coupled=False) if self.field == "loss" else point
+        return freed.changed(**{self.field: setting})
 
 
 AXES = {
@@ -75,7 +75,7 @@ def axis_of(name: str) -> Axis:
     """Return an axis by its name, or by that of any setting in its own unit. Raises UserError."""
     if name in AXES:
         return AXES[name]
-    usual = {name: getattr(POINTS["6g"], name)} if name in SETTINGS else _usual()
+    usual = {name: POINTS["6g"].setting(name)} if name in SETTINGS else _usual()
     if name not in usual:
         raise unknown("--over", name, {*AXES, *usual})
     return Axis(name, name.replace("_", " "), name, 1.0, "", isinstance(usual[name], str | bool))
@@ -110,7 +110,7 @@ def _usual() -> dict[str, object]:
     """Return what every setting of an operating point or of a channel usually is."""
     radios = CHANNELS.usable().values()
     of_radios = {name: getattr(channel, name) for channel in radios for name in settable(channel)}
-    return of_radios | {name: getattr(POINTS["6g"], name) for name in SETTINGS}
+    return of_radios | {name: POINTS["6g"].setting(name) for name in SETTINGS}
 
 
 def _values(axis: Axis, part: str) -> Sequence[float]:
@@ -160,6 +160,6 @@ def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tupl
 def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
     """Return the grid points, complete, for a manifest."""
     return {
-        name: [{"value": s.value, "vehicles": s.vehicles, **asdict(s.point)} for s in settings]
+        name: [{"value": s.value, "vehicles": s.vehicles, **s.point.record()} for s in settings]
         for name, settings in panels.items()
     }

@@ -108,8 +108,8 @@ class Choices:
         def choose(level: Level, ends: Floats, spent: Floats) -> Ints:
             intents = level.intents
             worth = worth_of(point, intents, level.draws) if known is None else known[id(level)]
-            may_ask = intents.valid & (intents.range_m <= point.radius_m)
-            asked = chosen(worth, point.asks_above, may_ask, intents.range_m, point.max_helpers)
+            may_ask = intents.valid & (intents.range_m <= point.ask.radius_m)
+            asked = chosen(worth, point.ask.above, may_ask, intents.range_m, point.ask.max_helpers)
             return self.index(asked).reshape(ends.shape[:2])
 
         return choose
@@ -127,14 +127,14 @@ def _of(values: Floats, k: Ints) -> Floats:
 
 def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
     """Raise UserError where what follows depends on more than who is heard now."""
-    shown = printable(point.name)
-    if point.consensus == EGO_PROMPT or RULES[point.consensus].start((), helpers, actions).shape[-1]:
+    shown, consensus = printable(point.name), point.fusion.consensus
+    if consensus == EGO_PROMPT or RULES[consensus].start((), helpers, actions).shape[-1]:
         raise UserError(
-            f"--condition {shown}: consensus {point.consensus} is no function of who is heard now, so that "
+            f"--condition {shown}: consensus {consensus} is no function of who is heard now, so that "
             "the oracle would be none; give linear, or another without memory"
         )
     for setting, honest in (("messages", "own"), ("attack", "")):
-        if getattr(point, setting) != honest:
+        if point.setting(setting) != honest:
             raise UserError(f"--condition {shown}: the oracle knows no {setting}; leave it out")
 
 
@@ -155,7 +155,7 @@ def choices(
     dataset, forest, seed = stored.dataset, stored.dataset.forest, np.array(seeds)
     helpers = stored.vehicles - 1
     refuse(point, helpers, len(dataset.actions))
-    sizes = range(min(point.max_helpers, helpers) + 1)
+    sizes = range(min(point.ask.max_helpers, helpers) + 1)
     members = [of for size in sizes for of in combinations(range(helpers), size)]
     if len(members) > MOST_SETS:
         raise UserError(

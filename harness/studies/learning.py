@@ -8,7 +8,7 @@ The threshold is chosen on tune layouts.
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +95,7 @@ def learn(train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callabl
     """
     made = [choices(stored, point, stored.seeds, progress) for stored in train]
     network, rest = None, [each.scheduled(point) for each in made]
-    looks = replace(point, schedule="coverage", threshold=None)  # it needs the outlook, as the network does
+    looks = point.changed(schedule="coverage", threshold=None)  # it needs the outlook, as the network does
     for _ in range(ROUNDS):
         pairs = [gains(each, looks, choose) for each, choose in zip(made, rest, strict=True)]
         network = fit(*(np.concatenate(part) for part in zip(*pairs, strict=True)))
@@ -109,7 +109,7 @@ def by_network(made: Choices, point: OperatingPoint, network: Network, threshold
     """Return the rule that asks whom the network says to."""
     schedule = Learnt(network, threshold)
     worths = [schedule.worth(known_of(point, level.intents, level.draws)) for level in made.levels]
-    return made.scheduled(replace(point, threshold=threshold), worths)
+    return made.scheduled(point.changed(threshold=threshold), worths)
 
 
 def tuned(
@@ -117,7 +117,7 @@ def tuned(
 ) -> float:
     """Return the threshold with the most success on tune layouts, averaged over runs; the highest such."""
     success = np.zeros(len(THRESHOLDS))
-    looks = replace(point, schedule="coverage", threshold=None)
+    looks = point.changed(schedule="coverage", threshold=None)
     for stored in tune:
         made = choices(stored, point, stored.seeds, progress)
         success += [made.played(by_network(made, looks, network, each))[0].mean() for each in THRESHOLDS]

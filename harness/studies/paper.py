@@ -1,7 +1,7 @@
 """`harness study paper`: operating points, swarm size, packet loss and entropy threshold, by the proxy."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from harness.coordination.operating_point import POINTS
@@ -37,9 +37,9 @@ def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
     Seeds times episodes is read as 5 x 1 500 and, at a grid point, 5 x 300.
     """
     # Helpers whose entropy is above tau open rounds of their own everywhere; at 0.7 nats none is.
-    points = {name: replace(point, helper_rounds=True) for name, point in POINTS.items()}
+    points = {name: point.changed(helper_rounds=True) for name, point in POINTS.items()}
     six = points["6g"]
-    crowded = replace(six, helper_rounds=False, density_coupled=True)
+    crowded = six.changed(helper_rounds=False, density_coupled=True)
     sizes = [Setting("6g", crowded, int(n), "size", n) for n in grid(AXES["size"], "1:8")]
     along = {
         name: [Setting("6g", AXES[name].at(six, v), VEHICLES, name, v) for v in grid(AXES[name])]

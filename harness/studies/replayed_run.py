@@ -213,7 +213,7 @@ class ReplayedRun:
         if manifest.device_profile is None:
             return np.full((len(moments), self.vehicles), np.nan)
         taken = device.vehicles_j(manifest.latency, moments, self._asker.answers)
-        if point.round_trip_s is not None or point.round_trip:
+        if point.cloud.round_trip_s is not None or point.cloud.round_trip:
             taken[:, 0] = np.nan  # the ego's model is in a cloud
         return taken
 

@@ -72,8 +72,8 @@ def headline(compared: Compared) -> list[str]:
     regret, bound = compared.regret, compared.oracle.means["messages"]
     sentences = [
         f"{compared.name}, {compared.point.name}: the oracle succeeds {shown(regret)} points more often than "
-        f"entropy above {compared.point.tau_nats:g} (n = {regret.n} episodes), with {bound:.1f} instead of "
-        f"{compared.paper.means['messages']:.1f} messages per episode."
+        f"entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} episodes), with {bound:.1f} instead "
+        f"of {compared.paper.means['messages']:.1f} messages per episode."
     ]
     within = [row for row in compared.rows[1:-1] if row.messages.value <= SLACK * compared.budget]
     if compared.tune and within:
@@ -100,7 +100,7 @@ def _steps(run: Compared, cost: str) -> Iterator[Steps]:
             color=COLOURS[n % len(COLOURS)], marker=MARKERS[n % len(MARKERS)],
         )  # fmt: skip
     yield steps("oracle, a bound", run.of_oracle(), linestyle="--", color=INK)
-    tau = f"entropy above {run.point.tau_nats:g}"
+    tau = f"entropy above {run.point.ask.tau_nats:g}"
     yield steps(tau, [run.paper], linestyle="", marker="*", color=INK, markersize=9)
 
 

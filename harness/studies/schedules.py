@@ -6,7 +6,7 @@ on tune layouts, where a run on such is given, and reported on others.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
@@ -43,10 +43,10 @@ class Setting:
     def at(self, point: OperatingPoint) -> OperatingPoint:
         """Return the operating point with this setting."""
         if self.schedule == PAPER and self.threshold is not None:
-            changed = replace(point, schedule=PAPER, threshold=None, tau_nats=self.threshold)
+            changed = point.changed(schedule=PAPER, threshold=None, tau_nats=self.threshold)
         else:
-            changed = replace(point, schedule=self.schedule, threshold=self.threshold)
-        return replace(changed, max_helpers=self.most)
+            changed = point.changed(schedule=self.schedule, threshold=self.threshold)
+        return changed.changed(max_helpers=self.most)
 
     def __str__(self) -> str:
         return f"{self.most}" if self.threshold is None else f"{self.most}, {self.threshold:g}"
@@ -86,13 +86,13 @@ def plays(choices: Choices, point: OperatingPoint, settings: Sequence[Setting]) 
 
 def settings(choices: Choices, point: OperatingPoint, schedule: str) -> list[Setting]:
     """Return the settings to try: tenths of what asking is worth, the own threshold, and 0."""
-    most = range(1, point.max_helpers + 1)
-    own = replace(point, schedule=schedule, threshold=None)
+    most = range(1, point.ask.max_helpers + 1)
+    own = point.changed(schedule=schedule, threshold=None)
     if schedule != PAPER and SCHEDULES[schedule].threshold is None:
         return [Setting(schedule, None, m) for m in most]
     best = [np.fmax.reduce(worth, axis=-1) for worth in choices.worths(own)]
     tenths = np.nanquantile(np.concatenate(best), SHARES).tolist()
-    tried = {0.0, own.asks_above, *(float(f"{value:.3g}") for value in tenths if value > 0)}
+    tried = {0.0, own.ask.above, *(float(f"{value:.3g}") for value in tenths if value > 0)}
     return [Setting(schedule, threshold, m) for threshold in sorted(tried) for m in most]
 
 
@@ -133,12 +133,12 @@ class Compared:
 
     @property
     def _paper(self) -> Setting:
-        return Setting(PAPER, self.point.tau_nats, self.point.max_helpers)
+        return Setting(PAPER, self.point.ask.tau_nats, self.point.ask.max_helpers)
 
     @property
     def everybody(self) -> Play:
         """Always asking all the helpers that the point allows."""
-        return _at(self.plays[ALWAYS], Setting(ALWAYS, None, self.point.max_helpers))
+        return _at(self.plays[ALWAYS], Setting(ALWAYS, None, self.point.ask.max_helpers))
 
     @cached_property
     def weights(self) -> Floats:
@@ -153,8 +153,8 @@ class Compared:
         Without tune layouts it is at the schedule's own threshold, with all helpers that the point allows.
         """
         if not self.tune:
-            threshold = self.point.tau_nats if schedule == PAPER else SCHEDULES[schedule].threshold
-            return _at(self.plays[schedule], Setting(schedule, threshold, self.point.max_helpers))
+            threshold = self.point.ask.tau_nats if schedule == PAPER else SCHEDULES[schedule].threshold
+            return _at(self.plays[schedule], Setting(schedule, threshold, self.point.ask.max_helpers))
         budget = self.budget * _at(self.tune[PAPER], self._paper).messages.mean()
         cheapest = min(self.tune[schedule], key=lambda play: play.messages.mean())
         within = [play for play in self.tune[schedule] if play.messages.mean() <= budget] or [cheapest]
@@ -239,7 +239,7 @@ class Compared:
 
     def random_like(self, play: Play) -> Floats:
         """Return success of `random` with as many messages, (S, E): a mean of its two shares next to it."""
-        most = self.point.max_helpers
+        most = self.point.ask.max_helpers
         every = [play for play in self.plays[RANDOM] if play.setting.most == most]
         ladder = sorted(
             [self.plays[NEVER][0], *every, self.everybody], key=lambda p: float(p.messages.mean())
@@ -281,7 +281,7 @@ def compare(
         if tune_run:
             of_tune[name] = plays(tune_run, point, tried)
         progress(1)
-    bound = Play(Setting(ORACLE, None, point.max_helpers), *run.oracle())
+    bound = Play(Setting(ORACLE, None, point.ask.max_helpers), *run.oracle())
     return Compared(stored.name, point, tuple(names), of_run, of_tune, bound, budget)
 
 

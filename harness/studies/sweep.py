@@ -78,7 +78,7 @@ def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
     if len(theirs) > 1:
         raise UserError(f"--condition {printable(name)} is not the same in all runs; sweep them one by one")
     point = theirs.pop() if theirs else named_point(name)
-    if point.profile is None:
+    if point.radio.profile is None:
         raise UserError(f"--condition {printable(name)} has no channel; nothing of it can be varied")
     return point
 
@@ -93,7 +93,7 @@ def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, t
         "tau": grid(AXES["tau"]),
     }
     panels = {name: settings(runs, [AXES[name]], [values], conditions) for name, values in grids.items()}
-    crowded = (replace(s, point=replace(s.point, density_coupled=True, loss=None)) for s in panels["size"])
+    crowded = (replace(s, point=s.point.changed(density_coupled=True, loss=None)) for s in panels["size"])
     core = tuple(Setting(name, point, vehicles) for name, point in own.items())
     return {CORE: core, **panels, "size": tuple(crowded)}
 
@@ -113,7 +113,7 @@ def run_sweep(
 
     def able(source: Source, point: OperatingPoint) -> bool:
         # The proxy has no model that could answer a fusion call, or blindly.
-        return source in runs or not (point.asks_again or point.asks_blind)
+        return source in runs or not (point.has_fusion_call or point.blind_helpers)
 
     results = {
         panel: [

@@ -5,7 +5,7 @@ same episodes, channel draws and attackers, so differences are paired by episode
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property, partial
 from itertools import product
@@ -92,7 +92,7 @@ def under(point: OperatingPoint, rule: str, attack: str, share: float) -> Operat
         raise UserError(f"--rules {printable(rule)}: a rule may have a weight_cap, such as {CAPPED}")
     more: dict[str, Any] = {key: setting_of(key, value) for key, value in pairs.items()}
     name = f"{point.name} · {rule}" + (f" · {text}" if text else "")
-    return replace(point, name=name, consensus=consensus, attack=text, **more)
+    return point.changed(name=name, consensus=consensus, attack=text, **more)
 
 
 def names_of(option: str, text: str, usual: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
@@ -252,7 +252,7 @@ def run_bench(
     point = point_of([run], condition)
     if why := point.idle("attack"):
         raise UserError(f"--condition {printable(condition)}: no attack changes anything: {why}")
-    if point.attack or EGO_PROMPT in rules:
+    if point.guard.attack or EGO_PROMPT in rules:
         raise UserError(
             "harness study trust: give a condition without attack, and rules that are arithmetic; a fusion "
             f"call is attacked by `harness eval --condition {condition}:consensus={EGO_PROMPT} --attack "
@@ -267,8 +267,8 @@ def run_bench(
         *product(dict.fromkeys([BASE, *rules]), attacks, shares),
     ]
     depends_on = [
-        run.manifest(), str(run.run.manifest.identity), asdict(point), list(seeds),
-        point.profile and CHANNELS.record(point.profile), versions(),
+        run.manifest(), str(run.run.manifest.identity), point.record(), list(seeds),
+        point.radio.profile and CHANNELS.record(point.radio.profile), versions(),
     ]  # fmt: skip
     kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[Key, Cell]()
 
@@ -281,7 +281,7 @@ def run_bench(
     for key in every:
         cells[key] = Cell(*key, **kept.part(key, partial(compute, key)))
         progress(1)
-    never = FrozenWorld(run.dataset, [alone := OperatingPoint("never asks", None)], seeds)
+    never = FrozenWorld(run.dataset, [alone := OperatingPoint.of("never asks")], seeds)
     for _ in walk(never, [alone], run.asked_in(never, [alone]), run.spec.ties):
         pass
     run.settle()

@@ -1,7 +1,5 @@
 """Runs whose every text is an attack, and the attacks: each way into markup with each thing to do there."""
 
-from dataclasses import replace
-
 from run_on_disk import configure, made_up
 
 from harness.coordination.operating_point import POINTS
@@ -79,7 +77,7 @@ def hostile(folder, dataset, n, conditions=PAYLOADS[:1]):
         decision=lambda row: _decision(row, dangers.setdefault(row["scene"], said())),
         episode=lambda row: row.update(danger=said()),
         answer=lambda row: _answer(row, said, n),
-        points=[replace(POINTS["6g"], name=name) for name in conditions],
+        points=[POINTS["6g"].changed(name=name) for name in conditions],
         seeds=(0,),
         episodes=3,
         steps=1,

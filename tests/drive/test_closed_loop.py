@@ -29,9 +29,9 @@ OPTIONS = (
 def test_every_grid_point_is_a_condition_that_its_name_tells() -> None:
     found = panels()
     assert [s.point.name for s in found["core"]] == ["single-local", "v2x", "6g"]
-    sizes = [(s.point.max_helpers, s.point.loss) for s in found["size"]]
+    sizes = [(s.point.ask.max_helpers, s.point.radio.loss) for s in found["size"]]
     assert sizes == [(0, 0.0), (1, 0.006), (2, 0.036), (3, 0.066)]
-    assert [s.point.loss for s in found["loss"]][:3] == [0.0, 0.05, 0.1]
+    assert [s.point.radio.loss for s in found["loss"]][:3] == [0.0, 0.05, 0.1]
     assert found["tau"][0].point.name == "6g:tau_nats=0.3"
 
 

@@ -212,7 +212,7 @@ def test_the_luck_is_the_frozen_runs(small):
 
 
 def test_helpers_that_cannot_be_heard_make_no_difference_but_time():
-    deaf = replace(POINTS["v2x"], name="deaf", loss=1.0)
+    deaf = POINTS["v2x"].changed(name="deaf", loss=1.0)
     alone, unheard = driven(spec(points=(ALONE, deaf), seeds=(0,), first_seed=FROM_LEFT)).episodes
     assert alone.messages == 0 < unheard.messages
     assert unheard.latency_ms > alone.latency_ms

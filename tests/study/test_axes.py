@@ -42,10 +42,10 @@ def test_every_axis_has_a_usual_grid_that_its_point_allows() -> None:
 
 def test_values_take_the_axis_unit() -> None:
     point = POINTS["6g"]
-    assert AXES["loss"].at(point, 0.1).loss == pytest.approx(0.1)
-    assert AXES["window"].at(point, 250.0).window_s == pytest.approx(0.25)
-    assert AXES["latency"].at(point, 25.0).latency_s == pytest.approx(0.025)
-    assert AXES["consensus"].at(point, "median").consensus == "median"
+    assert AXES["loss"].at(point, 0.1).radio.loss == pytest.approx(0.1)
+    assert AXES["window"].at(point, 250.0).fusion.window_s == pytest.approx(0.25)
+    assert AXES["latency"].at(point, 25.0).radio.latency_s == pytest.approx(0.025)
+    assert AXES["consensus"].at(point, "median").fusion.consensus == "median"
 
 
 def test_any_setting_is_an_axis_in_its_own_unit() -> None:
@@ -57,7 +57,7 @@ def test_any_setting_is_an_axis_in_its_own_unit() -> None:
         ("fallback", "uniform,brake", ("uniform", "brake")),
     ):
         axis = axis_of(name)
-        swept = [getattr(axis.at(point, value), name) for value in grid(axis, text)]
+        swept = [axis.at(point, value).setting(name) for value in grid(axis, text)]
         assert swept == list(settings)
         assert list(map(type, swept)) == [type(setting) for setting in settings]
     with pytest.raises(UserError, match=r"max_helpers is 1\.5"):

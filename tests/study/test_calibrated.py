@@ -29,7 +29,7 @@ from harness.studies.calibrated import (
 from harness.studies.fit import fit
 from harness.studies.play import WalkResult
 
-SURE = OperatingPoint("6g", "6g", loss=0.0)  # nothing is lost
+SURE = OperatingPoint.of("6g", "6g", loss=0.0)  # nothing is lost
 
 
 def walked(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0) -> WalkResult:
@@ -85,7 +85,7 @@ def test_stratified_draws_are_uniform_and_columns_independent() -> None:
 def test_every_seed_has_every_kind_of_episode_in_its_share() -> None:
     """Of 300, .689 x 300 = 206.7 guess rightly; the first helper saves .264 x .406 x 300 = 32.2."""
     source = Calibrated(300)
-    first_alone = replace(SURE, max_helpers=1)
+    first_alone = SURE.changed(max_helpers=1)
     for seed in range(20):
         alone = success(source, POINTS["single-local"], seed=seed)
         saved = success(source, first_alone, seed=seed) & ~alone
@@ -101,7 +101,7 @@ def test_luck_is_spread_over_those_whom_it_decides() -> None:
     for seed in range(40):
         alone, all_heard, some_heard = (
             success(source, point, vehicles=2, seed=seed)
-            for point in (POINTS["single-local"], SURE, replace(POINTS["6g"], loss=0.4))
+            for point in (POINTS["single-local"], SURE, POINTS["6g"].changed(loss=0.4))
         )
         heard.append((some_heard & ~alone).sum() / (all_heard & ~alone).sum())
     assert np.mean(heard) == pytest.approx(0.36, abs=0.03)
@@ -149,15 +149,15 @@ def test_what_nobody_reads_rightly_no_message_saves():
 def test_on_a_serial_channel_the_third_reply_is_late():
     """145 + 3 x 25 ms: whoever depends on the third helper is not saved."""
     third = Calibrated(100, Parameters(left_share=0.0, right_share=0.0, guess_right=0.0, know_right=1.0))
-    serial = replace(POINTS["v2x"], loss=0.0)
+    serial = POINTS["v2x"].changed(loss=0.0)
     assert not success(third, serial).any()
-    assert success(third, replace(serial, window_s=0.25)).all()
+    assert success(third, serial.changed(window_s=0.25)).all()
 
 
 def test_an_ego_that_has_heard_keeps_what_it_learnt():
     """It hears the witness while it asks; in the last decision it asks nobody, and is right."""
     source = Calibrated(300, Parameters(guess_right=0.0, know_right=1.0))
-    made = walked(source, replace(SURE, tau_nats=0.85))
+    made = walked(source, SURE.changed(tau_nats=0.85))
     asked = by_episode(made, "triggered") == 1.0
     quiet_at_last = asked[:, :-1].any(axis=1) & ~asked[:, -1]
     assert quiet_at_last.any()
@@ -167,13 +167,13 @@ def test_an_ego_that_has_heard_keeps_what_it_learnt():
 
 def test_alone_in_the_swarm_is_alone():
     source = Calibrated(300)
-    crowded = replace(POINTS["6g"], density_coupled=True)
+    crowded = POINTS["6g"].changed(density_coupled=True)
     assert (success(source, crowded, vehicles=1) == success(source, POINTS["single-local"])).all()
 
 
 def test_a_threshold_above_the_largest_entropy_is_as_good_as_no_channel():
     source = Calibrated(300)
-    deaf = replace(POINTS["6g"], tau_nats=float(np.log(ACTIONS)))
+    deaf = POINTS["6g"].changed(tau_nats=float(np.log(ACTIONS)))
     made = walked(source, deaf)
     assert not made.columns["triggered"].any()
     assert (ends(made) == success(source, POINTS["single-local"])).all()
@@ -181,7 +181,7 @@ def test_a_threshold_above_the_largest_entropy_is_as_good_as_no_channel():
 
 def test_more_loss_saves_nobody_who_was_lost_with_less():
     source = Calibrated(400)
-    saved = [success(source, replace(POINTS["6g"], loss=loss)) for loss in (0.0, 0.1, 0.3, 0.6, 1.0)]
+    saved = [success(source, POINTS["6g"].changed(loss=loss)) for loss in (0.0, 0.1, 0.3, 0.6, 1.0)]
     for less, more in pairwise(saved):
         assert (less >= more).all()
 
@@ -197,9 +197,9 @@ def test_more_helpers_change_nothing_of_the_first_ones_draws():
 def test_helpers_that_are_unsure_load_the_channel():
     """Below every entropy four vehicles transmit: 6.6 %; above the helpers' only the ego does."""
     source = Calibrated(50)
-    busy = replace(POINTS["6g"], helper_rounds=True)
-    low = walked(source, replace(busy, tau_nats=0.2))
-    high = walked(source, replace(busy, tau_nats=0.7))
+    busy = POINTS["6g"].changed(helper_rounds=True)
+    low = walked(source, busy.changed(tau_nats=0.2))
+    high = walked(source, busy.changed(tau_nats=0.7))
     assert low.columns["effective_loss"] == pytest.approx(np.full(50 * STEPS, 0.066))
     assert high.columns["effective_loss"] == pytest.approx(np.full(50 * STEPS, 0.012))
 

@@ -152,7 +152,7 @@ def by_hand(tune: bool = True) -> Compared:
     # On tune layouts the cheap entropy is worse than never, and dear.
     worse = [plays["entropy"][0], play("entropy", 1, 0.7, [0, 0, 0, 0], [1] * 4)]
     oracle = play("oracle", 2, None, [1, 1, 1, 1], [0, 1, 1, 2])
-    point = replace(SIXG, max_helpers=2)
+    point = SIXG.changed(max_helpers=2)
     return Compared("x", point, ("entropy",), plays, {**plays, "entropy": worse} if tune else {}, oracle, 0.5)
 
 
@@ -315,7 +315,7 @@ def test_a_schedule_is_learnt_and_then_one_of_its_name(
     assert "2 layouts" in text["learnt_from"][0]
     mine = SCHEDULES["mine"]
     assert isinstance(mine, Learnt)
-    assert mine.threshold == text["threshold"] == named_point("6g:schedule=mine").asks_above
+    assert mine.threshold == text["threshold"] == named_point("6g:schedule=mine").ask.above
     once = Path("schedules/mine.toml").read_text()
     code, _, err = harness(*typed)
     assert code == 2

@@ -1,7 +1,7 @@
 """Two finished runs on the same scenes with the same draws, as arrays of one layout."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -128,7 +128,7 @@ def _side(run: Run) -> Side:
         parameters = stated["world"]["scenario"]["parameters"]
         named["scenario"] = {key: parameters[key] for key in DIALS if key in parameters}
     # Through the class, which gives a setting that the run does not know the value it had then.
-    points = [asdict(OperatingPoint.from_dict(condition)) for condition in stated["conditions"]]
+    points = [OperatingPoint.from_dict(condition).record() for condition in stated["conditions"]]
     named["condition"] = {point["name"]: point for point in points}
     settings = {name: str(value) for name, value in facts(nameless(named)) if value is not None}
     return Side(run, settings, by_episode(metrics_of(run.world), run.grid, run.decisions, run.episodes))

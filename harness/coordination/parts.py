@@ -1,0 +1,200 @@
+"""Define the parts of an operating point: radio, whom the ego asks, fusion, what guards it, a cloud.
+
+Each part checks itself and raises ValueError with the setting, its value and what it must be.
+"""
+
+import math
+from typing import Annotated, Any, get_type_hints
+
+from msgspec import Meta, Struct, ValidationError, convert, structs
+
+from harness.coordination.attacks import attacks_of
+from harness.coordination.rules import EGO_PROMPT, RULES, names
+from harness.coordination.schedules import SCHEDULES
+from harness.coordination.scheduling import ORACLE, PAPER
+from harness.core.config import LONGEST_S
+from harness.core.errors import printable, unknown
+from harness.radio.networks import network
+from harness.radio.profiles import CHANNELS
+
+FALLBACKS = ("uniform", "brake")
+MESSAGES = ("own", "shuffled", "blind")
+DEFENCES = ("quoted", "schema", "majority")
+RELAY, FUSION = "relay", "fusion"
+EDGES = ("none", RELAY, FUSION)
+MOST_HELPERS = 1000
+
+Seconds = Annotated[float, Meta(ge=0, le=LONGEST_S, description="seconds, 0 or more, at most 3600")]
+Metres = Annotated[float, Meta(gt=0, le=1e6, description="metres above 0, at most 1000000")]
+Place = Annotated[float, Meta(ge=-10_000, le=10_000, description="metres from -10000 to 10000")]
+Text = Annotated[str, Meta(description="a text")]
+Flag = Annotated[bool, Meta(description="true or false")]
+
+
+class Part(Struct, frozen=True, kw_only=True):
+    """Settings that are checked as they are made; whole numbers become floats where a float is meant."""
+
+    def __post_init__(self) -> None:
+        for key, hint in get_type_hints(type(self), include_extras=True).items():
+            value = getattr(self, key)
+            try:
+                held = convert(value, hint)
+                if isinstance(held, float) and not math.isfinite(held):
+                    raise ValidationError
+            except (ValidationError, OverflowError):
+                raise wrong(key, value, _allowed(hint)) from None
+            structs.force_setattr(self, key, held)
+        self.check()
+
+    def check(self) -> None:
+        """Raise ValueError or UserError for what no single setting's type says."""
+
+
+def wrong(key: str, value: object, allowed: str) -> ValueError:
+    """Return the error of a setting that is not allowed."""
+    return ValueError(f"{key} is {printable(repr(value))}; it must be {allowed}")
+
+
+def _allowed(hint: Any) -> str:
+    for each in (hint, *getattr(hint, "__args__", ())):
+        for meta in getattr(each, "__metadata__", ()):
+            return str(meta.description)
+    raise AssertionError(hint)
+
+
+class Ask(Part, frozen=True, kw_only=True):
+    """Whom the ego asks, when, and what it hears."""
+
+    # The rule for whom and when: `entropy`, the paper's, or another of `SCHEDULES`.
+    schedule: Text = PAPER
+    # The entropy above which the ego asks, under the paper's schedule.
+    tau_nats: Annotated[float, Meta(ge=0, description="a finite number of nats, 0 or more")] = 0.7
+    # The worth above which another schedule asks, in its unit; None keeps the schedule's own.
+    threshold: Annotated[float, Meta(ge=0, description="a finite number, 0 or more")] | None = None
+    radius_m: Metres = 100.0  # the paper's R; helpers farther from the ego are not asked
+    # The cooperative neighbourhood; if there are more helpers, the nearest are asked.
+    max_helpers: Annotated[
+        int, Meta(ge=0, le=MOST_HELPERS, description=f"a whole number, 0 or more, at most {MOST_HELPERS}")
+    ] = 3
+    # Size of the request. The default is 50 bytes: who asks whom and until when, as compact JSON without a
+    # signature or headers. Replies are counted in the same way.
+    request_bits: Annotated[float, Meta(ge=0, le=1e12, description="bits, 0 or more, at most 1e12")] = 400.0
+    on_demand: Flag = False  # whether a helper infers only when it is asked, not in parallel with the ego
+    # What the ego hears: its `own` helpers, or as a control helpers of another layout (`shuffled`) or helpers
+    # that are shown nothing (`blind`). A gain that remains under a control is not from what helpers see.
+    messages: Text = "own"
+
+    def check(self) -> None:
+        if self.messages not in MESSAGES:
+            raise unknown("messages", self.messages, MESSAGES)
+        if self.schedule == ORACLE:
+            raise ValueError(
+                f"schedule {ORACLE} looks at how scenes end; `harness study schedule compare` plays it, and "
+                f"others are {', '.join(SCHEDULES)}"
+            )
+        if self.schedule not in SCHEDULES:
+            raise unknown("schedule", self.schedule, SCHEDULES)
+        if self.threshold is not None and self.schedule == PAPER:
+            raise wrong("threshold", self.threshold, f"left out where schedule is {PAPER}: its is tau_nats")
+        if self.threshold is not None and SCHEDULES[self.schedule].threshold is None:
+            raise wrong(
+                "threshold", self.threshold, f"left out where schedule is {self.schedule}, which has none"
+            )
+
+    @property
+    def above(self) -> float:
+        """The worth above which the ego asks, in the schedule's unit."""
+        if self.schedule == PAPER:
+            return self.tau_nats
+        default = SCHEDULES[self.schedule].threshold
+        return self.threshold if self.threshold is not None else 0.0 if default is None else default
+
+
+class Radio(Part, frozen=True, kw_only=True):
+    """The channel, what replaces its profile's settings, and a roadside unit."""
+
+    profile: Text | None = None  # channel profile; None disables V2V
+    # Probability that one transmission is lost; None keeps that of the profile or of the link.
+    loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")] | None = None
+    latency_s: Seconds | None = None  # nominal seconds of one exchange; None keeps the profile's
+    density_coupled: Flag = False  # whether loss follows the number of active vehicles
+    # Whether a helper whose entropy is above tau opens a round of its own, which loads the channel.
+    helper_rounds: Flag = False
+    # What a roadside unit does: `relay` sends replies once more; `fusion` asks the helpers for the ego and
+    # fuses (`harness.radio.roadside`). With the constant model a relay has no place (`constant.Radio`).
+    edge: Text = "none"
+    # From the end of what the unit receives to the start of what it sends: processing and backhaul. The
+    # default is declared: a unit that has nothing to wait for.
+    edge_delay_s: Seconds = 0.0
+    edge_x_m: Place = 0.0  # to the east of the centroid of the conflict zone; 0 and 0 is a gantry above it
+    edge_y_m: Place = 0.0  # to the south
+    # Height of the unit's antenna; by default that of TR 37.885, table 6.1.4-1, a roadside unit.
+    edge_antenna_m: Annotated[float, Meta(ge=1, le=100, description="metres from 1 to 100")] = 5.0
+    further: Text = ""  # further settings of the profile's channel, such as `density_per_km=200`
+
+    def check(self) -> None:
+        if self.profile is not None and self.profile not in CHANNELS:
+            raise unknown("channel profile", self.profile, CHANNELS, "; leave it out to disable V2V")
+        if self.edge not in EDGES:
+            raise unknown("edge", self.edge, EDGES)
+
+
+class Fusion(Part, frozen=True, kw_only=True):
+    """How the ego fuses what it has heard in time."""
+
+    consensus: Text = "linear"  # consensus rule, or `ego-prompt`
+    # Decision window, from the start of the decision; a later reply is not fused.
+    window_s: Annotated[float, Meta(gt=0, le=LONGEST_S, description="seconds above 0, at most 3600")] = 0.2
+    min_distance_m: Metres = 1.0  # lower bound of d in the paper's Eq. 2
+    # The ego's d in Eq. 2; None takes its distance to the centroid of the conflict zone. The paper's preset
+    # declares a proxy of 3.5 m (section IV-A).
+    ego_distance_m: Metres | None = None
+    # Largest share of the weight that one helper may have (`consensus.capped`); 1 caps nothing.
+    weight_cap: Annotated[float, Meta(gt=0, le=1, description="a share above 0, up to 1")] = 1.0
+    # What replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass on the
+    # first action, which is the most conservative one.
+    fallback: Text = "uniform"
+
+    def check(self) -> None:
+        if self.fallback not in FALLBACKS:
+            raise unknown("fallback", self.fallback, FALLBACKS)
+        if self.consensus not in RULES and self.consensus != EGO_PROMPT:
+            raise unknown("consensus", self.consensus, names())
+
+
+class Guard(Part, frozen=True, kw_only=True):
+    """What some helpers do instead of saying what they intend, and what guards a fusion call."""
+
+    attack: Text = ""  # such as `liar:share=1/3+spoof` (`harness.coordination.attacks`); empty for none
+    # Some of `DEFENCES` joined by `+`: `quoted` makes evidence a JSON string; `schema` removes free text from
+    # messages; `majority` lets an action on which most voices agree win against the call's.
+    defence: Text = ""
+
+    def check(self) -> None:
+        attacks_of(self.attack)
+        for part in filter(None, self.defence.split("+")):
+            if part not in DEFENCES:
+                raise unknown("defence", part, DEFENCES)
+
+    @property
+    def defences(self) -> tuple[str, ...]:
+        """The defences, in the order of `DEFENCES`."""
+        return tuple(part for part in DEFENCES if part in self.defence.split("+"))
+
+
+class Cloud(Part, frozen=True, kw_only=True):
+    """Where the ego's model runs, if not in the vehicle; at most one of the two is set."""
+
+    # From the ego's question to the answer of a model in a cloud; replaces the ego's own inference.
+    round_trip_s: Seconds | None = None
+    # Network over which the ego asks its model in a cloud, a name of `harness.radio.networks`. Each decision
+    # draws a round trip, which is added to the model's inference.
+    round_trip: Text = ""
+
+    def check(self) -> None:
+        if self.round_trip:
+            network(self.round_trip)
+            if self.round_trip_s is not None:
+                raise wrong(
+                    "round_trip", self.round_trip, "left out where round_trip_s says all; keep one of the two"
+                )
