@@ -215,7 +215,7 @@ def test_renamed_settings_are_mapped() -> None:
     point = {"name": "6g", "roadside_edge": True}
     [read] = formats.upgraded({"conditions": [point]})["conditions"]
     assert read["edge"] == "relay"
-    assert OperatingPoint.from_dict({**read, "profile": "6g"}).edge == "relay"
+    assert OperatingPoint.from_dict({**read, "profile": "6g"}).radio.edge == "relay"
 
 
 @pytest.mark.parametrize(

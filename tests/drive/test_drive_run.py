@@ -40,7 +40,7 @@ def whole(tmp_path_factory):
 
 
 def test_a_run_holds_what_was_driven_and_enough_to_drive_it_again(whole):
-    assert {p.name for p in whole.iterdir()} == {*FILES, "run.json", "sources"}
+    assert {p.name for p in whole.iterdir()} == {*FILES, "run.json", "run.toml", "sources"}
     manifest = json.loads((whole / "run.json").read_text())
     assert manifest["format"] == FORMAT
     assert (manifest["latency"]["ego_s"], manifest["latency"]["helper_s"]) == (0.145, 0.145)
@@ -99,7 +99,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
             resumed += 1
         if not (out / "run.json").exists() or (out / ".work").exists():
             assert folder_of(cruise, out) == expected
-        assert {p.name for p in out.iterdir()} == {*FILES, "run.json", "sources"}
+        assert {p.name for p in out.iterdir()} == {*FILES, "run.json", "run.toml", "sources"}
     assert resumed == 3
 
 
