@@ -184,7 +184,7 @@ def test_what_a_run_lacks_has_an_entry(run: str) -> None:
     helpers = sum(name.startswith("helper_") for name in columns)
     with (HERE / run / "episodes.csv").open() as file:
         head = next(csv.reader(file))
-    condition = {field.name for field in fields(OperatingPoint)}
+    condition = {*OperatingPoint.types()}
     card = {field.name for field in fields(Card)} - {"letters"}  # a setting of the agent
     lacks = {
         "SETTINGS": set(records.Manifest.__struct_fields__) - {*stated, *formats.AGENT},
