@@ -149,6 +149,52 @@ class Comparison:
         return _page([*names, *self.findings, *self.report["caveats"]], _frame(self.differences))
 
 
+def run(
+    *, out: str | PathLike[str] | None = None, cache: bool = True, workers: int = 1, quiet: bool = False,
+    **options: Any,
+) -> Run:  # fmt: skip
+    """Evaluate a model with a prompt, on frozen scenes or in closed loop, and return the run.
+
+    A run that was stopped goes on; the same call where it is finished raises UserError, as the command does.
+
+    Args:
+        out: the run's folder. Default: the command line's, under `reports`.
+        cache: whether answers that an earlier run stored are taken.
+        workers: processes; for rules on frozen scenes, and in closed loop.
+        quiet: whether progress is left out.
+        options: settings of `harness eval`, or of `harness drive` if one of its own is among them, such as
+            `scenario`: each by its name there, with `_` for `-`; a list where it is repeatable.
+
+    Raises:
+        UserError: a setting is unknown or not allowed, or the folder holds something else.
+    """
+    from harness.backends.cache import default_file
+    from harness.cli.run import default_out, evaluate
+    from harness.evaluate import resolve, settings
+    from harness.evaluate.spec import Source
+
+    names = {kind: {each.name: each for each in settings.options(kind)} for kind in settings.WORLDS.values()}
+    frozen, driven = names.values()
+    kind = settings.DriveSettings if set(options) & (driven.keys() - frozen) else settings.FrozenSettings
+    for name in options:
+        if name not in names[kind]:
+            raise unknown("setting", name, list(names[kind]))
+    given = {
+        name: [value] if names[kind][name].kind == list[str] and isinstance(value, str) else value
+        for name, value in options.items()
+    }
+    stated = settings.changed(settings.Settings(world=kind()), given)
+    source: Source
+    if isinstance(stated.world, settings.FrozenSettings):
+        source = resolve.frozen(stated.world, stated.world.dataset)
+    else:
+        source = resolve.driven(stated.world)
+    spec = resolve.spec(stated, source)
+    folder = default_out(spec) if out is None else Path(out)
+    evaluate(spec, folder, cache=default_file() if cache else None, quiet=quiet, workers=workers)
+    return load(folder)
+
+
 def load(run: str | PathLike[str]) -> Run:
     """Load a finished run.
 

@@ -25,7 +25,7 @@ def folder(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_there_are_few_names_and_importing_loads_nothing_else() -> None:
-    assert dir(harness) == ["UserError", "__version__", "compare", "load", "ls"]
+    assert dir(harness) == ["UserError", "__version__", "compare", "load", "ls", "run"]
     code = "import sys, harness; assert not {'numpy', 'pandas', 'msgspec'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(AttributeError, match="no attribute 'evaluation'; it has UserError, compare"):
@@ -101,3 +101,26 @@ def test_what_plug_ins_build_on_is_pinned() -> None:
     # A name that goes stays here for a release, with a warning: CONTRIBUTING.md.
     assert sorted(extend.__all__, key=str.lower) == sorted(names.split(), key=str.lower)
     assert all(getattr(extend, name) for name in extend.__all__)
+
+
+def test_a_run_is_evaluated_with_the_command_lines_names(small_path: Path, tmp_path: Path) -> None:
+    made = harness.run(
+        model="local-view",
+        dataset=str(small_path),
+        condition="6g",
+        limit=2,
+        seeds="0:2",
+        out=tmp_path / "run",
+    )
+    assert made.config["seeds"] == [0, 1]
+    assert [each["name"] for each in made.config["conditions"]] == ["6g"]
+    assert (made.path / "report.html").is_file()
+    driven = harness.run(
+        model="local-view", scenario="hard-brake-ahead", condition=["6g"], episodes=1, seeds="0",
+        out=tmp_path / "driven", quiet=True,
+    )  # fmt: skip
+    assert driven.config["world"]["scenario"]["name"] == "hard-brake-ahead"
+    with pytest.raises(harness.UserError, match="unknown setting 'dataest'; did you mean 'dataset'"):
+        harness.run(dataest="x")
+    with pytest.raises(harness.UserError, match="unknown setting 'dataset'"):
+        harness.run(scenario="blind-merge", dataset="x")

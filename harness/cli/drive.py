@@ -1,6 +1,5 @@
 """`harness drive`: a model with a prompt drives in the simulator."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -9,12 +8,10 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
-from harness.cli.run import Column, as_mapping, default_out, show
-from harness.core import extras, work
+from harness.cli.run import Column, as_mapping, default_out, evaluate, show
+from harness.core import extras
 from harness.core.errors import UserError, printable
-from harness.core.files import text_of
-from harness.core.resources import folder
-from harness.core.seeds import purpose, stated
+from harness.core.seeds import stated
 from harness.evaluate.settings import OUTPUT, DriveSettings, Settings, changed
 
 if TYPE_CHECKING:
@@ -57,11 +54,9 @@ def command(
     If the run is stopped, the same command continues it.
     """
     from harness.backends.cache import default_file
-    from harness.core.seeds import LAST_EPISODE, LAST_SEED
+    from harness.cli.video import write_failures
     from harness.evaluate import resolve
-    from harness.evaluate.live_world import LiveSource
-    from harness.evaluate.run import evaluate, evaluate_shard
-    from harness.world.environments.examination import examine
+    from harness.evaluate.run import evaluate_shard
     from harness.world.scenarios import DEFAULT
 
     world: Any = settings.world
@@ -70,12 +65,6 @@ def command(
             raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
         settings = changed(settings, {"condition": ()})
     name = options.scenario_name(world.scenario if world.scenario or env else DEFAULT, env, env_config)
-    shipped = _shipped(name.partition(":")[0], DEFAULT)
-    episodes = shipped["episodes"] if world.episodes is None else world.episodes
-    first_seed = shipped["seed"] if world.first_seed is None else world.first_seed
-    options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
-    options.in_range("--first-seed", first_seed, 0, LAST_SEED)
-    purpose(first_seed, episodes)
     who, part = options.workers_of(workers), options.shard_of(shard)
     if part and (out is None or save_video):
         raise UserError(
@@ -83,9 +72,7 @@ def command(
         )
     if save_video:
         extras.need("--save-video", "matplotlib")
-    source = LiveSource(first_seed, episodes, name, world.sample, world.sample_seed)
-    if source.scenario.is_environment:
-        examine(source.scenario, first_seed)
+    source = resolve.driven(world, name)
     driven = len(source.numbers)
     options.in_range("--save-video", save_video, 0, driven)
     spec = resolve.spec(settings, source)
@@ -97,17 +84,12 @@ def command(
             options.say_shard(part, out, f"{mine} of {driven} episodes")
         return
     where = out or default_out(spec)
-    with bar(f"driving {printable(spec.ego.card.name, 30)}", driven, silent) as progress:
-        cache = None if no_cache else default_file()
-        done = evaluate(spec, where, progress, cache, workers=who)
-    # They draw with matplotlib, which no episode waits for.
-    from harness.cli.report import write
-    from harness.cli.video import write_failures
+    videos: list[Path] = []
 
-    with work.going_on(where):
-        page = write([where], quiet=silent)
-        videos = write_failures(where, save_video, silent) if save_video else []
-    work.tidy(where)
+    done, page = evaluate(
+        spec, where, cache=None if no_cache else default_file(), quiet=silent, workers=who,
+        then=lambda: videos.extend(write_failures(where, save_video, silent) if save_video else ()),
+    )  # fmt: skip
     tell(done, as_json, quiet)
     if silent:
         return
@@ -134,12 +116,3 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
         "it did; both are means over episodes",
     )
     show(done, "closed loop", COLUMNS, notes)
-
-
-def _shipped(scenario: str, otherwise: str) -> dict[str, Any]:
-    """Manifest of the dataset that ships of a scenario; where none does, of the one `otherwise`."""
-    manifests = [
-        json.loads(text_of(file, "record")) for file in sorted(folder("datasets").glob("*/manifest.json"))
-    ]
-    by_scenario: dict[str, dict[str, Any]] = {manifest["scenario"]: manifest for manifest in manifests}
-    return by_scenario.get(scenario) or by_scenario[otherwise]

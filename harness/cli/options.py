@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option, echo
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, in_range, printable
 from harness.core.files import text_of
 from harness.evaluate import settings as stated
 from harness.evaluate.settings import HELP, parse_seeds
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 else:  # typer takes any text; what is evaluated says which are allowed
     AnswerMode = LettersMode = str
 
-__all__ = ["parse_seeds"]
+__all__ = ["in_range", "parse_seeds"]
 
 _RAY = "or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT."
 
@@ -253,9 +253,3 @@ def say_shard(shard: "shards.Shard", out: Path, what: str) -> None:
         f"wrote {printable(out)}: {what}, shard {shard}; merge all {shard.of} shards with "
         "`harness run merge FOLDER... --out FOLDER`"
     )
-
-
-def in_range(option: str, value: int, least: int, most: int) -> None:
-    """Raise UserError unless `least` <= `value` <= `most`."""
-    if not least <= value <= most:
-        raise UserError(f"{option} {value} is out of range; give {least} to {most}")

@@ -10,13 +10,16 @@ import msgspec
 import typer
 
 from harness.cli.estimates import console, table
+from harness.cli.progress import bar
 from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.formats import WORK
 
 if TYPE_CHECKING:
+    from harness.core.parallel import Workers
     from harness.evaluate.agent import Agent
     from harness.evaluate.lifecycle import Evaluated
+    from harness.evaluate.run import Opens
     from harness.evaluate.spec import Spec
     from harness.runs.records import Manifest, Score
 
@@ -41,6 +44,33 @@ class Column:
 def file_name(model: str) -> str:
     """A model's name as part of a folder's."""
     return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
+
+
+def evaluate(
+    spec: "Spec", folder: Path, opens: "Opens | None" = None, *, cache: Path | None, quiet: bool,
+    workers: "Workers", then: "Callable[[], object]" = lambda: None,
+) -> "tuple[Evaluated, Path]":  # fmt: skip
+    """Evaluate, frozen or in closed loop, with a progress bar; write the run and its page.
+
+    `then` adds files to the run; a run that is stopped there resumes there.
+    """
+    from harness.cli.report import write
+    from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.run import evaluate as evaluated
+
+    name, dataset = printable(spec.ego.card.name, 30), None
+    if isinstance(spec.source, FrozenSource):
+        dataset = spec.source.dataset
+        progress = bar(f"asking {name}", quiet=quiet, grows=True)
+    else:
+        progress = bar(f"driving {name}", len(list(spec.source.layout_seeds)), quiet)
+    with progress as done:
+        run = evaluated(spec, folder, done, cache, done.more, workers, opens)
+    with work.going_on(folder):
+        page = write([folder], quiet=quiet, dataset=dataset, workers=workers if dataset else 1)
+        then()
+    work.tidy(folder)
+    return run, page
 
 
 def default_out(spec: "Spec") -> Path:

@@ -62,10 +62,10 @@ def evaluate(
     folder = out or free_folder(specs, suite.name, together.goes_on)
     together.check(folder)
     opens = cache(open_backend)
-    for spec, dataset in zip(specs, datasets, strict=True):
+    for spec in specs:
         run = folder / spec.source.name
         if not (run / "run.json").is_file() or (run / WORK).is_dir():
-            evaluated(spec, dataset, run, opens)
+            evaluated(spec, run, opens)
     by_family = {spec.scenario.name: dataset for spec, dataset in zip(specs, datasets, strict=True)}
     runs = {family: read(folder / dataset.name) for family, dataset in by_family.items()}
     done = SuiteRun(folder, suite.name, suite.description, runs)

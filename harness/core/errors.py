@@ -58,3 +58,9 @@ def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserE
         suggestion = f"; did you mean one of {', '.join(begin)}?"
     listed = ", ".join(names) or "(none)"
     return UserError(f"unknown {kind} {printable(name)!r}{suggestion} known: {listed}{hint}")
+
+
+def in_range(option: str, value: int, least: int, most: int) -> None:
+    """Raise UserError unless `least` <= `value` <= `most`."""
+    if not least <= value <= most:
+        raise UserError(f"{option} {value} is out of range; give {least} to {most}")

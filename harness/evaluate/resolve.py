@@ -1,19 +1,30 @@
-"""Make an evaluation of settings: cards, prompts, operating points and seeds in place of their names."""
+"""Make an evaluation of settings: cards, prompts, datasets, operating points and seeds in place of names."""
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from harness.backends import cards, devices
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
-from harness.core.errors import UserError, unknown
+from harness.core.errors import UserError, in_range, unknown
+from harness.core.files import text_of
+from harness.core.resources import folder
+from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose
+from harness.dataset import load
+from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
-from harness.evaluate.settings import Settings, parse_seeds
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.live_world import LiveSource
+from harness.evaluate.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
 from harness.runs.folder import read
+from harness.world.environments.examination import examine
 from harness.world.scenario import Scenario
+from harness.world.scenarios import DEFAULT
 
 CONTROLS = {"shuffled-messages": "messages=shuffled", "no-messages": "loss=1", "blind": "messages=blind"}
 
@@ -31,6 +42,42 @@ def spec(settings: Settings, source: Source) -> Spec:
         tags=tuple(dict.fromkeys(settings.tag)), ask=settings.ask,
         ties=_usual_ties(ego) if settings.ties is None else settings.ties,
     )  # fmt: skip
+
+
+def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
+    """Return the selected episodes of a dataset, by its name or folder."""
+    selection = Selection(world.limit, world.only, world.danger, world.sample, world.sample_seed)
+    whole = load.load(load.find(dataset), None if selection.given else world.limit)
+    return FrozenSource(selection.of(whole), selection)
+
+
+def driven(world: DriveSettings, scenario: str | None = None) -> LiveSource:
+    """Return the layouts that are driven; by default as many, and the same, as the shipped dataset has.
+
+    Raises:
+        UserError: an episode or seed is out of range, or mixed with those of another purpose, or the
+            scenario is an environment that cannot be driven.
+    """
+    name = scenario or world.scenario or DEFAULT
+    shipped = _shipped(name.partition(":")[0])
+    episodes = shipped["episodes"] if world.episodes is None else world.episodes
+    first_seed = shipped["seed"] if world.first_seed is None else world.first_seed
+    in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
+    in_range("--first-seed", first_seed, 0, LAST_SEED)
+    purpose(first_seed, episodes)
+    source = LiveSource(first_seed, episodes, name, world.sample, world.sample_seed)
+    if source.scenario.is_environment:
+        examine(source.scenario, first_seed)
+    return source
+
+
+def _shipped(scenario: str) -> dict[str, Any]:
+    """Return the manifest of the dataset that ships of a scenario; where none does, of the default one."""
+    manifests = [
+        json.loads(text_of(file, "record")) for file in sorted(folder("datasets").glob("*/manifest.json"))
+    ]
+    by_scenario: dict[str, dict[str, Any]] = {manifest["scenario"]: manifest for manifest in manifests}
+    return by_scenario.get(scenario) or by_scenario[DEFAULT]
 
 
 def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, ...]]:
