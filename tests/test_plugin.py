@@ -204,7 +204,7 @@ def test_the_metric_is_in_the_summary(frozen: Tables):
 
 def test_a_sweep_plays_the_rule_on_what_is_stored(project: Path, frozen: Tables):
     over = ("--over", "consensus", "--grid", "linear,smoothing", "--condition", "6g", "--condition", "fog")
-    typed(project, "sweep", "frozen", *over, "--quiet")
+    typed(project, "study", "sweep", "frozen", *over, "--quiet")
     table = pd.read_csv(project / "frozen" / "sweep-consensus" / "conditions.csv")
     swept = table.set_index(["condition", "value", "metric", "interval"])["mean"].sort_index()
     own = frozen.summary.set_index(["condition", "metric", "interval"]).value.sort_index()
