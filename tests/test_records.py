@@ -59,7 +59,9 @@ READERS = {
 }
 
 
-@pytest.mark.parametrize("command", READERS)
+@pytest.mark.parametrize(
+    "command", [pytest.param("report", marks=pytest.mark.slow), "csv", "jsonl", "junit", "compare"]
+)
 @pytest.mark.parametrize("run", RUNS)
 def test_commands_read_every_run(run: str, command: str, harness: Typed) -> None:
     code, _, error = harness(*READERS[command].format(run=HERE / run).split())
@@ -81,6 +83,7 @@ SAME = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", STUDIES)
 @pytest.mark.parametrize("run", STUDIED)
 def test_studies_read_frozen_runs(
@@ -91,6 +94,7 @@ def test_studies_read_frozen_runs(
     assert (code, error) == (0, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", ["356ad2b/proxy", "0103f23/attack"])
 def test_a_replay_decides_as_the_run_did(run: str, kept: Callable[[str], Path], harness: Typed) -> None:
     harness(*f"eval --model replay:{kept(run)} {SAME[run]} --ties first --quiet --out again".split())
@@ -119,6 +123,7 @@ def test_folders_of_runs_are_listed_shown_and_compared(commit: str, harness: Typ
     assert browser.get("/run?path=sweep").status_code == 200
 
 
+@pytest.mark.slow
 def test_runs_of_different_days_are_compared(harness: Typed) -> None:
     code, out, error = harness("compare", HERE / "356ad2b/proxy", HERE / "0103f23/proxy")
     assert (code, error) == (0, "")
@@ -157,6 +162,7 @@ def test_what_a_run_cannot_have_is_one_line(commit: str, harness: Typed) -> None
 BEGUN = "drive --model local-view --episodes 40 --seeds 0 --workers 1 --condition single-local --quiet"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("commit", ["8cccefb", "0103f23"])
 def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: Typed) -> None:
     """The part that it had is taken as it is."""
@@ -232,6 +238,7 @@ def test_another_format_is_one_line(version: str, why: str) -> None:
         formats.checked(version, "run.json")
 
 
+@pytest.mark.slow
 def test_a_run_whose_tables_cannot_be_read_is_made_again_from_its_answers(
     kept: Callable[[str], Path], harness: Typed
 ) -> None:

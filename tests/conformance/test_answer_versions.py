@@ -113,6 +113,7 @@ def test_every_engine_but_a_replay_is_pinned() -> None:
     assert {engine for engine, _ in CARDS.values()} | {"replay"} == set(BUILT_IN)
 
 
+@pytest.mark.slow
 def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Path) -> None:
     """Every operating point, rule, attack and schedule, with the answers of the proxy."""
     changes = [
