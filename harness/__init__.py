@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from harness.core.errors import UserError
 
 if TYPE_CHECKING:
-    from harness.api import compare, load, ls, run
+    from harness.api import compare, load, ls, run, sweep
 
-__all__ = ["UserError", "compare", "load", "ls", "run"]
+__all__ = ["UserError", "compare", "load", "ls", "run", "sweep"]
 __version__ = "0.2.0"
 
 

@@ -1,6 +1,6 @@
 """Evaluate, load and compare runs from Python; results show themselves in a notebook (docs/python.md)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
@@ -149,6 +149,26 @@ class Comparison:
         return _page([*names, *self.findings, *self.report["caveats"]], _frame(self.differences))
 
 
+@dataclass(frozen=True)
+class Study:
+    """A finished study. A notebook shows its outcome and its figures."""
+
+    path: Path  # its folder, with `index.html`
+    headline: Sequence[str]  # the outcome in sentences
+    about: Sequence[str]  # n, what intervals are over, and what the outcome is conditional on
+    tables: "Mapping[str, pd.DataFrame]"  # its data, by the name of the file
+
+    def _repr_html_(self) -> str:
+        from harness.report.library import picture
+
+        image = '<img alt="{}" src="{}">'
+        figures = [
+            Markup(image).format(file.stem, picture(file.read_bytes()))
+            for file in sorted(self.path.glob("*.svg"))
+        ]
+        return _page(self.headline, *figures, *(Markup("<p>{}</p>").format(text) for text in self.about))
+
+
 def run(
     *, out: str | PathLike[str] | None = None, cache: bool = True, workers: int = 1, quiet: bool = False,
     **options: Any,
@@ -237,7 +257,47 @@ def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Compa
     )
 
 
-def _page(sentences: list[str], *parts: Markup | str) -> str:
+def sweep(
+    run: str | PathLike[str] | Run, over: str | Sequence[str] = (), grid: str | Sequence[str] = (), *,
+    condition: str | Sequence[str] = "6g", seeds: str | None = None, out: str | PathLike[str] | None = None,
+    quiet: bool = False,
+) -> Study:  # fmt: skip
+    """Score a run's stored answers at other operating points; write the study and return it.
+
+    Args:
+        run: the run. Its model is asked only where it has no answer.
+        over: settings to vary, as `harness study sweep --over` takes them; several are crossed.
+        grid: the values of each, such as `0:1:0.25`.
+        condition: operating points that are varied.
+        seeds: channel seeds, such as `0:5`. Default: the run's.
+        out: the study's folder. Default: the command line's, in the run's folder.
+        quiet: whether progress is left out.
+
+    Raises:
+        UserError: an axis, a value or a condition is unknown, or the folder holds another study.
+    """
+    from harness.cli.progress import bar
+    from harness.evaluate.settings import parse_seeds
+    from harness.studies.replayed_run import ReplayedRun
+    from harness.studies.study import write_study
+    from harness.studies.sweep import folder_of, panels_over, run_sweep
+
+    path = run.path if isinstance(run, Run) else Path(run)
+    with bar("grid points", quiet=quiet, grows=True) as progress:
+        replayed = ReplayedRun(path, more=progress.more, done=progress, say=progress.say)
+        panels = panels_over([replayed], _several(over), _several(grid), _several(condition))
+        progress.more(sum(map(len, panels.values())))
+        folder = folder_of(path, panels) if out is None else Path(out)
+        draws = parse_seeds(seeds) if seeds else replayed.seeds
+        study = run_sweep([replayed], panels, draws, folder, progress)
+    return Study(write_study(study, folder).parent, study.headline, study.about, study.data)
+
+
+def _several(value: str | Sequence[str]) -> Sequence[str]:
+    return [value] if isinstance(value, str) else value
+
+
+def _page(sentences: Sequence[str], *parts: Markup | str) -> str:
     paragraphs = [Markup("<p>{}</p>").format(sentence) for sentence in sentences]
     return Markup("").join([*paragraphs, *map(escape, parts)])
 

@@ -25,7 +25,7 @@ def folder(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_there_are_few_names_and_importing_loads_nothing_else() -> None:
-    assert dir(harness) == ["UserError", "__version__", "compare", "load", "ls", "run"]
+    assert dir(harness) == ["UserError", "__version__", "compare", "load", "ls", "run", "sweep"]
     code = "import sys, harness; assert not {'numpy', 'pandas', 'msgspec'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(AttributeError, match="no attribute 'evaluation'; it has UserError, compare"):
@@ -124,3 +124,13 @@ def test_a_run_is_evaluated_with_the_command_lines_names(small_path: Path, tmp_p
         harness.run(dataest="x")
     with pytest.raises(harness.UserError, match="unknown setting 'dataset'"):
         harness.run(scenario="blind-merge", dataset="x")
+
+
+def test_a_sweep_is_the_command_lines(folder: Path, tmp_path: Path) -> None:
+    study = harness.sweep(folder / "proxy", "loss", "0,1", out=tmp_path / "sweep", quiet=True)
+    table = study.tables["conditions"].query("metric == 'success_rate' and interval == 'episodes'")
+    assert table.value.tolist() == [0.0, 1.0]
+    assert study._repr_html_().count("<img") == len(list(study.path.glob("*.svg"))) >= 1
+    assert (study.path / "index.html").is_file()
+    with pytest.raises(harness.UserError, match="--grid: 2 given for 1 of --over"):
+        harness.sweep(folder / "proxy", "loss", ["0,1", "2"])

@@ -7,7 +7,7 @@ import typer
 from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.show import finish
-from harness.core.errors import UserError, unknown
+from harness.core.errors import unknown
 
 PROXY_EPISODES = 300  # a seed, as in the paper's sweeps
 
@@ -56,40 +56,22 @@ def command(
 
     The model is asked only where the run has no answer.
     """
-    from harness.studies.axes import CROSS, axis_of
-    from harness.studies.axes import grid as values_of
     from harness.studies.calibrated import Calibrated
     from harness.studies.play import Source
     from harness.studies.replayed_run import ReplayedRun
-    from harness.studies.sweep import run_sweep, settings, usual
+    from harness.studies.sweep import folder_of, panels_over, run_sweep
 
-    axes = [axis_of(name) for name in dict.fromkeys(over or ())]
-    given: list[str | None] = [*(grid or ())]
-    if len(given) > len(axes):
-        raise UserError(
-            f"--grid: {len(given)} given for {len(axes)} of --over; give one for each --over, in the same "
-            "order"
-        )
     if latency not in ("run", "paper"):
         raise unknown("--latency", latency, ("run", "paper"))
-    grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]
-    conditions = list(dict.fromkeys(condition))
     with bar("grid points", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
         replayed = [
             ReplayedRun(run, latency, progress.more, progress, not no_model, dataset, own, progress.say)
             for run in runs
         ]
-        parts = [slice(n, n + 1) for n in range(len(axes))] if apart else [slice(None)]
-        panels = {
-            CROSS.join(axis.name for axis in axes[part]): settings(
-                replayed, axes[part], grids[part], conditions
-            )
-            for part in parts
-            if axes
-        } or usual(replayed, conditions)
+        panels = panels_over(replayed, over or (), grid or (), list(dict.fromkeys(condition)), apart)
         draws = options.parse_seeds(seeds) if seeds else replayed[0].seeds
-        where = out or runs[0] / f"sweep-{'-'.join(panels).replace(CROSS, '-')}"
+        where = out or folder_of(runs[0], panels)
         sources: list[Source] = [*replayed, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
         progress.more(len(sources) * sum(map(len, panels.values())))
         study = run_sweep(sources, panels, draws, where, progress)

@@ -1,7 +1,8 @@
 """`harness study sweep`: a run's answers, scored again at every point of a grid."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.runs.metrics import SUCCESS
-from harness.studies.axes import AXES, CORE, CROSS, Axis, Setting, Value, crossed, described, grid
+from harness.studies.axes import AXES, CORE, CROSS, Axis, Setting, Value, axis_of, crossed, described, grid
 from harness.studies.figures.bars import operating_points
 from harness.studies.figures.heat_map import heat_map
 from harness.studies.figures.lines import along
@@ -96,6 +97,43 @@ def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, t
     crowded = (replace(s, point=s.point.changed(density_coupled=True, loss=None)) for s in panels["size"])
     core = tuple(Setting(name, point, vehicles) for name, point in own.items())
     return {CORE: core, **panels, "size": tuple(crowded)}
+
+
+def panels_over(
+    runs: Sequence[ReplayedRun], over: Sequence[str], grids: Sequence[str], conditions: Sequence[str],
+    apart: bool = False,
+) -> dict[str, tuple[Setting, ...]]:  # fmt: skip
+    """Return the panels of a sweep by name.
+
+    Args:
+        runs: whose answers are scored.
+        over: names of axes; without any, the paper's panels are returned.
+        grids: the values of each, in the same order; the axis's usual ones where there is none.
+        conditions: names of the operating points that are varied.
+        apart: whether each axis has a panel of its own, instead of all in one, crossed.
+
+    Raises:
+        UserError: as `settings`; or there are more grids than axes.
+    """
+    axes = [axis_of(name) for name in dict.fromkeys(over)]
+    if len(grids) > len(axes):
+        raise UserError(
+            f"--grid: {len(grids)} given for {len(axes)} of --over; give one for each --over, in the same "
+            "order"
+        )
+    values = [grid(axis, text) for axis, text in zip_longest(axes, grids)]
+    parts = [slice(n, n + 1) for n in range(len(axes))] if apart else [slice(None)]
+    panels = {
+        CROSS.join(axis.name for axis in axes[part]): settings(runs, axes[part], values[part], conditions)
+        for part in parts
+        if axes
+    }
+    return panels or usual(runs, conditions)
+
+
+def folder_of(run: Path, panels: Iterable[str]) -> Path:
+    """Return where a run's sweep lies by default."""
+    return run / f"sweep-{'-'.join(panels).replace(CROSS, '-')}"
 
 
 def run_sweep(
