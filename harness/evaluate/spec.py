@@ -68,49 +68,35 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Spec:
-    """One evaluation.
+    """One evaluation."""
 
-    Attributes:
-        ego: the agent that answers for the ego.
-        source: the world that is walked.
-        points: the conditions, each an operating point.
-        seeds: seeds of the channel's draws.
-        helpers: the agents that answer for the helpers. Helpers take them in turn, in the order in which they
-            were spawned. Empty if the ego's agent answers for the helpers, too.
-        batch_size: the most requests that go through an engine together.
-        servers: base URLs of the served model, which replace that of its card; any of them may answer.
-        device: the engines' device; None leaves the choice to them.
-        dtype: number format of the weights; None takes each card's.
-        temperature: sampling temperature; 0 takes the likeliest token each time.
-        sampling_seed: seed of the sampling; under another one, the same question gets other answers.
-        latency: where inference times come from: `card`, `paper`, `measured`, or seconds as `declared`
-            reads them; None for each card's, else the paper's.
-        device_profile: the computer that every vehicle has; it replaces `latency`: the time of an answer
-            follows from its own tokens. None for no profile.
-        device_model: the model whose row of the profile times all answers; None for each agent's own row.
-        tags: words by which to find the run; they change nothing in it.
-        ask: `used` asks a helper only when a condition uses its answer; `all` asks every helper in every
-            scene, which gives the same decisions.
-        ties: which of several likeliest actions is taken: one that is `drawn`, or the `first`.
-    """
-
-    ego: Agent
-    source: Source
-    points: tuple[OperatingPoint, ...]
-    seeds: tuple[int, ...]
+    ego: Agent  # the agent that answers for the ego
+    source: Source  # the world that is walked
+    points: tuple[OperatingPoint, ...]  # the conditions, each an operating point
+    seeds: tuple[int, ...]  # seeds of the channel's draws
+    # the agents that answer for the helpers. Helpers take them in turn, in the order in which they were
+    # spawned. Empty if the ego's agent answers for the helpers, too
     helpers: tuple[Agent, ...] = ()
-    batch_size: int = 8
+    batch_size: int = 8  # the most requests that go through an engine together
+    # base URLs of the served model, which replace that of its card; any of them may answer
     servers: tuple[str, ...] = ()
-    device: str | None = None
-    dtype: str | None = None
-    temperature: float = 0.0
-    sampling_seed: int = 0
+    device: str | None = None  # the engines' device; None leaves the choice to them
+    dtype: str | None = None  # number format of the weights; None takes each card's
+    temperature: float = 0.0  # sampling temperature; 0 takes the likeliest token each time
+    sampling_seed: int = 0  # seed of the sampling; under another one, the same question gets other answers
+    # where inference times come from: `card`, `paper`, `measured`, or seconds as `declared` reads them; None
+    # for each card's, else the paper's
     latency: str | None = None
+    # the computer that every vehicle has; it replaces `latency`: the time of an answer follows from its own
+    # tokens. None for no profile
     device_profile: Device | None = None
+    # the model whose row of the profile times all answers; None for each agent's own row
     device_model: str | None = None
-    tags: tuple[str, ...] = ()
+    tags: tuple[str, ...] = ()  # words by which to find the run; they change nothing in it
+    # `used` asks a helper only when a condition uses its answer; `all` asks every helper in every scene,
+    # which gives the same decisions
     ask: str = ASKS[0]
-    ties: str = TIES[0]
+    ties: str = TIES[0]  # which of several likeliest actions is taken: one that is `drawn`, or the `first`
 
     def __post_init__(self) -> None:
         if all(agent == self.ego for agent in self.helpers):
