@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from harness.api import compare, load, ls, run, sweep
 
 __all__ = ["UserError", "compare", "load", "ls", "run", "sweep"]
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 
 def __dir__() -> list[str]:

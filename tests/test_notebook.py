@@ -10,7 +10,7 @@ pytest.importorskip("ipykernel", reason="needs the dev extra")
 import nbformat
 from nbclient import NotebookClient
 
-NOTEBOOK = Path(__file__).parent.parent / "examples/run-as-tables.ipynb"
+NOTEBOOK = Path(__file__).parent.parent / "examples/from-python.ipynb"
 
 
 @pytest.mark.slow
@@ -20,4 +20,7 @@ def test_the_example_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not any(cell.outputs or cell.execution_count for cell in code)
     code[0].source = code[0].source.replace("LIMIT = 40", "LIMIT = 4")
     NotebookClient(notebook, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    assert [cell.outputs[0].output_type for cell in code[1:]] == ["execute_result"] * 5 + ["display_data"]
+    results, picture = code[:-1], code[-1]
+    assert [cell.outputs[-1].output_type for cell in results] == ["execute_result"] * len(results)
+    assert all("text/html" in cell.outputs[-1].data for cell in results[:4])
+    assert picture.outputs[0].output_type == "display_data"

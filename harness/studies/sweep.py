@@ -184,7 +184,7 @@ def run_sweep(
     return Study(
         "sweep", f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",
         [f"{table.title}: {in_a_sentence(table)}." for table in shown],
-        [f"n = {counts(sources, seeds)}. {PAIRED}"], shown,
+        [f"{counts(sources, seeds)}. {PAIRED}"], shown,
         {"conditions": summary, "episodes": whole.episodes},
         # Anew, since sources state what was left out.
         {**stated, "sources": [s.manifest() for s in sources], "versions": versions()},
@@ -196,7 +196,7 @@ def run_sweep(
 def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
     """Return how many episodes and seeds each source has, in words."""
     of_sources = (
-        f"{source.name}: {source.episodes} episodes × {len(seeds)} seeds"
+        f"{source.name}: n = {source.episodes} episodes × {len(seeds)} seeds"
         + (" of their own" if not source.same_episodes else "")
         for source in sources
     )
