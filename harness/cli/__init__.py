@@ -96,15 +96,15 @@ def _typed() -> None:
     try:
         sys.exit(_program()(standalone_mode=False))
     except UserError as error:
-        _fail(_noted(str(error), error), error.code)
+        _fail(_with_notes(str(error), error), error.code)
     except ModuleNotFoundError as error:
         if (lack := extras.OPTIONAL.get((error.name or "").partition(".")[0])) is None:
             raise
         _fail(str(extras.without("this command", *lack)))
     except shell.Stopped as stopped:
         stop = stopped.__cause__
-        said, code = (stop.word, stop.code) if isinstance(stop, Stop) else ("interrupted", 130)
-        _fail(_noted(said, stop), code)
+        words, code = (stop.word, stop.code) if isinstance(stop, Stop) else ("interrupted", 130)
+        _fail(_with_notes(words, stop), code)
     except _UsageError as error:
         message, context = error.format_message(), error.ctx
         if message.startswith("Usage:"):  # a group without a command shows its help
@@ -115,13 +115,13 @@ def _typed() -> None:
         _fail(f"{printable(message, 300)} in `{typed}`; see `{path} --help`")
 
 
-def _noted(said: str, error: BaseException | None) -> str:
-    """What is said of an error, with its notes of what is kept, and how to go on from there."""
+def _with_notes(words: str, error: BaseException | None) -> str:
+    """Return the words of an error, with its notes of what is kept, and how to go on from there."""
     notes = getattr(error, "__notes__", ())
     if not notes:
-        return said
+        return words
     typed = printable(shlex.join(["harness", *sys.argv[1:]]), 2000)
-    return "; ".join((said, *notes, f"type the same command to continue: {typed}"))
+    return "; ".join((words, *notes, f"type the same command to continue: {typed}"))
 
 
 def _fail(message: str, code: int = 2) -> None:

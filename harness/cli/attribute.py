@@ -42,8 +42,8 @@ def command(
             run, more=progress.more, done=progress, dataset=dataset, models=own, say=progress.say
         )
         chosen = condition or (USUAL if USUAL in stored.points else stored.run.conditions[-1])
-        found = attribute(stored, chosen, sample, sample_seed)
-    file, study = write(found, run), attribution_study(found, stored)
+        attribution = attribute(stored, chosen, sample, sample_seed)
+    file, study = write(attribution, run), attribution_study(attribution, stored)
     if as_json:
         echo_answer(study)
     elif not quiet:

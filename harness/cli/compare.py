@@ -49,8 +49,8 @@ def command(
     if junit and not fail_if:
         raise UserError("--junit writes gates; give one or more with --fail-if")
     gates = [gate(typed) for typed in fail_if or ()]
-    if said := [f"{words} ({printable(run)})" for run in (a, b) if gates and (words := why(run))]:
-        lacks = f"{'; '.join(said)}: the model could not be asked, so that --fail-if has nothing to judge"
+    if reasons := [f"{words} ({printable(run)})" for run in (a, b) if gates and (words := why(run))]:
+        lacks = f"{'; '.join(reasons)}: the model could not be asked, so that --fail-if has nothing to judge"
         if junit:
             save([text.junit_of_none([each.text for each in gates], lacks)], junit, "--junit")
         raise UserError(f"{lacks}; type the command of the run again")

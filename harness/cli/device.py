@@ -76,8 +76,8 @@ def show(
         raise UserError(f"--window-ms {window_ms:g} is out of range; give more than 0, to {MOST_MS}")
     device = devices.load(name)
     rows = _rows(device, model)
-    told = of_run(read(run)) if run else declared(prompt_tokens, answer_tokens)
-    found = fits(device, rows, told, window_ms / 1000)
+    answers = of_run(read(run)) if run else declared(prompt_tokens, answer_tokens)
+    results = fits(device, rows, answers, window_ms / 1000)
     if as_json:
         echo_json({
             "device": msgspec.to_builtins(device), "window_ms": window_ms, "run": run and str(run),
@@ -85,7 +85,7 @@ def show(
                 {"model": fit.row.model, "answer": fit.answer, "prompt_tokens": fit.prompt_tokens,
                  "output_tokens": fit.output_tokens, "ms": known(1000 * fit.seconds),
                  "in_time": as_mapping(fit.in_time), "joules": as_mapping(fit.joules)}
-                for fit in found
+                for fit in results
             ],
         })  # fmt: skip
         return
@@ -103,13 +103,13 @@ def show(
                 _share(fit.in_time) if run else _yes(fit.in_time.value),
                 _interval(fit.joules) if run else _shown(fit.joules.value, 2),
             )
-            for fit in found
+            for fit in results
         ],
     )
     typer.echo()
     if run:
         _say(
-            f"{printable(run)}: n = {len(told.prompt)} answers of {printable(told.who)} for the ego; "
+            f"{printable(run)}: n = {len(answers.prompt)} answers of {printable(answers.who)} for the ego; "
             "tokens and ms are medians, in time and J are means with 95 % intervals over episodes; in time: "
             f"within {window_ms:g} ms; readout: one token after the same prompts. Tokens are counted by the "
             "model's own tokenizer"
@@ -135,12 +135,12 @@ def check(
 
     device, done = devices.load(name), read(run)
     row = devices.find_row(device, model or str(done.manifest.model["name"]).partition(":")[0])
-    found = held(device, row, done)
+    results = held(device, row, done)
     if as_json:
         echo_json([
             {"role": each.role, "what": each.what, "measured": as_mapping(each.measured),
              "stated": known(each.stated)}
-            for each in found
+            for each in results
         ])  # fmt: skip
         return
     scales = {"seconds": ("answer, ms", 1000.0), "prefill_tokens_per_s": ("prefill, tokens/s", 1.0),
@@ -155,7 +155,7 @@ def check(
                 _shown(each.stated * scales[each.what][1], 1),
                 str(each.measured.n),
             )
-            for each in found
+            for each in results
         ],
     )
     _say(f"medians of answers asked alone, with 95 % intervals over episodes; {printable(row.model)}'s row")
@@ -244,11 +244,11 @@ def _origins(device: "Device", rows: "list[DeviceRow]") -> None:
     from harness.backends.devices import JOULES, RATES, constants
 
     for names, head in ((RATES, "rates"), (tuple(JOULES), "J")):
-        said = {
+        sources = {
             f"{c.status} ({_source(device, c)})": None
             for row in rows for name, c in constants(device, row) if name in names and c
         }  # fmt: skip
-        _say(f"{head}: {'; '.join(said) or 'unknown, since nobody states them'}")
+        _say(f"{head}: {'; '.join(sources) or 'unknown, since nobody states them'}")
     _say(f"power mode: {device.power_mode}")
 
 

@@ -68,8 +68,8 @@ def command(
 def _show_paces(paces: "Mapping[str, Sequence[Mapping[str, Any]]]") -> None:
     from harness.evaluate.pace import Pace, advice
 
-    for n, (name, found) in enumerate(paces.items()):
-        _line("" if n else "paces", f"{name}: {advice([Pace(**pace) for pace in found])}")
+    for n, (name, engine_paces) in enumerate(paces.items()):
+        _line("" if n else "paces", f"{name}: {advice([Pace(**pace) for pace in engine_paces])}")
 
 
 def _paces(quiet: bool) -> dict[str, list[dict[str, Any]]]:
@@ -79,14 +79,14 @@ def _paces(quiet: bool) -> dict[str, list[dict[str, Any]]]:
     from harness.core.errors import Unanswered
     from harness.evaluate.pace import paces
 
-    found = {}
+    by_card = {}
     stems = cards.names()
     with bar("timing engines", len(stems), quiet) as progress:
         for stem in stems:
             with suppress(UserError, Unanswered):  # a card with a mistake is reported above
-                found[stem] = [asdict(pace) for pace in paces(stem)]
+                by_card[stem] = [asdict(pace) for pace in paces(stem)]
             progress(1)
-    return {stem: of for stem, of in found.items() if of}
+    return {stem: of for stem, of in by_card.items() if of}
 
 
 def _line(head: str, text: str) -> None:

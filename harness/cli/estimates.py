@@ -50,8 +50,8 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     folded = zip(*([""] * (height - len(stack)) + stack for stack in stacks), strict=True)
     names_of_heads = [""] * (height - 1) + [heads[0]]
     lines = [*((name, *cells) for name, cells in zip(names_of_heads, folded, strict=True)), *rows]
-    names, *others = ([cell_len(cell) for cell in column] for column in zip(*lines, strict=True))
-    widths = [max(column) for column in others]
+    names, *values = ([cell_len(cell) for cell in column] for column in zip(*lines, strict=True))
+    widths = [max(column) for column in values]
     rooms = {gap: WIDTH - sum(widths) - gap * len(widths) for gap in (2, 1)}
     gap, room = max(rooms.items(), key=lambda item: sum(length <= item[1] for length in names))
     first = max((length for length in names if length <= room), default=0)

@@ -56,8 +56,8 @@ def command(
 
     files = {"--junit": junit, "--inspect": inspect, "--sft": sft}
     asked = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
-    [option, *others] = [name for name, given in asked.items() if given] or [""]
-    if others or not option:
+    [option, *surplus] = [name for name, given in asked.items() if given] or [""]
+    if surplus or not option:
         raise UserError(f"{', '.join(asked)}: give exactly one of them")
     if report_seeds_too and not sft:
         raise UserError("--report-seeds-too only goes with --sft; give --sft, or leave it out")
@@ -67,10 +67,10 @@ def command(
         raise UserError(
             f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
         )
-    if junit and (said := work.unanswered(run)):
+    if junit and (reason := work.unanswered(run)):
         from harness.report.page import save
 
-        save([export.junit_of_none(run, said)], junit, "--junit")
+        save([export.junit_of_none(run, reason)], junit, "--junit")
         typer.echo(printable(junit, 1000))
         return
     source, folder = read(run), out or run
@@ -99,7 +99,7 @@ def command(
                 written = [inspect_log.write(source, inspect, dataset)]
     except OSError as error:
         where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"
-        other = "name another file" if target else "choose another folder with --out"
-        raise UserError(f"{where} cannot be written ({error.strerror}); {other}") from None
+        remedy = "name another file" if target else "choose another folder with --out"
+        raise UserError(f"{where} cannot be written ({error.strerror}); {remedy}") from None
     for file in written:
         typer.echo(printable(file, 1000))

@@ -38,11 +38,11 @@ def list_models(as_json: options.Json = False) -> None:
     from harness.backends.registry import missing
 
     rows: list[tuple[str, Card | UserError, str | None]] = []
-    for name, found in resources.each(cards.names(), cards.each_engine).items():
-        if isinstance(found, UserError):
-            rows.append((name, found, None))
+    for name, entry in resources.each(cards.names(), cards.each_engine).items():
+        if isinstance(entry, UserError):
+            rows.append((name, entry, None))
         else:
-            rows += [(card.name, card, missing(card)) for card in found]
+            rows += [(card.name, card, missing(card)) for card in entry]
     if as_json:
         echo_json([
             {"name": name, "error": str(card)} if isinstance(card, UserError)
@@ -59,10 +59,10 @@ def list_models(as_json: options.Json = False) -> None:
         seconds = card.latency.inference_s
         latency = "paper" if seconds is None else f"card {seconds * 1000:g} ms"
         here = f"no: {lack}" if lack else "yes"
-        stem, _, other = name.partition(":")
+        stem, _, engine = name.partition(":")
         # A card's other engines stand below it.
-        typer.echo(line.format("" if other else printable(stem), card.engine, card.thinking, latency, here))
-        if not other:
+        typer.echo(line.format("" if engine else printable(stem), card.engine, card.thinking, latency, here))
+        if not engine:
             typer.echo(f"  {printable(card.description, 78)}")
 
 
@@ -115,14 +115,14 @@ def check(
                 f"{card.name}: engine {card.engine} is model-free: no weights, no tokens, nothing to load"
             )
         return
-    spec, seen, found = _seen(card, thinking, device, dtype)
+    spec, seen, result = _seen(card, thinking, device, dtype)
     paces = _paces(card)
     if as_json:
         typer.echo(
             json.dumps(
                 {
                     **head, "model_free": False, "thinking_asked": spec.ego.thinking, **asdict(seen),
-                    "findings": found and {**to_builtins(found), "reads_scene": found.reads_scene},
+                    "findings": result and {**to_builtins(result), "reads_scene": result.reads_scene},
                     "paces": [asdict(pace) for pace in paces],
                 },
                 indent=2,
@@ -130,7 +130,7 @@ def check(
         )  # fmt: skip
     else:
         _show(spec, seen)
-        _show_findings(found)
+        _show_findings(result)
         if paces:
             typer.echo(f"engines      {advice(paces)}")
     every = [*seen.answers.values(), *(seen.looks.answers.values() if seen.looks else ())]
@@ -151,7 +151,7 @@ def _usable(spec: "Spec", seen: "Checkup") -> bool:
     from harness.evaluate.asking import answer_of
 
     asked = spec.ego.blank("ego", spec.actions)
-    return any(answer_of(asked.alike(answer=mode), said).intent for mode, said in seen.answers.items())
+    return any(answer_of(asked.alike(answer=mode), reply).intent for mode, reply in seen.answers.items())
 
 
 def _blind(card: "Card", fault: str) -> str:
@@ -201,12 +201,12 @@ def _seen(
     if read_out is None or read_out.error is not None or (seen.looks and seen.looks.fault):
         return spec, seen, None
     with bar(f"examining {printable(card.name, 30)}", COUNT) as progress:
-        found = examine(backend, ego, progress)
-    if isinstance(found, str):
-        typer.echo(f"harness: the fixed questions got no answer: {printable(found, 300)}", err=True)
+        result = examine(backend, ego, progress)
+    if isinstance(result, str):
+        typer.echo(f"harness: the fixed questions got no answer: {printable(result, 300)}", err=True)
         return spec, seen, None
-    findings.keep(seen.identity, found)
-    return spec, seen, found
+    findings.keep(seen.identity, result)
+    return spec, seen, result
 
 
 def _paces(card: "Card") -> "list[Pace]":
@@ -260,20 +260,20 @@ def _show(spec: "Spec", seen: "Checkup") -> None:
         _show_answers(seen.looks.blank)
 
 
-def _show_findings(found: "Findings | None") -> None:
-    if found is None:
+def _show_findings(result: "Findings | None") -> None:
+    if result is None:
         return
     typer.echo(
-        f"letters      {100 * found.letter_share:.0f} % of a read-out follows the letter; the likeliest "
-        f"action does in {found.follows_letter} of {found.n} questions; mass on the letters "
-        f"{found.label_mass:.2f}"
+        f"letters      {100 * result.letter_share:.0f} % of a read-out follows the letter; the likeliest "
+        f"action does in {result.follows_letter} of {result.n} questions; mass on the letters "
+        f"{result.label_mass:.2f}"
     )
-    shown = ", ".join(f"{pair.fact} {pair.moved} of {pair.n} ({pair.change})" for pair in found.pairs)
+    shown = ", ".join(f"{pair.fact} {pair.moved} of {pair.n} ({pair.change})" for pair in result.pairs)
     typer.echo(
-        f"pairs        of questions that differ in one fact, letters {found.letters}; the answer "
+        f"pairs        of questions that differ in one fact, letters {result.letters}; the answer "
         f"followed the fact in (mean change of its probability): {shown}"
     )
-    for sentence in found.sentences():
+    for sentence in result.sentences():
         typer.echo(f"             {sentence}")
 
 

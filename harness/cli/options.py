@@ -141,8 +141,8 @@ def takes(world: type[stated.FrozenSettings] | type[stated.DriveSettings]) -> Ca
                 return command(stated.read(file, world, given), **values)
             return command(stated.changed(stated.Settings(world=world()), given), **values)
 
-        made = [_parameter(each) for each in stated.options(world)]
-        names = [each.name for each in made]
+        settings = [_parameter(each) for each in stated.options(world)]
+        names = [each.name for each in settings]
         file = inspect.Parameter(
             "file",
             inspect.Parameter.KEYWORD_ONLY,
@@ -155,7 +155,7 @@ def takes(world: type[stated.FrozenSettings] | type[stated.DriveSettings]) -> Ca
         )
         own = list(inspect.signature(command).parameters.values())[1:]
         own = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
-        parameters = [file, *made, *own]
+        parameters = [file, *settings, *own]
         typed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         typed.__annotations__ = {each.name: each.annotation for each in parameters}
         typed.__doc__, typed.__name__ = command.__doc__, command.__name__
@@ -199,7 +199,7 @@ def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
 
 
 def scenario_name(name: str | None, env: str | None, env_config: Path | None) -> str:
-    """The scenario that is meant by a name, or by an environment and what its configuration changes."""
+    """Return the scenario of a name, or of an environment and what its configuration changes."""
     import json
 
     from harness.world.environments import environment

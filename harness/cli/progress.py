@@ -36,13 +36,13 @@ class Bar:
         self.say: Callable[[str], None] = lambda text: None  # writes a line above the bar
 
     def __call__(self, done: int) -> None:
-        """So many are newly done."""
+        """Add `done` to the count, and show it."""
         self.done += done
         self.changed()
 
-    def more(self, owed: int) -> None:
-        """So many more turn out to be owed."""
-        self.total += owed
+    def more(self, count: int) -> None:
+        """Add `count` to the total."""
+        self.total += count
         self.changed()
 
 

@@ -109,9 +109,9 @@ def show(
     seen = {v: Sight(data.scenario, at.state, v, taker.vision.size_px) for v in viewers if taker}
     wrote = {v: pictures.write(image, out / f"{at.id}-{v}.png") for v, image in seen.items() if out}
     if as_json:
-        said = {v: {**taker.as_mapping(), "sha256": image.sha256} for v, image in seen.items() if taker}
+        images = {v: {**taker.as_mapping(), "sha256": image.sha256} for v, image in seen.items() if taker}
         echo_json({
-            v: [{**m, "image": said[v]} if "image" in m else m for m in messages]
+            v: [{**m, "image": images[v]} if "image" in m else m for m in messages]
             for v, messages in sent.items()
         })  # fmt: skip
         return
@@ -289,7 +289,7 @@ def compare(
     if as_json:
         about = ("version", "sha256", "released")
         sides = {key: {name: getattr(p, name) for name in about} for key, p in (("a", before), ("b", after))}
-        echo_json({**sides, **asdict(change), "scene": at.id, "sent": [asdict(one) for one in sent]})
+        echo_json({**sides, **asdict(change), "scene": at.id, "sent": [asdict(message) for message in sent]})
         return
     typer.echo(f"{a} → {b}: {'differ' if change else 'the same settings and texts'}")
     for name, *values in change.settings:
@@ -299,13 +299,13 @@ def compare(
     typer.echo(f"\nsent in scene {at.id}")
     if sent[0].tokens is None:
         typer.echo(NOT_COUNTED)
-    for one in sent:
-        counts = {"words": one.words, "tokens": one.tokens}
+    for message in sent:
+        counts = {"words": message.words, "tokens": message.tokens}
         sizes = ", ".join(
             f"{n[0]} → {n[1]} {unit} ({n[1] - n[0]:+d})" for unit, n in counts.items() if n is not None
         )
-        typer.echo(f"\n{one.viewer} {one.role}: {sizes}")
-        for part, text in one.parts.items():
+        typer.echo(f"\n{message.viewer} {message.role}: {sizes}")
+        for part, text in message.parts.items():
             _changed(part, text)
 
 

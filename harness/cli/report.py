@@ -56,8 +56,8 @@ def _write_suites(folders: list[Path], out: Path | None, quiet: bool) -> Path:
     from harness.report import suite
     from harness.runs.suite import read
 
-    if others := [folder for folder in folders if not (folder / SUITE).is_file()]:
-        raise UserError(f"{printable(others[0])} is no suite, but others are; write separate reports")
+    if rest := [folder for folder in folders if not (folder / SUITE).is_file()]:
+        raise UserError(f"{printable(rest[0])} is no suite, but others are; write separate reports")
     with bar("reading datasets", quiet=quiet):
         suites = [(each, suite.lines(each)) for each in map(read, dict.fromkeys(folders))]
     return suite.write(suites, out or folders[0] / "report.html")

@@ -98,10 +98,10 @@ def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
     """
     named = Path("reports") / name
     folders = (named if n == 1 else named.with_name(f"{name}-{n}") for n in count(1))
-    found = next(filter(usable, folders))
-    if found != named:
-        typer.echo(f"{printable(named)} is there already; this goes to {printable(found)}", err=True)
-    return found
+    folder = next(filter(usable, folders))
+    if folder != named:
+        typer.echo(f"{printable(named)} is there already; this goes to {printable(folder)}", err=True)
+    return folder
 
 
 @dataclass(frozen=True)

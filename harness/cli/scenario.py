@@ -21,15 +21,15 @@ def list_scenarios(as_json: options.Json = False) -> None:
     """List the scenarios, each with a summary."""
     from harness.world import scenarios
 
-    found = resources.each(scenarios.names(), scenarios.get)
+    entries = resources.each(scenarios.names(), scenarios.get)
     if as_json:
         echo_json([
             {"name": name, "error": str(each)} if isinstance(each, UserError)
             else {"name": name, "summary": each.summary}
-            for name, each in found.items()
+            for name, each in entries.items()
         ])  # fmt: skip
         return
-    for name, each in found.items():
+    for name, each in entries.items():
         if isinstance(each, UserError):
             echo_wrong(name, each)
         else:
@@ -96,16 +96,16 @@ def audit(
     from harness.world.audit import audit as run
 
     with bar(f"auditing {name}", layouts, as_json) as progress:
-        found = run(scenario, layouts, seed, progress, who)
+        result = run(scenario, layouts, seed, progress, who)
     if as_json:
         echo_json({
-            "scenario": name, "layouts": layouts, "seed": seed, "steps": found.steps, "tells": found.tells,
-            "worst": found.worst, "auc": {question: as_mapping(auc) for question, auc in found.auc.items()},
-            "told_by": found.told_by,
+            "scenario": name, "layouts": layouts, "seed": seed, "steps": result.steps, "tells": result.tells,
+            "worst": result.worst, "auc": {question: as_mapping(auc) for question, auc in result.auc.items()},
+            "told_by": result.told_by,
         })  # fmt: skip
     else:
-        _print(found)
-    if found.tells:
+        _print(result)
+    if result.tells:
         raise typer.Exit(1)
 
 
@@ -157,19 +157,19 @@ def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     )
 
 
-def _print(found: "Audit") -> None:
+def _print(result: "Audit") -> None:
     from harness.world.audit import MOST_AUC
 
     table(
         ("predicted from the ego's view", "AUC [95 % CI]"),
-        [(question, shown(auc, Unit(decimals=2))) for question, auc in found.auc.items()],
+        [(question, shown(auc, Unit(decimals=2))) for question, auc in result.auc.items()],
     )
     text = console()
-    text.print(f"n = {found.layouts} layouts, {stated(found.seed, found.layouts)};")
-    text.print(f"decision points {found.steps[0]} to {found.steps[-1]}, while the danger is out of sight")
-    if not found.tells:
+    text.print(f"n = {result.layouts} layouts, {stated(result.seed, result.layouts)};")
+    text.print(f"decision points {result.steps[0]} to {result.steps[-1]}, while the danger is out of sight")
+    if not result.tells:
         text.print(f"no tell: every AUC is {MOST_AUC:.2f} or less")
         return
-    text.print(f"a tell: {found.worst} is above {MOST_AUC:.2f}; AUC lost without each number:")
-    for name, lost in found.told_by.items():
+    text.print(f"a tell: {result.worst} is above {MOST_AUC:.2f}; AUC lost without each number:")
+    for name, lost in result.told_by.items():
         text.print(f"  {lost:.2f} {name}")

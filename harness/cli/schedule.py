@@ -46,14 +46,14 @@ def learn(
     point, own = named_point(condition), options.cards(model)
     command = shlex.join(["harness", *sys.argv[1:]])
     with bar("learning", ROUNDS, quiet=quiet) as progress:
-        train, others = (
+        train, tune_runs = (
             [ReplayedRun(run, None, progress.more, progress, models=own, say=progress.say) for run in of]
             for of in (runs, tune)
         )
-        progress.more(sum(each.dataset.scenario.parameters.decisions for each in (*train, *others)))
-        made = run_learn(train, others, point, out, command, progress)
+        progress.more(sum(each.dataset.scenario.parameters.decisions for each in (*train, *tune_runs)))
+        schedule = run_learn(train, tune_runs, point, out, command, progress)
     if not quiet:
-        typer.echo(f"wrote {printable(out)}: threshold {made.threshold:g}, the best on tune layouts")
+        typer.echo(f"wrote {printable(out)}: threshold {schedule.threshold:g}, the best on tune layouts")
 
 
 def compare(

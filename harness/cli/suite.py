@@ -105,12 +105,12 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
 
     text, m = console(), done.variant
     text.print(f"{printable(m.model, 30)} · prompt {m.prompt} · {m.answer} · suite {printable(done.name)}")
-    for said in (
+    for sentence in (
         *caveats.merged(done.runs, lambda run: caveats.unread(run.scores)),
         *caveats.merged(done.runs, ignores_input),
         *caveats.no_prompt(run.manifest for run in done.runs.values()),
     ):
-        text.print(said)
+        text.print(sentence)
     gaining = [c for c in done.conditions if c != BASELINE] if BASELINE in done.conditions else []
     _matrix("success, % [95 % CI]", "success", done.conditions, lines)
     _matrix(f"gain over {BASELINE}, points", "gain", gaining, lines)

@@ -148,7 +148,7 @@ class Asker:
         spec: the evaluation.
         answers: answers by request id, in the order of the requests.
         latency: how long inference takes.
-        tally: what became of the questions that were asked here.
+        tally: how the questions that were asked here ended.
         served: which server gave each answer that is not kept in a file.
     """
 
@@ -221,9 +221,9 @@ class Asker:
         finally:
             there = (request.id for request in missing if request.id in new_answers)
             self.answers |= {name: new_answers[name] for name in there}
-        found = Tally(new_answers.values())
-        if found.missing - set(HELPERS):
-            raise Unanswered(str(found))
+        tally = Tally(new_answers.values())
+        if tally.missing - set(HELPERS):
+            raise Unanswered(str(tally))
 
     def settle(self) -> None:
         """Raise Unanswered if too many of the questions that were asked here got no answer."""
@@ -231,7 +231,7 @@ class Asker:
             raise Unanswered(str(self.tally))
 
     def _take(self, answers: Collection[Answer], single: bool) -> None:
-        """Count and keep what came; stop if nothing is answered any more.
+        """Count and keep the answers; stop if nothing is answered any more.
 
         Args:
             answers: those of a chunk.

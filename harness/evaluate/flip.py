@@ -23,14 +23,14 @@ def asked(request: Request) -> Request:
     return request.alike(messages=messages, orders=tuple(orders), flips=(), actions=request.actions[::-1])
 
 
-def compared(answer: Answer, other: Answer) -> Answer:
+def compared(answer: Answer, mirror: Answer) -> Answer:
     """Return an answer that says whether no action is the likeliest in both lists.
 
-    Nothing is known if the reversed list, `other`, got no answer.
+    Nothing is known if the reversed list, `mirror`, got no answer.
     """
-    if answer.intent is None or other.intent is None:
+    if answer.intent is None or mirror.intent is None:
         return answer
-    return structs.replace(answer, flipped=not _likeliest(answer.intent) & _likeliest(other.intent[::-1]))
+    return structs.replace(answer, flipped=not _likeliest(answer.intent) & _likeliest(mirror.intent[::-1]))
 
 
 def _likeliest(p: tuple[float, ...]) -> set[int]:

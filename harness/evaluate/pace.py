@@ -39,11 +39,11 @@ def paces(stem: str) -> list[Pace]:
     return [_pace(card) for card in able]
 
 
-def advice(found: Sequence[Pace]) -> str:
+def advice(measured: Sequence[Pace]) -> str:
     """Say in one line which of several engines is faster here, and how to choose it."""
-    engines = " and ".join(pace.engine for pace in found)
-    of_letters, of_text = [pace.readout_s for pace in found], [pace.text_s for pace in found]
-    by_letters, by_text = _fastest(found, of_letters), _fastest(found, of_text)
+    engines = " and ".join(pace.engine for pace in measured)
+    of_letters, of_text = [pace.readout_s for pace in measured], [pace.text_s for pace in measured]
+    by_letters, by_text = _fastest(measured, of_letters), _fastest(measured, of_text)
     if by_letters == by_text:
         verdict = f"{by_text or 'neither'} is faster here"
     else:
@@ -54,10 +54,10 @@ def advice(found: Sequence[Pace]) -> str:
     )
 
 
-def _fastest(found: Sequence[Pace], seconds: Sequence[float]) -> str | None:
+def _fastest(measured: Sequence[Pace], seconds: Sequence[float]) -> str | None:
     """Return the engine that is clearly the fastest; None if none is."""
     first, second, *_ = sorted(seconds)
-    return found[seconds.index(first)].engine if second >= CLEAR * first else None
+    return measured[seconds.index(first)].engine if second >= CLEAR * first else None
 
 
 def _small(card: Card) -> bool:

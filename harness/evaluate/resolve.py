@@ -88,14 +88,14 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
     how = (settings.answer, settings.thinking, settings.image, settings.letters, settings.sums, settings.flip)
     ego = Agent(card, versions.load(version), *how)  # type: ignore[arg-type]
     prompt, mode = versions.load(own.prompt or version), own.answer or settings.answer
-    others = [cards.resolve(name.strip()) for name in own.model.split(",")] if own.model else [card]
+    helper_cards = [cards.resolve(name.strip()) for name in own.model.split(",")] if own.model else [card]
     with helper_options({"--answer": own.answer, "--thinking": own.thinking}):
         theirs = (
             prompt, mode, settings.thinking if own.thinking is None else own.thinking,
             settings.image if prompt.image else "own", settings.letters if mode == "readout" else None,
             settings.sums if mode == "json" else "refuse", settings.flip and mode == "readout",
         )  # fmt: skip
-        return ego, tuple(Agent(other, *theirs) for other in others)  # type: ignore[arg-type]
+        return ego, tuple(Agent(helper_card, *theirs) for helper_card in helper_cards)  # type: ignore[arg-type]
 
 
 def _usual_ties(ego: Agent) -> str:

@@ -290,8 +290,8 @@ def _answered_file(place: Path, chunk: Sequence[int]) -> Path:
 
 def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> None:
     """Raise Unanswered if a run needs answers that it lacks; its parts lose what lacks them."""
-    found = Tally(answers)
-    if not found.missing:
+    tally = Tally(answers)
+    if not tally.missing:
         return
     for part in parts:
         answered = read_kept(part / "answers.jsonl")
@@ -300,7 +300,7 @@ def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> N
             gone = part.with_name(f".{part.name}.{os.getpid()}.part")
             os.replace(part, gone)  # so that no part is ever half there
             shutil.rmtree(gone)
-    raise Unanswered(str(found))
+    raise Unanswered(str(tally))
 
 
 def _label(chunk: Sequence[int]) -> str:
@@ -364,11 +364,11 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
 
 def _gather(
     out: Path, begun: RunStart, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes],
-    others: Sequence[Path] = (),
+    folders: Sequence[Path] = (),
 ) -> Evaluated:  # fmt: skip
     """Score the chunks in a working folder and write the files of the finished run, with its sources.
 
-    `place` is the working folder, `made_of` has the sources by name, `others` are folders that the run is
+    `place` is the working folder, `made_of` has the sources by name, `folders` are folders that the run is
     merged from.
     """
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
@@ -405,7 +405,7 @@ def _gather(
         kept_sources.write(out, made_of, place)
         with suppress(UserError):  # a stranger's shard may state any command
             write_whole(out / FILE, text_of(of_words(begun.command)))
-        servers.write(out, [place, *(other / WORK for other in others)])
+        servers.write(out, [place, *(shard / WORK for shard in folders)])
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)

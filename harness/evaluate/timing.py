@@ -65,8 +65,8 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
             fusion.append(replace(fusion_request(spec, scene, by_viewer, heard), timed=True))
     sample = times([*answers.values(), *(answer_of(r, backend.complete([r])[0]) for r in fusion)])
     if "ego" not in sample:
-        if (found := Tally(answers.values())).unanswered["ego"]:
-            raise Unanswered(str(found))
+        if (tally := Tally(answers.values())).unanswered["ego"]:
+            raise Unanswered(str(tally))
         name = printable(spec.ego.card.name)
         raise UserError(
             f"--latency {MEASURED}: no answer of {name} could be timed in {len(scenes)} scenes; see what "

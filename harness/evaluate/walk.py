@@ -149,35 +149,35 @@ def walk(
     physical = {point for point in points if isinstance(point.channel, Physical)}
     while moments := world.observe():
         intents = ask(moments)
-        due = {point: of_point for point in points if len((of_point := world.due(point)).at)}
+        due = {point: each for point in points if len((each := world.due(point)).at)}
         if not physical.isdisjoint(due):
             intents = replace(intents, site=world.site({point.unit for point in due if point.unit}))
         if any(point.needs("outlook") for point in due):
             intents = replace(intents, outlook=world.outlook())
         if any(point.needs("claims") for point in due):
             intents = replace(intents, claims=world.claims())
-        asked_blind = [of_point.at for point, of_point in due.items() if point.blind_helpers]
+        asked_blind = [each.at for point, each in due.items() if point.blind_helpers]
         blind = ask.blind(moments, np.unique(np.concatenate(asked_blind))) if asked_blind else None
         intents, blind = _asked(ask, moments, due, intents, blind)
-        said = {
+        broadcasts = {
             point: attackers[point].said(
-                heard(point, intents, blind, of_point),
-                of_point.draws,
-                of_point.episodes if point.guard.attack else (),
+                heard(point, intents, blind, each),
+                each.draws,
+                each.episodes if point.guard.attack else (),
             )
-            for point, of_point in due.items()
+            for point, each in due.items()
         }
-        sent = {point: exchange(point, of_point.intents, of_point.draws) for point, of_point in said.items()}
-        calls = _fusion_calls(due, said, sent, moments, ask)
+        sent = {point: exchange(point, each.intents, each.draws) for point, each in broadcasts.items()}
+        calls = _fusion_calls(due, broadcasts, sent, moments, ask)
         decided = []
         for point, due_here in due.items():
-            said_here = said[point]
+            broadcast = broadcasts[point]
             call = (
-                calls[point.rewrites](due_here.at, shown(point, said_here)) if point.has_fusion_call else None
+                calls[point.rewrites](due_here.at, shown(point, broadcast)) if point.has_fusion_call else None
             )
             fusion = Fusion(call, memories[point].recall(due_here), tie_draws(due_here.draws, ties))
-            result = fuse(point, sent[point], said_here.intents, fusion)
-            decided.append(Decided(point, moments, due_here, result, said_here))
+            result = fuse(point, sent[point], broadcast.intents, fusion)
+            decided.append(Decided(point, moments, due_here, result, broadcast))
         for part in decided:
             memories[part.point].keep(part.due, part.result.state)
         yield decided
@@ -222,18 +222,18 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
     own = intents if every else intents.take(due.at)
     if point.blind_helpers:
         assert blind is not None
-        said = blind.take(due.at)
-        return _saying(own, said, said.valid)
+        source = blind.take(due.at)
+        return _with_helpers(own, source, source.valid)
     if point.ask.messages != "shuffled":
         return own
-    other = _sources(point, due)
-    said, alone = own.take(other), other == np.arange(len(other))
-    return _saying(own, said, said.valid & ~alone[:, None])
+    places = _sources(point, due)
+    source, alone = own.take(places), places == np.arange(len(places))
+    return _with_helpers(own, source, source.valid & ~alone[:, None])
 
 
-def _saying(own: Intents, said: Intents, valid: Bools) -> Intents:
+def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:
     return replace(
-        own, helpers=said.helpers, valid=valid, payload_bits=said.payload_bits, unasked=said.unasked
+        own, helpers=source.helpers, valid=valid, payload_bits=source.payload_bits, unasked=source.unasked
     )
 
 
@@ -245,9 +245,9 @@ def _sources(point: OperatingPoint, due: Due) -> Ints:
     following = np.roll(order, -1)
     starts = np.flatnonzero(np.diff(due.seed[order], prepend=due.seed[order[0]] - 1))
     following[np.roll(starts, -1) - 1] = order[starts]  # the last of a seed hears its first
-    other = np.empty_like(order)
-    other[order] = following
-    return other
+    sources = np.empty_like(order)
+    sources[order] = following
+    return sources
 
 
 class Memory:
@@ -267,7 +267,7 @@ class Memory:
 
 
 def _fusion_calls(
-    due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said],
+    due: Mapping[OperatingPoint, Due], broadcasts: Mapping[OperatingPoint, Said],
     sent: Mapping[OperatingPoint, Exchange], moments: Sequence[Moment], ask: Ask[Moment],
 ) -> dict[Rewrites, Fuses]:  # fmt: skip
     """Make one fusion call for each set of messages that any condition hears, and return them by rewrites.
@@ -277,12 +277,12 @@ def _fusion_calls(
     calls = {}
     for rewrites in dict.fromkeys(point.rewrites for point in due if point.has_fusion_call):
         alike = {point: due_here for point, due_here in due.items() if point.rewrites == rewrites}
-        calls[rewrites] = ask.fusion_call(moments, heard_codes(alike, said, sent), rewrites)
+        calls[rewrites] = ask.fusion_call(moments, heard_codes(alike, broadcasts, sent), rewrites)
     return calls
 
 
 def heard_codes(
-    due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said],
+    due: Mapping[OperatingPoint, Due], broadcasts: Mapping[OperatingPoint, Said],
     sent: Mapping[OperatingPoint, Exchange],
 ) -> Ints:  # fmt: skip
     """Return the sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
@@ -290,13 +290,13 @@ def heard_codes(
     for point, due_here in due.items():
         if point.has_fusion_call:
             on_time = sent[point].on_time
-            codes.append(codes_of(on_time, due_here.at, shown(point, said[point]))[on_time.any(axis=1)])
+            codes.append(codes_of(on_time, due_here.at, shown(point, broadcasts[point]))[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
 
 
-def shown(point: OperatingPoint, said: Said) -> Bools | None:
+def shown(point: OperatingPoint, broadcast: Said) -> Bools | None:
     """Return who attacks, (n, H), if the text of a fusion call depends on it; else None."""
-    return said.attackers if point.rewrites.attack else None
+    return broadcast.attackers if point.rewrites.attack else None
 
 
 @lru_cache(maxsize=1 << 16)
