@@ -126,10 +126,10 @@ class DecisionPoint:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Run B against run A. A notebook shows what became of success, and the differences."""
+    """Run B against run A. A notebook shows how success changed, and the differences."""
 
     report: Mapping[str, Any]  # what `harness compare --json` prints
-    findings: tuple[str, ...]  # what became of success in each condition, in a sentence
+    findings: tuple[str, ...]  # how success changed in each condition, in a sentence
 
     @cached_property
     def differences(self) -> "pd.DataFrame":

@@ -211,8 +211,8 @@ def no_prompt(manifests: Iterable[Manifest]) -> list[str]:
 
 
 def _no_prompt(how: str, models: Sequence[str], prompts: Sequence[str]) -> str:
-    *others, last = dict.fromkeys(models)
+    *names, last = dict.fromkeys(models)
     versions = " or ".join(dict.fromkeys(prompts))
-    if not others:
+    if not names:
         return f"{last} reads no prompt: it decides {how}, whatever {versions} says."
-    return f"{', '.join(others)} and {last} read no prompt: they decide {how}, whatever {versions} says."
+    return f"{', '.join(names)} and {last} read no prompt: they decide {how}, whatever {versions} says."

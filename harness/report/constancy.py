@@ -47,7 +47,7 @@ def commonest(run: Run) -> Commonest | None:
         return None
     likeliest = p >= p.max(axis=1, keepdims=True) - TIE
     [(places, count)] = Counter(map(tuple, likeliest.tolist())).most_common(1)
-    actions = [action for action, one in zip(run.actions, places, strict=True) if one]
+    actions = [action for action, likely in zip(run.actions, places, strict=True) if likely]
     moves = float(p[:, places.index(True)].std())
     return Commonest(actions, count, len(p), moves, len(p) == run.answered.count["ego"])
 

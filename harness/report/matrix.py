@@ -197,15 +197,15 @@ def figures(results: Sequence[Line]) -> list[dict[str, str]]:
 
 
 def headline(results: Sequence[Line]) -> str:
-    """What came out of several runs: under each condition the best, and which cannot be told from it."""
+    """Name the best of several runs under each condition, and which cannot be told from it."""
     outcomes = []
     for condition in dict.fromkeys(line.condition for line in results):
         of_condition = [line for line in results if line.condition == condition]
         best = next((line for line in of_condition if line.mark == BEST), None)
         if best is not None and (success := best.scores[SUCCESS]):
             close = [line.name for line in of_condition if line.mark == CLOSE]
-            others = f"{len(close)} others" if len(close) > 1 else "".join(close)
-            rest = f", which cannot be told from {others}" if close else ""
+            rivals = f"{len(close)} others" if len(close) > 1 else "".join(close)
+            rest = f", which cannot be told from {rivals}" if close else ""
             outcomes.append(f"{condition}: {best.name} {shown(success)['value']}{rest}")
         elif len(of_condition) > 1:
             outcomes.append(

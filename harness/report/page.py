@@ -120,7 +120,7 @@ def _pieces(
         *caveats.merged(by_name, caveats.unanswered),
         *caveats.merged(by_name, lambda run: caveats.unread(run.scores)),
     ]
-    others = [
+    warnings = [
         sentence
         for of in (ignores_input, caveats.causes, caveats.of_run)
         for sentence in caveats.merged(by_name, of)
@@ -130,7 +130,7 @@ def _pieces(
         title=runs.names[0] if alone else f"{len(runs.names)} runs",
         policy=library.policy(library.vega(), library.script()),
         lacks=" ".join(decisions.lacks()),
-        warnings=[*unread, *caveats.no_prompt(run.manifest for run in runs.runs), *others],
+        warnings=[*unread, *caveats.no_prompt(run.manifest for run in runs.runs), *warnings],
         unread=len(unread),
         size=contents.size(runs),
         headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),

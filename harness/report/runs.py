@@ -67,12 +67,12 @@ def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs
         UserError: a folder is no run, its dataset is gone or has changed, or two are not of the same scenes.
     """
     runs = [read(path) for path in dict.fromkeys(paths)]
-    first, *others = runs
-    for other in others:
-        if _scenes(first) != _scenes(other):
+    first, *rest = runs
+    for run in rest:
+        if _scenes(first) != _scenes(run):
             raise UserError(
-                f"{printable(first.path)} and {printable(other.path)} are not of the same scenes "
-                f"({_shown(first)} and {_shown(other)}); report them apart"
+                f"{printable(first.path)} and {printable(run.path)} are not of the same scenes "
+                f"({_shown(first)} and {_shown(run)}); report them apart"
             )
     world = first.manifest.world
     if not isinstance(world, FrozenScenes):

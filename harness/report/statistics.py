@@ -98,10 +98,10 @@ def tokens(run: Run) -> Table:
 
 
 def replies(run: Run) -> Table:
-    """What became of the replies that were scheduled."""
+    """Count the replies that were scheduled, by how they ended."""
     d = run.decisions
     delivered, on_time = d.of_messages("delivered"), d.of_messages("on_time")
-    became = {
+    by_reply = {
         "on time": on_time == 1.0,
         "late": (delivered == 1.0) & (on_time == 0.0),
         "lost": delivered == 0.0,
@@ -109,7 +109,7 @@ def replies(run: Run) -> Table:
     conditions = d.codes("condition", run.conditions)
     rows = []
     for place, condition in enumerate(run.conditions):
-        count = {reply: int(which[conditions == place].sum()) for reply, which in became.items()}
+        count = {reply: int(which[conditions == place].sum()) for reply, which in by_reply.items()}
         total = sum(count.values())
         rows += [
             {"condition": condition, "reply": reply, "count": n, "share": n / total, "n": total}

@@ -48,7 +48,7 @@ class Answers:
                     raise ValueError(f"answer {answer.id} heard messages, and is no fusion call's")
                 if answer.scene != scene:
                     scene = answer.scene
-                    keys = {other.key for place in of_scene.get(scene, ()) for other in self._span(place)}
+                    keys = {sibling.key for place in of_scene.get(scene, ()) for sibling in self._span(place)}
                     of_scene.setdefault(scene, []).append(len(self._spans))
                     self._spans.append((start, stop))
                 if answer.key in keys:

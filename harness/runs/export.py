@@ -55,7 +55,7 @@ def junit(run: Run, path: Path) -> Path:
 
     An episode with a question that got no answer is an error, unless it was a message that may be lost.
     """
-    said = _unanswered(run)
+    errors = _unanswered(run)
     episodes: dict[tuple[str, int], list[Episode]] = {}
     for outcome in run.episodes:
         episodes.setdefault((outcome.condition, outcome.episode), []).append(outcome)
@@ -64,7 +64,7 @@ def junit(run: Run, path: Path) -> Path:
         failed = [f"{outcome.failure} with seed {outcome.seed}" for outcome in by_seed if not outcome.success]
         group = f"{run.source} · {run.manifest.variant} · {condition}"
         failure = f"{len(failed)} of {len(by_seed)} seeds: {', '.join(failed)}"
-        words = said.get((condition, episode))
+        words = errors.get((condition, episode))
         error = f"{words}: the model could not be asked" if words else None
         cases.append(Case(group, f"episode {episode}", failure if failed else None, error))
     write_whole(path, test_suite(f"harness {run.manifest.name}", cases))
@@ -73,22 +73,22 @@ def junit(run: Run, path: Path) -> Path:
 
 def _unanswered(run: Run) -> dict[tuple[str, int], str]:
     """Return by condition and episode what a question said that got no answer."""
-    answers, said = list(lacking(run)), dict[tuple[str, int], str]()
+    answers, errors = list(lacking(run)), dict[tuple[str, int], str]()
     if not answers:
-        return said
+        return errors
     decisions = run.decisions
     numbers, conditions = decisions.whole("episode"), decisions.codes("condition", run.conditions)
     for answer in answers:
         for row in decisions.scenes.get(answer.scene, ()):
             if answer.role != "merge" or decisions["fusion_failed"][row] == 1.0:
-                said.setdefault((run.conditions[conditions[row]], int(numbers[row])), answer.error or "")
-    return said
+                errors.setdefault((run.conditions[conditions[row]], int(numbers[row])), answer.error or "")
+    return errors
 
 
-def junit_of_none(run: Path, said: str) -> str:
+def junit_of_none(run: Path, error: str) -> str:
     """Return JUnit's XML of a run that did not finish, since its model could not be asked: one error."""
     name = run.absolute().name
-    return test_suite(f"harness {name}", [Case(name, "the model answers", error=said)])
+    return test_suite(f"harness {name}", [Case(name, "the model answers", error=error)])
 
 
 def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -> Path:

@@ -177,7 +177,7 @@ class Run:
         if answer.agent is not msgspec.UNSET:
             return answer.agent
         # The answers of a scene are in the order of its viewers, the ego first.
-        viewers = [other.viewer for other in self.answers_by_scene[answer.scene] if not other.heard]
+        viewers = [each.viewer for each in self.answers_by_scene[answer.scene] if not each.heard]
         return viewers.index(answer.viewer)
 
     @cached_property
@@ -257,8 +257,8 @@ def read(path: Path) -> Run:
         raise UserError(
             f"{printable(path)} is a suite; give the folder of one of its runs"
             if (path / SUITE).is_file()
-            else f"{printable(path)} is no finished run, since its model could not be asked: {said}"
-            if (said := work.unanswered(path))
+            else f"{printable(path)} is no finished run, since its model could not be asked: {reason}"
+            if (reason := work.unanswered(path))
             else f"{printable(path)} is no finished run: it has no run.json; "
             "give a folder made by `harness eval` or `harness drive`"
         )
@@ -383,17 +383,17 @@ def dataset_of(run: Run, given: Path | None = None) -> Dataset:
     """
     stated = run.manifest.world
     assert isinstance(stated, FrozenScenes)
-    others: list[Path] = []
+    folders: list[Path] = []
     for path in [given] if given else dict.fromkeys(_datasets(run, stated)):
         if given or _holds(path):
             if _sha256_of(path) == stated.sha256:
                 return load(path)
-            others.append(path)
+            folders.append(path)
     repair = "restore it, give its folder to a command that has --dataset, or run again"
-    if others:
-        sha256 = _sha256_of(others[0]) or read_manifest(others[0])[1]  # which says what is wrong with it
+    if folders:
+        sha256 = _sha256_of(folders[0]) or read_manifest(folders[0])[1]  # which says what is wrong with it
         raise UserError(
-            f"dataset {printable(others[0])} is not the one that {printable(run.path)} was made on "
+            f"dataset {printable(folders[0])} is not the one that {printable(run.path)} was made on "
             f"(sha256 {sha256[:12]}…, not {printable(stated.sha256, 13)}); {repair}"
         )
     raise UserError(

@@ -75,8 +75,8 @@ class SuiteRun:
         return tuple(self._means())
 
     def _means(self) -> Iterator[Score]:
-        first, *others = self.runs.values()
-        others_by_key = [{(s.condition, s.metric, s.interval): s for s in run.scores} for run in others]
+        first, *rest = self.runs.values()
+        others_by_key = [{(s.condition, s.metric, s.interval): s for s in run.scores} for run in rest]
         for s in first.scores:
             key = s.condition, s.metric, s.interval
             if s.interval != "seed means" and all(key in scores for scores in others_by_key):
@@ -113,11 +113,11 @@ def read(path: Path) -> SuiteRun:
     """
     contents = contents_of(path)
     runs = {family: folder.read(path / name) for family, name in contents.families.items()}
-    first, *others = runs.values()
-    for other in others:
-        if _shared_settings(other) != _shared_settings(first):
+    first, *rest = runs.values()
+    for run in rest:
+        if _shared_settings(run) != _shared_settings(first):
             raise UserError(
-                f"{printable(other.path)} has another model, other conditions or seeds than "
+                f"{printable(run.path)} has another model, other conditions or seeds than "
                 f"{printable(first.path)}; make the runs of the suite again"
             )
     return SuiteRun(path, contents.name, contents.description, runs)

@@ -81,6 +81,6 @@ def lacking(run: Run) -> Iterator[Answer]:
 def why(path: Path) -> str | None:
     """Return why the results of a run are none, be it finished or not: its model could not be asked."""
     if (path / "run.json").is_file():
-        found = tally(read(path))
-        return str(found) if found.missing else None
+        counts = tally(read(path))
+        return str(counts) if counts.missing else None
     return work.unanswered(path)

@@ -170,18 +170,18 @@ def _messages(
     decisions, helpers = np.nonzero(part.result.on_time & np.array(chosen)[:, None])
     if not len(decisions):
         return
-    said = part.said.take(decisions)
+    broadcast = part.said.take(decisions)
     whole, at = _taken(part.result, decisions), due.at[decisions]
     rest = whole.on_time & (np.arange(whole.on_time.shape[1]) != helpers[:, None])
     call = None
     if point.has_fusion_call:
-        attackers = shown(point, said)
+        attackers = shown(point, broadcast)
         codes = np.unique(codes_of(rest, at, attackers)[rest.any(axis=1)])
         call = stored.fusion_call(moments, codes, point.rewrites)(at, attackers)
     fusion = Fusion(call, None if state is None else state[decisions])
-    less = fuse(point, replace(whole, on_time=rest), said.intents, fusion)
+    less = fuse(point, replace(whole, on_time=rest), broadcast.intents, fusion)
     for n, voice in enumerate(helpers.tolist()):
-        helper = voice if said.intents.voice_of is None else int(said.intents.voice_of[n, voice])
+        helper = voice if broadcast.intents.voice_of is None else int(broadcast.intents.voice_of[n, voice])
         scene = moments[at[n]]
         sender = scene.viewers[1 + helper]
         items = scene.graphs[sender].seen
@@ -209,12 +209,12 @@ def _left_out(
     )  # fmt: skip
 
 
-def rows(found: Attribution) -> list[Row]:
+def rows(result: Attribution) -> list[Row]:
     """Return a row for each kind of thing that was left out; intervals are over episodes."""
     return [
         _row(role, kind, some)
         for role, kind in KINDS
-        if (some := [each for each in found.left_out if (each.role, each.kind) == (role, kind)])
+        if (some := [each for each in result.left_out if (each.role, each.kind) == (role, kind)])
     ]
 
 
@@ -248,12 +248,12 @@ def headline(table: Sequence[Row]) -> str:
     )
 
 
-def attribution_study(found: Attribution, run: ReplayedRun) -> Study:
+def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
     """Declare the study of what was left out, of which `harness report` shows every decision."""
-    table, parts = rows(found), ("shift", "flips", "failed")
+    table, parts = rows(result), ("shift", "flips", "failed")
     answer = {
-        "run": str(run.run.path), "condition": found.condition, "decision_points": found.decision_points,
-        "of": found.of, "sample_seed": found.sample_seed,
+        "run": str(run.run.path), "condition": result.condition, "decision_points": result.decision_points,
+        "of": result.of, "sample_seed": result.sample_seed,
         "rows": [
             {"role": row.role, "kind": row.kind, **{n: as_mapping(getattr(row, n)) for n in parts}}
             for row in table
@@ -269,8 +269,8 @@ def attribution_study(found: Attribution, run: ReplayedRun) -> Study:
     return Study(
         "attribution", f"{run.name} · {run.run.source}", [headline(table)],
         [
-            f"{found.decision_points} of the {found.of} decision points of {found.condition}, drawn with "
-            f"sample seed {found.sample_seed}, each as likely as any other; 95 % intervals are over "
+            f"{result.decision_points} of the {result.of} decision points of {result.condition}, drawn with "
+            f"sample seed {result.sample_seed}, each as likely as any other; 95 % intervals are over "
             "episodes. Of: the prompt that it is left out of; fusion: a message that came in time. Shift: "
             "total variation distance of the answers or policies; flips: another action is most probable; "
             "failed: the answer without it could not be read."
@@ -283,7 +283,7 @@ def attribution_study(found: Attribution, run: ReplayedRun) -> Study:
     )  # fmt: skip
 
 
-def write(found: Attribution, run: Path) -> Path:
+def write(result: Attribution, run: Path) -> Path:
     """Write the file beside a run's tables."""
-    write_whole(run / FILE, msgspec.json.format(msgspec.json.encode(found), indent=1) + b"\n")
+    write_whole(run / FILE, msgspec.json.format(msgspec.json.encode(result), indent=1) + b"\n")
     return run / FILE

@@ -98,8 +98,8 @@ class Choices:
         codes = self.sets @ (1 << np.arange(self.sets.shape[1]))
         order = np.argsort(codes)
         wide = np.pad(asked, [(0, 0)] * (asked.ndim - 1) + [(0, self.sets.shape[1] - asked.shape[-1])])
-        found: Ints = order[np.searchsorted(codes[order], wide @ (1 << np.arange(self.sets.shape[1])))]
-        return found
+        places: Ints = order[np.searchsorted(codes[order], wide @ (1 << np.arange(self.sets.shape[1])))]
+        return places
 
     def scheduled(self, point: OperatingPoint, worths: Sequence[Floats] | None = None) -> Choose:
         """Return the rule that asks whom a point's schedule asks, with each level's `worths` if known."""

@@ -121,16 +121,16 @@ def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
         frozen_end=both.failure_frozen.where(~both.success_frozen, "success"),
         closed_end=both.failure_closed.where(~both.success_closed, "success"),
     )
-    other = ends[ends.success_frozen != ends.success_closed]
+    differing = ends[ends.success_frozen != ends.success_closed]
     places = [*WHO, "condition", "frozen_end", "closed_end"]
-    counts = other.groupby(places, sort=False).size().rename("count").reset_index()
+    counts = differing.groupby(places, sort=False).size().rename("count").reset_index()
     return counts.sort_values("count", ascending=False, kind="stable")
 
 
 def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> Study:
     """Declare the study of a comparison."""
     rows: list[dict[Any, Any]] = result.table.to_dict("records")
-    other = disagreements(result.episodes).head(SHOWN).to_dict("records")
+    differing = disagreements(result.episodes).head(SHOWN).to_dict("records")
     heads = (PLACE, "frozen %", "closed loop %", "difference, points", "same %", "n")
     ends_heads = (PLACE, "end on frozen scenes", "end in closed loop", "episodes × seeds")
     return Study(
@@ -151,7 +151,7 @@ def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> Study:
             ], terminal=(0, 1, 2, 3, 4)),
             Table("Where they disagree", ends_heads, [
                 (_place(row), *(str(row[name]) for name in ("frozen_end", "closed_end", "count")))
-                for row in other
+                for row in differing
             ]),
         ],
         {"fidelity": result.table, "episodes": result.episodes},

@@ -149,7 +149,7 @@ def run_cells(
         helpers: agents of the helpers.
         out: the grid's folder.
         progress: called with the number of new answers.
-        more: called with the number of answers that are owed next.
+        more: called with the number of answers that are asked for next.
         cache_file: of completions kept between runs; None for no cache.
 
     Raises:
@@ -230,10 +230,10 @@ class Grid:
 
     def _main(self, condition: str) -> Iterator[tuple[str, Floats, Floats]]:
         for factor in self.factors:
-            base, *others = factor.levels
-            for other in others:
-                low, high = (self._mean(condition, **{factor.name: at}) for at in (base, other))
-                yield f"{factor.name}: {base} → {other}", low, high
+            base, *levels = factor.levels
+            for new_level in levels:
+                low, high = (self._mean(condition, **{factor.name: at}) for at in (base, new_level))
+                yield f"{factor.name}: {base} → {new_level}", low, high
 
     def _interactions(self, condition: str) -> Iterator[tuple[str, Floats, Floats]]:
         for a, b in combinations(self.factors, 2):

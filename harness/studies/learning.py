@@ -46,11 +46,11 @@ def layouts(stored: ReplayedRun, wanted: Purpose) -> str:
     return f"{stored.name} on {stored.dataset.name}, {stated(first, count)}, {len(seeds)} layouts"
 
 
-def gains(made: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:
+def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:
     """Return inputs (n, F) and gains (n,) of asking each helper alone, wherever it may be asked."""
-    alone = [made.index(np.eye(made.sets.shape[1], dtype=bool)[h]) for h in range(made.sets.shape[1])]
+    alone = [tree.index(np.eye(tree.sets.shape[1], dtype=bool)[h]) for h in range(tree.sets.shape[1])]
     rows, targets = [], []
-    for level, ends, _, _ in made.backwards(choose):
+    for level, ends, _, _ in tree.backwards(choose):
         known = known_of(point, level.intents, level.draws)
         places = slice(0, len(level.at))  # what is known is the same under every seed
         gain = (ends[..., alone] - ends[..., :1]).mean(axis=0)
@@ -93,23 +93,23 @@ def learn(train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callabl
 
     Its `max_helpers` are asked while it is learnt; the first round decides by its own schedule.
     """
-    made = [choices(stored, point, stored.seeds, progress) for stored in train]
-    network, rest = None, [each.scheduled(point) for each in made]
+    trees = [choices(stored, point, stored.seeds, progress) for stored in train]
+    network, rest = None, [each.scheduled(point) for each in trees]
     looks = point.changed(schedule="coverage", threshold=None)  # it needs the outlook, as the network does
     for _ in range(ROUNDS):
-        pairs = [gains(each, looks, choose) for each, choose in zip(made, rest, strict=True)]
+        pairs = [gains(each, looks, choose) for each, choose in zip(trees, rest, strict=True)]
         network = fit(*(np.concatenate(part) for part in zip(*pairs, strict=True)))
-        rest = [by_network(each, looks, network, WHILE_LEARNING) for each in made]
+        rest = [by_network(each, looks, network, WHILE_LEARNING) for each in trees]
         progress(1)
     assert network is not None
     return network
 
 
-def by_network(made: Choices, point: OperatingPoint, network: Network, threshold: float) -> Choose:
+def by_network(tree: Choices, point: OperatingPoint, network: Network, threshold: float) -> Choose:
     """Return the rule that asks whom the network says to."""
     schedule = Learnt(network, threshold)
-    worths = [schedule.worth(known_of(point, level.intents, level.draws)) for level in made.levels]
-    return made.scheduled(point.changed(threshold=threshold), worths)
+    worths = [schedule.worth(known_of(point, level.intents, level.draws)) for level in tree.levels]
+    return tree.scheduled(point.changed(threshold=threshold), worths)
 
 
 def tuned(
@@ -119,8 +119,8 @@ def tuned(
     success = np.zeros(len(THRESHOLDS))
     looks = point.changed(schedule="coverage", threshold=None)
     for stored in tune:
-        made = choices(stored, point, stored.seeds, progress)
-        success += [made.played(by_network(made, looks, network, each))[0].mean() for each in THRESHOLDS]
+        tree = choices(stored, point, stored.seeds, progress)
+        success += [tree.played(by_network(tree, looks, network, each))[0].mean() for each in THRESHOLDS]
     return THRESHOLDS[int(np.flatnonzero(np.isclose(success, success.max()))[-1])]
 
 
@@ -150,10 +150,10 @@ def run_learn(
     for stored in (*train, *tune):
         stored.settle()
     weights = {name: np.asarray(part).tolist() for name, part in asdict(network).items()}
-    made = Stated(
+    schedule = Stated(
         description=f"Learnt: the gain of asking a helper, under {point.name}.", command=command,
         learnt_from=learnt_from, tuned_on=tuned_on, condition=point.name,
         threshold=threshold, inputs=INPUTS, network=Weights(**weights),
     )  # fmt: skip
-    write_whole(out, text(made))
-    return made
+    write_whole(out, text(schedule))
+    return schedule

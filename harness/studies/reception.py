@@ -112,8 +112,8 @@ def _p95(values: Floats, trips: Ints) -> Estimate:
     if not len(there):
         return Estimate(math.nan, math.nan, math.nan, 0, 0)
     times = resampled(noise.generator("waits"), len(there), RESAMPLES)
-    value, *found = (np.quantile(np.repeat(values, row[of]), 0.95) for row in times)
-    low, high = np.quantile(found, [0.025, 0.975]).tolist()
+    value, *bootstrap = (np.quantile(np.repeat(values, row[of]), 0.95) for row in times)
+    low, high = np.quantile(bootstrap, [0.025, 0.975]).tolist()
     return Estimate(float(value), low, high, len(there), 0)
 
 

@@ -47,7 +47,7 @@ def run_repeats(
         repeats: how many.
         out: the folder.
         progress: called with the number of new answers.
-        more: called with the number of answers that are owed next.
+        more: called with the number of answers that are asked for next.
         cache_file: of completions kept between runs; None for no cache.
 
     Raises:

@@ -79,7 +79,7 @@ class ReplayedRun:
         Args:
             folder: its folder.
             latency: `paper` for the paper's inference times.
-            more: told how many answers are owed.
+            more: called with the number of answers that are asked for next.
             done: told how many have come.
             asks: whether its model is asked what the run has no answer to. Else a walk is left out that
                 comes to a decision point without an answer of the ego, and one that needs a helper whom the
@@ -121,41 +121,41 @@ class ReplayedRun:
         self._asks, self._models = asks, models
         self._say, self._more, self._done = say, more, done
         self.left_out: set[str] = set()
-        self._said, self._due = False, 0  # questions that are owed next
+        self._announced, self._left = False, 0  # questions that are asked next
         self._opened: dict[int, Backend] = {}
-        self._laid_out: Intents | None = None  # at every decision point that was asked for
+        self._intents: Intents | None = None  # at every decision point that was asked for
         self._row: dict[str, int] = {}  # of each of them, by id
         missing = tally(self.run).missing  # a lost message is a part of the run; what it lacks is asked again
         answers = {a.id: a for a in self.run.answers if a.error is None or a.role not in missing}
         self._asker = Asker(
             self._spec(), self._open, PAPER if latency == "paper" else manifest.latency, folder / MORE,
-            answers, self._came, self._owed,
+            answers, self._count_answered, self._set_left,
         )  # fmt: skip
 
-    def _owed(self, count: int) -> None:
-        self._due = count
+    def _set_left(self, count: int) -> None:
+        self._left = count
         self._more(count)
 
-    def _came(self, count: int) -> None:
-        self._due -= count
+    def _count_answered(self, count: int) -> None:
+        self._left -= count
         self._done(count)
 
-    def _say_once(self) -> None:
+    def _announce_once(self) -> None:
         """Tell how much is asked now, at the first questions to a language model."""
-        if self._said or not any(agent.can.language_model for agent in self.spec.agents):
+        if self._announced or not any(agent.can.language_model for agent in self.spec.agents):
             return
-        self._said = True
+        self._announced = True
         tokens = [answer.prompt_tokens for answer in self.run.answers if answer.prompt_tokens is not None]
-        about = f" (about {float(f'{self._due * np.mean(tokens):.2g}'):.0f} prompt tokens)" if tokens else ""
+        size = f" (about {float(f'{self._left * np.mean(tokens):.2g}'):.0f} prompt tokens)" if tokens else ""
         reached = self.run.decisions.scenes
         lacks = len(reached) * self.vehicles - sum(answer.role in OWN for answer in self.run.answers)
-        questions = "1 question" if self._due == 1 else f"{self._due} questions"
-        others = (
+        questions = "1 question" if self._left == 1 else f"{self._left} questions"
+        unasked = (
             f"; of helpers at the {len(reached)} decision points that it reached, it lacks {lacks} at most"
         )
         self._say(
-            f"{printable(self.name)} is asked {questions} now that the run did not ask{about}"
-            f"{others if lacks > 0 else ''}"
+            f"{printable(self.name)} is asked {questions} now that the run did not ask{size}"
+            f"{unasked if lacks > 0 else ''}"
         )
 
     def _roots(self) -> list[str]:
@@ -294,14 +294,14 @@ class ReplayedRun:
     def _lay_out(self, scenes: Sequence[Scene]) -> None:
         """Keep the intents in these scenes as arrays."""
         more = self._asker.laid_out(scenes, width=self.vehicles)
-        before = 0 if self._laid_out is None else len(self._laid_out.own)
-        self._laid_out = Intents.joined([self._laid_out, more]) if self._laid_out else more
+        before = 0 if self._intents is None else len(self._intents.own)
+        self._intents = Intents.joined([self._intents, more]) if self._intents else more
         self._row |= {scene.id: before + n for n, scene in enumerate(scenes)}
 
     def _there(self, scenes: Sequence[Scene], helpers: int) -> Intents:
         """The intents in scenes that were laid out."""
-        assert self._laid_out is not None
-        return self._laid_out.take([self._row[scene.id] for scene in scenes]).of_first(helpers)
+        assert self._intents is not None
+        return self._intents.take([self._row[scene.id] for scene in scenes]).of_first(helpers)
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
         """Return the same where helpers are shown nothing, as far as the run has answers or asks them all."""
@@ -359,7 +359,7 @@ class ReplayedRun:
         """This process's backend, opened once: a forked process may not ask its parent's."""
         if (process := os.getpid()) not in self._opened:
             self._opened[process] = self._newly_opened()
-        self._say_once()
+        self._announce_once()
         return self._opened[process]
 
     def _newly_opened(self) -> Backend:
@@ -376,9 +376,9 @@ class ReplayedRun:
         identity = together(cards, models).identity()
         stored, now = manifest.identity, msgspec.json.decode(canonical_json(identity))
         if not same_model(stored, now):
-            other = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
+            changes = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
             raise UserError(
-                f"{shown}: the model is not what it was ({printable(', '.join(other))}); run again"
+                f"{shown}: the model is not what it was ({printable(', '.join(changes))}); run again"
             )
         return together(cards, models, default_file())
 

@@ -161,5 +161,5 @@ def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
 
 
 def _on_tune(run: Compared, play: Play) -> float | None:
-    tuned = {other.setting: other for other in run.tune.get(play.setting.schedule, ())}
+    tuned = {candidate.setting: candidate for candidate in run.tune.get(play.setting.schedule, ())}
     return float(tuned[play.setting].success.mean()) if tuned else None

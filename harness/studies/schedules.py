@@ -54,7 +54,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Play:
-    """What came of a setting: success, (S, E), and `COSTS`, (S, E, C), of every episode."""
+    """The outcome of a setting: success, (S, E), and `COSTS`, (S, E, C), of every episode."""
 
     setting: Setting
     success: Floats
@@ -305,8 +305,8 @@ def run_schedules(
     })  # fmt: skip
     more(sum(run.dataset.scenario.parameters.decisions for run in every) + len(runs) * len(names))
     compared = [
-        compare(run, other, point_of([run], condition), names, seeds, budget, progress)
-        for run, other in zip_longest(runs, tune)
+        compare(run, tune_run, point_of([run], condition), names, seeds, budget, progress)
+        for run, tune_run in zip_longest(runs, tune)
     ]
     for run in every:
         run.settle()

@@ -162,9 +162,9 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
         stated = {}  # it is no study of this kind
     theirs = stated if isinstance(stated, dict) else {}
     now = json.loads(json.dumps(manifest))
-    if other := [key for key, value in now.items() if _lasting(key, theirs.get(key)) != _lasting(key, value)]:
+    if keys := [key for key, value in now.items() if _lasting(key, theirs.get(key)) != _lasting(key, value)]:
         raise UserError(
-            f"{printable(out)} holds another {kind}, with other {', '.join(other)}; name another folder with "
+            f"{printable(out)} holds another {kind}, with other {', '.join(keys)}; name another folder with "
             "--out, or delete it"
         )
 

@@ -49,7 +49,7 @@ def settings(
     """
     runs = [source for source in sources if isinstance(source, ReplayedRun)]
     vehicles = min(run.vehicles for run in runs)
-    name, found = CROSS.join(axis.name for axis in axes), list[Setting]()
+    name, result = CROSS.join(axis.name for axis in axes), list[Setting]()
     for axis, values in zip(axes, grids, strict=True):
         if axis.field is None and max(map(float, values)) > vehicles:
             raise UserError(
@@ -63,14 +63,14 @@ def settings(
             for axis, value in zip(axes, values, strict=True):
                 point, size = axis.at(point, value), size if axis.field else int(value)
             idle.append({axis.name: point.idle(axis.field) for axis in axes})
-            found.append(Setting(condition, point, size, name, values if len(axes) > 1 else values[0]))
+            result.append(Setting(condition, point, size, name, values if len(axes) > 1 else values[0]))
         for axis in axes:
             if all(point[axis.name] for point in idle):
                 raise UserError(
                     f"--over {axis.name}: it changes nothing in {printable(condition)}: "
                     f"{idle[0][axis.name]}; vary another setting or another --condition"
                 )
-    return tuple(found)
+    return tuple(result)
 
 
 def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
@@ -205,12 +205,12 @@ def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
 
 def _map(part: "pd.DataFrame") -> Figure:
     """Draw success of crossed axes: the first down, the second across, a panel for each of the others."""
-    down, across, *others = part.variable.iloc[0].split(CROSS)
+    down, across, *panel_axes = part.variable.iloc[0].split(CROSS)
     rows = part[(part.metric == SUCCESS) & (part.interval == _interval(part))]
-    groups = rows.groupby(others, sort=False) if others else [((), rows)]
+    groups = rows.groupby(panel_axes, sort=False) if panel_axes else [((), rows)]
     panels = {}
     for values, group in groups:
-        names = [f"{name} {value}" for name, value in zip(others, values, strict=True)]
+        names = [f"{name} {value}" for name, value in zip(panel_axes, values, strict=True)]
         wide = group.pivot(index=down, columns=across, values="mean")
         wide = wide.reindex(index=group[down].unique(), columns=group[across].unique())
         panels[", ".join([str(group.condition.iloc[0]), *names])] = 100 * wide.to_numpy(dtype=float)
@@ -226,11 +226,11 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
         # Over episodes, but where a seed has episodes of its own.
         metrics = group.sort_values("interval", ascending=False, kind="stable").set_index("metric")
         metrics = metrics[~metrics.index.duplicated(keep="last")]
-        others = (f"{scale * metrics['mean'][name]:.1f}" for name, scale in HEADS.values())
+        means = (f"{scale * metrics['mean'][name]:.1f}" for name, scale in HEADS.values())
         core = panel == CORE
         title = str(source) if core else f"{source} · {condition} over {panel}"
         heads[title] = "condition" if core else str(panel)
-        cells = (str(condition) if core else _text(value), percent(metrics.loc[SUCCESS], *ESTIMATE), *others)
+        cells = (str(condition) if core else _text(value), percent(metrics.loc[SUCCESS], *ESTIMATE), *means)
         rows.setdefault(title, []).append(cells)
     return [
         Table(title, (head, "success %, 95 % CI", *HEADS), rows[title], terminal=range(2 + len(HEADS)))

@@ -33,7 +33,7 @@ def trust_study(bench: Bench) -> Study:
     cells = [
         {"rule": c.rule, "attack": c.attack or None, "share": c.share,
          "success": as_mapping(over_episodes(SUCCESS, c.success)),
-         "detection": {k: as_mapping(e) for k, e in found.items()} if (found := c.detection()) else None}
+         "detection": {k: as_mapping(e) for k, e in rates.items()} if (rates := c.detection()) else None}
         for c in bench.cells.values()
     ]  # fmt: skip
     n = bench.price(BASE).n
@@ -127,11 +127,11 @@ def _detections(bench: Bench) -> Iterator[Table]:
     for rule in bench.rules:
         rows = [
             (
-                c.attack or "nobody attacks", f"{c.share:.2f}", *(shown(found[name]) for name in names),
+                c.attack or "nobody attacks", f"{c.share:.2f}", *(shown(rates[name]) for name in names),
                 "–" if np.isnan(c.time_to_detection) else f"{c.time_to_detection:.0f}",
                 f"{sum(map(bool, c.first))} of {len(c.first)}",
             )
-            for c in bench.cells.values() if c.rule == rule and (found := c.detection())
+            for c in bench.cells.values() if c.rule == rule and (rates := c.detection())
         ]  # fmt: skip
         if rows:
             yield Table(

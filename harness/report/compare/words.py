@@ -95,7 +95,7 @@ def rest(c: InCondition) -> list[Difference]:
 
 
 def findings(comparison: Comparison) -> list[tuple[str, str]]:
-    """Return what became of success in each condition: a sentence and its verdict."""
+    """Return how success changed in each condition: a sentence and its verdict."""
     rows = [
         (c.condition, d, line(d)) for c in comparison.conditions for d in c.differences if d.metric == SUCCESS
     ]
@@ -290,7 +290,7 @@ def settings(comparison: Comparison) -> list[str]:
 
 
 def judged(verdict: Verdict, sign: str = "+") -> str:
-    """What became of a gate; `sign` is the format's, of values that are no differences `-`."""
+    """Say whether a gate held; `sign` is the format's, of values that are no differences `-`."""
     gate = printable(verdict.gate)
     if not verdict.failed:
         return f"passed: {gate}"

@@ -210,10 +210,10 @@ def _words(figure: Figure, scene: Scene, viewer: str, seen: set[str]) -> None:
     left, height = 0.1 / figure.get_figwidth(), figure.get_figheight()
     title = f"Scene {printable(scene.id, 40)} at {state.time_s:.1f} s, ego {state.ego.speed_mps:.1f} m/s"
     figure.text(left, 1 - 0.24 / height, title, size=10, weight="bold")
-    others = [v.id for v in state.vehicles if v.id != viewer]
+    neighbours = [v.id for v in state.vehicles if v.id != viewer]
     parts = [
-        f"{viewer} ({graph.role}) sees {_list(v for v in others if v in seen)}",
-        f"hidden: {_list(v for v in others if v not in seen)}",
+        f"{viewer} ({graph.role}) sees {_list(v for v in neighbours if v in seen)}",
+        f"hidden: {_list(v for v in neighbours if v not in seen)}",
         f"occluded sectors: {_list(graph.occluded)}",
     ]
     figure.text(left, 1 - 0.45 / height, printable("; ".join(parts), 110), size=7.5)

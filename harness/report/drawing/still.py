@@ -191,8 +191,8 @@ def _sight(state: WorldState, seen: dict[str, list[str]]) -> Iterator[Artist]:
     at = {v.id: north_up(np.array([v.x_m, v.y_m])) for v in state.vehicles}
     for viewer, ids in seen.items():
         colour = ROLES["ego" if viewer == state.ego.id else "helper"]
-        there = [other for other in ids if viewer in at and other in at]  # traffic may have left since
-        lines = [np.array([at[viewer], at[other]]) for other in there]
+        there = [vehicle for vehicle in ids if viewer in at and vehicle in at]  # traffic may have left since
+        lines = [np.array([at[viewer], at[vehicle]]) for vehicle in there]
         yield LineCollection(lines, colors=colour, linewidths=0.6, alpha=0.5)
 
 

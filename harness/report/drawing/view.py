@@ -45,13 +45,13 @@ class View:
         low, high = self.edges
         return bool(np.all((points >= low + margin_m) & (points <= high - margin_m)))
 
-    def toward(self, other: "View", share: float) -> "View":
+    def toward(self, target: "View", share: float) -> "View":
         """On the way to another view."""
         return View(
-            self.west_m + share * (other.west_m - self.west_m),
-            self.south_m + share * (other.south_m - self.south_m),
-            self.width_m + share * (other.width_m - self.width_m),
-            self.height_m + share * (other.height_m - self.height_m),
+            self.west_m + share * (target.west_m - self.west_m),
+            self.south_m + share * (target.south_m - self.south_m),
+            self.width_m + share * (target.width_m - self.width_m),
+            self.height_m + share * (target.height_m - self.height_m),
         )
 
 
@@ -70,8 +70,8 @@ def spots(
     wanted = {*who, state.ego.id, *(conflict.vehicle for conflict in conflicts)}
     wanted |= {graph.viewer} if graph else set()
     at = [(v.x_m, v.y_m) for v in state.vehicles if v.id in wanted]
-    found: Floats = np.concatenate([north_up(np.array([*at, zone_m])), crossings])
-    near: Floats = found[np.abs(found - found[0]).max(axis=1) <= NEAR_M]
+    points: Floats = np.concatenate([north_up(np.array([*at, zone_m])), crossings])
+    near: Floats = points[np.abs(points - points[0]).max(axis=1) <= NEAR_M]
     return near
 
 
@@ -102,11 +102,11 @@ def views(held: Sequence[Floats], parts: Sequence[int], shape: float = 1.0) -> l
     targets = [
         view_of(np.concatenate(held[turn:end]), shape) for turn, end in zip(turns, starts[1:], strict=True)
     ]
-    found = []
+    stills = []
     for n, target in enumerate(targets):
         turn, end = turns[n + 1] if n + 1 < len(targets) else starts[n + 1], starts[n + 1]
-        found += [target] * (turn - starts[n])
+        stills += [target] * (turn - starts[n])
         for still in range(turn, end):
             share = (still - turn + 1) / (end - turn + 1)
-            found.append(target.toward(targets[n + 1], share * share * (3 - 2 * share)))
-    return found
+            stills.append(target.toward(targets[n + 1], share * share * (3 - 2 * share)))
+    return stills

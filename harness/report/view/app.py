@@ -117,7 +117,7 @@ class View:
 
     async def run(self, request: Request) -> Response:
         """The page of one run or study."""
-        [run] = await run_in_threadpool(self._found, [request.query_params.get("path", "")])
+        [run] = await run_in_threadpool(self._listed, [request.query_params.get("path", "")])
         if run.state != "finished":
             raise UserError(
                 f"{printable(run.name)} is {run.state} ({printable(run.why)}); it has no page yet"
@@ -133,7 +133,7 @@ class View:
 
     def picture(self, request: Request) -> Response:
         """A picture of a study."""
-        [run] = self._found([request.query_params.get("path", "")])
+        [run] = self._listed([request.query_params.get("path", "")])
         name = request.query_params.get("name", "")
         file = own_file(self.folder, run.name, name) if name in pictures(self.folder, run.name) else None
         if file is None:
@@ -170,7 +170,7 @@ class View:
         traceback.print_exception(error)
         return HTMLResponse(pages.wrong("this page cannot be made; the terminal says why"), 500)
 
-    def _found(self, names: Sequence[str]) -> Sequence[Listed]:
+    def _listed(self, names: Sequence[str]) -> Sequence[Listed]:
         by_name = {run.name: run for run in runs(self.folder)}
         for name in names:
             if name not in by_name:
@@ -180,7 +180,7 @@ class View:
         return [by_name[name] for name in names]
 
     def _picked(self, request: Request) -> Sequence[Listed]:
-        listed = self._found(list(dict.fromkeys(request.query_params.getlist("path"))))
+        listed = self._listed(list(dict.fromkeys(request.query_params.getlist("path"))))
         for run in listed:
             if run.state != "finished" or run.kind not in pages.RUNS:
                 raise UserError(f"{printable(run.name)} is no finished run of a model; pick others")

@@ -218,19 +218,19 @@ def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -
     graphs = scene.graphs
     if twin.graph:
         graphs = {viewer: twin.graph(spec, scene, graph) for viewer, graph in graphs.items()}
-    others = requests(spec, [_named(scene, twin, graphs=graphs)])
-    for question, other in zip(questions, others, strict=True):
+    copies = requests(spec, [_named(scene, twin, graphs=graphs)])
+    for question, copy in zip(questions, copies, strict=True):
         if spec.ego.can.language_model:
-            other = twin.text(spec, other) if twin.text else other
+            copy = twin.text(spec, copy) if twin.text else copy
             viewer = question.id.rpartition("/")[2]
-            if twin.image and other.image and graphs[viewer] != scene.graphs[viewer]:
-                other = replace(other, image=twin.image(other.image))
-            differ = _differ(question, other)
+            if twin.image and copy.image and graphs[viewer] != scene.graphs[viewer]:
+                copy = replace(copy, image=twin.image(copy.image))
+            differ = _differ(question, copy)
         else:
-            other = replace(other, view=twin.view(other.view)) if twin.view and other.view else other
-            differ = question.view != other.view
+            copy = replace(copy, view=twin.view(copy.view)) if twin.view and copy.view else copy
+            differ = question.view != copy.view
         if differ:
-            yield twin, question.role, question, other
+            yield twin, question.role, question, copy
 
 
 def _fusion(spec: Spec, twin: Twin, scene: Scene, answers: Mapping[str, Answer]) -> Iterator[Asked]:
@@ -239,14 +239,14 @@ def _fusion(spec: Spec, twin: Twin, scene: Scene, answers: Mapping[str, Answer])
     senders = [message["sender"] for message in messages_of(by_viewer, scene.viewers[1:], spec.actions)]
     if senders and twin.senders:
         question = fusion_request(spec, scene, by_viewer, senders)
-        other = fusion_request(spec, _named(scene, twin), by_viewer, twin.senders(senders))
-        if _differ(question, other):
-            yield twin, "fusion", question, other
+        copy = fusion_request(spec, _named(scene, twin), by_viewer, twin.senders(senders))
+        if _differ(question, copy):
+            yield twin, "fusion", question, copy
 
 
-def _named(scene: Scene, twin: Twin, **others: Any) -> Scene:
+def _named(scene: Scene, twin: Twin, **changes: Any) -> Scene:
     """A scene of another name, so that its answers have names of their own."""
-    return scene.changed(**others, scene=f"{scene.id}~{twin.name}")
+    return scene.changed(**changes, scene=f"{scene.id}~{twin.name}")
 
 
 def _differ(a: Request, b: Request) -> bool:

@@ -229,8 +229,8 @@ def other_units(spec: Spec, request: Request) -> Request:
 
     def reworded(text: str) -> str:
         text = text.replace(f"{_speeds(spec, 1.0)} m/s", f"{_speeds(spec, KMH)} m/s")
-        for unit, other in UNITS.items():
-            text = re.sub(unit, other, text)
+        for unit, new_unit in UNITS.items():
+            text = re.sub(unit, new_unit, text)
         return text
 
     return _reworded(request, reworded)
@@ -240,8 +240,8 @@ def paraphrased(spec: Spec, request: Request) -> Request:
     """Every sentence of `paraphrases.toml` in other words."""
 
     def reworded(text: str) -> str:
-        for sentence, other in paraphrases().items():
-            text = text.replace(sentence, other)
+        for sentence, paraphrase in paraphrases().items():
+            text = text.replace(sentence, paraphrase)
         return text
 
     return _reworded(request, reworded)
@@ -251,7 +251,7 @@ def paraphrased(spec: Spec, request: Request) -> Request:
 def paraphrases() -> dict[str, str]:
     """Return other words for sentences."""
     text = text_of(Path(__file__).parent / "paraphrases.toml", "settings")
-    return {str(sentence): str(other) for sentence, other in tomllib.loads(text).items()}
+    return {str(sentence): str(paraphrase) for sentence, paraphrase in tomllib.loads(text).items()}
 
 
 def reordered_keys(spec: Spec, request: Request) -> Request:

@@ -102,8 +102,8 @@ def _example(actions: Sequence[str], row: Row, n: int, pair: Pair) -> Markup:
         )
     )
     whole = Markup("\n").join(
-        Markup("<pre>{}\n--- answer\n{}</pre>").format(visible(question), visible(said))
-        for question, said in zip(pair.messages, pair.said, strict=True)
+        Markup("<pre>{}\n--- answer\n{}</pre>").format(visible(question), visible(answer))
+        for question, answer in zip(pair.messages, pair.said, strict=True)
     )
     return Markup(
         '<section class="answer" id="{}-{}"><h3>{}, {}: {} in scene {}, TV {} <a href="#{}">back</a></h3>\n'
