@@ -50,10 +50,10 @@ class Intents:
             **{name: array[at] for name, array in self.arrays().items()},
         )
 
-    def replaced(self, at: Ints, other: "Intents") -> "Intents":
-        """Return the same with the decisions `other` at these indices; places and claims stay."""
+    def replaced(self, at: Ints, newer: "Intents") -> "Intents":
+        """Return the same with the decisions `newer` at these indices; places and claims stay."""
         arrays = {name: array.copy() for name, array in self.arrays().items()}
-        for name, values in other.arrays().items():
+        for name, values in newer.arrays().items():
             arrays[name][at] = values
         return replace(self, **arrays)
 

@@ -125,14 +125,14 @@ def moments(points: Sequence[tuple[World, WorldState, int, Sequence[VehicleState
 
 def _moment(world: World, state: WorldState, episode: int, graphs: dict[str, SceneGraph]) -> Record:
     """Return a decision point's record, with the scene graphs of its viewers, by their ids."""
-    zone, (ego_id, *others) = world.scenario.road().zone_m, graphs
+    zone, (ego_id, *helpers) = world.scenario.road().zone_m, graphs
     ego = state.vehicle(ego_id)
     known_states = {name: known(state, name, ego_id) for name in graphs}
     return Record(
         scene=scene_id(episode, state), episode=episode, episode_seed=world.seed, step=state.step,
         danger=Danger(world.layout.danger, world.layout.danger_id), state=state, graphs=graphs,
         distance_m={name: _distance_m(v, *zone) for name, v in known_states.items()},
-        range_m={name: _distance_m(known_states[name], ego.x_m, ego.y_m) for name in others},
+        range_m={name: _distance_m(known_states[name], ego.x_m, ego.y_m) for name in helpers},
     )  # fmt: skip
 
 

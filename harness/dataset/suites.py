@@ -36,11 +36,11 @@ def named(text: str) -> Suite | None:
     if not text.startswith(PREFIX):
         return None
     name, files = text.removeprefix(PREFIX), entries("datasets", "suites.toml")
-    found = each(map(str, files), lambda file: _tables(Path(file)))
-    wrong = [read for read in found.values() if isinstance(read, UserError)]
+    results = each(map(str, files), lambda file: _tables(Path(file)))
+    wrong = [read for read in results.values() if isinstance(read, UserError)]
     tables = [
         (file, key, table)
-        for file, read in found.items() if not isinstance(read, UserError)
+        for file, read in results.items() if not isinstance(read, UserError)
         for key, table in read.items()
     ]  # fmt: skip
     matches = [(file, table) for file, key, table in tables if key == name]

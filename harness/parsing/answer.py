@@ -142,8 +142,8 @@ def recommended(maneuver: str, confidence: float, actions: Sequence[str]) -> val
     """Return the intent with `confidence` on the maneuver and the rest spread evenly over the others."""
     if len(actions) == 1:
         return (1.0,)
-    others = (1 - confidence) / (len(actions) - 1)
-    return tuple(confidence if action == maneuver else others for action in actions)
+    share = (1 - confidence) / (len(actions) - 1)
+    return tuple(confidence if action == maneuver else share for action in actions)
 
 
 def _maneuver(value: object, actions: Sequence[str], repairs: set[Repair]) -> str:

@@ -125,17 +125,17 @@ def _around(
     A quote in its evidence breaks the object, and nothing else. None if there is no such object.
     """
     start = objects.broken or 0
-    inner = [(at, one) for at, one in objects.readings if at > start and _shaped(one.value, role, actions)]
+    inner = [(at, each) for at, each in objects.readings if at > start and _shaped(each.value, role, actions)]
     if len(inner) != 1 or len(objects.readings) != 1:
         return None
     [(at, reading)] = inner
     try:
-        others, name, rest = mend.around(text[start:], at - start, reading.end - start, FIELDS[role], cut)
+        members, name, rest = mend.around(text[start:], at - start, reading.end - start, FIELDS[role], cut)
     except Failure:
         return None
     around = _repairs_around(text[:start], rest, reasons_first)
     repairs = frozenset(reading.repairs) | around | {Repair.JSON_REPAIR}
-    return Candidate({**others, name: reading.value}, repairs)
+    return Candidate({**members, name: reading.value}, repairs)
 
 
 def _objects(text: str, cut: bool) -> _Objects:

@@ -203,7 +203,7 @@ def _choose(objects: list[Candidate], shape: Shape, divides: bool) -> Answer:
     agree = all(abs(p - q) <= _SAME for a in answers for p, q in zip(a.intent, last.intent, strict=True))
     if serious or not agree:
         count = len(answers) + len(serious)
-        faults = _distinct([Status.CONFLICTING_ANSWERS, *(f for one in serious for f in one.faults)])
+        faults = _distinct([Status.CONFLICTING_ANSWERS, *(f for each in serious for f in each.faults)])
         detail = f"{count} answers stand in the text and they differ"
         raise Failure(Status.CONFLICTING_ANSWERS, detail, faults=faults)
     return last.mended(Repair.REPEATED_ANSWER) if len(answers) > 1 else last
@@ -213,7 +213,7 @@ def _none_read(
     objects: Sequence[Candidate], failures: Sequence[Failure], serious: Sequence[Failure]
 ) -> Failure:
     """Return the failure of candidates of which none is an answer."""
-    last, faults = (serious or failures)[-1], [fault for one in failures for fault in one.faults]
+    last, faults = (serious or failures)[-1], [fault for each in failures for fault in each.faults]
     if any(Repair.JSON_REPAIR in candidate.repairs for candidate in objects):
         # An error in a guessed object need not be one of the text; that it was copied shows in its words.
         last, faults = unreadable(), [fault for fault in faults if fault is Status.SCHEMA_ECHO]

@@ -14,11 +14,11 @@ def fits(value: object, shape: Shape) -> bool:
     return _is_json(value) and bool(_validator(shape).is_valid(value))
 
 
-def further(said: dict[str, Any], shape: Shape) -> dict[str, Any] | None:
+def further(members: dict[str, Any], shape: Shape) -> dict[str, Any] | None:
     """Return the further members of an answer, without lone surrogates, if they fit; else None."""
-    if not _is_json(said) or not _further_validator(shape).is_valid(said):
+    if not _is_json(members) or not _further_validator(shape).is_valid(members):
         return None
-    text = json.dumps(said, ensure_ascii=False).encode("utf-8", "replace").decode()
+    text = json.dumps(members, ensure_ascii=False).encode("utf-8", "replace").decode()
     return dict(json.loads(text))
 
 

@@ -39,7 +39,7 @@ def match(name: str, known: Sequence[str]) -> str | None:
     """Return the known name that is meant: the same, or the only one with other case and separators."""
     if name in known:
         return name
-    similar = [other for other in known if _plain(other) == _plain(name)]
+    similar = [candidate for candidate in known if _plain(candidate) == _plain(name)]
     return similar[0] if len(similar) == 1 else None
 
 

@@ -73,8 +73,8 @@ def answer_schema(
     if role == "helper":
         report |= {"evidence": {"type": "string", "maxLength": EVIDENCE_CHARS}, "risk": _choice(RISKS)}
     distribution = {"action_distribution": closed(dict.fromkeys(actions, probability))}
-    one = {NAMED[role]: _choice(actions), "confidence": probability}
-    forms = [closed(report | (distribution if each == "distribution" else one)) for each in shape.forms]
+    single = {NAMED[role]: _choice(actions), "confidence": probability}
+    forms = [closed(report | (distribution if each == "distribution" else single)) for each in shape.forms]
     title = f"{role} answer" + (f", {scenario}" if scenario else "")
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title}
     return head | (forms[0] if len(forms) == 1 else {"oneOf": forms})

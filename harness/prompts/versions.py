@@ -195,8 +195,8 @@ class Prompt:
         )
         if letter or "question" not in template.blocks:
             return self._rendered(graph.role, variables, blocks, needs)
-        *others, user, question = self._rendered(graph.role, variables, (*blocks, "question"), needs)
-        return [*others, f"{user}\n{question}"]
+        *head, user, question = self._rendered(graph.role, variables, (*blocks, "question"), needs)
+        return [*head, f"{user}\n{question}"]
 
     def _rendered(
         self, role: str, variables: Mapping[str, Any], blocks: Sequence[str], needs: str

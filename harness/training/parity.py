@@ -104,19 +104,19 @@ def compare(
             engines.insert(0, ("F32", exact))
         alone: list[tuple[str, Callable[..., Backend], list[str]]] = [("transformers", plain, expected.texts)]
         for label, engine in engines:
-            other = _outputs(engine(batch_size=1), asked, letters, rows)
+            trial = _outputs(engine(batch_size=1), asked, letters, rows)
             if engine is exact:
-                alone.append(("llama.cpp F32", engine, other.texts))
+                alone.append(("llama.cpp F32", engine, trial.texts))
             ids = json_ids + letter_ids
-            findings.append(_equal(f"{label}: token ids equal", 1.0, ids, expected.tokens, other.tokens))
+            findings.append(_equal(f"{label}: token ids equal", 1.0, ids, expected.tokens, trial.tokens))
             if asked:
-                logit = np.abs(expected.logits - other.logits).max(axis=1)
+                logit = np.abs(expected.logits - trial.logits).max(axis=1)
                 most = most_logit.get(label)
                 findings += [
                     _near(f"{label}: largest difference of a logit", most, json_ids, logit),
-                    _equal(f"{label}: greedy text equal", LEAST_TEXTS, json_ids, expected.texts, other.texts),
+                    _equal(f"{label}: greedy text equal", LEAST_TEXTS, json_ids, expected.texts, trial.texts),
                 ]
-            readout = np.abs(expected.readouts - other.readouts).max(axis=1)
+            readout = np.abs(expected.readouts - trial.readouts).max(axis=1)
             what = f"{label}: largest difference of a read-out"
             findings.append(_near(what, MOST_READOUT, letter_ids, readout))
             progress(1)

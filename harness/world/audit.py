@@ -132,9 +132,9 @@ def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float]]:
     for name in road.sectors:
         yield f"{name}: seen_share", seen[name].seen_share
         yield f"{name}: hidden by", float(len(seen[name].by))
-        others = [conflict.other for conflict in graph.conflicts if conflict.sector == name]
-        first = min(others, key=lambda other: other.arc_m, default=None)
-        yield f"{name}: conflicts", float(len(others))
+        arrivals = [conflict.other for conflict in graph.conflicts if conflict.sector == name]
+        first = min(arrivals, key=lambda arrival: arrival.arc_m, default=None)
+        yield f"{name}: conflicts", float(len(arrivals))
         for number in ("arc_m", "time_s", "speed_mps"):
             yield f"{name}: first conflict {number}", _known(getattr(first, number, None))
 

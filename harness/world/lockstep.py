@@ -164,10 +164,10 @@ def _lanes(road: Callable[[], Road]) -> Lanes | None:
         return None
     arc = np.array([type(lane) is CircularLane for lane in lanes])
 
-    def each(name: str, other: Any, arcs: bool) -> Floats:
+    def each(name: str, blank: Any, arcs: bool) -> Floats:
         return np.array(
             [
-                getattr(lane, name) if is_arc == arcs else other
+                getattr(lane, name) if is_arc == arcs else blank
                 for lane, is_arc in zip(lanes, arc, strict=True)
             ],
             dtype=float,

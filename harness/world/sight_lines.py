@@ -45,16 +45,16 @@ def site(
 
 def _site(points: Sequence[tuple[WorldState, VehicleState | Place, Sequence[VehicleState]]]) -> Site:
     """Return the links from one end, a vehicle or a place, to some vehicles."""
-    n, most = len(points), max((len(others) for _, _, others in points), default=0)
+    n, most = len(points), max((len(targets) for _, _, targets in points), default=0)
     xy_m = np.full((n, 1 + most, 2), np.nan)
     sight, blocker_m = np.full((n, most), CLEAR), np.zeros((n, most))
     corner_m = np.full((n, most, 2), np.nan)
-    for i, (state, first, others) in enumerate(points):
-        xy_m[i, : 1 + len(others)] = [_xy(end) for end in (first, *others)]
-        for h, other in enumerate(others):
-            sight[i, h], blocker_m[i, h] = _between(state, first, other)
+    for i, (state, first, targets) in enumerate(points):
+        xy_m[i, : 1 + len(targets)] = [_xy(end) for end in (first, *targets)]
+        for h, target in enumerate(targets):
+            sight[i, h], blocker_m[i, h] = _between(state, first, target)
             if isinstance(first, VehicleState):
-                corner_m[i, h] = corner(first, other)
+                corner_m[i, h] = corner(first, target)
     return Site(xy_m, sight, blocker_m, corner_m)
 
 

@@ -247,10 +247,10 @@ class World:
             standing: ids of the vehicles that had crashed before that frame.
         """
         p = self.scenario.parameters
-        ego, others = self.vehicles[0], self.vehicles[1:]
-        crashed = {v.spawn.id for v in others if v.crashed and v.spawn.id not in standing}
+        ego, traffic = self.vehicles[0], self.vehicles[1:]
+        crashed = {v.spawn.id for v in traffic if v.crashed and v.spawn.id not in standing}
         if ego.crashed:
-            how = self._collision(ego, [v for v in others if v.crashed])
+            how = self._collision(ego, [v for v in traffic if v.crashed])
             crashed.discard(how.get("partner", ""))
             self.outcome = self.outcome.ending("collision", self.time_s, **how)
         elif not ego.on_road:
@@ -277,9 +277,9 @@ def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
     most_m = centres_m - (sizes_m[:, None, :1, 1] + sizes_m[:, None, 1:, 1]) / 2
     bound_m = np.fmin(least_m, np.fmin.reduce(most_m, axis=(1, 2), initial=np.inf))
     close = centres_m - (farthest_m[..., :1] + farthest_m[..., 1:]) / 2 <= bound_m[:, None, None]
-    worlds, frames, others = np.nonzero(close)
-    mine, its = poses[worlds, frames, 0, :3], poses[worlds, frames, 1 + others, :3]
-    sizes, its_sizes = sizes_m[worlds, 0], sizes_m[worlds, 1 + others]
+    worlds, frames, vehicles = np.nonzero(close)
+    mine, its = poses[worlds, frames, 0, :3], poses[worlds, frames, 1 + vehicles, :3]
+    sizes, its_sizes = sizes_m[worlds, 0], sizes_m[worlds, 1 + vehicles]
     at_least_m = separation_m(mine, sizes, its, its_sizes)
     gaps_m = least_m.copy()
 

@@ -92,7 +92,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 def reset(name: str, seed: int) -> Any:
     """Return an environment at the start of a seed's episode. Raises UserError if there is none."""
-    env = _made(name)
+    env = _create(name)
     _constants().restore()
     try:
         env.reset(seed=seed)
@@ -102,7 +102,7 @@ def reset(name: str, seed: int) -> Any:
     return env
 
 
-def _made(name: str) -> Any:
+def _create(name: str) -> Any:
     import gymnasium
     import highway_env
     from highway_env.envs.common.abstract import AbstractEnv
@@ -162,7 +162,7 @@ def _merged(default: Any, value: Any) -> Any:
 
 def config(name: str) -> dict[str, Any]:
     """Return an environment's whole configuration."""
-    whole: dict[str, Any] = json.loads(json.dumps(_made(name).config, default=str), parse_constant=str)
+    whole: dict[str, Any] = json.loads(json.dumps(_create(name).config, default=str), parse_constant=str)
     return whole
 
 

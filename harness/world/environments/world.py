@@ -60,8 +60,8 @@ class EnvironmentWorld(World):
         world = cls(scenario, seed, layout, env.road, env=env, here=here, constants=Constants.now())
         ego.to_go_m = p.goal_s * first_target_mps(ego)
         world._enter(ego, "ego")
-        others = (v for v in env.road.vehicles if v is not ego)
-        nearest = sorted(others, key=lambda v: (v not in env.controlled_vehicles, _apart_m(v, ego)))
+        traffic = (v for v in env.road.vehicles if v is not ego)
+        nearest = sorted(traffic, key=lambda v: (v not in env.controlled_vehicles, _apart_m(v, ego)))
         for n, v in enumerate(nearest):
             world._enter(v, "helper" if n < p.helpers else "other")
         poses = beacons.lead_in(p, world._in_road_frame(world._poses()))

@@ -68,14 +68,14 @@ class Frame(Image):
 
     def boxes(self) -> dict[str, list[tuple[int, int, int, int]]]:
         """Return each object's bounding boxes in either half: left, top, right and bottom (exclusive)."""
-        half, found = len(self.owners) // 2, dict[str, list[tuple[int, int, int, int]]]()
+        half, boxes = len(self.owners) // 2, dict[str, list[tuple[int, int, int, int]]]()
         for place, name in enumerate(self.ids):
             for top in (0, half):
                 rows, columns = np.nonzero(self.owners[top : top + half] == place)
                 if len(rows):
                     box = columns.min(), top + rows.min(), columns.max() + 1, top + rows.max() + 1
-                    found.setdefault(name, []).append((int(box[0]), int(box[1]), int(box[2]), int(box[3])))
-        return found
+                    boxes.setdefault(name, []).append((int(box[0]), int(box[1]), int(box[2]), int(box[3])))
+        return boxes
 
 
 def frame(scenario: Scenario, state: WorldState, viewer_id: str, size_px: tuple[int, int] = SIZE_PX) -> Frame:

@@ -127,9 +127,9 @@ def conflicts(road: Road, all_known: Sequence[Known]) -> list[list[Conflict]]:
     if road.form == 2:
         for n, conflict in _along(road, all_known):
             met[n].append(conflict)
-    for found, known in zip(met, all_known, strict=True):
-        if not found and (meeting := _meeting(road, known)):
-            found.append(meeting)
+    for seen, known in zip(met, all_known, strict=True):
+        if not seen and (meeting := _meeting(road, known)):
+            seen.append(meeting)
     return met
 
 
@@ -173,7 +173,7 @@ def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Confli
     of = [n for n, _, _ in shared]
     on = np.array([all_known[n].place.near[key] for n, _, key in shared]).reshape(-1, 2)
     cos = np.cos(its_heading[of] - on[:, 1]).tolist()
-    found = []
+    pairs = []
     for (n, side, key), separate, turned in zip(shared, apart, cos, strict=True):
         known = all_known[n]
         gap = known.place.near[key][0] - known.ego_arc_m
@@ -187,11 +187,11 @@ def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Confli
         closing_mps = (ego_mps - its_mps) * (1 if gap > 0 else -1)
         share = {"ahead": 1.0, "behind": 0.0, "oncoming": ego_mps / max(closing_mps, 0.1)}[kind]
         time_s = tenths(abs(gap) / closing_mps) if closing_mps > 0.5 else None
-        found.append((n, side, key, kind, gap, share, time_s))
+        pairs.append((n, side, key, kind, gap, share, time_s))
     points = _at(road, [
-        (key, all_known[n].ego_arc_m + max(gap, 0.0) * share) for n, _, key, _, gap, share, _ in found
+        (key, all_known[n].ego_arc_m + max(gap, 0.0) * share) for n, _, key, _, gap, share, _ in pairs
     ])  # fmt: skip
-    for (n, side, _, kind, gap, share, time_s), (x, y, _) in zip(found, points.tolist(), strict=True):
+    for (n, side, _, kind, gap, share, time_s), (x, y, _) in zip(pairs, points.tolist(), strict=True):
         known = all_known[n]
         yield n, Conflict(
             known.d.id, *known.key, known.seat.relative(x, y), EgoArrival(tenths(abs(gap) * share), time_s),
@@ -209,16 +209,16 @@ def _apart(road: Road, shared: Sequence[tuple[Known, PathKey]]) -> list[bool]:
     at = _at(road, [(shared[n][0].own, arc_m) for n, arc_m in zip(aside.tolist(), arc.tolist(), strict=True)])
     apart = np.zeros(len(shared), dtype=bool)
     apart[aside] = road.project(way[aside], at[:, 0], at[:, 1])[1] > ONE_LANE_M
-    found: list[bool] = apart.tolist()
-    return found
+    result: list[bool] = apart.tolist()
+    return result
 
 
 def _at(road: Road, asked: Sequence[tuple[PathKey, float]]) -> Floats:
     """Return x, y and heading at an arc length of a path, for each that is asked for, (n, 3)."""
-    found = np.empty((len(asked), 3))
+    poses = np.empty((len(asked), 3))
     of: dict[PathKey, list[int]] = {}
     for n, (key, _) in enumerate(asked):
         of.setdefault(key, []).append(n)
     for key, numbers in of.items():
-        found[numbers] = np.stack(road.paths[key].places(np.array([asked[n][1] for n in numbers])), axis=-1)
-    return found
+        poses[numbers] = np.stack(road.paths[key].places(np.array([asked[n][1] for n in numbers])), axis=-1)
+    return poses

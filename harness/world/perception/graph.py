@@ -61,12 +61,12 @@ def _exact(v: VehicleState) -> Detection:
 def _seen(scenario: Scenario, looks: Sequence[Look], left_out: Collection[str]) -> list[SceneGraph]:
     around = surfaces(looks)
     hit = around.by_viewer(rays_on_vehicles(around)) >= LEAST_RAYS
-    others = [[v for v in state.vehicles if v.id != viewer.id] for state, viewer in looks]
+    nearby = [[v for v in state.vehicles if v.id != viewer.id] for state, viewer in looks]
     in_sight = list(zip(*(numbers.tolist() for numbers in np.nonzero(hit)), strict=True))
-    found = detections([(*looks[n], others[n][place]) for n, place in in_sight], scenario.parameters.light)
+    known = detections([(*looks[n], nearby[n][place]) for n, place in in_sight], scenario.parameters.light)
     detected: list[list[Detection]] = [[] for _ in looks]
     reported = np.zeros_like(hit)
-    for (n, place), d in zip(in_sight, found, strict=True):
+    for (n, place), d in zip(in_sight, known, strict=True):
         if d and d.id not in left_out:
             detected[n].append(d)
             reported[n, place] = True
@@ -93,10 +93,10 @@ def _graphs(
     seats = [Seat(*place) for place in places_m]
     # The viewer itself may be in the ego's way, too.
     listed = [
-        [*found, *([] if road.form == 1 or viewer.id == state.ego.id else [_exact(viewer)])]
-        for (state, viewer), found in zip(looks, detected, strict=True)
+        [*seen, *([] if road.form == 1 or viewer.id == state.ego.id else [_exact(viewer)])]
+        for (state, viewer), seen in zip(looks, detected, strict=True)
     ]
-    things = [(n, d) for n, found in enumerate(listed) for d in found]
+    things = [(n, d) for n, seen in enumerate(listed) for d in seen]
     where = places(road, [d for _, d in things])
     of = [k for k, (n, d) in enumerate(things) if where[k].key and d.id != egos[n].id]
     known = [

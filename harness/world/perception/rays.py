@@ -61,20 +61,20 @@ def surfaces(looks: Sequence[Look]) -> Surfaces:
     for key, state in states.items():
         first[key] = begin, box
         begin, box = begin + len(state.vehicles), box + len(state.buildings)
-    at, ids, others = [], [], []
+    at, ids, counts = [], [], []
     for state, viewer in looks:
         begin, box = first[id(state)]
         seen = [n for n, v in enumerate(state.vehicles) if v.id != viewer.id]
         at += [begin + n for n in seen]
         at += range(box, box + len(state.buildings))
         ids.append((*(state.vehicles[n].id for n in seen), *(b.id for b in state.buildings)))
-        others.append(len(seen))
+        counts.append(len(seen))
     sizes = list(map(len, ids))
     whose = np.repeat(np.arange(len(looks)), sizes)
     place = np.concatenate([np.arange(size) for size in sizes])
     return Surfaces(
         np.array([(v.x_m, v.y_m) for _, v in looks]), tuple(ids), whose, place,
-        place < np.array(others)[whose], corners[np.array(at, dtype=int)],
+        place < np.array(counts)[whose], corners[np.array(at, dtype=int)],
     )  # fmt: skip
 
 
@@ -157,8 +157,8 @@ def _swept(around: Surfaces, of: Bools) -> tuple[Floats, Ints]:
     if not of.all():
         cast = np.zeros(len(around.ids) * RAYS, dtype=bool)
         cast[target[of[surface]]] = True
-        told = cast[target]
-        surface, ray, target = surface[told], ray[told], target[told]
+        needed = cast[target]
+        surface, ray, target = surface[needed], ray[needed], target[needed]
     walls = _walls(around.origins_m[around.viewer], around.corners_m)
     t, _ = _met(walls.take(surface, axis=2), *_all_round()[1].take(ray, axis=1))
     return _first(surface, target, t.min(axis=0), len(around.ids) * RAYS)

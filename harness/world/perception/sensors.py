@@ -29,7 +29,7 @@ LEAST_RAYS = 3  # rays on an object below which no sensor reports it
 LIDAR_NOISE_M, RADAR_NOISE_M = 0.1, 0.4
 # Names of the sensors that report, by whether each of them does.
 SENSORS = {
-    told: tuple(compress(("camera", "lidar", "radar"), told)) for told in product((False, True), repeat=3)
+    flags: tuple(compress(("camera", "lidar", "radar"), flags)) for flags in product((False, True), repeat=3)
 }
 
 
@@ -53,8 +53,8 @@ def detect(
     state: WorldState, viewer: VehicleState, view: Sweep, ambient: Ambient = AMBIENTS[DAY]
 ) -> list[Detection]:
     """Return the detections of one vehicle's sensors, in the order of the state's vehicles."""
-    others = [v for v in state.vehicles if v.id != viewer.id and len(view.hits.get(v.id, ())) >= LEAST_RAYS]
-    return [d for d in detections([(state, viewer, v) for v in others], ambient) if d]
+    visible = [v for v in state.vehicles if v.id != viewer.id and len(view.hits.get(v.id, ())) >= LEAST_RAYS]
+    return [d for d in detections([(state, viewer, v) for v in visible], ambient) if d]
 
 
 def detections(
@@ -68,11 +68,11 @@ def detections(
     """
     if not pairs:
         return []
-    viewers, others = (
+    viewers, targets = (
         np.array([(v.x_m, v.y_m, v.heading_rad, v.speed_mps) for v in pair]).T.copy()
-        for pair in ([viewer for _, viewer, _ in pairs], [other for *_, other in pairs])
+        for pair in ([viewer for _, viewer, _ in pairs], [target for *_, target in pairs])
     )
-    (its_x, its_y, its_heading, its_speed), (x, y, heading, speed) = viewers, others
+    (its_x, its_y, its_heading, its_speed), (x, y, heading, speed) = viewers, targets
     dx, dy = x - its_x, y - its_y
     distance, bearing = np.hypot(dx, dy), np.arctan2(dy, dx)
     off_axis = np.abs(turned(bearing - its_heading))

@@ -84,9 +84,9 @@ def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
     scenario = get(name)
     here = {field.name: getattr(scenario.parameters, field.name) for field in fields(scenario.parameters)}
     where = f"scenario {printable(scenario.name, 80)}"
-    if others := [key for key in parameters if key not in here]:
+    if extra := [key for key in parameters if key not in here]:
         raise UserError(
-            f"{where} has other parameters here (not {printable(others[0])}); "
+            f"{where} has other parameters here (not {printable(extra[0])}); "
             "use the version that its manifest names"
         )
     # Numbers in a manifest are decoded as floats.

@@ -143,16 +143,16 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     }
     numbers = draws.numbers(len(cars))
     ids = {what: f"v{5 + int(number)}" for what, number in zip(cars, numbers, strict=True)}
-    others = []
+    traffic = []
     for what, (approach, share, offset_s) in cars.items():
         if draws.share(what) < share:
             speed = draws.between(f"{what}_speed", p.main_mps)
             arc = arc_m(speed, draws.between(f"{what}_offset", offset_s))
-            others.append(Spawn(ids[what], "car", "other", approach, "straight", arc, speed))
-    spawns += sorted(others, key=lambda spawn: spawn.id)
+            traffic.append(Spawn(ids[what], "car", "other", approach, "straight", arc, speed))
+    spawns += sorted(traffic, key=lambda spawn: spawn.id)
 
     wall = Building("b1", BEGIN_M, WALL_M[0], -draws.between("wall_end", p.wall_end_m), WALL_M[1])
-    danger_id = ids["danger"] if any(spawn.id == ids["danger"] for spawn in others) else None
+    danger_id = ids["danger"] if any(spawn.id == ids["danger"] for spawn in traffic) else None
     return Layout(tuple(spawns), (wall,), "main" if danger_id else None, danger_id)
 
 

@@ -121,10 +121,10 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     numbers = draws.numbers(2)
     danger_id, late_id = (f"v{5 + int(n)}" for n in numbers)
     danger = draws.share("danger") < p.danger_share
-    others = [oncoming(danger_id, draws.between("danger_s", p.danger_s))] if danger else []
+    traffic = [oncoming(danger_id, draws.between("danger_s", p.danger_s))] if danger else []
     if draws.share("late") < p.late_share:
-        others.append(oncoming(late_id, draws.between("late_s", p.late_s)))
-    spawns += sorted(others, key=lambda spawn: spawn.id)
+        traffic.append(oncoming(late_id, draws.between("late_s", p.late_s)))
+    spawns += sorted(traffic, key=lambda spawn: spawn.id)
     return Layout(tuple(spawns), (), "oncoming" if danger else None, danger_id if danger else None)
 
 

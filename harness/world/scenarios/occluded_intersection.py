@@ -81,24 +81,24 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     truck_speed = draws.between("truck_speed", p.truck_speed_mps)
     truck_arc = timed("oncoming", truck_speed, draws.between("truck_offset", p.truck_offset_s))
-    others: dict[str, tuple[Kind, str, str, float, float]] = {
+    traffic: dict[str, tuple[Kind, str, str, float, float]] = {
         "truck": ("truck", "oncoming", "straight", truck_arc, truck_speed)
     }
     if danger == "oncoming":
         arc = truck_arc - draws.between("follow", p.follow_m)
-        others["danger"] = ("car", danger, ROUTES[danger], arc, truck_speed)
+        traffic["danger"] = ("car", danger, ROUTES[danger], arc, truck_speed)
     elif danger:
         speed = draws.between("crossing_speed", p.crossing_speed_mps)
         ego_s = (crossings[danger, ROUTES[danger]].ego_arc_m - ego_arc) / p.ego_speed_mps
         soonest, latest = p.danger_offset_s
         soonest = max(soonest, behind_truck_s(danger, speed, truck_arc, truck_speed) - ego_s)
         offset = draws.between("danger_offset", (soonest, max(soonest, latest)))
-        others["danger"] = ("car", danger, ROUTES[danger], timed(danger, speed, offset), speed)
+        traffic["danger"] = ("car", danger, ROUTES[danger], timed(danger, speed, offset), speed)
     if draws.share("late") < p.late_share:
         arm = SECTORS[int(draws.share("late_sector") * len(SECTORS))]
         speed = draws.between("late_speed", p.truck_speed_mps if arm == "oncoming" else p.crossing_speed_mps)
         arc = timed(arm, speed, draws.between("late_offset", p.late_offset_s))
-        others["late"] = ("car", arm, ROUTES[arm], arc, speed)
+        traffic["late"] = ("car", arm, ROUTES[arm], arc, speed)
 
     spawns = [Spawn("v1", "car", "ego", "own", "straight", ego_arc, p.ego_speed_mps)]
     for n, (approach, exit_name) in enumerate((("right", "left"), ("left", "right"), ("own", "ahead"))):
@@ -112,8 +112,8 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     numbers = draws.numbers(3)
     roles = ("danger", "truck", "late")
     ids = {role: f"v{5 + int(number)}" for role, number in zip(roles, numbers, strict=True)}
-    for name in sorted(others, key=ids.__getitem__):
-        kind, approach, route, arc, speed = others[name]
+    for name in sorted(traffic, key=ids.__getitem__):
+        kind, approach, route, arc, speed = traffic[name]
         spawns.append(Spawn(ids[name], kind, "other", approach, route, arc, speed))
 
     buildings = []

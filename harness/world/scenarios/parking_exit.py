@@ -148,23 +148,23 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     ]
     numbers = draws.numbers(6)
     danger_id, late_id, oncoming_id, *parked = (f"v{5 + int(n)}" for n in numbers)
-    others = [
+    traffic = [
         standing(parked[0], "van", "other", row[0]),
         standing(parked[1], "van", "other", row[1]),
         standing(parked[2], "van", "other", ahead),
     ]
     danger = draws.share("danger") < p.danger_share
     if danger:
-        others.append(coming(danger_id, "danger", p.danger_offset_s))
+        traffic.append(coming(danger_id, "danger", p.danger_offset_s))
     if draws.share("late") < p.late_share:
-        others.append(coming(late_id, "late", p.late_offset_s))
+        traffic.append(coming(late_id, "late", p.late_offset_s))
     if draws.share("oncoming") < p.oncoming_share:
         arc, speed = (
             END_M - start - draws.between("oncoming", p.oncoming_m),
             draws.between("oncoming_speed", p.lane_mps),
         )
-        others.append(Spawn(oncoming_id, "car", "other", "oncoming", "straight", arc, speed))
-    spawns += sorted(others, key=lambda spawn: int(spawn.id[1:]))
+        traffic.append(Spawn(oncoming_id, "car", "other", "oncoming", "straight", arc, speed))
+    spawns += sorted(traffic, key=lambda spawn: int(spawn.id[1:]))
     return Layout(tuple(spawns), (), "behind" if danger else None, danger_id if danger else None)
 
 

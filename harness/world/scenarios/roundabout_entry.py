@@ -202,16 +202,16 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     numbers = draws.numbers(3)
     ids = {what: f"v{5 + int(n)}" for what, n in zip(("round", "before", "late"), numbers, strict=True)}
     danger = arm("sector") if draws.share("danger") < p.danger_share else None
-    others = []
+    traffic = []
     if danger:
-        others.append(car("round", danger, "straight", p.danger_offset_s))
+        traffic.append(car("round", danger, "straight", p.danger_offset_s))
     elif draws.share("leaver") < p.leaver_share:
-        others.append(car("round", arm("sector"), "right", p.danger_offset_s))
+        traffic.append(car("round", arm("sector"), "right", p.danger_offset_s))
     if draws.share("before") < p.before_share:
-        others.append(car("before", arm("before_sector"), "right", p.before_offset_s))
+        traffic.append(car("before", arm("before_sector"), "right", p.before_offset_s))
     if draws.share("late") < p.late_share:
-        others.append(car("late", arm("late_sector"), "straight", p.late_offset_s))
-    spawns += sorted(others, key=lambda spawn: spawn.id)
+        traffic.append(car("late", arm("late_sector"), "straight", p.late_offset_s))
+    spawns += sorted(traffic, key=lambda spawn: spawn.id)
 
     half, mound = p.hedge_half_m, draws.between("mound", p.mound_m)
     hedge = -half, draws.between("hedge_end", p.hedge_end_m), half, ARC_Y_M + ARM_M
