@@ -157,9 +157,9 @@ def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, A
     identity = {key: value for key, value in now.items() if key != "states" or key in stored}
     if "answers" in stored:
         identity.setdefault("answers", 1)  # of an engine from outside that states none
-    helpers, others = identity.get("helpers"), stored.get("helpers")
-    if isinstance(helpers, list | tuple) and isinstance(others, list | tuple) and len(helpers) == len(others):
-        pairs = zip(helpers, others, strict=True)
+    helpers, theirs = identity.get("helpers"), stored.get("helpers")
+    if isinstance(helpers, list | tuple) and isinstance(theirs, list | tuple) and len(helpers) == len(theirs):
+        pairs = zip(helpers, theirs, strict=True)
         identity["helpers"] = [_as_stored(h, o) if isinstance(o, Mapping) else h for h, o in pairs]
     return identity
 

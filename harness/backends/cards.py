@@ -133,16 +133,16 @@ def each_engine(stem: str) -> list[Card]:
 def _read(path: Path) -> list[Card]:
     where = f"model card {path}"
     table = _with_latency(toml(path, where))
-    others = convert(table, _File, where, name=path.stem).engines
+    engines = convert(table, _File, where, name=path.stem).engines
     table.pop("engines", None)
     cards = [_card(table, where, path.stem)]
     shared = {key: value for key, value in table.items() if key not in _PER_ENGINE}
     if cards[0].latency.source == "paper":  # a declared latency does not hold for another engine
         shared["latency"] = table["latency"]
-    for engine, settings in others.items():
+    for engine, settings in engines.items():
         at = f"{where} [engines.{printable(engine)}]"
-        other = None if engine == table["engine"] else ENGINES.get(engine)
-        if other is None or "weights" not in other.allowed_keys:
+        registered = None if engine == table["engine"] else ENGINES.get(engine)
+        if registered is None or "weights" not in registered.allowed_keys:
             allowed = [name for name in _engines_with("weights") if name != table["engine"]]
             raise unknown(f"engine in {where}", engine, allowed)
         if not isinstance(settings, dict):

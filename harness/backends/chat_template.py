@@ -54,8 +54,8 @@ def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any],
     """Return messages in the way of a card's `system`: `first-user`, or None to leave them as they are."""
     if way != FIRST_USER or len(messages) < 2 or messages[0]["role"] != "system":
         return tuple(messages)
-    system, first, *others = messages
-    return ({**first, "content": f"{system['content']}\n\n{first['content']}"}, *others)
+    system, first, *rest = messages
+    return ({**first, "content": f"{system['content']}\n\n{first['content']}"}, *rest)
 
 
 def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:

@@ -94,14 +94,14 @@ def check(
 
 
 def _leading(ids: Sequence[int], token: int | None) -> int:
-    return next((n for n, other in enumerate(ids) if other != token), len(ids))
+    return next((n for n, each in enumerate(ids) if each != token), len(ids))
 
 
 def _looks(answer: Callable[..., Completion], shown: Sequence[Pictured]) -> Looks:
     answers = {own.answer: answer(own) for own, _, _ in shown}
-    others = {blank.answer: answer(blank, warm=True) for _, blank, _ in shown}
-    answered = [text for _, _, text in shown if not (answers[text.answer].error or others[text.answer].error)]
-    return Looks(answers, others, answer(answered[-1], warm=True) if answered else None)
+    blanks = {blank.answer: answer(blank, warm=True) for _, blank, _ in shown}
+    answered = [text for _, _, text in shown if not (answers[text.answer].error or blanks[text.answer].error)]
+    return Looks(answers, blanks, answer(answered[-1], warm=True) if answered else None)
 
 
 def _answer(backend: Rendering, request: Request, warm: bool = False) -> Completion:
@@ -112,8 +112,8 @@ def _answer(backend: Rendering, request: Request, warm: bool = False) -> Complet
         # The first answer's time includes loading kernels and caches. As in a run, the first question has the
         # same system prompt and another scene.
         *head, last = request.messages
-        other = {**last, "content": f"Another scene. {last['content']}"}
-        backend.complete([replace(request, messages=(*head, other))])
+        message = {**last, "content": f"Another scene. {last['content']}"}
+        backend.complete([replace(request, messages=(*head, message))])
         [completion] = backend.complete([request])
     except UserError as error:  # the tokenizer or the server leaves no room for this answer mode
         return failed(request, str(error))

@@ -182,9 +182,9 @@ class Decoding:
 
 
 def _completion(
-    request: Request, text: str, tokens: int, batch_size: int, reason: FinishReason = "stop", **others: Any
+    request: Request, text: str, tokens: int, batch_size: int, reason: FinishReason = "stop", **details: Any
 ) -> Completion:
-    return Completion(request.id, text, None, tokens, reason, None, batch_size, **others)
+    return Completion(request.id, text, None, tokens, reason, None, batch_size, **details)
 
 
 def _completion_of_letters(

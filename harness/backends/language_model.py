@@ -44,8 +44,8 @@ class LanguageModel:
         done: dict[int, Completion] = {}
         fitting = []
         for position, request in enumerate(requests):
-            others = (request.alike(messages=messages) for messages in request.orders)
-            orders = [self.tokens(each) for each in (request, *others)]
+            rotations = (request.alike(messages=messages) for messages in request.orders)
+            orders = [self.tokens(each) for each in (request, *rotations)]
             longest, room = max(map(len, orders)), self._decoding.room(request)
             if longest + room > (most := self.engine.context_tokens):
                 parts = f"({longest} in the prompt, {room} for the answer)"

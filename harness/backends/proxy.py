@@ -106,10 +106,10 @@ def _hedged(actions: Sequence[str], planned: str, view: SceneGraph) -> dict[str,
         hidden = max((1.0 - sector.seen_share for sector in view.sectors), default=0.0)
         braking = LEAST_DOUBT + (MOST_DOUBT - LEAST_DOUBT) * hidden
     rest = 1.0 - braking
-    others = [a for a in actions if a not in ("SLOWER", planned)]
-    shares = {a: min(OTHER, rest) / len(others) for a in others}
+    rest_actions = [a for a in actions if a not in ("SLOWER", planned)]
+    shares = {a: min(OTHER, rest) / len(rest_actions) for a in rest_actions}
     if planned == "SLOWER":
-        shares = {a: rest / len(others) for a in others}
+        shares = {a: rest / len(rest_actions) for a in rest_actions}
     else:
         shares[planned] = rest - sum(shares.values())
     return dict(zip(actions, rounded([shares.get(a, braking) for a in actions]), strict=True))

@@ -49,20 +49,20 @@ class Fields:
     repeat_penalty: _Sent = True  # 1, for the kinds of llama.cpp
 
     def __post_init__(self) -> None:
-        others = [other for other in vars(self).values() if isinstance(other, str)]
-        for name, other in self.changed.items():
-            if other in _RESERVED or other in vars(self) or others.count(str(other)) > 1:
-                raise ValueError(f"{name} is sent as {other}, the name of another field; give one of its own")
+        names = [alias for alias in vars(self).values() if isinstance(alias, str)]
+        for name, alias in self.changed.items():
+            if alias in _RESERVED or alias in vars(self) or names.count(str(alias)) > 1:
+                raise ValueError(f"{name} is sent as {alias}, the name of another field; give one of its own")
 
     @property
     def changed(self) -> Mapping[str, str | bool]:
-        return {name: other for name, other in vars(self).items() if other is not True}
+        return {name: alias for name, alias in vars(self).items() if alias is not True}
 
     def applied(self, body: Mapping[str, Any]) -> dict[str, Any]:
         """Return a request with the fields left out and renamed."""
         sent = {name: vars(self).get(name, True) for name in body}
         return {
-            name if other is True else other: body[name] for name, other in sent.items() if other is not False
+            name if alias is True else alias: body[name] for name, alias in sent.items() if alias is not False
         }
 
 

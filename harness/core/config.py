@@ -200,7 +200,7 @@ def _mistake(message: str, table: Mapping[str, Any], kind: Any, where: str) -> U
     """Rewrite a message of msgspec, such as "Expected `int`, got `str` - at `$.latency.n`", for people."""
     problem, _, location = message.partition(" - at `")
     of_key = location.startswith("key` in `")
-    path, value, hint = _found(table, kind, location)
+    path, value, hint = _locate(table, kind, location)
     here = _place(where, path)
     if missing := _MISSING.fullmatch(problem):
         return UserError(f"{here} has no {missing[1]}; add it")
@@ -220,7 +220,7 @@ def _mistake(message: str, table: Mapping[str, Any], kind: Any, where: str) -> U
     return UserError(f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}")
 
 
-def _found(value: Any, hint: Any, location: str) -> tuple[list[str], Any, Any]:
+def _locate(value: Any, hint: Any, location: str) -> tuple[list[str], Any, Any]:
     """Follow a location such as `$.points[...][1].loss` to the wrong value: its path, itself and its type.
 
     msgspec writes `[...]` for a value of a mapping; it is the first one that does not fit. Where the way is

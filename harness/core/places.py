@@ -36,7 +36,7 @@ def text(value: str) -> str:
     """Return a text with the names of files in place of their absolute paths; see `nameless`."""
     if _WHOLE.fullmatch(value) and not _ADDRESS.match(value):
         return name(value)
-    return _PATH.sub(lambda found: address(found[0]) if found["address"] else name(found[0]), value)
+    return _PATH.sub(lambda match: address(match[0]) if match["address"] else name(match[0]), value)
 
 
 def name(path: str) -> str:

@@ -82,8 +82,8 @@ def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
     configs = [_read(folder, kind) for folder in folders]
     first, facts = folders[0], configs[0].facts()
     for folder, config in zip(folders, configs, strict=True):
-        others = config.facts()
-        if differ := [key for key in {**facts, **others} if facts.get(key) != others.get(key)]:
+        theirs = config.facts()
+        if differ := [key for key in {**facts, **theirs} if facts.get(key) != theirs.get(key)]:
             raise UserError(
                 f"{printable(folder)} and {printable(first)} differ in {printable(', '.join(differ))}; give "
                 "shards of one run"

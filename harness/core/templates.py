@@ -139,7 +139,7 @@ def _extent(value: Any) -> int:
     return len(value) if isinstance(value, str) else _size(value)
 
 
-def _made(value: Any) -> Any:
+def _charged(value: Any) -> Any:
     """Return a result after paying for it; items that are made one by one are paid for as they come."""
     if isinstance(value, str | bytes):
         spend(len(value) >> 3)
@@ -180,20 +180,20 @@ def _filter(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(function)
     def paid(*given: Any, **named: Any) -> Any:
-        value, others = given[at], [*given[at + 1 :], *named.values()]
-        if not others and (type(value) in _SMALL or (type(value) is str and len(value) < _SHORT)):
+        value, arguments = given[at], [*given[at + 1 :], *named.values()]
+        if not arguments and (type(value) in _SMALL or (type(value) is str and len(value) < _SHORT)):
             return function(*given)
         size = _size(value)
         if name in _GROWING:
-            extent = sum(map(_extent, others))
+            extent = sum(map(_extent, arguments))
             if name == "tojson" and extent > _DEEPEST_INDENT:
                 raise TooMuch(f"JSON indented by more than {_DEEPEST_INDENT}")
             spend(size * (1 + extent))
         else:
-            spend(size + sum(map(_size, others)))
+            spend(size + sum(map(_size, arguments)))
         if name in _SLOW:
             spend(size * size)
-        return _made(function(*given, **named))
+        return _charged(function(*given, **named))
 
     return paid
 
@@ -380,7 +380,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         except RecursionError:
             raise TemplateSyntaxError("its parts are nested too deeply", 1) from None
         # At the end, so that lines keep their numbers.
-        return f"{code}\nfrom {__name__} import _made as made, looked_in, read, spend\n"
+        return f"{code}\nfrom {__name__} import _charged as made, looked_in, read, spend\n"
 
     def is_small(self, node: nodes.Node) -> bool:
         """Whether it is known of an expression that its value costs nothing to read."""
@@ -419,8 +419,8 @@ class Sandbox(ImmutableSandboxedEnvironment):
         if operator == "%" and isinstance(left, str):
             _formatted(left, right)
         elif operator == "+" and isinstance(left, _WITH_LENGTH):
-            _made(left)
-            _made(right)
+            _charged(left)
+            _charged(right)
         elif operator == "*" and (isinstance(left, int) or isinstance(right, int)):
             times, items = (left, right) if isinstance(left, int) else (right, left)
             length = len(items) if isinstance(items, _WITH_LENGTH) else 0
@@ -438,7 +438,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         owner = getattr(called, "__self__", None)
         if isinstance(owner, str):
             given = self._pay_for_method(owner, called.__name__, given)
-        return _made(super().call(context, called, *given, **named))
+        return _charged(super().call(context, called, *given, **named))
 
     def _pay_for_method(self, owner: str, name: str, given: tuple[Any, ...]) -> tuple[Any, ...]:
         size = _size(owner)

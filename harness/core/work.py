@@ -48,13 +48,13 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
     try:
         if file.is_file() and not idle(out):
             return msgspec.json.decode(text_of(file, "record"), type=kind)
-        others = out.is_dir() and any(path.name != WORK for path in out.iterdir())
+        occupied = out.is_dir() and any(path.name != WORK for path in out.iterdir())
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{printable(file)} is damaged ({printable(error)}); delete --out {shown} and start again"
         ) from None
-    if others or (out.exists() and not out.is_dir()):
-        what = "a folder with other files in it" if others else "no folder"
+    if occupied or (out.exists() and not out.is_dir()):
+        what = "a folder with other files in it" if occupied else "no folder"
         raise UserError(f"--out {shown} is {what}; choose an empty or a new one")
     return None
 

@@ -151,7 +151,7 @@ class ServerPool:
             return None
         if pending := self._next(server):
             return pending
-        queue = max((other.queue for other in self._servers), key=len)
+        queue = max((peer.queue for peer in self._servers), key=len)
         return queue.pop() if queue and not queue[-1].failed[server] else None
 
     async def _work(self, server: _ServerState, pending: _Pending | None) -> None:
