@@ -148,7 +148,7 @@ class Backend(Protocol):
 
 
 def same_model(stored: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether an identity is that of a stored one; what a server did not state then is not compared."""
+    """Return whether two identities are of one model; what a server did not state then is not compared."""
     return canonical_json(_as_stored(now, stored)) == canonical_json(stored)
 
 

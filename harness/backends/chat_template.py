@@ -77,7 +77,7 @@ def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
 
 
 def needs_first_user(text: str) -> bool:
-    """Whether a template refuses a system message and takes its text in the first user turn."""
+    """Return whether a template refuses a system message and takes its text in the first user turn."""
     asked = ({"role": "system", "content": "Be brief."}, {"role": "user", "content": "Where to?"})
     empty = {"bos_token": "", "eos_token": ""}
     try:

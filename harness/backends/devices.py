@@ -102,15 +102,15 @@ def speed(device: Device, row: DeviceRow) -> Speed:
 
 def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
     """Return the seconds of one answer: prompt and output tokens, each over its rate; NaN if unknown."""
-    rates = _known(speed.prefill_tokens_per_s), _known(speed.decode_tokens_per_s)
+    rates = _or_nan(speed.prefill_tokens_per_s), _or_nan(speed.decode_tokens_per_s)
     return prompt_tokens / rates[0] + output_tokens / rates[1]
 
 
 def joules(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
     """Return the joules of one answer, with those of the idle device in that time; NaN if unknown."""
-    per_token = _known(speed.joules_per_prompt_token), _known(speed.joules_per_output_token)
+    per_token = _or_nan(speed.joules_per_prompt_token), _or_nan(speed.joules_per_output_token)
     return prompt_tokens * per_token[0] + output_tokens * per_token[1]
 
 
-def _known(value: float | None) -> float:
+def _or_nan(value: float | None) -> float:
     return float("nan") if value is None else value

@@ -137,7 +137,7 @@ class Server:
 
 
 def readable(variable: str) -> bool:
-    """Whether a card may have this environment variable sent to its server.
+    """Return whether a card may have this environment variable sent to its server.
 
     It ends in KEY or TOKEN and has the word of a service or a server of models, or the user lists it.
     """

@@ -82,7 +82,7 @@ def find_gguf(card: Card) -> Path:
 
 
 def is_gguf(card: Card) -> bool:
-    """Whether a card's weights are a GGUF file, on whatever engine; packages have no others."""
+    """Return whether a card's weights are a GGUF file, on whatever engine; packages have no others."""
     weights = card.file or card.weights or ""
     return weights.endswith(".gguf") or weights.startswith(packages.PREFIX)
 

@@ -73,7 +73,7 @@ def _show_paces(paces: "Mapping[str, Sequence[Mapping[str, Any]]]") -> None:
 
 
 def _paces(quiet: bool) -> dict[str, list[dict[str, Any]]]:
-    """How fast the engines of each small model are here, by card file; those alone that have several."""
+    """Measure the engines of each small model that has several, by card file."""
     from harness.backends import cards
     from harness.cli.progress import bar
     from harness.core.errors import Unanswered
@@ -100,7 +100,7 @@ def _lacking(remedies: list[tuple[str, str]]) -> None:
 
 
 def look(gpu: bool) -> dict[str, Any]:
-    """What `harness model doctor --json` prints.
+    """Return what `harness model doctor --json` prints.
 
     Args:
         gpu: ask torch for GPUs too, which takes seconds to load.
@@ -139,7 +139,7 @@ def _model(card: "Card") -> dict[str, Any]:
 
 
 def _remedy(card: "Card", lack: str | None) -> str | None:
-    """What to do about what is missing; what else the card needs, which was not tried."""
+    """Return what to do about what is missing; what else the card needs, which was not tried."""
     if card.server:
         return f"needs a server at {printable(' or '.join(card.server.urls))} (not tried)"
     if lack is None:

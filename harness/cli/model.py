@@ -115,7 +115,7 @@ def check(
                 f"{card.name}: engine {card.engine} is model-free: no weights, no tokens, nothing to load"
             )
         return
-    spec, seen, result = _seen(card, thinking, device, dtype)
+    spec, seen, result = _examine(card, thinking, device, dtype)
     paces = _paces(card)
     if as_json:
         typer.echo(
@@ -147,7 +147,7 @@ def check(
 
 
 def _usable(spec: "Spec", seen: "Checkup") -> bool:
-    """Whether an answer in any mode says what to do."""
+    """Return whether an answer in any mode says what to do."""
     from harness.evaluate.asking import answer_of
 
     asked = spec.ego.blank("ego", spec.actions)
@@ -155,14 +155,14 @@ def _usable(spec: "Spec", seen: "Checkup") -> bool:
 
 
 def _blind(card: "Card", fault: str) -> str:
-    """What to say of a model that does not see, though its card says so."""
+    """Return what to say of a model that does not see, though its card says so."""
     who, remedy = printable(card.name), "leave [vision] out of its card"
     if card.server:
         who, remedy = f"the server of {who}", f"start it with its projector, or {remedy}"
     return f"{who} {printable(fault, 300)}; {remedy}"
 
 
-def _seen(
+def _examine(
     card: "Card", thinking: bool, device: str | None, dtype: str | None
 ) -> "tuple[Spec, Checkup, Findings | None]":
     """Check a model, examine it if it answers by letters, and keep what was found."""

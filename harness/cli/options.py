@@ -234,7 +234,7 @@ def typed_scenario(scenario: str) -> str:
 
 
 def workers_of(text: str) -> "parallel.Workers":
-    """Who `--workers` names. Raises UserError where it names nobody."""
+    """Return who `--workers` names. Raises UserError where it names nobody."""
     from harness.core.parallel import workers_of
 
     return workers_of(text)

@@ -132,7 +132,7 @@ class Together:
             (finished if (out / name / "run.json").is_file() else unfinished)(spec, out / name)
 
     def goes_on(self, out: Path) -> bool:
-        """Whether these runs were stopped in a folder, and nobody is at them."""
+        """Return whether these runs were stopped in a folder, and nobody is at them."""
         try:
             self.check(out)
         except UserError:
@@ -195,7 +195,7 @@ def show(
 
 
 def of_letter(figures: "Mapping[tuple[str, str], Score]", role: str) -> str | None:
-    """How much of a role's read-outs over cyclic orders follows the letter; None without such orders."""
+    """Return the share of a role's read-outs that follows the letter; None without cyclic orders."""
     share, follows = (figures.get(("all", f"{what}_{role}")) for what in ("letter_share", "follows_letter"))
     if share is None or follows is None:
         return None

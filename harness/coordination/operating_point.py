@@ -67,7 +67,7 @@ class OperatingPoint:
         try:
             self._check_together()
         except ValueError as error:
-            raise _of(self.name, error) from None
+            raise _error_of(self.name, error) from None
         _ = self.channel
 
     def _check_together(self) -> None:
@@ -133,7 +133,7 @@ class OperatingPoint:
         try:
             parts = {part: structs.replace(getattr(self, part), **some) for part, some in by_part.items()}
         except ValueError as error:
-            raise _of(name, error) from None
+            raise _error_of(name, error) from None
         return replace(self, name=name, **parts)
 
     @cached_property
@@ -234,7 +234,7 @@ class OperatingPoint:
         return self.radio.profile is not None and self.ask.max_helpers > 0 and self.ask.schedule != NEVER
 
     def needs(self, what: str) -> bool:
-        """Whether its schedule, its rule or an attack needs `in_time`, `outlook`, `lot` or `claims`."""
+        """Return whether a schedule, rule or attack of it needs `in_time`, `outlook`, `lot` or `claims`."""
         return what in self._needs
 
     @cached_property
@@ -262,10 +262,10 @@ class OperatingPoint:
         return Rewrites(self.blind_helpers, in_text(self.guard.attack), shows)
 
     def _wrong(self, key: str, allowed: str) -> UserError:
-        return _of(self.name, wrong(key, self.setting(key), allowed))
+        return _error_of(self.name, wrong(key, self.setting(key), allowed))
 
 
-def _of(name: str, error: ValueError) -> UserError:
+def _error_of(name: str, error: ValueError) -> UserError:
     return UserError(f"operating point {printable(name)!r}: {error}")
 
 

@@ -17,5 +17,5 @@ def normalised_entropy(p: Floats) -> Floats:
 
 
 def triggered(p: Floats, tau_nats: float) -> Bools:
-    """Whether the entropy of intents `(..., A)` is above the threshold (paper Eq. 3, strictly above)."""
+    """Return whether the entropy of intents `(..., A)` is strictly above the threshold (paper Eq. 3)."""
     return entropy_nats(p) > tau_nats

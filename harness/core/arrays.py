@@ -22,7 +22,7 @@ def summed(values: Floats, axis: int) -> Floats:
 
 
 def any_of(flags: Bools) -> Bools:
-    """Whether any is true along a short last axis, such as that of helpers; faster than `np.any`."""
+    """Return whether any is true along a short last axis, such as that of helpers; faster than `np.any`."""
     first = np.zeros(flags.shape[:-1], dtype=bool)
     result: Bools = reduce(np.logical_or, [flags[..., k] for k in range(flags.shape[-1])], first)
     return result

@@ -57,7 +57,7 @@ def _quick() -> Callable[[Any], bytes]:
 
 
 def _written_alike(value: Any) -> bool:
-    """Whether msgspec and the standard library encode a value alike.
+    """Return whether msgspec and the standard library encode a value alike.
 
     They differ on exponents, NaN and types that JSON lacks.
     """

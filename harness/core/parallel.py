@@ -52,7 +52,7 @@ class Executor(Protocol):
     """Runs items on workers. Every submitted item comes back once, as its result or as `WorkerDied`."""
 
     def room(self) -> bool:
-        """Whether another item can be submitted."""
+        """Return whether another item can be submitted."""
         ...
 
     def give(self, place: int, item: Any) -> None:

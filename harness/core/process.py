@@ -128,7 +128,7 @@ class _Stops:
 
 
 def _imports(frame: FrameType | None) -> bool:
-    """Whether a module is being imported in a frame or in one that called it."""
+    """Return whether a module is being imported in a frame or in one that called it."""
     while frame:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             return True

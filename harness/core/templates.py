@@ -311,7 +311,7 @@ class Code(CodeGenerator):
 
 
 def _is_constant(node: nodes.Node) -> bool:
-    """Whether an expression is a literal: a text, a number, or a list of these."""
+    """Return whether an expression is a literal: a text, a number, or a list of these."""
     items = node.items if isinstance(node, nodes.List | nodes.Tuple) else [node]
     return all(isinstance(item, nodes.Const) for item in items)
 
@@ -383,7 +383,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return f"{code}\nfrom {__name__} import _charged as made, looked_in, read, spend\n"
 
     def is_small(self, node: nodes.Node) -> bool:
-        """Whether it is known of an expression that its value costs nothing to read."""
+        """Return whether it is known of an expression that its value costs nothing to read."""
         return isinstance(node, nodes.Const)
 
     def _put_steps_into(self, source: nodes.Template) -> None:

@@ -68,7 +68,7 @@ def unanswered(out: Path) -> str | None:
 
 
 def idle(out: Path) -> bool:
-    """Whether the work in a folder stopped before its model answered anything.
+    """Return whether the work in a folder stopped before its model answered anything.
 
     Nothing is lost if it begins anew, with other settings or a model that its server has only now.
     """
@@ -98,7 +98,7 @@ def same(out: Path, now: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
 
 
 def held(out: Path) -> bool:
-    """Whether another process is working in a folder."""
+    """Return whether another process is working in a folder."""
     try:
         with alone(out / WORK / LOCK, GONE_S):
             return False

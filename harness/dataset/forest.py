@@ -80,9 +80,9 @@ class Forest:
     @cached_property
     def cleared_s(self) -> Floats:
         """When each edge reaches the goal, (edges,); inf if it ends otherwise or leads on."""
-        return np.array([
-            edge.end.time_s if edge.end and edge.end.result == "cleared" else np.inf for edge in self.edges
-        ])  # fmt: skip
+        return np.array(
+            [edge.end.time_s if edge.end and edge.end.result == "cleared" else np.inf for edge in self.edges]
+        )
 
     @cached_property
     def earliest_s(self) -> Floats:

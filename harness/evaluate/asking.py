@@ -256,11 +256,11 @@ class Asker:
             self.served += these
 
     def _first(self) -> int:
-        """How many questions are asked before anything was answered: whole batches."""
+        """Return how many questions are asked before anything was answered: whole batches."""
         return self.spec.batch_size * math.ceil(FIRST / self.spec.batch_size)
 
     def _refused_so_far(self) -> bool:
-        """Whether no question that was asked here got an answer."""
+        """Return whether no question that was asked here got an answer."""
         return self.tally.asked == self.tally.unanswered
 
     def _recall(self, cut: bool = False) -> None:
@@ -272,7 +272,7 @@ class Asker:
                 os.truncate(self._kept, self._read_b)
 
     def _to_disk(self) -> bool:
-        """Whether the last answers reached the disk long enough ago."""
+        """Return whether the last answers reached the disk long enough ago."""
         due = time.monotonic() - self._on_disk_s >= SYNC_S
         if due:
             self._on_disk_s = time.monotonic()
@@ -426,7 +426,7 @@ def _answer_chunks(
 
 def _heard_sets(
     moments: Sequence[Scene], codes: Ints, rewrites: Rewrites
-) -> Iterator[tuple[Scene, list[str]]]:  # fmt: skip
+) -> Iterator[tuple[Scene, list[str]]]:
     """Yield the scene of each set of messages and the keys of its senders."""
     helpers = max(len(scene.viewers) for scene in moments) - 1
     for code in codes.tolist():

@@ -13,7 +13,7 @@ STEP = 1.5e-6  # shares that differ by the last digit of a read-out's text, a mi
 
 
 def wanted(request: Request, answer: Answer) -> bool:
-    """Whether the reversed list is to be asked for: there is an answer to compare it with."""
+    """Return whether the reversed list is to be asked for: there is an answer to compare it with."""
     return bool(request.flips) and answer.intent is not None and answer.flipped is UNSET
 
 

@@ -101,7 +101,7 @@ def _rules(versions: Mapping[str, str]) -> dict[str, str]:
 
 
 def resumable(spec: Spec, out: Path) -> bool:
-    """Whether this run was stopped in a folder and no process is working there."""
+    """Return whether this run was stopped in a folder and no process is working there."""
     try:
         return (work.idle(out) or unfinished(spec, out) is not None) and not work.held(out)
     except UserError:

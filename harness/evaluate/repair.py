@@ -19,7 +19,7 @@ _CONTROL = re.compile(r"[<＜](?=\S)|[\[［](?=/?[A-Za-z])")
 
 
 def wanted(request: Request, answer: Answer, prompt: Prompt) -> bool:
-    """Whether to ask again: a model wrote the answer as free text, and no intent can be parsed from it."""
+    """Return whether to ask again: a model answered in free text, and no intent can be parsed from it."""
     return (
         request.answer == "json"
         and request.role in prompt.repair_turn

@@ -330,13 +330,13 @@ def _drive(
 
 
 def _reproducible(spec: Spec) -> bool:
-    """Whether a question gets the same answer on every machine; that of a language model may differ."""
+    """Return whether all machines give a question the same answer; those of a language model may differ."""
     return not any(agent.can.language_model for agent in spec.agents)
 
 
 def _walk_chunk(
     spec: Spec, begun: RunStart, cache: Path | None, place: Path | None, chunk: Sequence[int]
-) -> dict[str, bytes]:  # fmt: skip
+) -> dict[str, bytes]:
     """Walk a chunk in a worker process and return its files by name; `place` keeps its answers until then."""
     kept = place and _answered_file(place, chunk)
 

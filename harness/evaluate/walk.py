@@ -340,9 +340,9 @@ def tie_draws(draws: Draws, ties: str) -> TieDraws | None:
 
     def drawn(tied: Bools) -> Floats:
         keys = (key[tied].tolist() for key in (trips.seed, trips.layout_seed, trips.step))
-        return np.array([
-            _tie_uniforms(seed, layout, trips.steps)[step] for seed, layout, step in zip(*keys, strict=True)
-        ])  # fmt: skip
+        return np.array(
+            [_tie_uniforms(seed, layout, trips.steps)[step] for seed, layout, step in zip(*keys, strict=True)]
+        )
 
     return drawn
 
@@ -425,13 +425,12 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
         "seed": np.concatenate([part.due.seed for part in decided]), "episode": episode, "step": step,
     }  # fmt: skip
     labels = {
-        "scene": _labels(ids, at), "danger": _labels([s.record.danger.sector for s in scenes], at),
+        "scene": _labels(ids, at),
+        "danger": _labels([s.record.danger.sector for s in scenes], at),
         "condition": Labels(point, points),
         "action": Labels(np.concatenate([part.result.action for part in decided]), actions),
-        **{
-            f"helper_{h + 1}": _labels([row[h] for row in senders], at, asked[:, h]) for h in range(helpers)
-        },
-    }  # fmt: skip
+        **{f"helper_{h + 1}": _labels([row[h] for row in senders], at, asked[:, h]) for h in range(helpers)},
+    }
     return Decisions.of({**values, **labels}, actions, helpers).take(order)
 
 

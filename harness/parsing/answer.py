@@ -82,7 +82,7 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
 
 
 def _is_other_form(fields: dict[str, Any], shape: Shape) -> bool:
-    """Whether the answer has another form than the one that was asked for."""
+    """Return whether the answer has another form than the one that was asked for."""
     return bool(shape.form) and ("action_distribution" in fields) == (shape.form != "distribution")
 
 
@@ -160,7 +160,7 @@ def _maneuver(value: object, actions: Sequence[str], repairs: set[Repair]) -> st
 
 
 def _lists(value: str, options: Sequence[str]) -> bool:
-    """Whether a text lists all options instead of choosing one: low|medium|high, low or medium or high."""
+    """Return whether a text lists all options and chooses none: low|medium|high, low or medium or high."""
     listed = all(re.search(rf"\b{re.escape(option)}\b", value) for option in options)
     return "|" in value or (listed and len(options) > 1)
 

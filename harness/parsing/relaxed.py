@@ -194,7 +194,7 @@ class _Reader:
         return items
 
     def _closed(self, closer: str, after_comma: bool) -> bool:
-        """Whether the container ends here, where a member or an item may begin."""
+        """Return whether the container ends here, where a member or an item may begin."""
         if self.token.kind != "mark" or self.token.text != closer:
             return False
         if after_comma and self.last.text == ",":
@@ -203,7 +203,7 @@ class _Reader:
         return True
 
     def _ends_after_value(self, closer: str) -> bool:
-        """Whether the container ends after a value; consumes the comma or the closing bracket there."""
+        """Read the comma or the closing bracket after a value; return whether the container ends there."""
         token = self.token
         if token.kind == "mark" and token.text in (",", closer):
             return self._take().text == closer

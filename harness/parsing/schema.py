@@ -10,7 +10,7 @@ from harness.prompts.answer_schema import Shape, answer_schema, closed
 
 
 def fits(value: object, shape: Shape) -> bool:
-    """Whether a value read from JSON fits; a repeated key and NaN, which are no JSON, never do."""
+    """Return whether a value read from JSON fits; a repeated key and NaN, which are no JSON, never do."""
     return _is_json(value) and bool(_validator(shape).is_valid(value))
 
 

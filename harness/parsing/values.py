@@ -175,19 +175,19 @@ def check_range(name: str, value: float) -> None:
 
 
 def is_placeholder(value: object) -> bool:
-    """Whether a text is a prompt's placeholder for a number: p1, <number>, 0..1."""
+    """Return whether a text is a prompt's placeholder for a number: p1, <number>, 0..1."""
     return isinstance(value, str) and bool(_PLACEHOLDER.fullmatch(value.strip()))
 
 
 def is_placeholder_text(value: object) -> bool:
-    """Whether a text is a prompt's placeholder for words: max 12 words, <text>."""
+    """Return whether a text is a prompt's placeholder for words: max 12 words, <text>."""
     return isinstance(value, str) and bool(
         _WORDS.fullmatch(value.strip().strip(".").strip() or value.strip())
     )
 
 
 def is_schema(value: object) -> bool:
-    """Whether an object is a JSON Schema instead of an answer to it."""
+    """Return whether an object is a JSON Schema instead of an answer to it."""
     return isinstance(value, dict) and ("$schema" in value or "properties" in value)
 
 

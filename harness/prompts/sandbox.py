@@ -109,7 +109,7 @@ class Code(templates.Code):
 
 
 def _is_path(node: nodes.Node) -> bool:
-    """Whether an expression is a name or a member of one."""
+    """Return whether an expression is a name or a member of one."""
     return isinstance(node, nodes.Name) or (isinstance(node, nodes.Getattr) and _is_path(node.node))
 
 
@@ -125,7 +125,7 @@ def _is_given(node: nodes.Node, chain: int = LONGEST_CHAIN) -> bool:
 
 
 def _keeps_small(node: nodes.Filter) -> bool:
-    """Whether a filter makes a value not much larger."""
+    """Return whether a filter makes a value not much larger."""
     name = node.name.removeprefix(templates.FREE)
     if node.kwargs or node.dyn_args or node.dyn_kwargs:
         return False
@@ -153,7 +153,7 @@ def _is_loop(node: nodes.Node) -> bool:
 
 
 def _bare(node: nodes.Filter, name: str) -> bool:
-    """Whether a filter is the one of this name, without arguments, and applied to an expression."""
+    """Return whether a filter is the one of this name, without arguments, and applied to an expression."""
     given = node.args or node.kwargs or node.dyn_args or node.dyn_kwargs
     return node.name.removeprefix(templates.FREE) == name and not given and node.node is not None
 
@@ -205,7 +205,7 @@ class Sandbox(templates.Sandbox):
         super()._put_steps_into(source)
 
     def is_small(self, node: nodes.Node) -> bool:
-        """Whether it is known of an expression that its value costs nothing to read."""
+        """Return whether it is known of an expression that its value costs nothing to read."""
         number = isinstance(node, nodes.Filter) and node.name.removeprefix(templates.FREE) in NUMBERS
         return number or super().is_small(node) or (self._binds_nothing and _is_given(node))
 

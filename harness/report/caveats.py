@@ -40,7 +40,7 @@ def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
 
 
 def merged(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
-    """What is to be said of runs, each sentence once; of several with the names of those it is about."""
+    """Return the caveats of runs, each sentence once; of several with the names of those it is about."""
     about: dict[str, list[str]] = {}
     for name, run in runs.items():
         for sentence in of(run):
@@ -51,7 +51,7 @@ def merged(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[
 
 
 def unread(scores: Sequence[Score]) -> Iterator[str]:
-    """Whose answers could not be read, half of them or more, and what takes their place."""
+    """Yield whose answers could not be read, half of them or more, and what takes their place."""
     failed = {s.metric: s for s in scores if s.condition == ALL}
     for role, (whose, instead) in _FAILED.items():
         score = failed.get(f"failed_rate_{role}")
@@ -61,7 +61,7 @@ def unread(scores: Sequence[Score]) -> Iterator[str]:
 
 
 def causes(run: Run) -> Iterator[str]:
-    """How many of each role's answers could not be read, and the commonest cause of it."""
+    """Yield how many of each role's answers could not be read, and the commonest cause of it."""
     meanings = {str(status): status.meaning for status in Status}
     rates = {role: run.score(ALL, f"failed_rate_{role}") for role in _FAILED}
     for role in [role for role, rate in rates.items() if rate and rate.value]:
@@ -76,7 +76,7 @@ def causes(run: Run) -> Iterator[str]:
 
 
 def unanswered(run: Run) -> Iterator[str]:
-    """What the questions said that got no answer, where a run cannot do without."""
+    """Yield what the questions said that got no answer, where a run cannot do without."""
     if (tallied := tally(run)).missing:
         yield f"{tallied}: the model could not be asked, so that this is no result."
 
@@ -125,7 +125,7 @@ def of_run(run: Run) -> Iterator[str]:
 
 
 def findings_of(manifest: Manifest) -> Iterator[str]:
-    """What `harness model check` found here of the language models of a run."""
+    """Yield what `harness model check` found here of the language models of a run."""
     helpers = manifest.identity.get("helpers")
     identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
     agents = [manifest.agent(0), *manifest.helpers]
@@ -136,7 +136,7 @@ def findings_of(manifest: Manifest) -> Iterator[str]:
 
 
 def by_letter(scores: Sequence[Score]) -> Iterator[str]:
-    """Whose read-outs follow the letter more than all else, where they were read over cyclic orders."""
+    """Yield whose read-outs follow the letter more than all else, where they were read over cyclic orders."""
     of = {s.metric: s for s in scores if s.condition == ALL}
     for role, (whose, _) in _FAILED.items():
         share, follows = of.get(f"letter_share_{role}"), of.get(f"follows_letter_{role}")
@@ -167,7 +167,7 @@ def lost_at_once(run: Run) -> Iterator[str]:
 
 
 def moved_system(manifest: Manifest) -> Iterator[str]:
-    """Whose system text stands in the first user turn, since the chat template has no place for it."""
+    """Yield whose system text stands in the first user turn, since the chat template has no place for it."""
     agents = (manifest.agent(0), *manifest.helpers)
     for name in dict.fromkeys(str(a["model"]["name"]) for a in agents if a["model"].get("system")):
         yield (

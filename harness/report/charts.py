@@ -72,7 +72,7 @@ def success_latency(rows: Rows, references: Mapping[str, float], window_ms: Sequ
 
 
 def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
-    """What the paper reports for its own operating points, as a ring with its name."""
+    """Return what the paper reports for its own operating points, as a ring with its name."""
     values = [
         {"paper": f"paper: {name}", "latency_ms": PAPER[name][0], "success": PAPER[name][1]}
         for name in conditions if name in PAPER

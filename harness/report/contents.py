@@ -14,7 +14,7 @@ MOVED = 5  # decision points whose answers moved most
 
 
 def size(runs: Runs) -> str:
-    """How much was run, of what: said once for all numbers."""
+    """Return how much was run, of what: said once for all numbers."""
     first = runs.runs[0]
     episodes, seeds = (sorted({len(of) for of in each}) for each in (
         [run.grid.episodes for run in runs.runs], [run.grid.seeds for run in runs.runs],
@@ -36,7 +36,7 @@ def summary(run: Run) -> list[dict[str, Any]]:
 
 
 def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
-    """What does not depend on the condition: a metric a line, with its value in each run."""
+    """Return what does not depend on the condition: a metric a line, with its value in each run."""
     names = dict.fromkeys(s.metric for run in runs.runs for s in run.scores if s.condition == "all")
     return [
         (entry(m).label, [(s := run.score("all", m)) and words.shown(s) for run in runs.runs]) for m in names

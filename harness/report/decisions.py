@@ -115,7 +115,7 @@ class Decisions:
         }  # fmt: skip
 
     def lacks(self) -> dict[str, str]:
-        """What these scenes could show and do not, in a word, and why."""
+        """Return what these scenes could show and do not, in a word, and why."""
         lacks = {}
         if unknown := self._details.without_prompts():
             lacks["prompts"] = lacking(unknown[0]) or "they are not known"

@@ -211,7 +211,7 @@ def _shown(d: Decision) -> dict[str, Any]:
 
 
 def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
-    """Where in a recovered completion its answers stand."""
+    """Return where in a recovered completion its answers stand."""
     role = "helper" if answer.role in ("helper", "blind") else "ego"
     return spans(answer.raw, role, run.actions, run.agent(answer)["thinking"])
 
@@ -227,7 +227,7 @@ def _left_out(run: Run) -> dict[str, list[dict[str, Any]]]:
 
 
 def _end(e: Episode) -> dict[str, Any]:
-    """How an episode ended, for the page."""
+    """Return how an episode ended, for the page."""
     return {
         "condition": e.condition, "seed": e.seed, "result": e.failure or "cleared", "partner": e.partner,
         "striker": e.striker, "fault": e.fault, "time_s": e.time_s, "delay_s": e.delay_s,

@@ -57,7 +57,7 @@ def script() -> Markup:
 
 
 def licence() -> str:
-    """Which libraries the page carries; their licences are in templates/licences.txt."""
+    """Return which libraries the page carries; their licences are in templates/licences.txt."""
     package = distribution(PACKAGE)
     # As it stands in the file: newer Pythons refuse to write this message's long header as text.
     carried = re.findall(r"^\s*- (Vega.*): ([\d.]+)$", package.read_text("METADATA") or "", re.MULTILINE)

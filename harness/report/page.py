@@ -174,7 +174,7 @@ def _packed(parts: Sequence[Part], progress: Callable[[int], None], workers: Wor
 
 
 def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
-    """What the page's script has to know of the runs, besides the decisions."""
+    """Return what the page's script has to know of the runs, besides the decisions."""
     surface = ground_of(runs.scenario)
     return {
         "names": runs.names,

@@ -71,13 +71,13 @@ def panels(runs: Runs) -> Iterator[Panel]:
         )  # fmt: skip
     if rows := joined(statistics.entropies):
         yield Panel(
-            "entropy", "answers", "Entropy of the ego's own answers",
+            "entropy",
+            "answers",
+            "Entropy of the ego's own answers",
             "Number of the ego's own answers by entropy, for those that could be read. Dashed: τ, above "
             "which the ego asks helpers.",
-            charts.bars(
-                rows, "entropy_nats", ENTROPY, "answers", statistics.ENTROPY_NATS, rules=tau_nats
-            ),
-        )  # fmt: skip
+            charts.bars(rows, "entropy_nats", ENTROPY, "answers", statistics.ENTROPY_NATS, rules=tau_nats),
+        )
     if rows := joined(statistics.errors):
         yield Panel(
             "entropy-error", "answers", "Entropy against error",
@@ -106,15 +106,15 @@ def panels(runs: Runs) -> Iterator[Panel]:
         )  # fmt: skip
     if rows := joined(statistics.energies):
         yield Panel(
-            "energy", "communication", "Energy of a decision",
+            "energy",
+            "communication",
+            "Energy of a decision",
             "Joules of inference on the declared device and of the radios, as means over decisions; the "
             "interval is that of the total, over episodes. All helpers in the radius infer from the start, "
             "asked or not; with on_demand=true those alone that are asked. If the radios' part is too small "
             "to see, cooperation costs energy because helpers infer, not because they transmit.",
-            charts.stacked(
-                rows, "condition", "part", charts.ENERGIES, "J per decision", amount="joules"
-            ),
-        )  # fmt: skip
+            charts.stacked(rows, "condition", "part", charts.ENERGIES, "J per decision", amount="joules"),
+        )
     if rows := joined(statistics.arrivals):
         yield Panel(
             "arrivals", "communication", "When replies arrive",

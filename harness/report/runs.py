@@ -89,7 +89,7 @@ def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs
 
 
 def _scenes(run: Run) -> Any:
-    """What pins a run's scenes."""
+    """Return what pins a run's scenes."""
     world = run.manifest.world
     if isinstance(world, FrozenScenes):
         return run.actions, world.sha256

@@ -23,7 +23,7 @@ SHADES, HALF_A_SHADE = np.uint8(0xF8), np.uint8(0x04)
 
 
 def world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) -> dict[str, Any]:
-    """What is where, in m to the east and to the north, and what each viewer sees of it.
+    """Return what is where, in m to the east and to the north, and what each viewer sees of it.
 
     Of each viewer, too, the part that is shown of it: for whom the ego asked in each of some decisions.
     """
@@ -82,7 +82,7 @@ def _conflicts(state: WorldState, graph: SceneGraph) -> list[dict[str, Any]]:
 
 
 def outcomes(forest: Forest, name: str) -> list[dict[str, Any]]:
-    """What each action leads to at a decision point if the full-view driver takes the rest."""
+    """Return what each action leads to at a decision point if the full-view driver takes the rest."""
     n = forest.place[name]
     last = forest.then_full_view[n]
     in_time = forest.succeeds(last, forest.tree[n])

@@ -36,7 +36,7 @@ def success(run: Run) -> Table:
 
 
 def statuses(run: Run) -> Table:
-    """How many answers of each role have which status."""
+    """Return how many answers of each role have which status."""
     count = Counter((a.role, a.status, a.verdict) for a in run.answers)
     of: Counter[str] = Counter()
     for (role, _, _), n in count.items():
@@ -52,14 +52,14 @@ def statuses(run: Run) -> Table:
 
 
 def reliability(run: Run) -> Table:
-    """How often the action taken was safe, by how probable fusion held it."""
+    """Return how often the action taken was safe, by how probable fusion held it."""
     certainty = run.decisions.of_actions("fused").max(axis=1)
     bins = np.minimum((certainty / CERTAINTY).astype(int), round(1 / CERTAINTY) - 1)
     return list(_shares(run, bins, certainty, 1.0 - run.decisions["regret"], "certainty"))
 
 
 def errors(run: Run) -> Table:
-    """How often a decision was unsafe, by the entropy of the ego's own intent."""
+    """Return how often a decision was unsafe, by the entropy of the ego's own intent."""
     nats = run.decisions["entropy_nats"]
     bins = np.where(np.isnan(nats), -1, nats / ENTROPY_NATS).astype(int)
     return list(_shares(run, bins, nats, run.decisions["regret"], "entropy_nats"))
@@ -79,7 +79,7 @@ def _shares(run: Run, bins: Ints, value: Floats, hits: Floats, name: str) -> Ite
 
 
 def entropies(run: Run) -> Table:
-    """How uncertain the ego's own answers are."""
+    """Return how uncertain the ego's own answers are."""
     p = [a.intent for a in run.answers if a.role == "ego" and a.intent]
     if not p:
         return []
@@ -135,7 +135,7 @@ def energies(run: Run) -> Table:
 
 
 def arrivals(run: Run) -> Table:
-    """When replies that are not lost arrive, in ms from the start of the decision."""
+    """Return when replies that are not lost arrive, in ms from the start of the decision."""
     d = run.decisions
     arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)
     by_condition = {name: arrival_ms[conditions == place] for place, name in enumerate(run.conditions)}

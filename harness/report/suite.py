@@ -82,7 +82,7 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
 
 
 def seeds_of(run: Run) -> str:
-    """What the layout seeds of a run's episodes are for."""
+    """Return what the layout seeds of a run's episodes are for."""
     seeds = [episode.layout_seed for episode in run.episodes]
     return " and ".join(purposes(min(seeds), max(seeds) - min(seeds) + 1))
 

@@ -91,7 +91,7 @@ def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
 
 
 def p_value(p: float) -> str:
-    """What stands behind `p`: `= 0.012`, or `< 0.001`, since no p-value is 0."""
+    """Return what stands behind `p`: `= 0.012`, or `< 0.001`, since no p-value is 0."""
     return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 
@@ -102,7 +102,7 @@ def _success(run: Run | SuiteRun, condition: str) -> str:
 
 
 def latency_source(latency: Latency) -> str:
-    """Where the inference time comes from, and how long it is."""
+    """Return where the inference time comes from, and how long it is."""
     source = {
         "measured": "measured on the machine of the run, before it",
         "card": "stated by the model card, not measured here",
@@ -120,7 +120,7 @@ def latency_source(latency: Latency) -> str:
 
 
 def energy(m: Manifest, score: Callable[[str, str], Score | None]) -> Iterator[str]:
-    """What a decision takes in each condition, as lines; none without a device profile.
+    """Yield what a decision takes in each condition, as lines; none without a device profile.
 
     Args:
         m: the run's manifest.
@@ -137,7 +137,7 @@ def energy(m: Manifest, score: Callable[[str, str], Score | None]) -> Iterator[s
 
 
 def answer_times(times: Mapping[str, Times]) -> str:
-    """How long a run's own answers took."""
+    """Return how long a run's own answers took."""
     parts = []
     for role, took in times.items():
         low, half, high = (f"{1000 * s:.0f}" for s in (took.p5_s, took.median_s, took.p95_s))
@@ -146,7 +146,7 @@ def answer_times(times: Mapping[str, Times]) -> str:
 
 
 def pace(m: Manifest) -> Iterator[str]:
-    """What prefill and decode take of answers that were asked alone, a role after the other, as lines.
+    """Yield what prefill and decode take of answers that were asked alone, a role after the other, as lines.
 
     TTFT is the time to first token, TPOT that of each token after it. They are of the run's own answers;
     where it knows none of these, of those that its latency was measured with.

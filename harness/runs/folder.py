@@ -309,9 +309,7 @@ def write_part(out: Path, files: Mapping[str, bytes]) -> None:
     os.replace(part, out)
 
 
-def read_part(
-    part: Path, actions: Sequence[str]
-) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:  # fmt: skip
+def read_part(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:
     """Read a part that `write_part` wrote. Raises UserError if it is broken."""
     return whole(part, lambda part: (
         *_read_tables(part, actions), facts_of(part),
@@ -426,7 +424,7 @@ def _sha256_of(path: Path) -> str | None:
 
 
 def _holds(path: Path) -> bool:
-    """Whether there is a dataset in a folder."""
+    """Return whether there is a dataset in a folder."""
     try:
         return (path / "manifest.json").is_file()
     except (OSError, ValueError):  # a name that no file can have

@@ -81,9 +81,8 @@ class Figures:
     def scores(self) -> list[Score]:
         """Return every score."""
         values = {
-            name: v for name, v in self.values.items()
-            if not (entry(name).optional and np.isnan(v).all())
-        }  # fmt: skip
+            name: v for name, v in self.values.items() if not (entry(name).optional and np.isnan(v).all())
+        }
         return [
             *of_conditions(self.grid.conditions, values),
             *of_latencies(self.grid, self.latency_ms),

@@ -63,7 +63,7 @@ class Tables:
             name: [answer.cell(name) for answer in answers]
             for name in (*Answer.__struct_fields__, *TURNS)
             if name not in ("heard", "repairs", "intent", "message", "first", "extension")
-        }  # fmt: skip
+        }
         unknown = (np.nan,) * len(actions)
         intents = np.array([answer.intent or unknown for answer in answers]).reshape(-1, len(actions))
         table = pd.DataFrame({

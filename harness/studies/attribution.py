@@ -148,7 +148,7 @@ def _questions(stored: ReplayedRun, scene: Scene) -> Iterator[tuple[Scene, str, 
 
 
 def _kind(scene: Scene, viewer: str, item: str) -> str:
-    """Whether its viewer sees an object in conflict with the ego, and if so, whether the ego sees it too."""
+    """Return an item's kind: without a conflict that its viewer sees, seen by the ego, or hidden from it."""
     if item not in {conflict.vehicle for conflict in scene.graphs[viewer].conflicts}:
         return OTHER
     return SEEN if item in scene.graphs[scene.viewers[0]].seen else HIDDEN

@@ -141,7 +141,7 @@ class CalibratedWorld:
         return range(len(self._knows))
 
     def __call__(self, moments: Sequence[int]) -> Intents:
-        """What every vehicle intends at this step."""
+        """Return what every vehicle intends at this step."""
         own = np.where(self._knows[:, None], self._now.knowing, self._now.intents.own)
         return replace(self._now.intents, own=own)
 

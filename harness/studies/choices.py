@@ -79,7 +79,7 @@ class Choices:
                 ends = np.where(child >= 0, success[seed, place], ends)
                 spent = spent + np.where((child >= 0)[..., None], costs[seed, place], 0.0)
             k = choose(level, ends, spent)
-            success, costs = _of(ends, k), _of(spent, k)
+            success, costs = _values_of(ends, k), _values_of(spent, k)
             following = level.at
             yield level, ends, spent, k
 
@@ -87,7 +87,7 @@ class Choices:
         """Return success, (S, E), and costs, (S, E, C), of every episode, by a rule as in `backwards`."""
         [*_, (level, ends, spent, k)] = self.backwards(choose)
         root = np.searchsorted(level.at, self.forest.root)
-        return _of(ends, k)[:, root], _of(spent, k)[:, root]
+        return _values_of(ends, k)[:, root], _values_of(spent, k)[:, root]
 
     def oracle(self) -> tuple[Floats, Floats]:
         """Return what the best choice of helpers comes to, with the fewest messages that it takes."""
@@ -119,8 +119,8 @@ class Choices:
         return [worth_of(point, level.intents, level.draws) for level in self.levels]
 
 
-def _of(values: Floats, k: Ints) -> Floats:
-    """Of the sets `k`, (S, N), what `values` say of each set, (S, N, K, ...)."""
+def _values_of(values: Floats, k: Ints) -> Floats:
+    """Return the values, (S, N, ...), of the sets `k`, (S, N), from those of each set, (S, N, K, ...)."""
     index = k.reshape(*k.shape, *[1] * (values.ndim - 2))
     return np.asarray(np.take_along_axis(values, index, 2)[:, :, 0])
 

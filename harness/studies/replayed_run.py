@@ -252,7 +252,7 @@ class ReplayedRun:
         self._asker.settle()
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
-        """What every vehicle intends. Where the run has no answer of an ego its model is asked."""
+        """Return what every vehicle intends. Where the run has no answer of an ego its model is asked."""
         with self._writing():
             return self._asker(moments)
 
@@ -390,15 +390,15 @@ class _Nearest:
         self._stored, self._helpers, self._leave_out = stored, helpers, leave_out
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
-        return self._of(self._stored.intents(moments, self._leave_out))
+        return self._nearest(self._stored.intents(moments, self._leave_out))
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
-        return self._of(self._stored.blind(moments, at))
+        return self._nearest(self._stored.blind(moments, at))
 
     def helpers(self, moments: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
-        return self._of(self._stored.helpers(moments, wanted, blind))
+        return self._nearest(self._stored.helpers(moments, wanted, blind))
 
-    def _of(self, intents: Intents) -> Intents:
+    def _nearest(self, intents: Intents) -> Intents:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)
         near = chosen(np.zeros_like(reach), -1.0, np.isfinite(reach), reach, self._helpers)
         return replace(intents, valid=intents.valid & near)

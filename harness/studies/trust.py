@@ -215,7 +215,7 @@ class Bench:
         return dict(zip(known, holm(list(known.values())), strict=True))
 
     def clear(self, *key: Any) -> bool:
-        """Whether a rule differs from the linear pool under an attack by more than chance explains."""
+        """Return whether a rule differs from the linear pool under an attack by more than chance explains."""
         return self.holm.get(key, 1.0) <= LEVEL
 
     def worst(self, rule: str, share: float) -> str:

@@ -122,7 +122,7 @@ def _tables(bench: Bench, share: float) -> Iterator[Table]:
 
 
 def _detections(bench: Bench) -> Iterator[Table]:
-    """How rules that judge helpers find attackers, and whom they take for one in peace."""
+    """Yield how rules that judge helpers find attackers, and whom they take for one in peace."""
     names = ("precision", "recall", "f1", "false_alarms")
     for rule in bench.rules:
         rows = [

@@ -124,9 +124,9 @@ def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float]]:
         node = min(nodes, key=lambda n: float(np.hypot(n.forward_m, n.left_m)), default=None)
         yield f"{lane}: vehicles", float(len(nodes))
         for name in ("forward_m", "left_m", "speed_mps", "heading_deg", "range_rate_mps"):
-            yield f"{lane}: nearest {name}", _known(getattr(node, name, None))
-        yield f"{lane}: nearest kind", _known(BY_SIZE.get(node.type) if node else None)
-        yield f"{lane}: nearest indicator", _known(INDICATORS.get((node and node.indicator) or ""))
+            yield f"{lane}: nearest {name}", _or_nan(getattr(node, name, None))
+        yield f"{lane}: nearest kind", _or_nan(BY_SIZE.get(node.type) if node else None)
+        yield f"{lane}: nearest indicator", _or_nan(INDICATORS.get((node and node.indicator) or ""))
         yield f"{lane}: nearest sensors", float(len(node.sensors) if node else 0)
     seen = {sector.sector: sector for sector in graph.sectors}
     for name in road.sectors:
@@ -136,10 +136,10 @@ def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float]]:
         first = min(arrivals, key=lambda arrival: arrival.arc_m, default=None)
         yield f"{name}: conflicts", float(len(arrivals))
         for number in ("arc_m", "time_s", "speed_mps"):
-            yield f"{name}: first conflict {number}", _known(getattr(first, number, None))
+            yield f"{name}: first conflict {number}", _or_nan(getattr(first, number, None))
 
 
-def _known(value: float | None) -> float:
+def _or_nan(value: float | None) -> float:
     return np.nan if value is None else float(value)
 
 

@@ -121,7 +121,7 @@ def _chosen(
 
 
 def _too_fast(way: Path, at_m: float, tried: Rollouts, under_way: Bools | bool) -> Bools:
-    """Whether each motion takes a bend faster than tyres hold, (motions,)."""
+    """Return whether each motion takes a bend faster than tyres hold, (motions,)."""
     if tried.fastest_mps**2 * way.sharpest <= LATERAL_MPS2:  # most ways are straight; the look-up costs
         return np.zeros(len(tried.travelled_m), dtype=np.bool_)
     places = np.searchsorted(way.arc_m, at_m + tried.travelled_m).clip(0, len(way.arc_m) - 1)

@@ -54,7 +54,7 @@ class _Road(Road):  # type: ignore[misc]
 
 
 def _apart(v: Vehicle, other: Vehicle, dx_m: float, dy_m: float, dt: float) -> bool:
-    """Whether a separating axis keeps two outlines farther apart than both vehicles can move in `dt`."""
+    """Return whether a separating axis keeps two outlines farther apart than both can move in `dt`."""
     (cos, sin), (other_cos, other_sin) = v.direction.tolist(), other.direction.tolist()
     dot, cross = abs(cos * other_cos + sin * other_sin), abs(cos * other_sin - sin * other_cos)
     moves = (abs(v.speed) + abs(other.speed)) * dt + NEAR_M

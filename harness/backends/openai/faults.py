@@ -20,7 +20,7 @@ class Fault(NamedTuple):
 
 
 def may_pass(status: int) -> bool:
-    """Whether another attempt may succeed after an HTTP status: the server is busy, or has broken down."""
+    """Return whether another attempt may succeed after an HTTP status: a server is busy or broke down."""
     return status == 429 or status >= 500
 
 

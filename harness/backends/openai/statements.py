@@ -43,7 +43,7 @@ class Model(NamedTuple):
         return any(name.rpartition(".")[2] in _WEIGHTS for name in self.states)
 
     def covers(self, earlier: "Model") -> bool:
-        """Whether it states all that an earlier statement did; a server that is loading states less."""
+        """Return whether it states all that an earlier one did; a server that is loading states less."""
         lists = earlier.listed is None or self.listed is not None
         tells_version = earlier.version is None or self.version is not None
         return lists and tells_version and earlier.states.keys() <= self.states.keys()

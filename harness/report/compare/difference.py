@@ -114,7 +114,7 @@ def compare(pair: Pair) -> Comparison:
 
 
 def _prompts(pair: Pair) -> PromptChange | str | None:
-    """What differs between the egos' prompts, and between the first helpers'."""
+    """Return what differs between the egos' prompts, and between the first helpers'."""
     a, b = ([side.run.manifest.agent(place)["prompt"] for place in (0, 1)] for side in (pair.a, pair.b))
     if [prompt["sha256"] for prompt in a] == [prompt["sha256"] for prompt in b]:
         return None

@@ -25,7 +25,7 @@ class DecisionFlip:
 
 
 def flips(pair: Pair, condition: str) -> tuple[int, tuple[DecisionFlip, ...]]:
-    """How many decisions both runs have in a condition, and the flips: by `LOST_BY`, then by most seeds."""
+    """Count the decisions of both runs in a condition; list the flips by `LOST_BY`, then by most seeds."""
     names = sorted({*pair.a.run.decisions.scenes, *pair.b.run.decisions.scenes})
     (keys_a, rows_a), (keys_b, rows_b) = (_keys(pair, side, condition, names) for side in (pair.a, pair.b))
     _, of_a, of_b = np.intersect1d(keys_a, keys_b, assume_unique=True, return_indices=True)

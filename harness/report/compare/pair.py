@@ -28,7 +28,7 @@ SETTINGS = (
 
 
 def scenes_of(run: Run) -> Any:
-    """What pins a run's scenes: the dataset's digest, or the scenario's layouts, of whatever beacons."""
+    """Return what pins a run's scenes: the dataset's digest or the scenario's layouts, of any beacons."""
     world = run.manifest.world
     if isinstance(world, FrozenScenes):
         return world.sha256

@@ -82,9 +82,8 @@ def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
 
     primary = [d for d in c.differences if d.primary]
     changed = [
-        d for d in c.differences
-        if not d.primary and _visible(d) and (verdict(d) or d.p_value is None)
-    ]  # fmt: skip
+        d for d in c.differences if not d.primary and _visible(d) and (verdict(d) or d.p_value is None)
+    ]
     return primary, sorted(changed, key=order)[: max(SHOWN - len(primary), 0)]
 
 
@@ -124,13 +123,13 @@ def sides(pair: Pair, whole: bool = False) -> list[tuple[str, str]]:
 
 
 def paces(pair: Pair) -> list[str]:
-    """What prefill and decode take, with the run's letter."""
+    """Return what prefill and decode take, with the run's letter."""
     sides = (("A", pair.a.run), ("B", pair.b.run))
     return [f"{name}: {line.strip()}" for name, run in sides for line in pace(run.manifest)]
 
 
 def caveats(pair: Pair) -> list[str]:
-    """What must be said of the runs before their numbers, with the run's letter where it is of one."""
+    """Return what must be said of the runs before their numbers, with the run's letter where it is of one."""
     sides = (("A", pair.a.run), ("B", pair.b.run))
     return [
         *(f"{name}: {text}" for name, run in sides for text in (*unanswered(run), *unread(run.scores))),
@@ -139,7 +138,7 @@ def caveats(pair: Pair) -> list[str]:
 
 
 def paired(pair: Pair) -> str:
-    """What is paired, and what only one of the runs has."""
+    """Return what is paired, and what only one of the runs has."""
     text = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {where(pair.a.run)}"
     for name, side in (("A", pair.a), ("B", pair.b)):
         conditions = [c for c in side.run.conditions if c not in pair.conditions]
@@ -152,13 +151,13 @@ def paired(pair: Pair) -> str:
 
 
 def differing(comparison: Comparison) -> str:
-    """What kinds of settings the runs differ in."""
+    """Return what kinds of settings the runs differ in."""
     kinds = list(dict.fromkeys(name.partition(".")[0] for name, _, _ in comparison.settings))
     return f"differ in {', '.join(kinds)}" if kinds else "differ in no setting"
 
 
 def success(c: InCondition, pair: Pair) -> str:
-    """How many successes were gained and lost, and what the test says."""
+    """Return how many successes were gained and lost, and what the test says."""
     gained, lost = (sum(len(t.seeds) for t in flips) for flips in (c.gained, c.lost))
     of = f"{len(pair.episodes) * len(pair.seeds)} episodes" + (" × seeds" if len(pair.seeds) > 1 else "")
     text = f"success: {gained} gained, {lost} lost of {of}"
@@ -187,7 +186,7 @@ def many(comparison: Comparison) -> str:
 
 
 def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
-    """What a condition lost and what it gained, where it did: up to so many episodes of each."""
+    """Return what a condition lost and what it gained, where it did: up to so many episodes of each."""
     ways = (("lost", c.lost), ("gained", c.gained))
     return [(way, _flips(some, pair, most)) for way, some in ways if some]
 
@@ -202,7 +201,7 @@ def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
 
 
 def decisions(c: InCondition, pair: Pair) -> str:
-    """How many decisions flipped, and in how many one run alone gave success away."""
+    """Return how many decisions flipped, and in how many one run alone gave success away."""
     n = {by: sum(len(flip.seeds) for flip in c.flips if flip.lost_by == by) for by in LOST_BY}
     text = f"decisions: {sum(n.values())} flipped of the {c.decisions} that both runs have"
     if not c.flips or pair.a.run.world == "closed-loop":  # which knows no regret
@@ -232,7 +231,7 @@ def _seeds(seeds: Sequence[int], pair: Pair) -> str:
 
 
 def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
-    """What differs between the texts, up to so many changes; none where the prompts are the same."""
+    """Return what differs between the texts, up to so many changes; none where the prompts are the same."""
     change = comparison.prompts
     if change is None or isinstance(change, str):
         return [change] if change else []
@@ -265,7 +264,7 @@ def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
 
 
 def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
-    """How many answers of a role changed their verdict, and up to so many of them."""
+    """Return how many answers of a role changed their verdict, and up to so many of them."""
     return [
         (
             f"{t.role} {t.a} → {t.b}: {len(t.requests)} of {comparison.answers_in_both[t.role]}",

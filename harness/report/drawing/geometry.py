@@ -35,7 +35,7 @@ def conflict_points(state: WorldState, graph: SceneGraph) -> tuple[list[Conflict
 
 
 def ground_of(scenario: Scenario) -> Ground:
-    """What is drawn of a scenario's road, to beyond the edge."""
+    """Return what is drawn of a scenario's road, to beyond the edge."""
     return scenario.road().ground(VIEW_M + BEYOND_M)
 
 

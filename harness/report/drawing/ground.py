@@ -54,7 +54,7 @@ def named(buildings: Iterable[Building], view: View, tall_m: float) -> Iterator[
 
 
 def scale_m(view: View) -> int:
-    """How long the bar is that tells a picture's scale."""
+    """Return how long the bar is that tells a picture's scale."""
     return 20 if view.width_m > 100 else 10
 
 

@@ -15,7 +15,7 @@ NOWHERE = np.zeros(2)
 
 
 def covered(spots: Floats, half: Floats, boxes: Sequence[Floats]) -> Floats:
-    """How many boxes (2, 2) a label of half that size would cover at each spot (n, 2)."""
+    """Return how many boxes (2, 2) a label of half that size would cover at each spot (n, 2)."""
     if not boxes:
         return np.zeros(len(spots))
     low, high = np.swapaxes(np.array(boxes), 0, 1)
@@ -25,14 +25,14 @@ def covered(spots: Floats, half: Floats, boxes: Sequence[Floats]) -> Floats:
 
 
 def cut(spots: Floats, half: Floats, view: View) -> Floats:
-    """How far a label at each spot (n, 2) would stick out of the view, m."""
+    """Return how far a label at each spot (n, 2) would stick out of the view, m."""
     low, high = view.edges
     out: Floats = np.maximum(low - (spots - half), spots + half - high).max(axis=1).clip(0.0)
     return out
 
 
 def crossed(at: Floats, ends: Floats, lines: Sequence[Floats]) -> Floats:
-    """How many lines (2, 2) a line from (2,) to each end (n, 2) would cross."""
+    """Return how many lines (2, 2) a line from (2,) to each end (n, 2) would cross."""
     if not lines:
         return np.zeros(len(ends))
     a, b = np.swapaxes(np.array(lines), 0, 1)
@@ -116,7 +116,7 @@ class Labels:
         return size_em * self.size_pt / self.pt_per_m / 2 + 0.6 * self.view.scale
 
     def _cost(self, spots: Floats, half: Floats, at: Floats, toward: Floats) -> Floats:
-        """How far away each is, and far more than any distance for what would be covered or cut."""
+        """Return how far away each is, and far more than any distance for what would be covered or cut."""
         edges = at.clip(spots - half, spots + half)
         away: Floats = np.hypot(*(edges - at).T) / self.view.scale
         away += np.where((spots - at) @ toward < 0, 10.0, 0.0) + 20.0 * crossed(at, edges, self._leaders)

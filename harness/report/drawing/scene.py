@@ -95,7 +95,7 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
 
 
 def style_of(look: str, hidden: bool) -> dict[str, Any]:
-    """How a vehicle's outline is drawn; of one that is hidden only the dashed line."""
+    """Return how a vehicle's outline is drawn; of one that is hidden only the dashed line."""
     if not hidden:
         return dict(LOOKS[look])
     return {key: value for key, value in LOOKS[look].items() if key != "hatch"} | HIDDEN

@@ -96,7 +96,7 @@ def _pictures(played: Played, progress: Callable[[int], None]) -> Iterator[Pixel
 
 
 def _graphs(scenario: Scenario, listed: Iterable[Still]) -> Iterator[dict[str, SceneGraph]]:
-    """What each viewer saw when each still's decision began."""
+    """Yield what each viewer saw when each still's decision began."""
     moment, graphs = None, dict[str, SceneGraph]()
     for still in listed:
         if still.seen != moment:
@@ -108,7 +108,7 @@ def _graphs(scenario: Scenario, listed: Iterable[Still]) -> Iterator[dict[str, S
 def _views(
     scenario: Scenario, listed: Sequence[Still], graphs: Iterable[Mapping[str, SceneGraph]]
 ) -> Iterable[View]:
-    """What each still shows: one view from each decision to the next, then one for each of their periods."""
+    """Return a view for each still: one from each decision to the next, then one for each period of these."""
     period_s, zone_m = scenario.parameters.decision_period_s, scenario.road().zone_m
     held = []
     for still, seen in zip(listed, graphs, strict=True):

@@ -41,7 +41,7 @@ class View:
         return self.width_m / (2 * VIEW_M)
 
     def holds(self, points: Floats, margin_m: float = 0.0) -> bool:
-        """Whether points (..., 2) are in it, and so far from its edge."""
+        """Return whether points (..., 2) are in it, and so far from its edge."""
         low, high = self.edges
         return bool(np.all((points >= low + margin_m) & (points <= high - margin_m)))
 
@@ -58,7 +58,7 @@ class View:
 def spots(
     state: WorldState, zone_m: tuple[float, float], graph: SceneGraph | None, who: Collection[str | None]
 ) -> Floats:
-    """What a picture of a moment holds, (n, 2) m to the east and north, the ego first.
+    """Return what a picture of a moment holds, (n, 2) m to the east and north, the ego first.
 
     Args:
         state: who is where.
@@ -76,7 +76,7 @@ def spots(
 
 
 def view_of(held: Floats, shape: float = 1.0) -> View:
-    """What holds spots (n, 2) with a margin, in the middle of it if the world goes on that far.
+    """Return what holds spots (n, 2) with a margin, in the middle of it if the world goes on that far.
 
     Its height is `shape` times its width.
     """

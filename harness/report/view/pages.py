@@ -102,6 +102,6 @@ def _has(run: Listed, words: str) -> bool:
 
 
 def _next(column: str, order: str) -> str:
-    """What a click on a column's head asks for: numbers and dates begin with the greatest."""
+    """Return what a click on a column's head asks for: numbers and dates begin with the greatest."""
     first = f"-{column}" if column in ("success", "date") else column
     return (column if first.startswith("-") else f"-{column}") if order == first else first

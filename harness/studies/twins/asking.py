@@ -84,7 +84,7 @@ class Questions:
         return work.WorkStart(settings=msgspec.json.decode(msgspec.json.encode(settings)))
 
     def goes_on(self, out: Path) -> bool:
-        """Whether this was begun in a folder, stopped there, and nobody is at it."""
+        """Return whether this was begun in a folder, stopped there, and nobody is at it."""
         try:
             left = work.begun(out, work.WorkStart)
             if work.idle(out):
@@ -250,7 +250,7 @@ def _named(scene: Scene, twin: Twin, **changes: Any) -> Scene:
 
 
 def _differ(a: Request, b: Request) -> bool:
-    """Whether a language model is asked otherwise."""
+    """Return whether a language model is asked otherwise."""
     return (a.messages, a.actions) != (b.messages, b.actions) or a.image_sha256 != b.image_sha256
 
 

@@ -204,7 +204,7 @@ def _in_feet(key: str, value: Any) -> Any:
 
 
 def _says_units(spec: Spec, role: str) -> bool:
-    """Whether a template has both units, and no number of its own with one, but for the target speeds.
+    """Return whether a template has both units, and no number of its own with one, but for the target speeds.
 
     The numbers of examples are metres and stay so.
     """
@@ -277,7 +277,7 @@ def _reversed_members(text: str) -> str:
 
 
 def _closing(text: str, start: int) -> int:
-    """Where the brace that opens at `start` is closed; 0 if it is not."""
+    """Return where the brace that opens at `start` is closed; 0 if it is not."""
     depth = 0
     for n, character in enumerate(text[start:], start):
         depth += {"{": 1, "}": -1}.get(character, 0)

@@ -53,7 +53,7 @@ def distance(p: Sequence[float] | None, q: Sequence[float] | None) -> float | No
 
 
 def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bool:
-    """Whether what a twin declares holds of two distributions; not where one is missing."""
+    """Return whether what a twin declares holds of two distributions; not where one is missing."""
     if not p or not q:
         return False
     if twin.within is not None:

@@ -164,7 +164,7 @@ def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> li
 
 
 def of_constant(questions: Questions, twin: Twin) -> bool:
-    """Whether a twin holds of an ego that always gives the same answer: every time, or never.
+    """Return whether a twin holds of an ego that always gives the same answer: every time, or never.
 
     Over cyclic orders one letter is every action alike, which is the same for the twin.
     """

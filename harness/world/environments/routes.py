@@ -148,7 +148,7 @@ def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
 
 
 def _goes_on(network: Any, street: Street, following: Street) -> bool:
-    """Whether some lane of the second road continues one of the first."""
+    """Return whether some lane of the second road continues one of the first."""
     return any(
         _apart_m(a, b) <= GAP_M and math.cos(a.heading_at(a.length) - b.heading_at(0.0)) > math.cos(TURN_RAD)
         for a in _lanes(network, street)

@@ -199,7 +199,7 @@ class EnvironmentWorld(World):
 
 
 def _reads_observations(env: Any) -> bool:
-    """Whether observations, each as slow as many frames, affect the episode."""
+    """Return whether observations, each as slow as many frames, affect the episode."""
     own = any(not f.__module__.startswith("highway_env.") for f in (type(env).step, type(env)._info))
     return own or type(env.observation_type).__name__ == "KinematicsGoalObservation"
 

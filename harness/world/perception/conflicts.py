@@ -188,9 +188,9 @@ def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Confli
         share = {"ahead": 1.0, "behind": 0.0, "oncoming": ego_mps / max(closing_mps, 0.1)}[kind]
         time_s = tenths(abs(gap) / closing_mps) if closing_mps > 0.5 else None
         pairs.append((n, side, key, kind, gap, share, time_s))
-    points = _at(road, [
-        (key, all_known[n].ego_arc_m + max(gap, 0.0) * share) for n, _, key, _, gap, share, _ in pairs
-    ])  # fmt: skip
+    points = _at(
+        road, [(key, all_known[n].ego_arc_m + max(gap, 0.0) * share) for n, _, key, _, gap, share, _ in pairs]
+    )
     for (n, side, _, kind, gap, share, time_s), (x, y, _) in zip(pairs, points.tolist(), strict=True):
         known = all_known[n]
         yield n, Conflict(
@@ -200,7 +200,7 @@ def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Confli
 
 
 def _apart(road: Road, shared: Sequence[tuple[Known, PathKey]]) -> list[bool]:
-    """Whether each way is in another lane than the ego's where the vehicle is."""
+    """Return whether each way is in another lane than the ego's where the vehicle is."""
     x, y = np.array([(known.d.x_m, known.d.y_m) for known, _ in shared]).reshape(-1, 2).T
     own = np.array([road.number[known.own] for known, _ in shared], dtype=int)
     way = np.array([road.number[key] for _, key in shared], dtype=int)

@@ -34,7 +34,7 @@ def scene_graphs(
     """Return the scene graphs of some states, each as the vehicle with an id sees it."""
     return [
         graph for begin in range(0, len(looks), AT_ONCE)
-        for graph in _seen(
+        for graph in _perceived(
             scenario, [(s, s.vehicle(viewer)) for s, viewer in looks[begin : begin + AT_ONCE]], left_out
         )
     ]  # fmt: skip
@@ -58,7 +58,7 @@ def _exact(v: VehicleState) -> Detection:
     )
 
 
-def _seen(scenario: Scenario, looks: Sequence[Look], left_out: Collection[str]) -> list[SceneGraph]:
+def _perceived(scenario: Scenario, looks: Sequence[Look], left_out: Collection[str]) -> list[SceneGraph]:
     around = surfaces(looks)
     hit = around.by_viewer(rays_on_vehicles(around)) >= LEAST_RAYS
     nearby = [[v for v in state.vehicles if v.id != viewer.id] for state, viewer in looks]

@@ -195,9 +195,7 @@ def hidden(around: Surfaces, points: Floats, solid: Bools) -> Ints:
     x, y = points.T[:, None] - around.origins_m.T[..., None]
     t, _ = _met(walls[..., None], x[viewer], y[viewer])
     target = viewer[:, None] * len(points) + np.arange(len(points))
-    least, met = _first(
-        np.repeat(surface, len(points)), target.ravel(), t.min(axis=0).ravel(), x.size
-    )  # fmt: skip
+    least, met = _first(np.repeat(surface, len(points)), target.ravel(), t.min(axis=0).ravel(), x.size)
     return np.where(least < 1, met, -1).reshape(x.shape)
 
 

@@ -115,7 +115,7 @@ def detections(
 
 
 def _dazzled(episode_seeds: Sequence[int], bearing_rad: Floats, ambient: Ambient) -> Bools:
-    """Whether the sun blinds a camera in each direction (n,), in episodes of these seeds."""
+    """Return whether the sun blinds a camera in each direction (n,), in episodes of these seeds."""
     suns = {seed: sun_rad(seed) for seed in set(episode_seeds)}
     sun = np.array([suns[seed] for seed in episode_seeds])
     return np.asarray(np.abs(turned(bearing_rad - sun)) < ambient.glare_rad)

@@ -72,7 +72,7 @@ def _named(name: str) -> Scenario:
 
 
 def is_here(name: str) -> bool:
-    """Whether a scenario is in this package."""
+    """Return whether a scenario is in this package."""
     return name in _files()
 
 

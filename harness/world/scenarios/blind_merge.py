@@ -157,7 +157,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Whether the ego's centre is far enough along the right lane."""
+    """Return whether the ego's centre is far enough along the right lane."""
     return np.asarray(xy_m[..., 0, 0] > parameters.cleared_m)
 
 

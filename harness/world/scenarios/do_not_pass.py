@@ -129,7 +129,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Whether the ego is back ahead of the truck, or has let go by what came towards it."""
+    """Return whether the ego is back ahead of the truck, or has let go by what came towards it."""
     x, lengths = xy_m[..., 0], (CAR + TRUCK) / 2
     in_lane = np.abs(xy_m[..., 0, 1] - LANE_WIDTH_M) <= LANE_WIDTH_M / 4
     ahead_m = x[..., 0] - x[..., 1]

@@ -123,7 +123,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Whether the ego's centre is far enough behind the conflict zone."""
+    """Return whether the ego's centre is far enough behind the conflict zone."""
     return np.asarray(xy_m[..., 0, 0] > ZONE_M + parameters.cleared_m)
 
 

@@ -143,7 +143,7 @@ def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mp
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Whether the ego's centre is far enough behind the junction's exit."""
+    """Return whether the ego's centre is far enough behind the junction's exit."""
     return np.asarray(JUNCTION_M + parameters.cleared_m <= -xy_m[..., 0, 1])
 
 

@@ -169,7 +169,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Whether the ego's centre is far enough along the lane."""
+    """Return whether the ego's centre is far enough along the lane."""
     return np.asarray(xy_m[..., 0, 0] > OUT_M + parameters.cleared_m)
 
 

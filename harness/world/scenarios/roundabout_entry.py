@@ -224,7 +224,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Whether the ego is past the first exit behind its entry."""
+    """Return whether the ego is past the first exit behind its entry."""
     x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
     return np.asarray((x > 0) & (np.arctan2(y, x) < _ring_rad(1)))
 
