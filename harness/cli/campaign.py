@@ -31,12 +31,14 @@ def paper(
     It plays the paper's study, and writes a page with both numbers, and Figures A and B.
     """
     from harness.studies.paper import panels, run_paper
+    from harness.studies.study import refuse_taken
 
     options.in_range("--episodes", episodes, 10, MOST_EPISODES)
     options.in_range("--sweep-episodes", sweep_episodes, 10, MOST_EPISODES)
     draws = options.parse_seeds(seeds)
     if len(set(draws)) < len(draws):
         raise UserError(f"--seeds {printable(seeds)}: give different whole numbers, such as 0:5")
+    refuse_taken(out, "study")
     settings = panels(episodes, sweep_episodes)
     with bar("grid points", sum(len(panel.settings) for panel in settings), as_json or quiet) as progress:
         study = run_paper(settings, draws, progress)
@@ -77,6 +79,7 @@ def closed_loop(
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
     from harness.studies.closed_loop import panels, run_closed_loop
+    from harness.studies.study import refuse_taken
 
     options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     options.in_range("--first-seed", first_seed, 0, LAST_SEED)
@@ -92,6 +95,7 @@ def closed_loop(
         latency=latency,
     )
     where = out or Path("reports") / f"closed-loop-{file_name(spec.ego.card.name)}-{prompt}"
+    refuse_taken(where, "closed-loop")
     with bar("layouts", episodes, as_json or quiet) as progress:
         study = run_closed_loop(spec, where, who, progress, default_file())
     finish(study, where, as_json, quiet)

@@ -99,11 +99,13 @@ def command(
     )
     from harness.studies.grid import run_cells
     from harness.studies.grid_study import grid_study
+    from harness.studies.study import refuse_taken
 
     names = "-".join(dict.fromkeys(file_name(agent.card.name) for agent in (*egos, *helpers)))
     folder = out or first_folder(
         f"grid-{names}-{frozen.name}", lambda folder: not (folder / "grid.json").exists()
     )
+    refuse_taken(folder, "grid")
     if (folder / "grid.json").exists():
         raise UserError(
             f"--out {printable(folder)} already holds a finished grid; choose another or delete it"

@@ -27,6 +27,11 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).parent / "templates"
 WIDEST_REM, REM_PER_INCH = 66, 10.5
 SOURCE = ("name", "latency")  # of a source, what makes a study another one
+# What else may lie in a folder, each as `<name>.json`; some of their files have the names of a study's.
+MANIFESTS = (
+    "run", "suite", "sweep", "grid", "repeats", "trust", "schedule", "fidelity", "twins", "study",
+    "closed-loop",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -98,6 +103,7 @@ def percent(row: Any, value: str, low: str, high: str) -> str:
 
 def write_study(study: Study, out: Path) -> Path:
     """Write tables, figures, the page, and last the manifest, each file whole; return the page."""
+    refuse_taken(out, study.kind)
     write(out, study.figures, study.data)
     pictures = {
         stem: (
@@ -146,14 +152,24 @@ def lay_out(figure: Figure) -> None:
         figure.set_layout_engine("none")
 
 
+def refuse_taken(out: Path, kind: str) -> None:
+    """Raise UserError if a folder has a finished run, or a finished study of another kind."""
+    for name in MANIFESTS:
+        if name != kind and (out / f"{name}.json").exists():
+            raise UserError(
+                f"--out {printable(out)} holds something else, as its {name}.json says; name another folder"
+            )
+
+
 def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
-    """Raise UserError if a folder has a finished study of this kind that was made otherwise.
+    """Raise UserError if a folder has a run, another kind of study, or one of this kind made otherwise.
 
     Args:
         out: the folder.
         kind: of the study.
         manifest: what its `<kind>.json` has to state; of sources, only what they are and their latency.
     """
+    refuse_taken(out, kind)
     try:
         stated = json.loads(text_of(out / f"{kind}.json"))
     except FileNotFoundError:

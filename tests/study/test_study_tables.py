@@ -5,9 +5,20 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 from markupsafe import Markup
 
-from harness.studies.study import Cells, Study, Table, p_cell, strong, write_study, write_table
+from harness.core.errors import UserError
+from harness.studies.study import (
+    Cells,
+    Study,
+    Table,
+    p_cell,
+    refuse_other,
+    strong,
+    write_study,
+    write_table,
+)
 
 HOSTILE = "=cmd()</script>\u202e"
 
@@ -43,6 +54,29 @@ def test_a_page_shows_text_as_text_and_a_terminal_no_markup(tmp_path: Path) -> N
     assert table.in_terminal == (["name", "value"], [[HOSTILE, "1.0"]])
     assert not isinstance(table.in_terminal[1][0][1], Markup)
     assert json.loads((tmp_path / "sweep.json").read_text()) == {"format": "swarmdrive-sweep/1", "a": 1}
+
+
+def test_a_study_is_not_written_over_a_run_or_another_study(tmp_path: Path) -> None:
+    """Their tables may have the names of its own: a sweep's and a run's are `episodes.csv`."""
+    study = Study("sweep", "a", ["b"], ["c"], [], {"episodes": pd.DataFrame({"a": [1]})}, {}, {})
+    for name in ("run", "trust"):
+        out = tmp_path / name
+        out.mkdir()
+        (out / f"{name}.json").write_text("{}")
+        (out / "episodes.csv").write_text("kept")
+        for write in (
+            lambda out=out: write_study(study, out),
+            lambda out=out: refuse_other(out, "sweep", {}),
+        ):
+            with pytest.raises(
+                UserError, match=f"holds something else, as its {name}.json says; name another"
+            ):
+                write()
+        assert {path.name: path.read_text() for path in out.iterdir()} == {
+            f"{name}.json": "{}", "episodes.csv": "kept",
+        }  # fmt: skip
+    out = tmp_path / "sweep"
+    assert write_study(study, out) == write_study(study, out) == out / "index.html"
 
 
 def test_parts_are_kept_to_the_last_bit_but_those_of_something_else_and_torn_ones(tmp_path: Path) -> None:
