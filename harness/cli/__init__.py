@@ -112,7 +112,7 @@ def _typed() -> None:
             sys.exit(2)
         path = context.command_path if context else "harness"
         typed = printable(" ".join(["harness", *sys.argv[1:]]))
-        _fail(f"{printable(message, 300)} in `{typed}`; see `{path} --help`")
+        _fail(f"{printable(message.removesuffix('.'), 300)} in `{typed}`; see `{path} --help`")
 
 
 def _with_notes(words: str, error: BaseException | None) -> str:

@@ -94,14 +94,14 @@ class Group(TyperGroup):
             )
         args = new.split() + args[len(old.split()) :]
         if args[0] not in self.commands and not args[0].startswith("-") and not ctx.resilient_parsing:
-            last = {words.split()[-1]: words for words in (*COMMANDS, *OLD.values())}
+            last = {**OLD, **{words.split()[-1]: words for words in (*COMMANDS, *OLD.values())}}
             near = get_close_matches(args[0], [*self.commands, *last])
             meant = dict.fromkeys(
                 f"{self.path} {name}".strip() if name in self.commands else last[name] for name in near
             )
             ctx.fail(
-                f"No such command {args[0]!r}."
-                + (f" Did you mean {', '.join(f'`harness {words}`' for words in meant)}?" if meant else "")
+                f"No such command {args[0]!r}"
+                + (f" (did you mean {', '.join(f'`harness {words}`' for words in meant)}?)" if meant else "")
             )
         return super().resolve_command(ctx, args)
 

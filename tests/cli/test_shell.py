@@ -109,12 +109,14 @@ def test_what_machines_read_stays_json_under_an_old_spelling(harness: Callable[.
     [
         ("evl", "`harness eval`"), ("pull", "`harness model pull`"), ("sweeps", "`harness study sweep`"),
         ("study fidelty", "`harness study fidelity`"), ("models", "`harness model`"),
+        ("chanel", "`harness radio`"),
     ],
 )  # fmt: skip
 def test_a_slip_is_answered_with_what_was_meant(harness: Callable[..., Said], typed: str, meant: str) -> None:
     code, out, err = harness(*typed.split())
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert f"No such command {typed.split()[-1]!r}. Did you mean {meant}" in err
+    assert f"No such command {typed.split()[-1]!r} (did you mean {meant}" in err
+    assert f"?) in `harness {typed}`; see" in err
 
 
 def test_the_help_of_trust_names_every_attack_and_rule(harness: Callable[..., Said]) -> None:

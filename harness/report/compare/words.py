@@ -172,6 +172,8 @@ def success(c: InCondition, pair: Pair) -> str:
 def many(comparison: Comparison) -> str:
     """Say how many differences were tested, how p counts that, and how many hold."""
     tested = [d for c in comparison.conditions for d in c.differences if d.p_value is not None]
+    if not tested:
+        return "no difference has a p: too few episodes, or none of them changed"
     p_values = [d.p_corrected for d in tested if d.p_corrected is not None]
     hints = sum(not d.primary and (d.p_value or 0.0) <= LEVEL for d in tested)
     return (
