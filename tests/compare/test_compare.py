@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from harness.core.multiplicity import holm
 from harness.core.paired import SuccessTest
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
+from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
 from harness.report.compare.pair import pair
 from harness.runs.metrics import METRICS
@@ -350,3 +352,10 @@ def test_a_damaged_run_is_one_line(
     code, out, err = harness("compare", *runs, "--html", "page.html")
     assert (code, out, err.count("\n")) == (2, "", 1), err
     assert not Path("page.html").exists()
+
+
+def test_where_nothing_could_be_tested_that_is_said(runs: tuple[Path, Path]) -> None:
+    """Such as of runs of one episode, whose differences have no interval."""
+    assert words.many(replace(found(runs), conditions=())).startswith(
+        "no difference has a p: too few episodes"
+    )

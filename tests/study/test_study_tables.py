@@ -64,14 +64,11 @@ def test_a_study_is_not_written_over_a_run_or_another_study(tmp_path: Path) -> N
         out.mkdir()
         (out / f"{name}.json").write_text("{}")
         (out / "episodes.csv").write_text("kept")
-        for write in (
-            lambda out=out: write_study(study, out),
-            lambda out=out: refuse_other(out, "sweep", {}),
-        ):
-            with pytest.raises(
-                UserError, match=f"holds something else, as its {name}.json says; name another"
-            ):
-                write()
+        said = f"holds something else, as its {name}.json says; name another"
+        with pytest.raises(UserError, match=said):
+            write_study(study, out)
+        with pytest.raises(UserError, match=said):
+            refuse_other(out, "sweep", {})
         assert {path.name: path.read_text() for path in out.iterdir()} == {
             f"{name}.json": "{}", "episodes.csv": "kept",
         }  # fmt: skip
