@@ -104,7 +104,7 @@ def command(
 
 
 def _counts(text: str, least: int) -> list[int]:
-    """Four numbers of sequences, none below `least`."""
+    """Return four numbers of sequences, none below `least`."""
     try:
         counts = [int(part) for part in text.split(",")]
     except ValueError:

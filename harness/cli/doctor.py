@@ -160,7 +160,7 @@ def _package_remedy(engine: str) -> str | None:
 
 
 def _memory_gib() -> float | None:
-    """Memory of the machine; None where the system does not tell."""
+    """Return the machine's memory; None where the system does not tell."""
     try:
         return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GIB, 1)
     except (AttributeError, ValueError, OSError):

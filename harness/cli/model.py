@@ -291,7 +291,7 @@ def _show_answers(answers: "Mapping[AnswerMode, Completion]") -> None:
 
 
 def _token_lines(tokens: list[tuple[int, str]]) -> list[str]:
-    """Ids with their pieces, as many to a line as fit."""
+    """Return ids with their pieces, as many to a line as fit."""
     lines = [""]
     for number, piece in tokens:
         shown = f"{number} {printable(repr(piece), 60)}"

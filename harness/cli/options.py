@@ -182,7 +182,7 @@ def _parameter(option: stated.Option) -> inspect.Parameter:
 
 
 def cards(models: "Sequence[str] | None") -> "list[Card]":
-    """Cards of the models that a user names. Raises UserError if there is no such model."""
+    """Return cards of the models that a user names. Raises UserError if there is no such model."""
     from harness.backends.cards import resolve
 
     return [resolve(model) for model in models or ()]
@@ -241,7 +241,7 @@ def workers_of(text: str) -> "parallel.Workers":
 
 
 def shard_of(text: str | None) -> "shards.Shard | None":
-    """The shard that `--shard` names; None where it is not given."""
+    """Return the shard that `--shard` names; None where it is not given."""
     from harness.core.shards import shard_of
 
     return None if text is None else shard_of(text)

@@ -48,13 +48,13 @@ class Taker:
         return difference and f"model {printable(self.card.name)!r}: {difference}"
 
     def as_mapping(self) -> dict[str, Any]:
-        """The same as plain values."""
+        """Return the same as plain values."""
         width, height = self.vision.size_px
         return {"model": self.card.name, "width_px": width, "height_px": height, "tokens": self.vision.tokens}
 
 
 def taker(prompt: "Prompt", model: str | None, checked: bool = False) -> Taker | None:
-    """The model that an image prompt's picture is drawn for; None if the prompt shows none.
+    """Return the model that an image prompt's picture is drawn for; None if the prompt shows none.
 
     Args:
         prompt: the prompt.
@@ -121,7 +121,7 @@ def half_blocks(pixels: "Pixels") -> "Text":
 
 
 def _shrunk(pixels: Any, n: int, axis: int) -> Any:
-    """The means of n parts of an axis, each as long as another or longer by a pixel."""
+    """Return the means of n parts of an axis, each as long as another or longer by a pixel."""
     import numpy as np
 
     size = pixels.shape[axis]

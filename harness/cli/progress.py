@@ -108,7 +108,7 @@ def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> st
 
 
 def drawn(console: "Console") -> "Progress":
-    """The bar's columns. The bar itself gives way where the line is narrow."""
+    """Return the bar's columns. The bar itself gives way where the line is narrow."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
     from rich.table import Column
     from rich.text import Text

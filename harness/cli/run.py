@@ -33,7 +33,7 @@ class Column:
     interval: bool = False
 
     def cell(self, score: "Score | None") -> str:
-        """The metric's score; a dash if there is none."""
+        """Return the metric's score; a dash if there is none."""
         if score is None or score.value is None:
             return "-"
         from harness.runs.metrics import entry, written
@@ -42,7 +42,7 @@ class Column:
 
 
 def file_name(model: str) -> str:
-    """A model's name as part of a folder's."""
+    """Return a model's name as part of a folder's."""
     return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
 
 
@@ -74,14 +74,14 @@ def evaluate(
 
 
 def default_out(spec: "Spec") -> Path:
-    """The first folder of the run's name under reports/ that is free, or where this was stopped."""
+    """Return the first folder of the run's name under reports/ that is free, or where this was stopped."""
     from harness.evaluate.lifecycle import resumable
 
     return free_folder([spec], spec.source.name, lambda folder: resumable(spec, folder))
 
 
 def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], bool]) -> Path:
-    """The first folder of a name under reports/ that is not there, or in which this goes on."""
+    """Return the first folder of a name under reports/ that is not there, or in which this goes on."""
     ego, *helpers = specs[0].agents
     prompts = "-".join(dict.fromkeys(spec.ego.prompt.version for spec in specs))
     name = f"{file_name(ego.card.name)}-{prompts}{_mode(ego)}"
@@ -92,7 +92,7 @@ def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], 
 
 
 def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
-    """The first under reports/ of this name, or of this name with a number, that can be used.
+    """Return the first under reports/ of this name, or of this name with a number, that can be used.
 
     On stderr it says of a number that it was needed.
     """

@@ -122,7 +122,7 @@ def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episod
 
 
 def _parameters(scenario: "Scenario") -> dict[str, dict[str, Any]]:
-    """Value of each parameter, and its meaning."""
+    """Return the value of each parameter, and its meaning."""
     from dataclasses import asdict
 
     from harness.cli.docstrings import attributes

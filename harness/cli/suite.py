@@ -80,7 +80,7 @@ def evaluate(
 
 
 def _mapping(done: "SuiteRun", lines: "Sequence[Line]") -> dict[str, Any]:
-    """A suite's run for machines: each family's run, and the means over families."""
+    """Return a suite's run for machines: each family's run, and the means over families."""
     from harness.evaluate.lifecycle import Evaluated
 
     drivers = {line.name: msgspec.to_builtins(line.drivers) for line in lines}

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def asks(prompt: "Prompt", model: str, engine: str | None) -> "Card":
-    """The card of the model that a prompt is tried on.
+    """Return the card of the model that a prompt is tried on.
 
     Raises:
         UserError: it is no language model, or the prompt cannot ask the fixed questions.
@@ -61,7 +61,7 @@ def tried(
 
 
 def as_mapping(trial: "Trial", findings: "Findings | str | None") -> dict[str, Any]:
-    """The same as plain values."""
+    """Return the same as plain values."""
     values: dict[str, Any] = to_builtins({"trial": trial, "readout": findings})
     return values
 

@@ -100,7 +100,7 @@ def command(
 
 
 def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> "Spec":
-    """The evaluation whose answers are walked."""
+    """Return the evaluation whose answers are walked."""
     from harness.dataset import load
     from harness.evaluate import resolve
     from harness.evaluate.frozen_world import FrozenSource

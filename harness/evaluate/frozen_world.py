@@ -95,7 +95,7 @@ class FrozenWorld(Placed):
         self._luck: tuple[Bools, Draws] | None = None  # of the moments just shown
 
     def observe(self) -> Sequence[Scene]:
-        """Every decision point to which some walk has come."""
+        """Return every decision point to which some walk has come."""
         places = np.unique(np.concatenate([walks.at.ravel() for walks in self._walks.values()]))
         self._moments, self._luck = places[places >= 0], None
         self.scenes = self._dataset.scenes([self._forest.ids[n] for n in self._moments.tolist()])

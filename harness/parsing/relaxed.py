@@ -73,7 +73,7 @@ class Reading:
 
 
 def from_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An `object_pairs_hook` that marks an object with a repeated key."""
+    """Return an `object_pairs_hook` that marks an object with a repeated key."""
     members = dict(pairs)
     return members if len(members) == len(pairs) else Repeated(members)
 

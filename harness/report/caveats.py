@@ -33,7 +33,7 @@ _CONTROLS = {
 
 
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
-    """Sentences for a run's headline; none for a language model whose answers could be read."""
+    """Return sentences for a run's headline; none for a language model whose answers could be read."""
     first = [*unread(scores), *no_prompt([manifest]), *findings_of(manifest), *moved_system(manifest)]
     first += by_letter(scores)
     return [*first, *beyond_sources(manifest), *on_device(manifest)]
@@ -191,7 +191,7 @@ def on_device(manifest: Manifest) -> Iterator[str]:
 
 
 def beyond_sources(manifest: Manifest) -> Iterator[str]:
-    """Conditions whose radio has settings that its model's source never held against anything."""
+    """Yield conditions whose radio has settings that its model's source never held against anything."""
     for condition in manifest.conditions:
         if record := manifest.channels.get(condition.get("profile") or ""):
             settings = {**record.parameters, **pairs(condition.get("radio", ""))}

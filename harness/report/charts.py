@@ -49,7 +49,7 @@ PAPER = {"single-local": (145.0, 0.689), "v2x": (218.9, 0.835), "6g": (151.4, 0.
 
 
 def success_latency(rows: Rows, references: Mapping[str, float], window_ms: Sequence[float]) -> Spec:
-    """Success over latency, a point a run and condition, and the paper's; references are lines."""
+    """Draw success over latency, a point a run and condition, and the paper's; references are lines."""
     condition = condition_colours(rows)
     condition["legend"] = {**condition["legend"], "title": None}
     shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition")
@@ -101,7 +101,7 @@ def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
 
 
 def _references(success: Mapping[str, float], y: Spec) -> Spec:
-    """A dashed line for each value; names of lines too near for one each stand above the highest."""
+    """Return a dashed line for each value; names of lines too near for one each stand above the highest."""
     highest_first = sorted(success.items(), key=lambda of: -of[1])
     lines = [{"reference": name, "success": value} for name, value in highest_first]
     names: list[dict[str, Any]] = []
@@ -124,7 +124,7 @@ def _references(success: Mapping[str, float], y: Spec) -> Spec:
 
 
 def statuses(rows: Rows) -> Spec:
-    """Statuses of answers, a stacked bar a run and role."""
+    """Draw statuses of answers, a stacked bar a run and role."""
     # A run's file may say anything; what is no verdict is no answer.
     verdicts = [str(row["verdict"]) if row["verdict"] in VERDICTS else "failed" for row in rows]
     met = list(dict.fromkeys((v, str(row["status"])) for v, row in zip(verdicts, rows, strict=True)))
@@ -138,7 +138,7 @@ def statuses(rows: Rows) -> Spec:
 
 
 def policies(actions: Sequence[str]) -> Spec:
-    """One decision's distributions around fusion; the page fills in `values`: who, what, action, p."""
+    """Return one decision's distributions around fusion; the page fills in `values`: who, what, action, p."""
     scale = {"domain": list(actions), "range": list(colours.actions(actions).values())}
     return {
         **BASE,
@@ -182,7 +182,7 @@ def timeline() -> Spec:
 def stacked(
     rows: Rows, by: str, field: str, colours: Mapping[str, str], what: str, amount: str = "share"
 ) -> Spec:
-    """A bar a run and `by`, in parts of the values of a field, in the order of their colours.
+    """Return a bar a run and `by`, in parts of the values of a field, in the order of their colours.
 
     Their lengths are shares, or another `amount` of the rows.
     """
@@ -216,7 +216,7 @@ def stacked(
 def shares(
     rows: Rows, field: str, title: str, what: str, diagonal: bool = False, rules: Sequence[float] = ()
 ) -> Spec:
-    """Shares over a field, a line a condition; on the `diagonal` the two agree."""
+    """Draw shares over a field, a line a condition; on the `diagonal` the two agree."""
     x, y = x_axis(field, title), share_axis("share", what)
     condition, shape = condition_colours(rows), shapes_of(rows, "condition")
     if not diagonal:
@@ -237,7 +237,7 @@ def bars(
     rows: Rows, field: str, title: str, what: str, width: float, *,
     series: str = "", rules: Sequence[float] = (), within: tuple[float, float] | None = None,
 ) -> Spec:  # fmt: skip
-    """Counts over a field in bins of one width, with a shaded budget to be `within`."""
+    """Draw counts over a field in bins of one width, with a shaded budget to be `within`."""
     bars = [{**row, "to": row[field] + width} for row in rows]
     met = {row[series] for row in rows} if series else set()
     encoding: Spec = {
@@ -258,12 +258,12 @@ def bars(
 
 
 def named(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row in which no text is one that Vega stumbles over; what is added is not to be seen."""
+    """Return a row in which no text is one that Vega stumbles over; what is added is not to be seen."""
     return {key: f"{value} " if value in TAKEN else value for key, value in row.items()}
 
 
 def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) -> Spec:
-    """Layers over one table, one run of which is chosen where there are several."""
+    """Return layers over one table, one run of which is chosen where there are several."""
     runs = list(dict.fromkeys(str(row["run"]) for row in rows if "run" in row))
     chart: Spec = {
         **BASE,
@@ -280,18 +280,18 @@ def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) 
 
 
 def x_axis(field: str, title: str) -> Spec:
-    """A field along x, where its values are."""
+    """Return a field along x, where its values are."""
     axis = {"labelOverlap": True, "tickCount": 8}
     return {"field": field, **NUMBER, "title": title, "axis": axis, "scale": {"zero": False, "nice": True}}
 
 
 def share_axis(field: str, title: str) -> Spec:
-    """A share along y, from 0 to 100 %."""
+    """Return a share along y, from 0 to 100 %."""
     return {"field": field, **NUMBER, "title": title, "axis": {"format": "%"}, "scale": {"domain": [0, 1]}}
 
 
 def colour(field: str, colours: Mapping[str, str]) -> Spec:
-    """A colour for each value of a field, whose name the legend leaves out."""
+    """Return a colour for each value of a field, whose name the legend leaves out."""
     return {
         "field": field, "type": "nominal",
         "scale": {"domain": list(colours), "range": list(colours.values())},
@@ -300,30 +300,30 @@ def colour(field: str, colours: Mapping[str, str]) -> Spec:
 
 
 def condition_colours(rows: Rows) -> Spec:
-    """The colour of each row's condition."""
+    """Return the colour of each row's condition."""
     shapes = shapes_of(rows, "condition")
     by_name = colours.conditions(shapes["scale"]["domain"])
     return {**shapes, "scale": {**shapes["scale"], "range": list(by_name.values())}}
 
 
 def shapes_of(rows: Rows, field: str) -> Spec:
-    """A shape where `condition_colours` has a colour; of one field, both have one legend."""
+    """Return a shape where `condition_colours` has a colour; of one field, both have one legend."""
     domain = list(dict.fromkeys(str(row[field]) for row in rows))
     return {"field": field, "type": "nominal", "scale": {"domain": domain}, "legend": {"orient": "top"}}
 
 
 def names_axis(field: str) -> Spec:
-    """A name a line along y, in the order in which they come."""
+    """Return names along y, one a line, in the order in which they come."""
     return {"field": field, "type": "nominal", "sort": None, "title": None}
 
 
 def point(size: int, **encoding: Spec | list[Spec]) -> Spec:
-    """A filled point for each row."""
+    """Return a filled point for each row."""
     return {"mark": {"type": "point", "filled": True, "size": size, "opacity": 1}, "encoding": encoding}
 
 
 def tooltip(rows: Rows) -> list[Spec]:
-    """Every field of a table in its tooltip."""
+    """Return every field of a table in its tooltip."""
     return [
         {"field": name, "format": ".3~f"} if isinstance(value, float) else {"field": name}
         for name, value in (rows[0] if rows else {}).items()
@@ -336,7 +336,7 @@ def interval(**encoding: Spec) -> Spec:
 
 
 def band(start: float, end: float, what: str, named: bool = False) -> Spec:
-    """A shaded range of x, named at its top or by its tooltip alone."""
+    """Return a shaded range of x, named at its top or by its tooltip alone."""
     x: Spec = {"x": {"field": "from", **NUMBER}}
     shade: Spec = {
         "mark": {"type": "rect", "color": GREY, "opacity": 0.14},
@@ -353,7 +353,7 @@ def band(start: float, end: float, what: str, named: bool = False) -> Spec:
 
 
 def rules_at(field: str, at: Sequence[float], what: str = "") -> list[Spec]:
-    """Vertical lines, named at their top where `what` they are is given, in ms."""
+    """Return vertical lines, named at their top where `what` they are is given, in ms."""
     values = [{field: value, "what": f"{what}, {value:g} ms"} for value in at]
     x: Spec = {"x": {"field": field, **NUMBER}}
     line: Spec = {"mark": RULE, "encoding": x}

@@ -8,7 +8,7 @@ from harness.runs.folder import Run
 
 
 def failures(run: Run) -> dict[str, int]:
-    """Decision points at which a driven layout begins to fail, and the seed with which it does.
+    """Return decision points at which a driven layout begins to fail, and the seed with which it does.
 
     It is the last that a layout's failed episodes share with one that did not fail; where all of them fail,
     the last of the first.
@@ -57,6 +57,6 @@ def lost(run: Run) -> list[str]:
 
 
 def spread(items: Sequence[str], n: int) -> list[str]:
-    """Up to n of the items, evenly spaced, the first among them."""
+    """Return up to n of the items, evenly spaced, the first among them."""
     n = min(n, len(items))
     return [items[k * len(items) // n] for k in range(n)]

@@ -24,7 +24,7 @@ def size(runs: Runs) -> str:
 
 
 def summary(run: Run) -> list[dict[str, Any]]:
-    """A run's summary: a metric a line, with its value in each condition."""
+    """Return a run's summary: a metric a line, with its value in each condition."""
     return [
         {
             "name": entry(metric).label,
@@ -44,7 +44,7 @@ def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
 
 
 def examples(runs: Runs) -> list[dict[str, Any]]:
-    """The first answers of each status but strict, and where each stands."""
+    """Return the first answers of each status but strict, and where each stands."""
     by_status: dict[str, list[dict[str, Any]]] = {}
     for n, run in enumerate(runs.runs):
         for answer in run.answers:
@@ -67,7 +67,7 @@ def attributions(runs: Runs) -> list[dict[str, Any]]:
 
 
 def sweeps(run: Run) -> list[dict[str, str]]:
-    """Pictures of the sweeps that lie in the run's folder; none that a link leads out of it to."""
+    """Return pictures of the sweeps that lie in the run's folder; none that a link leads out of it to."""
     here = run.path.resolve()
     return [
         {"name": f"{manifest.parent.name}: {svg.stem}", "src": picture(bytes_of(svg, "picture"))}

@@ -56,7 +56,7 @@ class Decisions:
         }
 
     def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
-        """The telling decision points, replayed; none where this simulator differs from the run's."""
+        """Return the telling decision points, replayed; none where this simulator differs from the run's."""
         from harness.evaluate.replay import scene_of  # loads the simulator
 
         telling = dict.fromkeys(
@@ -76,7 +76,7 @@ class Decisions:
         return replayed
 
     def _telling(self) -> frozenset[str]:
-        """Decision points that have cameras' pictures: where episodes are lost, then a sample."""
+        """Return decision points that have cameras' pictures: where episodes are lost, then a sample."""
         most = FRAMES // (1 + max(run.decisions.helpers for run in self._runs.runs))
         if self._runs.live:
             return frozenset(spread(list(self._replayed), most))
@@ -86,7 +86,7 @@ class Decisions:
         return frozenset((*first, *spread(list(more), most - len(first))))
 
     def _indexed(self, n: int, first_failures: Sequence[str]) -> dict[str, Any]:
-        """One run's part of the index: a letter a scene, condition and seed, in this order."""
+        """Return one run's part of the index: a letter a scene, condition and seed, in this order."""
         run = self._runs.runs[n]
         d, shape = run.decisions, run.grid.shape[:2]
         place = {scene: position for position, scene in enumerate(self.ids)}
@@ -124,5 +124,5 @@ class Decisions:
         return lacks
 
     def parts(self) -> list[Part]:
-        """The details of all scenes, in parts."""
+        """Return the details of all scenes, in parts."""
         return [Part(self._details, self.ids[at : at + AT_ONCE]) for at in range(0, len(self.ids), AT_ONCE)]

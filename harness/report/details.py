@@ -73,7 +73,7 @@ def prompts_of(run: Run) -> Sent | None:
 
 
 def as_shown(scene: Scene, answer: Answer) -> Scene:
-    """A decision point as it was shown to who answered."""
+    """Return a decision point as it was shown to who answered."""
     if answer.role != "blind":
         return scene
     return scene.changed(graphs={viewer: graph.blinded() for viewer, graph in scene.graphs.items()})
@@ -109,7 +109,7 @@ class Details:
         return [self.prompts(run) for run in self.runs.runs]
 
     def without_prompts(self) -> list[Run]:
-        """The runs whose prompts are not known."""
+        """Return the runs whose prompts are not known."""
         return [run for run, sent in zip(self.runs.runs, self._sent, strict=True) if sent is None]
 
     @cached_property
@@ -199,7 +199,7 @@ class Part:
         return Part, (self.details.of_scenes(self.ids), self.ids)
 
     def packed(self) -> list[Markup]:
-        """The blocks of the scenes, as the page holds them."""
+        """Return the blocks of the scenes, as the page holds them."""
         return [packed(block) for block in self.details.blocks(self.ids)]
 
 

@@ -42,7 +42,7 @@ def history(
     folder: Path, metric: str, condition: str | None = None, dataset: str | None = None,
     wrong: Callable[[str, UserError], object] = lambda name, error: None,
 ) -> list[Group]:  # fmt: skip
-    """The finished runs in a folder, the group whose last run is the newest first.
+    """Return the finished runs in a folder, the group whose last run is the newest first.
 
     Args:
         folder: is looked through as `harness run ls` does.
@@ -103,7 +103,7 @@ def write(groups: Sequence[Group], metric: str, out: Path) -> None:
 
 
 def render(groups: Sequence[Group], metric: str, place: Place) -> str:
-    """The page; `place` gives the link to a run's own."""
+    """Return the page; `place` gives the link to a run's own."""
     return environment().get_template("history.html.j2").render(
         groups=[(group, reach(line.score for line in group.lines if line.score)) for group in groups],
         forest=forest, metric=entry(metric).label, place=place,

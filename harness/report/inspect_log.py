@@ -49,7 +49,7 @@ def write(run: Run, path: Path, dataset: Path | None = None) -> Path:
 
 
 def log_of(run: Run, scenes: Mapping[str, Scene]) -> log.EvalLog:
-    """The log: its task is dataset and prompt version, its results the run's summary over episodes."""
+    """Return the log: its task is dataset and prompt version, its results the run's summary over episodes."""
     manifest, variant = run.manifest, run.manifest.variant
     whole = msgspec.to_builtins(manifest)
     stated = nameless(whole)
@@ -76,7 +76,7 @@ def log_of(run: Run, scenes: Mapping[str, Scene]) -> log.EvalLog:
 
 
 def _results(run: Run) -> Iterator[log.EvalScore]:
-    """The summary over episodes or answers, a score a condition."""
+    """Yield the summary over episodes or answers, a score a condition."""
     for condition in dict.fromkeys(score.condition for score in run.scores):
         metrics = {
             s.metric: log.EvalMetric(
@@ -152,7 +152,7 @@ def _kept(run: Run, condition: Any, regret: Any) -> dict[str, Score]:
 
 
 def _scenes(run: Run, folder: Path | None) -> dict[str, Scene]:
-    """The run's decision points; none where its dataset is not here as it was, or it was driven."""
+    """Return the run's decision points; none where its dataset is not here as it was, or it was driven."""
     if not isinstance(run.manifest.world, FrozenScenes):
         return {}
     try:

@@ -51,7 +51,7 @@ def vega() -> str:
 
 @cache
 def script() -> Markup:
-    """The page's own script."""
+    """Return the page's own script."""
     parts = "\n".join(text_of(FOLDER / f"{name}.js") for name in SCRIPTS)
     return Markup(f'"use strict";\n(() => {{\n{parts}}})();\n')
 
@@ -66,7 +66,7 @@ def licence() -> str:
 
 
 def packed(value: Any) -> Markup:
-    """Text, or anything else as JSON, compressed, in characters that mean nothing in HTML."""
+    """Return text, or anything else as JSON, compressed, in characters that mean nothing in HTML."""
     text = value
     if not isinstance(value, str):
         text = json.dumps(value, separators=(",", ":"), allow_nan=False)
@@ -74,7 +74,7 @@ def packed(value: Any) -> Markup:
 
 
 def picture(content: bytes, kind: str = "svg+xml") -> str:
-    """A picture as an address that a page which stands alone can show."""
+    """Return a picture as an address that a page which stands alone can show."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 

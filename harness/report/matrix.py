@@ -69,7 +69,7 @@ METRICS = (
 
 
 def lines(runs: Runs) -> list[Line]:
-    """Every run under each of its conditions, by condition and then in the runs' order."""
+    """Return every run under each of its conditions, by condition and then in the runs' order."""
     ended = [_successes(run) if len(runs.runs) > 1 else {} for run in runs.runs]
     lengths = [_tokens(run) for run in runs.runs]
     all_marks = marked([[of.get(condition, {}) for of in ended] for condition in runs.conditions])
@@ -85,7 +85,7 @@ def lines(runs: Runs) -> list[Line]:
 
 
 def grids(results: Sequence[Line]) -> list[Grid]:
-    """The lines as a table a condition, with the models and prompts that were run under it."""
+    """Return the lines as a table a condition, with the models and prompts that were run under it."""
     modes = {line.answer for line in results}
     tables: dict[str, dict[tuple[str, str], list[Line]]] = {}
     for line in results:
@@ -102,7 +102,7 @@ def grids(results: Sequence[Line]) -> list[Grid]:
 
 
 def _score(run: Run, condition: str, metric: str) -> Score | None:
-    """A condition's; for answers the ego's, which are the same under all."""
+    """Return a condition's score; for answers the ego's, which are the same under all."""
     return run.score(condition, metric) or run.score("all", f"{metric}_ego")
 
 
@@ -114,7 +114,7 @@ def _tokens(run: Run) -> tuple[float | None, float | None]:
 
 
 def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
-    """Success by condition and, in each, by episode and seed."""
+    """Return success by condition and, in each, by episode and seed."""
     by_condition: dict[str, dict[tuple[int, int], float]] = {name: {} for name in run.conditions}
     for episode in run.episodes:
         by_condition[episode.condition][episode.episode, episode.seed] = float(episode.success)
@@ -122,7 +122,7 @@ def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
 
 
 def marked(conditions: Sequence[Sequence[Successes]]) -> list[list[tuple[str, Behind | None]]]:
-    """The mark of each run under each condition, and how it stands to the best one there.
+    """Return the mark of each run under each condition, and how it stands to the best one there.
 
     Args:
         conditions: of each, the successes of every run; empty for one that was not made under it.
@@ -145,7 +145,7 @@ def marked(conditions: Sequence[Sequence[Successes]]) -> list[list[tuple[str, Be
 
 
 def _behind_best(ended: Sequence[Successes]) -> tuple[int | None, dict[int, Behind]]:
-    """The best run and the others against it, p not yet corrected; None where there is no such run.
+    """Return the best run and the others against it, p not yet corrected; None where there is no such run.
 
     The best is not behind any other on the episodes and seeds that the two share: a run of other episodes is
     no better for their being easy.
@@ -188,7 +188,7 @@ def uneven(runs: Runs) -> str | None:
 
 
 def figures(results: Sequence[Line]) -> list[dict[str, str]]:
-    """The best run's success under each condition, with what it is and its interval."""
+    """Return the best run's success under each condition, with what it is and its interval."""
     bests = [(line, success) for line in results if line.mark == BEST and (success := line.scores[SUCCESS])]
     return [
         {"what": f"success with {line.condition}, best: {line.name}", **shown(success)}

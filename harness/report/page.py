@@ -104,7 +104,7 @@ def save(pieces: Iterable[str], out: Path, option: str) -> None:
 def render(
     runs: Runs, prompts: Prompts = prompts_of, progress: Callable[[int], None] = lambda done: None
 ) -> str:
-    """The page."""
+    """Return the page."""
     return "".join(_pieces(runs, Decisions(runs, prompts), progress, 1))
 
 
@@ -155,7 +155,7 @@ def _pieces(
 
 
 def _packed(parts: Sequence[Part], progress: Callable[[int], None], workers: Workers) -> Iterator[Markup]:
-    """The blocks of all parts, in order."""
+    """Yield the blocks of all parts, in order."""
     if workers == 1 or len(parts) == 1:
         for part in parts:
             for block in part.details.blocks(part.ids):
@@ -201,7 +201,7 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
 
 
 def _actions(runs: Runs) -> dict[str, tuple[str, str]]:
-    """The colour of each action, and of text on it."""
+    """Return the colour of each action, and of text on it."""
     every = colours.actions(runs.actions)
     return {
         name: (c, colours.INK if 5 * n < 3 * len(every) else colours.WHITE)
@@ -211,7 +211,7 @@ def _actions(runs: Runs) -> dict[str, tuple[str, str]]:
 
 @cache
 def environment(*more: Path) -> Environment:
-    """The report's templates, and those of other folders: everything is escaped and made `visible`."""
+    """Return the report's templates, and those of other folders: everything is escaped and made `visible`."""
     templates = Environment(
         loader=FileSystemLoader([*more, TEMPLATES]),
         autoescape=True,
@@ -241,11 +241,11 @@ def visible(value: Any) -> Any:
 
 
 def _mapping(record: Any) -> Any:
-    """A record as plain values, without the folders of the machine that it was made on."""
+    """Return a record as plain values, without the folders of the machine that it was made on."""
     return nameless(msgspec.to_builtins(record))
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[Any]]]:
-    """Head and body of a table with a column for every key."""
+    """Return the head and body of a table with a column for every key."""
     head = list(dict.fromkeys(key for row in rows for key in row))
     return head, [[row.get(key) for key in head] for row in rows]

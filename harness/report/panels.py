@@ -27,7 +27,7 @@ class Panel:
 
 
 def panels(runs: Runs) -> Iterator[Panel]:
-    """The charts of which there is anything to draw."""
+    """Yield the charts of which there is anything to draw."""
 
     def joined(of: Callable[[Run], statistics.Table]) -> statistics.Table:
         return [
@@ -128,7 +128,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
 
 
 def _references(runs: Runs) -> dict[str, Score]:
-    """Success of the references: from the trees, in closed loop from their own runs."""
+    """Return success of the references: from the trees, in closed loop from their own runs."""
     if runs.dataset is None:
         return driven(runs.runs)
     return in_trees(runs.dataset.of_episodes({number for run in runs.runs for number in run.grid.episodes}))

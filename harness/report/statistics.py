@@ -22,7 +22,7 @@ ENERGIES = ("ego's inference", "helpers' inference", "radios")
 
 
 def success(run: Run) -> Table:
-    """Success and latency of each condition, of which both are known."""
+    """Return success and latency of each condition, of which both are known."""
     rows = []
     for condition in run.conditions:
         latency, rate = run.score(condition, LATENCY), run.score(condition, SUCCESS)
@@ -89,7 +89,7 @@ def entropies(run: Run) -> Table:
 
 
 def tokens(run: Run) -> Table:
-    """Tokens of prompts by role, where the engine counts them."""
+    """Count the tokens of prompts by role, where the engine counts them."""
     by_role: dict[str, list[float]] = {}
     for answer in run.answers:
         if answer.prompt_tokens is not None:
@@ -148,7 +148,7 @@ def arrivals(run: Run) -> Table:
 
 
 def _histogram(values: Sequence[float] | Floats, width: float, name: str) -> Table:
-    """Bars of one width with their lower end, from the first that is not empty to the last."""
+    """Return bars of one width with their lower end, from the first that is not empty to the last."""
     # A value on a bin's edge belongs to the bin above it, whatever rounding makes of the quotient.
     bins = np.floor(np.asarray(values, dtype=float) / width + 1e-9).astype(int)
     first = int(bins.min())

@@ -121,7 +121,7 @@ def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> s
 
 
 def _figures(suite: SuiteRun) -> list[dict[str, str]]:
-    """Success under each condition, and the gain of the best."""
+    """Return success under each condition, and the gain of the best."""
     best, base = words.compared(suite)
     scores = {f"success with {c}": suite.score(c, SUCCESS) for c in suite.conditions}
     scores[f"more with {best} than with {base}"] = suite.score(best, GAIN) if base == BASELINE else None
@@ -129,13 +129,13 @@ def _figures(suite: SuiteRun) -> list[dict[str, str]]:
 
 
 def _metrics(suite: SuiteRun) -> list[tuple[str, str, list[Score | None]]]:
-    """Means over families of every metric: its name, its meaning, its value in each condition."""
+    """Return means over families of every metric: its name, its meaning, its value in each condition."""
     names = dict.fromkeys(s.metric for s in suite.scores if s.condition != "all")
     return [(entry(m).label, entry(m).meaning, [suite.score(c, m) for c in suite.conditions]) for m in names]
 
 
 def _picture(line: Line, of_conditions: Mapping[str, str]) -> Markup:
-    """The success rates of a line and their intervals, from 0 to 100 %; drivers are thin lines."""
+    """Return the success rates of a line and their intervals, from 0 to 100 %; drivers are thin lines."""
     height = STEP * (len(line.cells) + 1)
     parts = [f'<path class="driver" d="M{WIDTH * (d.value or 0.0):.1f} 2V{height - 2}"/>'
              for d in line.drivers.values()]  # fmt: skip

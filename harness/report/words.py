@@ -18,7 +18,7 @@ from harness.runs.suite import SuiteRun
 
 
 def shown(score: Score) -> dict[str, str]:
-    """Value, interval and n of a score, for a cell of the table."""
+    """Return value, interval and n of a score, for a cell of the table."""
     unit = entry(score.metric).unit
     n = f"n = {score.n} {score.interval}"
     if score.n_excluded:
@@ -27,7 +27,7 @@ def shown(score: Score) -> dict[str, str]:
 
 
 def headline(run: Run | SuiteRun) -> str:
-    """The result in one short sentence: the best condition, and the one without V2V beside it."""
+    """Return the result in one short sentence: the best condition, and the one without V2V beside it."""
     model = f"{run.manifest.variant.model}{run.manifest.variant.mix}"
     best, base = compared(run)
     if not best:
@@ -49,7 +49,7 @@ def headline(run: Run | SuiteRun) -> str:
 
 
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
-    """The best condition, and the one that it is held against: the one without V2V, or the worst.
+    """Return the best condition, and the one that it is held against: the one without V2V, or the worst.
 
     Empty where there is none.
     """
@@ -61,7 +61,7 @@ def compared(run: Run | SuiteRun) -> tuple[str, str]:
 
 
 def figures(run: Run) -> list[dict[str, str]]:
-    """The few numbers of a run that are read first, each with what it is and its interval."""
+    """Return the few numbers of a run that are read first, each with what it is and its interval."""
     best, base = compared(run)
     wanted = [
         (f"success under {best}", run.score(best, SUCCESS)),
@@ -173,7 +173,7 @@ def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:
 
 
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:
-    """A nested mapping as lines of a table: dotted name and value."""
+    """Return a nested mapping as lines of a table: dotted name and value."""
     if isinstance(value, Mapping):
         return [
             line

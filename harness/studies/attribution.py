@@ -115,7 +115,7 @@ def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[d
 
 
 def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
-    """Every listed object left out of every prompt about these decision points in turn."""
+    """Yield every listed object left out of every prompt about these decision points in turn."""
     asked = [each for scene in scenes for each in _questions(stored, scene)]
     whole = requests(stored.spec, scenes)
     answers = stored.answered([*whole, *(request for *_, request in asked)])
@@ -129,7 +129,7 @@ def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
 
 
 def _questions(stored: ReplayedRun, scene: Scene) -> Iterator[tuple[Scene, str, str, Request]]:
-    """The decision point, who is asked, what is left out, and the question."""
+    """Yield the decision point, who is asked, what is left out, and the question."""
     spec, graphs = stored.spec, scene.graphs
     listed: dict[str, list[str]] = {}
     for place, viewer in enumerate(spec.viewers(scene)):

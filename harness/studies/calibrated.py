@@ -152,7 +152,7 @@ class CalibratedWorld:
     helpers = fusion_call = blind
 
     def due(self, point: OperatingPoint) -> Due:
-        """Every episode."""
+        """Return every episode."""
         return Due(np.arange(len(self._knows)), self._episode, self._seed, self._now.draws)
 
     def outlook(self, *_: Any) -> None:
@@ -217,7 +217,7 @@ class Calibrated:
             yield WalkResult(numbers, ends, columns, places)
 
     def _drawn(self, seeds: tuple[int, ...], helpers: int, first: int) -> Sequence[_Drawn]:
-        """The rows of each step."""
+        """Return the rows of each step."""
         drawn = _below([self._draw(seed, helpers, first) for seed in seeds])
         return [drawn.step(number) for number in range(STEPS)]
 

@@ -90,7 +90,7 @@ def _rank(rows: "pd.DataFrame") -> tuple[float, int]:
 
 
 def _episodes(path: Path) -> "tuple[World, pd.DataFrame]":
-    """The world of a run, and the result of each of its episodes."""
+    """Return the world of a run, and the result of each of its episodes."""
     import pandas as pd
 
     run = read(path)

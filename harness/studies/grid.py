@@ -219,7 +219,7 @@ class Grid:
         )
 
     def _mean(self, condition: str, **levels: str) -> Floats:
-        """Mean success of the cells with these levels, by factor's name, (E, S)."""
+        """Return mean success of the cells with these levels, by factor's name, (E, S)."""
         at = self.conditions.index(condition)
         having = [
             cell.values[SUCCESS][at]

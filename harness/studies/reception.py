@@ -107,7 +107,7 @@ def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int =
 
 
 def _p95(values: Floats, trips: Ints) -> Estimate:
-    """The 95th percentile, with the bootstrap's interval over trips; NaN of none."""
+    """Return the 95th percentile, with the bootstrap's interval over trips; NaN of none."""
     there, of = np.unique(trips, return_inverse=True)
     if not len(there):
         return Estimate(math.nan, math.nan, math.nan, 0, 0)
@@ -159,7 +159,7 @@ def curves_of(path: Path) -> list[Curve]:
 
 
 def _plain(cell: Any) -> Any:
-    """A number as JSON writes it: `.9` is none there."""
+    """Return a number as JSON writes it: `.9` is none there."""
     try:
         return repr(float(cell))
     except (TypeError, ValueError):

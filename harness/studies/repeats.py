@@ -151,7 +151,7 @@ class Repeats:
         return [point for point in points if point.flips > 0]
 
     def _doubts(self) -> Iterator[tuple[str, Estimate]]:
-        """The entropy that the ego's answers state, and that of the actions which they rank first."""
+        """Yield the entropy that the ego's answers state, and that of the actions which they rank first."""
         intents: dict[str, list[tuple[float, ...]]] = {}
         for run in self.runs:
             for answer in run.answers:

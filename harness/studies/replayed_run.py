@@ -187,7 +187,7 @@ class ReplayedRun:
     def _walked(
         self, points: Sequence[OperatingPoint], vehicles: int, seeds: Sequence[int]
     ) -> Iterator[Sequence[WalkResult]]:
-        """The same at points that are walked together."""
+        """Yield the same at points that are walked together."""
         different = list(dict.fromkeys(points))
         world = FrozenWorld(self.dataset, different, seeds)
         ask = self.asked_in(world, different, vehicles - 1)
@@ -299,7 +299,7 @@ class ReplayedRun:
         self._row |= {scene.id: before + n for n, scene in enumerate(scenes)}
 
     def _there(self, scenes: Sequence[Scene], helpers: int) -> Intents:
-        """The intents in scenes that were laid out."""
+        """Return the intents in scenes that were laid out."""
         assert self._intents is not None
         return self._intents.take([self._row[scene.id] for scene in scenes]).of_first(helpers)
 

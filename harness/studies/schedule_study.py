@@ -88,7 +88,7 @@ def headline(compared: Compared) -> list[str]:
 
 
 def _steps(run: Compared, cost: str) -> Iterator[Steps]:
-    """The settings that are taken as the budget grows."""
+    """Yield the settings that are taken as the budget grows."""
 
     def steps(label: str, plays: Sequence[Play], **look: Any) -> Steps:
         success = [100 * float(play.success.mean()) for play in plays]

@@ -210,7 +210,7 @@ class Compared:
         return resampled_estimate(values, self.weights.shape[1])
 
     def _resampled(self, values: Sequence[Floats]) -> Floats:
-        """Means of values (S, E) in each resample, (1 + RESAMPLES, P)."""
+        """Return means of values (S, E) in each resample, (1 + RESAMPLES, P)."""
         return np.asarray(self.weights @ np.array([each.mean(axis=0) for each in values]).T)
 
     @cached_property
@@ -335,5 +335,5 @@ def _area(success: Floats, messages: Floats, ranks: Floats, most: Floats) -> Flo
 
 
 def _ratio(part: Floats, whole: Floats) -> Floats:
-    """A share, NaN of nothing."""
+    """Return a share, NaN of nothing."""
     return np.where(whole > 0, part / np.where(whole > 0, whole, 1.0), np.nan)

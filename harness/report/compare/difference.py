@@ -191,7 +191,7 @@ def _difference(metric: str, a: Floats, b: Floats) -> Difference:
 
 
 def _flips(pair: Pair, condition: str, which: Bools) -> Iterator[Flip]:
-    """Those (E, S) that flip, one an episode and way of ending."""
+    """Yield those (E, S) that flip, one an episode and way of ending."""
     for episode, row in zip(pair.episodes, which, strict=True):
         seeds: dict[tuple[str, str], list[int]] = {}
         for seed in np.array(pair.seeds)[row].tolist():

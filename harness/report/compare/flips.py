@@ -54,7 +54,7 @@ def flips(pair: Pair, condition: str) -> tuple[int, tuple[DecisionFlip, ...]]:
 
 
 def _keys(pair: Pair, side: Side, condition: str, names: Sequence[str]) -> tuple[Ints, Ints]:
-    """A number for each decision in a condition, the same in both runs, and the decision's row."""
+    """Return a number for each decision in a condition, the same in both runs, and the decision's row."""
     run = side.run
     d = run.decisions
     rows = np.flatnonzero(d.codes("condition", run.conditions) == run.conditions.index(condition))

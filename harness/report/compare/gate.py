@@ -44,7 +44,7 @@ def gate(
     text: str, names: Sequence[str] = (), place: str = "CONDITION",
     example: str = "6g:success_rate < -0.01",
 ) -> Gate:  # fmt: skip
-    """A gate from `success_rate < -0.01`, `6g:success_rate < -0.01` or `success_rate.high < 0`.
+    """Return a gate from `success_rate < -0.01`, `6g:success_rate < -0.01` or `success_rate.high < 0`.
 
     Args:
         text: as it was typed.

@@ -27,7 +27,7 @@ Place = Callable[[Run], str | None]  # where the page of a run is, as a link
 
 
 def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place: Place) -> str:
-    """The page; `most` episodes and requests are listed of each kind, with links to the runs' pages."""
+    """Yield the page; `most` episodes and requests are listed of each kind, with links to the runs' pages."""
     pair = comparison.pair
     lost = {name: _lost(side) for name, side in (("A", pair.a), ("B", pair.b))}
 
@@ -53,7 +53,7 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
 
 
 def beside(out: Path) -> Place:
-    """Links from a file to the pages in the runs' folders, where there are any.
+    """Return links from a file to the pages in the runs' folders, where there are any.
 
     A link names no folder of the machine: both lie below the current folder, or the page below the file.
     """

@@ -38,7 +38,7 @@ def scenes_of(run: Run) -> Any:
 
 
 def where(run: Run) -> str:
-    """A run's scenes, for people."""
+    """Return a run's scenes, for people."""
     world = run.manifest.world
     if isinstance(world, FrozenScenes):
         return f"{world.name} {world.sha256[:12]}"
@@ -70,7 +70,7 @@ class Pair:
     episodes: tuple[int, ...]  # numbers of the episodes that both have, ascending
 
     def values(self, side: Side, metric: str, condition: str) -> Floats:
-        """A metric of the episodes that both have, (E, S)."""
+        """Return a metric of the episodes that both have, (E, S)."""
         grid = side.run.grid
         seeds, episodes = map(grid.seeds.index, self.seeds), map(grid.episodes.index, self.episodes)
         of_condition = side.values[metric][grid.conditions.index(condition)]

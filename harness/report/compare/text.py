@@ -123,19 +123,19 @@ def _table(c: InCondition, whole: bool) -> list[str]:
 
 
 def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
-    """The gates as test cases, for what shows JUnit's XML."""
+    """Return the gates as test cases, for what shows JUnit's XML."""
     runs = " against ".join(printable(words.who(side)) for side in (comparison.pair.b, comparison.pair.a))
     cases = [Case(runs, v.gate, words.judged(v) if v.failed else None) for v in verdicts]
     return test_suite("harness compare", cases)
 
 
 def junit_of_none(gates: Sequence[str], reason: str) -> str:
-    """The gates as test cases where they cannot be judged, since a model could not be asked."""
+    """Return the gates as test cases where they cannot be judged, since a model could not be asked."""
     return test_suite("harness compare", [Case("harness compare", gate, error=reason) for gate in gates])
 
 
 def code(text: str) -> str:
-    """Text as Markdown's code, whatever backticks it has."""
+    """Return a text as Markdown's code, whatever backticks it has."""
     text = printable(text, WHOLE)
     fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
     pad = " " if "`" in text else ""

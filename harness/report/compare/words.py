@@ -109,7 +109,7 @@ def findings(comparison: Comparison) -> list[tuple[str, str]]:
 
 
 def who(side: Side) -> str:
-    """Model, prompt and answer mode of a run."""
+    """Return the model, prompt and answer mode of a run."""
     variant = side.run.manifest.variant
     return f"{variant.model} · prompt {variant.prompt} · {variant.answer}{variant.mix}"
 
@@ -194,7 +194,7 @@ def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
 
 
 def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
-    """Up to so many episodes, each with how it failed; seeds where it is not all of them."""
+    """Return up to so many episodes, each with how it failed; seeds where it is not all of them."""
     episodes = []
     for t in some[:most]:
         how = t.a if t.b == "success" else t.b
@@ -224,7 +224,7 @@ def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
 
 
 def decision_flip(flip: DecisionFlip, pair: Pair) -> str:
-    """A decision point and what both did there; seeds where it is not all of them."""
+    """Return a decision point and what both did there; seeds where it is not all of them."""
     return f"{flip.scene} {flip.a} → {flip.b}{_seeds(flip.seeds, pair)}"
 
 
@@ -277,7 +277,7 @@ def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
 
 
 def _listed(some: Sequence[str], n: int, most: int) -> str:
-    """Some of n, and how many more there are."""
+    """Return some of n, and how many more there are."""
     return ", ".join([*some, f"{n - most} more"] if n > most else some)
 
 

@@ -43,7 +43,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
 def conditions(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each operating point: the paper's have their own, a change of one has another."""
+    """Return a colour for each operating point: the paper's have their own, a change of one has another."""
     chosen: dict[str, str] = {}
     for name in dict.fromkeys(names):
         free = [
@@ -54,7 +54,7 @@ def conditions(names: Iterable[str]) -> dict[str, str]:
 
 
 def actions(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each action, in the scenario's order, from slow to fast."""
+    """Return a colour for each action, in the scenario's order, from slow to fast."""
     every = list(names)
     last = max(len(every) - 1, 1)
     return {name: _SLOW_TO_FAST[round(4 * n / last)] for n, name in enumerate(every)}

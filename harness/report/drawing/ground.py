@@ -21,7 +21,7 @@ FAR_M = 4 * VIEW_M  # from an eye to the end of what is in shadow
 
 
 def roads(scenario: Scenario) -> Iterator[Artist]:
-    """Roads with their lane marks."""
+    """Yield roads with their lane marks."""
     surface = ground_of(scenario)
     yield PathPatch(
         _closed(surface.outlines), facecolor=LIGHT["road"], edgecolor=LIGHT["kerb"], linewidth=0.8
@@ -31,14 +31,14 @@ def roads(scenario: Scenario) -> Iterator[Artist]:
 
 
 def shade(state: WorldState, eye: VehicleState) -> Artist:
-    """All that walls and vehicles hide from one."""
+    """Return all that walls and vehicles hide from one."""
     return PathPatch(
         _closed(shadows(state, eye, FAR_M)), facecolor=LIGHT["shade"], edgecolor="none", alpha=0.22
     )
 
 
 def walls(buildings: Iterable[Building]) -> Iterator[Artist]:
-    """Buildings; of those that overlap the outline of the whole."""
+    """Yield buildings; of those that overlap the outline of the whole."""
     outlines = _closed([north_up(building.corners()) for building in buildings])
     yield PathPatch(outlines, facecolor="none", edgecolor=LIGHT["wall"], linewidth=1.6)
     yield PathPatch(outlines, facecolor=LIGHT["building"], edgecolor="none")

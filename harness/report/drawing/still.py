@@ -74,7 +74,7 @@ class Canvas:
         self.sides: dict[str, int] = {}
 
     def picture(self, still: Still, seen: dict[str, list[str]], view: View) -> Pixels:
-        """One still, with what each viewer saw when the decision began."""
+        """Return one still, with what each viewer saw when the decision began."""
         viewers = _watched(still.state, seen)
         self._words(still, viewers)
         self._above(still, seen, view)
@@ -180,7 +180,7 @@ class Canvas:
 
 
 def _watched(state: WorldState, seen: dict[str, list[str]]) -> list[str]:
-    """The ego, and the helper that saw most of whom the ego did not see."""
+    """Return the ego, and the helper that saw most of whom the ego did not see."""
     ego = state.ego.id
     helpers = [v.id for v in state.vehicles if v.id in seen and v.id != ego]
     more = {helper: len({*seen[helper]} - {*seen[ego], ego, helper}) for helper in helpers}
@@ -226,7 +226,7 @@ def _moved(outline: Outline, to: Floats, scale: float) -> Outline:
 
 @lru_cache(maxsize=1024)
 def _outline(text: str) -> Outline:
-    """A text's outline in points: as one shape, many cost a fifth of as many texts."""
+    """Return a text's outline in points: as one shape, many cost a fifth of as many texts."""
     return TextPath((0.0, 0.0), text, size=NAME_PT)
 
 
@@ -261,7 +261,7 @@ def _messages(played: Played, still: Still) -> Iterator[Artist]:
 
 
 def _bars(still: Still, actions: Sequence[str]) -> Iterator[Artist]:
-    """The policy of the last decision, pale until it is ready."""
+    """Yield the policy of the last decision, pale until it is ready."""
     decision, colours = still.decision, colours_of(actions)
     for n, (action, p) in enumerate(zip(actions, decision.fused, strict=True)):
         width = 1.4 if action == decision.action else 0.3

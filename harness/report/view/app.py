@@ -64,7 +64,7 @@ WAY_BACK = (  # a report's navigation begins at the top of its page and would li
 
 
 def app(folder: Path, token: str) -> ASGIApp:
-    """The application for one folder of runs, for who has the token."""
+    """Return the application for one folder of runs, for who has the token."""
     view = View(folder)
     routes = {
         "/": view.index, "/style.css": view.style, "/run": view.run, "/picture": view.picture,
@@ -107,16 +107,16 @@ class View:
         self._drawing = asyncio.Lock()  # a page holds all rows of its runs
 
     def index(self, request: Request) -> Response:
-        """The list of runs, filtered by `q` and sorted by `sort`."""
+        """Return the list of runs, filtered by `q` and sorted by `sort`."""
         query = request.query_params
         return HTMLResponse(pages.listed(self.folder, query.get("q", ""), query.get("sort", "")))
 
     def style(self, request: Request) -> Response:
-        """The style of the list; reports have their own within."""
+        """Return the style of the list; reports have their own within."""
         return Response(pages.style(), media_type="text/css")
 
     async def run(self, request: Request) -> Response:
-        """The page of one run or study."""
+        """Return the page of one run or study."""
         [run] = await run_in_threadpool(self._listed, [request.query_params.get("path", "")])
         if run.state != "finished":
             raise UserError(
@@ -132,7 +132,7 @@ class View:
         return await self._drawn(request, partial(pages.report, self._whole([run])))
 
     def picture(self, request: Request) -> Response:
-        """A picture of a study."""
+        """Return a picture of a study."""
         [run] = self._listed([request.query_params.get("path", "")])
         name = request.query_params.get("name", "")
         file = own_file(self.folder, run.name, name) if name in pictures(self.folder, run.name) else None
@@ -143,7 +143,7 @@ class View:
         return FileResponse(file, headers=policy, media_type=PICTURES[file.suffix])
 
     async def compare(self, request: Request) -> Response:
-        """Two runs compared; the older is A."""
+        """Compare two runs; the older is A."""
         picked = await run_in_threadpool(self._picked, request)
         if len(picked) != 2:
             raise UserError(f"{len(picked)} runs are picked; pick two to compare them")
@@ -151,14 +151,14 @@ class View:
         return await self._drawn(request, partial(pages.compared, self.folder, older, newer))
 
     async def report(self, request: Request) -> Response:
-        """The report of all runs that are picked."""
+        """Return the report of all runs that are picked."""
         picked = await run_in_threadpool(self._picked, request)
         if not picked:
             raise UserError("no run is picked; pick one or more for a report")
         return await self._drawn(request, partial(pages.report, self._whole(picked)))
 
     def wrong(self, request: Request, error: Exception) -> Response:
-        """A page of one line about a request that cannot be answered."""
+        """Return a page of one line about a request that cannot be answered."""
         status, reason = (
             (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, error)
         )
@@ -166,7 +166,7 @@ class View:
         return HTMLResponse(pages.wrong(str(reason)), status, headers)
 
     def bug(self, request: Request, error: Exception) -> Response:
-        """The same for a bug, of which the terminal has the traceback."""
+        """Return the same for a bug, of which the terminal has the traceback."""
         traceback.print_exception(error)
         return HTMLResponse(pages.wrong("this page cannot be made; the terminal says why"), 500)
 
@@ -224,5 +224,5 @@ def _shown(page: Path) -> Response:
 
 
 def _with_way_back(page: str) -> Response:
-    """A page of a run, with a link to the list before all that it says itself."""
+    """Return a page of a run, with a link to the list before all that it says itself."""
     return HTMLResponse(page.replace("<body>", f"<body>\n{WAY_BACK}", 1), headers=OF_RUNS)

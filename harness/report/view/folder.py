@@ -29,7 +29,7 @@ def own_file(root: Path, run: str, name: str) -> Path | None:
 
 
 def whole(root: Path, run: str) -> Path:
-    """The folder of a listed run, every file of which may be read.
+    """Return the folder of a listed run, every file of which may be read.
 
     Raises:
         UserError: one is missing, no file or a link that leads out.
@@ -41,7 +41,7 @@ def whole(root: Path, run: str) -> Path:
 
 
 def pictures(root: Path, run: str) -> list[str]:
-    """Names of a listed study's pictures; of one in several formats the one that scales."""
+    """Return the names of a listed study's pictures; of one in several formats the one that scales."""
     names = sorted(os.listdir(root / run))
     scaled = {Path(name).stem for name in names if name.endswith(".svg")}
     return [

@@ -32,7 +32,7 @@ COLUMNS: dict[str, Callable[[Listed], Any]] = {
 
 
 def report(folders: Sequence[Path]) -> str:
-    """The report of one run or several."""
+    """Return the report of one run or several."""
     return render(gather(folders))
 
 
@@ -42,7 +42,7 @@ def compared(folder: Path, a: Path, b: Path) -> str:
 
 
 def suite(folder: Path, path: Path) -> str:
-    """The page of a suite's runs, in a folder of it."""
+    """Return the page of a suite's runs, in a folder of it."""
     done = read(path)
     return suites.render([(done, suites.lines(done))], partial(_place, folder))
 
@@ -77,17 +77,17 @@ def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
 
 
 def study(run: Listed, pictures: Sequence[str]) -> str:
-    """The pictures of a study that has no page of its own."""
+    """Return the pictures of a study that has no page of its own."""
     return _page("study.html.j2", run=run, pictures=pictures)
 
 
 def wrong(reason: str) -> str:
-    """One line about a request that cannot be answered."""
+    """Return one line about a request that cannot be answered."""
     return _page("wrong.html.j2", reason=reason)
 
 
 def style() -> str:
-    """The report's style, and the list's own."""
+    """Return the report's style, and the list's own."""
     return environment().get_template("style.css").render() + text_of(TEMPLATES / "list.css")
 
 

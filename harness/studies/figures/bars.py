@@ -82,7 +82,7 @@ def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) 
 def _value(
     rows: "pd.DataFrame", condition: str, metric: str, scale: float = 1.0
 ) -> tuple[float, float, float]:
-    """Mean, and how far the interval reaches below and above it."""
+    """Return the mean, and how far the interval reaches below and above it."""
     of = rows[(rows.condition == condition) & (rows.metric == metric)]
     [estimate] = of[of.interval == interval_of(of)][["mean", "ci_low", "ci_high"]].to_numpy(dtype=float)
     mean, low, high = scale * estimate

@@ -214,7 +214,7 @@ def _asked(
 
 
 def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -> Iterator[Asked]:
-    """The questions about a scene that the twin changes for who reads them, each with its twin."""
+    """Yield the questions about a scene that the twin changes for who reads them, each with its twin."""
     graphs = scene.graphs
     if twin.graph:
         graphs = {viewer: twin.graph(spec, scene, graph) for viewer, graph in graphs.items()}
@@ -234,7 +234,7 @@ def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -
 
 
 def _fusion(spec: Spec, twin: Twin, scene: Scene, answers: Mapping[str, Answer]) -> Iterator[Asked]:
-    """The ego's fusion call with the messages of all helpers, and its twin."""
+    """Yield the ego's fusion call with the messages of all helpers, and its twin."""
     by_viewer = {v: answers[f"{scene.id}/{v}"] for v in spec.viewers(scene)}
     senders = [message["sender"] for message in messages_of(by_viewer, scene.viewers[1:], spec.actions)]
     if senders and twin.senders:
@@ -245,7 +245,7 @@ def _fusion(spec: Spec, twin: Twin, scene: Scene, answers: Mapping[str, Answer])
 
 
 def _named(scene: Scene, twin: Twin, **changes: Any) -> Scene:
-    """A scene of another name, so that its answers have names of their own."""
+    """Return a scene of another name, so that its answers have names of their own."""
     return scene.changed(**changes, scene=f"{scene.id}~{twin.name}")
 
 

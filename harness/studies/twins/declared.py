@@ -217,7 +217,7 @@ def _says_units(spec: Spec, role: str) -> bool:
 
 
 def _speeds(spec: Spec, factor: float) -> str:
-    """The target speeds as prompts have them, `14, 7, 0`."""
+    """Return the target speeds as prompts have them, `14, 7, 0`."""
     speeds = spec.scenario.prompt_words["speeds"].split(", ")
     return ", ".join(f"{round(float(speed) * factor, 1):g}" for speed in speeds)
 
@@ -237,7 +237,7 @@ def other_units(spec: Spec, request: Request) -> Request:
 
 
 def paraphrased(spec: Spec, request: Request) -> Request:
-    """Every sentence of `paraphrases.toml` in other words."""
+    """Put every sentence of `paraphrases.toml` in other words."""
 
     def reworded(text: str) -> str:
         for sentence, paraphrase in paraphrases().items():

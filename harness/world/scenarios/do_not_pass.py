@@ -83,7 +83,7 @@ def road() -> Road:
 
 @cache
 def network() -> Any:
-    """Lanes as `TwoWayEnv` has them: the left one is there twice, once in each direction."""
+    """Return the lanes as `TwoWayEnv` has them: the left one is there twice, once in each direction."""
     from highway_env.road.lane import LineType
 
     striped, edge, none = LineType.STRIPED, LineType.CONTINUOUS_LINE, LineType.NONE

@@ -61,7 +61,7 @@ class Parameters(Common):
 
 @cache
 def road() -> Road:
-    """Two lanes to the east."""
+    """Return two lanes to the east."""
     lanes = {RIGHT: ("0", "1", 1), LEFT: ("0", "1", 0)}
     paths: dict[PathKey, Path] = {
         ("own", name): Path.along(network(), "own", name, [lane], [name], 0) for name, lane in lanes.items()
