@@ -181,7 +181,7 @@ def headline(result: Fidelity) -> list[str]:
 
 
 def _who(row: dict[Any, Any]) -> str:
-    return " · ".join(str(row[name]) for name in WHO)
+    return str(Variant(*(row[name] for name in WHO)))
 
 
 def _place(row: dict[Any, Any]) -> str:

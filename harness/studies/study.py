@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 TEMPLATES = Path(__file__).parent / "templates"
+LONGEST_NUMBER = 40  # characters of a cell at the right of its column, such as a number with its interval
 WIDEST_REM, REM_PER_INCH = 66, 10.5
 SOURCE = ("name", "latency")  # of a source, what makes a study another one
 # What else may lie in a folder, each as `<name>.json`; some of their files have the names of a study's.
@@ -46,6 +47,14 @@ class Table:
     # the columns that a terminal has room for; none where only the page shows the table
     terminal: Sequence[int] = ()
     most: int | None = None  # how many rows a terminal shows; None for all
+
+    @property
+    def words(self) -> list[bool]:
+        """Whether each column has sentences, which begin at the left and wrap on the page."""
+        return [
+            any(len(Markup(row[n]).striptags()) > LONGEST_NUMBER for row in self.rows)
+            for n in range(len(self.heads))
+        ]
 
     @property
     def in_terminal(self) -> tuple[list[str], list[list[str]]]:

@@ -78,6 +78,7 @@ def test_the_command_writes_a_page_and_says_the_largest_difference(
     assert (code, err) == (0, "")
     assert "rank correlation of 5 models and conditions" in out
     assert "Largest difference, frozen minus closed" in out
+    assert "json · " not in out + Path("told/index.html").read_text(), "the ego's agent answers for helpers"
     few = harness("study", "fidelity", *(run for run in runs if "proxy" in str(run)), "--out", "few")[1]
     assert "Spearman" not in few
     assert re.search(

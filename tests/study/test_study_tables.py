@@ -56,6 +56,15 @@ def test_a_page_shows_text_as_text_and_a_terminal_no_markup(tmp_path: Path) -> N
     assert json.loads((tmp_path / "sweep.json").read_text()) == {"format": "swarmdrive-sweep/1", "a": 1}
 
 
+def test_a_column_of_sentences_begins_at_the_left_in_every_row(tmp_path: Path) -> None:
+    rows = [("a", "1.0", "short"), ("b", "22.0", "a sentence " * 4)]
+    table = Table("t", ("name", "value", "text"), rows)
+    assert table.words == [False, False, True]
+    page = write_study(Study("sweep", "a", ["b"], ["c"], [table], {}, {}, {}), tmp_path).read_text()
+    assert page.count('<td class="words">') == 2
+    assert '<th scope="col" class="number">value</th><th scope="col">text</th>' in page
+
+
 def test_a_study_is_not_written_over_a_run_or_another_study(tmp_path: Path) -> None:
     """Their tables may have the names of its own: a sweep's and a run's are `episodes.csv`."""
     study = Study("sweep", "a", ["b"], ["c"], [], {"episodes": pd.DataFrame({"a": [1]})}, {}, {})
