@@ -108,6 +108,8 @@ HOSTILE = {
     'server = ["http://theirs:1/v1"]': "a file names no server to ask; give --server, or take the line out",
     "model = 3": "model = 3; allowed: str",
     'prompd = "v2"': "unknown key in settings stated.toml 'prompd'; did you mean 'prompt'?",
+    '[world]\nkind = "frozen"\nlimti = 1': "unknown key in settings stated.toml [world] 'limti'; did you "
+    "mean 'limit'?",
     '[world]\nkind = "closed-loop"': "are of `harness drive`; type that",
     '[world]\nkind = "dream"': "stated.toml",
     "model =": "stated.toml is no TOML",

@@ -174,7 +174,7 @@ def _unknown_keys(
     value: Any, hint: Any, path: tuple[str, ...], exempt: Collection[str] = ()
 ) -> Iterator[tuple[tuple[str, ...], str, list[str]]]:
     """Yield each unknown key: the path of its table, the key, and the names of the known fields."""
-    members = [member for member in _members(hint) if member is not NoneType]
+    members = [member for member in _members(hint, value) if member is not NoneType]
     if len(members) != 1 or not isinstance(value, Mapping | list):
         return
     entries: Iterable[tuple[Any, Any]] = value.items() if isinstance(value, Mapping) else enumerate(value)
