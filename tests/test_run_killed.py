@@ -25,7 +25,7 @@ from harness.evaluate.latency import PAPER
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 
-RESULT = {*FILES, "run.json", "sources"}
+RESULT = {*FILES, "run.json", "run.toml", "sources"}
 
 
 @pytest.fixture(scope="module")

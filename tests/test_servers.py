@@ -357,7 +357,10 @@ def test_which_servers_answer_is_no_part_of_the_models_identity() -> None:
         serving(said_back, lists({"id": "m"}, "1")) as other,
     ):
         identities = [opened(*there, kind="vllm").identity() for there in ((one,), (other, one))]
-    expected = {"engine": "openai", "server": "vllm", "model": "m", "listed": {"id": "m"}, "version": "1"}
+    expected = {
+        "engine": "openai", "answers": 1, "server": "vllm", "model": "m", "listed": {"id": "m"},
+        "version": "1",
+    }  # fmt: skip
     assert identities == [expected, expected]
 
 

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from harness.backends import cards, devices
 from harness.coordination.coordinate import TIES
@@ -17,14 +17,15 @@ from harness.dataset import load
 from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
-from harness.evaluate.live_world import LiveSource
 from harness.evaluate.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
 from harness.runs.folder import read
-from harness.world.environments.examination import examine
 from harness.world.scenario import Scenario
 from harness.world.scenarios import DEFAULT
+
+if TYPE_CHECKING:
+    from harness.evaluate.live_world import LiveSource
 
 CONTROLS = {"shuffled-messages": "messages=shuffled", "no-messages": "loss=1", "blind": "messages=blind"}
 
@@ -51,13 +52,17 @@ def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
     return FrozenSource(selection.of(whole), selection)
 
 
-def driven(world: DriveSettings, scenario: str | None = None) -> LiveSource:
+def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
     """Return the layouts that are driven; by default as many, and the same, as the shipped dataset has.
 
     Raises:
         UserError: an episode or seed is out of range, or mixed with those of another purpose, or the
             scenario is an environment that cannot be driven.
     """
+    # A base install evaluates without the simulator.
+    from harness.evaluate.live_world import LiveSource
+    from harness.world.environments.examination import examine
+
     name = scenario or world.scenario or DEFAULT
     shipped = _shipped(name.partition(":")[0])
     episodes = shipped["episodes"] if world.episodes is None else world.episodes

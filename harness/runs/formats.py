@@ -9,11 +9,10 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from msgspec import UNSET
-
 from harness.core.errors import UserError, printable
 
 NUMBER = 2
+UNSET = "unset"  # stands for `msgspec.UNSET`: a folder is listed without loading msgspec
 FORMAT = f"swarmdrive-run/{NUMBER}"
 # Older formats, and the version of the harness that reads each.
 READ_BY = {"swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1"}

@@ -106,8 +106,8 @@ def test_a_run_without_streams_is_whole(closed: tuple[int, ...], tmp_path: Path)
     )  # fmt: skip
     assert done.returncode == 0
     assert {path.name for path in (tmp_path / "run").iterdir()} == {
-        "answers.jsonl", "decisions.parquet", "episodes.csv", "report.html", "run.json", "sources",
-        "summary.csv",
+        "answers.jsonl", "decisions.parquet", "episodes.csv", "report.html", "run.json", "run.toml",
+        "sources", "summary.csv",
     }  # fmt: skip
 
 

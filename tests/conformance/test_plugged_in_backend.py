@@ -67,7 +67,7 @@ def test_a_card_names_it_and_it_is_listed_and_run(
     )
     assert (code, err.count("harness: ")) == (0, 0), err
     manifest = json.loads((project / "run" / "run.json").read_text())
-    assert manifest["identity"] == {"engine": "cautious", "version": 1}
+    assert manifest["identity"] == {"engine": "cautious", "answers": 1, "version": 1}
 
 
 def test_what_it_cannot_do_is_refused_by_its_capabilities(
