@@ -65,7 +65,7 @@ def agent(engine: str, letters: Any = "cyclic") -> Agent:
 
 def test_the_letters_are_read_as_the_card_says_unless_told_otherwise() -> None:
     assert agent("llama-cpp", None).letters == "raw"
-    assert "letters" not in agent("llama-cpp", None).settings()
+    assert agent("llama-cpp", None).settings()["letters"] == "raw"
     assert agent("llama-cpp").settings()["letters"] == "cyclic"
     assert Agent(cards.resolve("qwen3-0.6b"), versions.load("v4"), "readout").letters == "cyclic"
     assert Agent(cards.resolve("qwen3-0.6b"), versions.load("v4"), "json").letters == "raw"

@@ -15,7 +15,10 @@ from harness.runs.folder import read
 Typed = Callable[..., tuple[int, str, str]]
 CANARY = "canary-in-a-folder"
 SECRET = "letmein"
-RECORDS = {"run.json", "sweep.json", "schedule.json", "suite.json", "twins.json", "cells.jsonl", *FILES}
+RECORDS = {
+    "run.json", "run.toml", "sweep.json", "schedule.json", "suite.json", "twins.json", "fidelity.json",
+    "cells.jsonl", *FILES,
+}  # fmt: skip
 EVAL = ("--seeds", "0", "--limit", "1", "--quiet", "--condition", "single-local", "--condition", "6g")
 
 

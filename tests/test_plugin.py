@@ -109,7 +109,7 @@ def smoothed(run: Tables, decisions: pd.DataFrame) -> tuple[np.ndarray, np.ndarr
 
 
 def test_the_backend_answers_by_its_rule_on_what_each_viewer_sees(frozen: Tables, small: Dataset):
-    assert frozen.config["identity"] == {"engine": "cautious", "version": 1}
+    assert frozen.config["identity"] == {"engine": "cautious", "answers": 1, "version": 1}
     asked = small.scenes(frozen.answers.scene.unique().tolist())
     graphs = {scene.id: scene.graphs for scene in asked}
     answers = frozen.answers

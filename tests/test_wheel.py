@@ -64,7 +64,7 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, t
     assert str(site) in told["manifest"]["world"]["path"]
     run = tmp_path / told["run"]
     files = {"run.json", "answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv", "report.html"}
-    assert {p.name for p in run.iterdir()} == {*files, "sources"}
+    assert {p.name for p in run.iterdir()} == {*files, "run.toml", "sources"}
     simulated = typed("drive", "--model", "proxy")
     assert (simulated.returncode, simulated.stderr.count("\n")) == (2, 1)
     assert "pip install 'swarmdrive-harness[sim]'" in simulated.stderr
