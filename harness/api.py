@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup, escape
 
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import bytes_of
 from harness.runs.records import FrozenScenes, Score
 from harness.runs.tables import Tables, tables_of
 
@@ -163,7 +164,7 @@ class Study:
 
         image = '<img alt="{}" src="{}">'
         figures = [
-            Markup(image).format(file.stem, picture(file.read_bytes()))
+            Markup(image).format(file.stem, picture(bytes_of(file, "picture")))
             for file in sorted(self.path.glob("*.svg"))
         ]
         return _page(self.headline, *figures, *(Markup("<p>{}</p>").format(text) for text in self.about))
