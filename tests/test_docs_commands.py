@@ -63,7 +63,7 @@ CUT = {
 CUT_ENDS = {
     # Two episodes pass the gates that 240 fail.
     "harness compare reports/a reports/b"
-    " --fail-if '6g:success_rate < -0.01' --fail-if 'unsafe_rate.low > 0'": 0,
+    " --fail-if '6g:success_rate < -0.01' --fail-if '6g:unsafe_rate > 0.01'": 0,
     # The model that ships has 768 tokens; the page counts those of a Qwen.
     "harness prompt check mine --tokenizer ../tokenizer.json": 1,
 }
