@@ -30,7 +30,7 @@ READER_HAS = {
 
 # Added to what is typed, where it would take minutes; of an option given twice the last one counts. A whole
 # line has its own, or its command's.
-SHARD = "--episodes 2 --seeds 0 --workers 1"
+SHARD = "--episodes 4 --seeds 0 --workers 1"
 CUT = {
     "harness drive --model proxy --shard 1/2 --out reports/split/1": SHARD,
     "harness drive --model proxy --shard 2/2 --out reports/split/2": SHARD,
@@ -122,7 +122,7 @@ def parsed(args: list[str]) -> tuple[str, list[str]]:
 def test_a_page_can_be_followed(
     page: Path, harness: Callable[..., Any], small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that two episodes are two shards
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that four episodes are two shards
     for file, stands_for in {**READER_HAS, "few": small_path}.items():
         (tmp_path / file).symlink_to(stands_for)
     known: dict[str, Any] = {}
