@@ -33,7 +33,7 @@ quick: .venv/dev ## nine tests of ten in a minute: all that are not marked slow
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" --hypothesis-profile quick --cpu-limit 0.5
 
 test: check browser ## every check and every test
-	$(BIN)/python -m pytest -n 2 --dist worksteal --cpu-limit 1
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 light: .venv-light/test ## the tests without torch, llama.cpp and a browser, or ONLY some: what needs one is skipped
 	.venv-light/bin/python -m pytest -n 2 --dist worksteal $(ONLY)

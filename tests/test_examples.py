@@ -207,6 +207,7 @@ def test_reasons_may_stand_before_an_answer_where_the_prompt_asks_for_them() -> 
 # -- with the model that ships --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["json", "constrained", "readout"])
 def test_the_model_that_ships_takes_earlier_turns(answer: Any, small: Dataset) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
@@ -275,6 +276,7 @@ def project(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path("prompts/mine")
 
 
+@pytest.mark.slow
 def test_the_command_draws_them_from_train_layouts(project: Path, harness: Harness) -> None:
     pytest.importorskip("highway_env", reason="needs the sim extra")
     drawing = ("prompt", "examples", "mine", "--scenario", scenarios.DEFAULT)

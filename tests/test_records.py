@@ -146,6 +146,7 @@ def test_a_driven_run_is_drawn(harness: Typed) -> None:
     assert code == 0, error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("commit", COMMITS)
 def test_what_a_run_cannot_have_is_one_line(commit: str, harness: Typed) -> None:
     for words, why in {

@@ -73,6 +73,7 @@ def test_an_evaluation_states_the_settings_that_make_it(small: Dataset) -> None:
     assert resolve.spec(settings, spec.source) == spec
 
 
+@pytest.mark.slow
 def test_a_run_is_repeated_by_its_file(harness: Callable[..., Said], small_path: Path) -> None:
     asked = (
         "eval",

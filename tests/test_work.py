@@ -127,6 +127,7 @@ spread(work, sys.argv[1:] * 2, 2, lambda done: None)
 """
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     parent = subprocess.Popen([sys.executable, "-c", PARENT, str(tmp_path)])
     while len(workers := list(tmp_path.iterdir())) < 2:
