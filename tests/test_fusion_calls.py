@@ -271,25 +271,17 @@ def killed(spec: Spec, out: Path, how: str, after: int) -> None:
         evaluate(spec, out, progress, more=more)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "how",
-    [
-        "announced",
-        # Alone it passes; among all tests its decisions differ. The cause is not known yet.
-        pytest.param("made", marks=pytest.mark.xfail(reason="differs after other tests of its process")),
-    ],
-)
-def test_killed_among_the_fusion_calls_it_goes_on(how: str, small: Dataset, tmp_path: Path) -> None:
-    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+@pytest.mark.parametrize("how", ["announced", "made"])
+def test_killed_among_the_fusion_calls_it_goes_on(
+    how: str, done: Evaluated, small: Dataset, tmp_path: Path
+) -> None:
     spec = spec_of(small, LANGUAGE_MODEL, points=CONDITIONS, latency="paper")
     killed(spec, tmp_path / "run", how, after=1)
     run(spec, tmp_path / "run")
-    whole = run(spec, tmp_path / "whole")  # of the same process and moment, as engines go
-    assert same_decisions(tmp_path / "run", whole.out)
+    assert same_decisions(tmp_path / "run", done.out)
     timeless = [
         [msgspec.structs.replace(answer, **UNTIMED) for answer in answers_of(out)]
-        for out in (tmp_path / "run", whole.out)
+        for out in (tmp_path / "run", done.out)
     ]
     assert timeless[0] == timeless[1], "but for the seconds of one that was asked alone"
 

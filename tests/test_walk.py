@@ -1,6 +1,6 @@
 """The walk through frozen scenes, step by step, against results that can be counted by hand."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -53,9 +53,10 @@ def lossy() -> OperatingPoint:
 def played(small: Dataset) -> Dataset:
     """Episode 1 ends a step before its neighbours. Every vehicle is as far from the zone as any other."""
     data = course(small, 3, OUTCOMES)
-    for scene in all_scenes(data):
-        scene.record.distance_m.update(dict.fromkeys(scene.record.distance_m, 10.0))
-    return data
+    scenes = [
+        scene.changed(distance_m=dict.fromkeys(scene.record.distance_m, 10.0)) for scene in all_scenes(data)
+    ]
+    return replace(data, _scenes={scene.id: scene for scene in scenes})
 
 
 def script(data: Dataset) -> Scripted:
