@@ -20,14 +20,13 @@ if TYPE_CHECKING:
 
     from harness.dataset.load import Scene
 
-HEADLINE = {
+HEADLINE = {  # metrics of a run's own table, by their heads
     "success": "success_rate",
     "unsafe": "unsafe_rate",
     "latency": "latency_proxy_ms",
     "asked": "trigger_rate",
     "messages": "messages_per_episode",
 }
-"""Metrics of a run's own table, by their heads."""
 
 
 class Run(Tables):
@@ -58,8 +57,7 @@ class Run(Tables):
             seen = scene_of(self.source, scene)
             if seen.id != scene:
                 raise UserError(f"decision point {printable(scene)} comes out otherwise in this simulator")
-        if viewer is not None and viewer not in seen.viewers:
-            raise unknown(f"viewer of scene {printable(scene, 40)}", viewer, seen.viewers)
+        seen.viewer(viewer)  # refuses a name that nobody has
         return DecisionPoint(self, seen, viewer)
 
     def _repr_html_(self) -> str:
@@ -201,7 +199,7 @@ def run(
         if name not in names[kind]:
             raise unknown("setting", name, list(names[kind]))
     given = {
-        name: [value] if names[kind][name].kind == list[str] and isinstance(value, str) else value
+        name: _several(value) if names[kind][name].kind == list[str] else value
         for name, value in options.items()
     }
     stated = settings.changed(settings.Settings(world=kind()), given)

@@ -11,7 +11,7 @@ from harness.cli import options
 from harness.cli.estimates import console, echo_json, table
 from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import UserError, printable
 from harness.core.figures import PLAIN, as_mapping, shown
 
 if TYPE_CHECKING:
@@ -118,13 +118,12 @@ def show(
         )
     data = load.load(load.find(dataset))
     drawn = data.scene(scene)
-    if viewer is not None and viewer not in drawn.viewers:
-        raise unknown(f"viewer of scene {drawn.id}", viewer, drawn.viewers)
+    viewer = drawn.viewer(viewer)
     picture = BytesIO()
     if camera:
         from harness.world.perception.camera import frame
 
-        picture.write(frame(data.scenario, drawn.state, viewer or drawn.viewers[0]).png())
+        picture.write(frame(data.scenario, drawn.state, viewer).png())
     else:
         from harness.report.drawing.scene import draw
 

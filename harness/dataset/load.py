@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import structs
 
 from harness.core.arrays import Floats
-from harness.core.errors import UserError, unknown
+from harness.core.errors import UserError, printable, unknown
 from harness.core.files import text_of
 from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
@@ -71,6 +71,12 @@ class Scene:
     def viewers(self) -> tuple[str, ...]:
         """Ids of the ego and the helpers, the ego first."""
         return tuple(self.graphs)
+
+    def viewer(self, name: str | None) -> str:
+        """Return a viewer's id, the ego's for None. Raises UserError if nobody of that name answers here."""
+        if name is not None and name not in self.viewers:
+            raise unknown(f"viewer of scene {printable(self.id, 40)}", name, self.viewers)
+        return self.viewers[0] if name is None else name
 
     def changed(self, **fields: Any) -> "Scene":
         """Return the scene with other values in some fields of its record."""

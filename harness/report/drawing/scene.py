@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
-from harness.core.errors import printable, unknown
+from harness.core.errors import printable
 from harness.dataset.load import Scene
 from harness.report.drawing.colours import BUILDING_NAME, GREY, HATCHED, INK, LIGHT, ROLES
 from harness.report.drawing.geometry import conflict_points, north_up, shape_of
@@ -59,9 +59,7 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     Raises:
         UserError: the vehicle is no viewer of this scene, or the format is unknown.
     """
-    viewer = scene.viewers[0] if viewer is None else viewer
-    if viewer not in scene.viewers:
-        raise unknown(f"viewer of scene {printable(scene.id, 40)}", viewer, scene.viewers)
+    viewer = scene.viewer(viewer)
     graph = scene.graphs[viewer]
     seen = {*graph.seen, viewer}
 
