@@ -7,7 +7,7 @@ import typer
 from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.show import echo_answer, show
-from harness.core.errors import printable
+from harness.core.errors import in_range, printable
 
 MOST = 100_000
 USUAL = "6g"
@@ -35,7 +35,7 @@ def command(
     from harness.studies.attribution import attribute, attribution_study, write
     from harness.studies.replayed_run import ReplayedRun
 
-    options.in_range("--sample", sample, 1, MOST)
+    in_range("--sample", sample, 1, MOST)
     with bar("asking without", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
         stored = ReplayedRun(

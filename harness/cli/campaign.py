@@ -8,8 +8,9 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.run import file_name
 from harness.cli.show import finish
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import FIRST, purpose
+from harness.evaluate.settings import parse_seeds
 
 MOST_EPISODES = 1_000_000
 
@@ -33,9 +34,9 @@ def paper(
     from harness.studies.paper import panels, run_paper
     from harness.studies.study import refuse_taken
 
-    options.in_range("--episodes", episodes, 10, MOST_EPISODES)
-    options.in_range("--sweep-episodes", sweep_episodes, 10, MOST_EPISODES)
-    draws = options.parse_seeds(seeds)
+    in_range("--episodes", episodes, 10, MOST_EPISODES)
+    in_range("--sweep-episodes", sweep_episodes, 10, MOST_EPISODES)
+    draws = parse_seeds(seeds)
     if len(set(draws)) < len(draws):
         raise UserError(f"--seeds {printable(seeds)}: give different whole numbers, such as 0:5")
     refuse_taken(out, "study")
@@ -81,8 +82,8 @@ def closed_loop(
     from harness.studies.closed_loop import panels, run_closed_loop
     from harness.studies.study import refuse_taken
 
-    options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
-    options.in_range("--first-seed", first_seed, 0, LAST_SEED)
+    in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
+    in_range("--first-seed", first_seed, 0, LAST_SEED)
     purpose(first_seed, episodes)
     who = options.workers_of(workers)
     points = {s.point.name: s.point for panel in panels().values() for s in panel}
@@ -90,7 +91,7 @@ def closed_loop(
         Agent(cards.resolve(model), versions.load(prompt), answer),
         LiveSource(first_seed, episodes),
         tuple(points.values()),
-        options.parse_seeds(seeds),
+        parse_seeds(seeds),
         batch_size=batch_size,
         latency=latency,
     )

@@ -6,7 +6,7 @@ import typer
 
 from harness.cli import options
 from harness.cli.estimates import echo_json
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, in_range, printable
 
 
 def command(
@@ -42,7 +42,7 @@ def command(
 
     if as_markdown and as_json:
         raise UserError("--markdown and --json: give one of them")
-    options.in_range("--show", show, 0, 100_000)
+    in_range("--show", show, 0, 100_000)
     for option, file in (("--html", html), ("--junit", junit)):
         if file and file.is_dir():
             raise UserError(f"{option} {printable(file)} is a folder; name a file in it")

@@ -10,7 +10,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import echo_json, echo_wrong, table
 from harness.core import resources
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, in_range, printable
 from harness.core.figures import Unit, as_mapping, known, shown
 
 if TYPE_CHECKING:
@@ -70,8 +70,8 @@ def show(
     from harness.runs.folder import read
     from harness.studies.device_fit import declared, fits, of_run
 
-    options.in_range("--prompt-tokens", prompt_tokens, 1, MOST_TOKENS)
-    options.in_range("--answer-tokens", answer_tokens, 1, MOST_TOKENS)
+    in_range("--prompt-tokens", prompt_tokens, 1, MOST_TOKENS)
+    in_range("--answer-tokens", answer_tokens, 1, MOST_TOKENS)
     if not 0 < window_ms <= MOST_MS:
         raise UserError(f"--window-ms {window_ms:g} is out of range; give more than 0, to {MOST_MS}")
     device = devices.load(name)

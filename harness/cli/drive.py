@@ -10,7 +10,7 @@ from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show
 from harness.core import extras
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import stated
 from harness.evaluate.settings import OUTPUT, DriveSettings, Settings, changed
 
@@ -74,7 +74,7 @@ def command(
         extras.need("--save-video", "matplotlib")
     source = resolve.driven(world, name)
     driven = len(source.numbers)
-    options.in_range("--save-video", save_video, 0, driven)
+    in_range("--save-video", save_video, 0, driven)
     spec = resolve.spec(settings, source)
     silent = as_json or quiet
     if part and out:

@@ -12,6 +12,7 @@ from harness.cli.run import file_name, first_folder
 from harness.cli.show import finish
 from harness.core import extras, resources
 from harness.core.errors import UserError, printable
+from harness.evaluate.settings import parse_seeds
 
 MOST_CELLS = 256
 
@@ -90,7 +91,7 @@ def command(
         ego=egos[0],
         source=FrozenSource(frozen, Selection(limit)),
         points=resolve.points(condition or tuple(POINTS), control or (), attack or ()),
-        seeds=options.parse_seeds(seeds),
+        seeds=parse_seeds(seeds),
         batch_size=batch_size,
         device=device,
         dtype=dtype,

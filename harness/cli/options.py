@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option, echo
 
-from harness.core.errors import UserError, in_range, printable
+from harness.core.errors import UserError, printable
 from harness.core.files import text_of
 from harness.evaluate import settings as stated
-from harness.evaluate.settings import HELP, parse_seeds
+from harness.evaluate.settings import HELP
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from harness.dataset.load import Dataset as Frozen  # Dataset is an option here
 else:  # typer takes any text; what is evaluated says which are allowed
     AnswerMode = LettersMode = str
-
-__all__ = ["in_range", "parse_seeds"]
 
 _RAY = "or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT."
 

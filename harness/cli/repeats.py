@@ -3,12 +3,11 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.run import Together, free_folder
 from harness.cli.show import finish
 from harness.core import work
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, in_range, printable
 
 if TYPE_CHECKING:
     from harness.evaluate.spec import Spec
@@ -20,7 +19,7 @@ def check(spec: "Spec", repeats: int) -> None:
     """Raise UserError unless an evaluation can be repeated."""
     from harness.evaluate.latency import MEASURED
 
-    options.in_range("--repeats", repeats, 2, MOST)
+    in_range("--repeats", repeats, 2, MOST)
     if not spec.temperature:
         raise UserError(
             f"--repeats {repeats}: greedy answers are the same every time; give a --temperature above 0, "

@@ -8,7 +8,7 @@ from harness.cli import options
 from harness.cli.estimates import console, echo_json, echo_wrong, table
 from harness.cli.progress import bar
 from harness.core import resources
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, in_range, printable
 from harness.core.figures import Unit, as_mapping, shown
 from harness.core.seeds import FIRST, purpose, stated
 
@@ -115,8 +115,8 @@ def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episod
     from harness.world import scenarios
 
     scenario = scenarios.get(options.typed_scenario(name))
-    options.in_range(counted, episodes, 1, LAST_EPISODE + 1)
-    options.in_range("--seed", seed, 0, LAST_SEED)
+    in_range(counted, episodes, 1, LAST_EPISODE + 1)
+    in_range("--seed", seed, 0, LAST_SEED)
     purpose(seed, episodes)
     return scenario
 

@@ -11,6 +11,7 @@ from harness.cli.progress import bar
 from harness.cli.show import finish
 from harness.core import extras
 from harness.core.errors import UserError, printable, unknown
+from harness.evaluate.settings import parse_seeds
 
 TrainRuns = typer.Argument(
     help="One or more folders of finished runs on train layouts (seeds 100000 to 199999).", metavar="RUN..."
@@ -116,7 +117,7 @@ def compare(
             ]
             for folders in (runs, tune)
         )
-        draws = options.parse_seeds(seeds) if seeds else replayed[0].seeds
+        draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or runs[0] / "schedules"
         compared = run_schedules(
             replayed, tuned, condition, names, draws, budget, where, progress, progress.more

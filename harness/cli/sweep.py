@@ -8,6 +8,7 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.show import finish
 from harness.core.errors import unknown
+from harness.evaluate.settings import parse_seeds
 
 PROXY_EPISODES = 300  # a seed, as in the paper's sweeps
 
@@ -70,7 +71,7 @@ def command(
             for run in runs
         ]
         panels = panels_over(replayed, over or (), grid or (), list(dict.fromkeys(condition)), apart)
-        draws = options.parse_seeds(seeds) if seeds else replayed[0].seeds
+        draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or folder_of(runs[0], panels)
         sources: list[Source] = [*replayed, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
         progress.more(len(sources) * sum(map(len, panels.values())))

@@ -11,6 +11,7 @@ from harness.cli.run import file_name
 from harness.cli.show import finish
 from harness.core import resources, work
 from harness.core.errors import UserError
+from harness.evaluate.settings import parse_seeds
 
 if TYPE_CHECKING:
     from harness.evaluate.spec import Spec
@@ -90,7 +91,7 @@ def command(
         replayed = ReplayedRun(
             run, more=progress.more, done=progress, asks=not no_model, models=own, say=progress.say
         )
-        draws = options.parse_seeds(seeds) if seeds else replayed.seeds
+        draws = parse_seeds(seeds) if seeds else replayed.seeds
         where = out or run / "trust"
         with work.going_on(where):
             bench = run_bench(

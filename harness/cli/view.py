@@ -7,6 +7,7 @@ from threading import Thread
 import typer
 
 from harness.cli import options
+from harness.core.errors import in_range
 
 
 def command(
@@ -28,7 +29,7 @@ def command(
 
             Thread(target=webbrowser.open, args=[_leading_to(url, Path(private))], daemon=True).start()
 
-    options.in_range("--port", port, 0, 65535)
+    in_range("--port", port, 0, 65535)
     runs(folder)  # says what is wrong with the folder
     with TemporaryDirectory(prefix="harness-view-") as private:  # which only this user can read
         try:
