@@ -9,7 +9,7 @@ from harness.cli.progress import bar
 from harness.cli.run import file_name
 from harness.cli.show import finish
 from harness.core.errors import UserError, in_range, printable
-from harness.core.seeds import FIRST, purpose
+from harness.core.seeds import FIRST
 from harness.evaluate.settings import parse_seeds
 
 MOST_EPISODES = 1_000_000
@@ -74,22 +74,20 @@ def closed_loop(
     """
     from harness.backends import cards
     from harness.backends.cache import default_file
-    from harness.core.seeds import LAST_EPISODE, LAST_SEED
+    from harness.evaluate import resolve
     from harness.evaluate.agent import Agent
-    from harness.evaluate.live_world import LiveSource
+    from harness.evaluate.settings import DriveSettings
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
     from harness.studies.closed_loop import panels, run_closed_loop
     from harness.studies.study import refuse_taken
 
-    in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
-    in_range("--first-seed", first_seed, 0, LAST_SEED)
-    purpose(first_seed, episodes)
+    source = resolve.driven(DriveSettings(episodes=episodes, first_seed=first_seed))
     who = options.workers_of(workers)
     points = {s.point.name: s.point for panel in panels().values() for s in panel}
     spec = Spec(
         Agent(cards.resolve(model), versions.load(prompt), answer),
-        LiveSource(first_seed, episodes),
+        source,
         tuple(points.values()),
         parse_seeds(seeds),
         batch_size=batch_size,

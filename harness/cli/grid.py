@@ -56,16 +56,15 @@ def command(
     from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS
-    from harness.dataset import load
-    from harness.dataset.select import Selection
     from harness.evaluate import resolve
     from harness.evaluate.agent import Agent
-    from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.settings import FrozenSettings
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
 
     extras.need("harness study grid", "matplotlib")
-    frozen = load.load(load.find(dataset), limit)
+    source = resolve.frozen(FrozenSettings(limit=limit), dataset)
+    frozen = source.dataset
     options.say_all(limit, [frozen])
     prompt = prompt or frozen.scenario.prompt
 
@@ -89,7 +88,7 @@ def command(
         raise UserError(f"{cells} combinations: give 2 to {MOST_CELLS}, such as --model a,b")
     spec = Spec(
         ego=egos[0],
-        source=FrozenSource(frozen, Selection(limit)),
+        source=source,
         points=resolve.points(condition or tuple(POINTS), control or (), attack or ()),
         seeds=parse_seeds(seeds),
         batch_size=batch_size,

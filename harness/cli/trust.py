@@ -102,10 +102,8 @@ def command(
 
 def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> "Spec":
     """Return the evaluation whose answers are walked."""
-    from harness.dataset import load
     from harness.evaluate import resolve
-    from harness.evaluate.frozen_world import FrozenSource
-    from harness.evaluate.settings import Settings
+    from harness.evaluate.settings import FrozenSettings, Settings
 
     settings = Settings(
         model=model,
@@ -114,4 +112,4 @@ def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> 
         seeds=seeds or "0:5",
         ask="all",  # attacks use what every helper intends
     )
-    return resolve.spec(settings, FrozenSource(load.load(load.find(resources.DATASET))))
+    return resolve.spec(settings, resolve.frozen(FrozenSettings(), resources.DATASET))
