@@ -60,7 +60,9 @@ def test_the_same_again_is_refused_and_goes_on_where_it_was_stopped(
     Path("run/report.html").unlink()
     code, out, err = harness(*args[:-4], "--seeds", "0:2", "--out", "run")
     assert (code, out) == (2, "")
-    assert err.startswith("harness: --out run was begun with another seeds; repeat its settings")
+    assert err.startswith(
+        "harness: --out run was begun with --seeds 0:1, and not with --seeds 0,1; repeat its settings, "
+    )
     code, again, err = harness(*args)
     assert (code, again, err) == (0, first, "")
     assert Path("run/report.html").is_file()

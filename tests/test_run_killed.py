@@ -160,13 +160,13 @@ def test_damaged_answers_are_one_line(line: bytes, answers: bytes, small: Datase
 @pytest.mark.parametrize(
     ("other", "named"),
     [
-        ({"seeds": (0, 2)}, "seeds"),
-        ({"batch_size": 3}, "batch_size"),
-        ({"prompt": "v1"}, "prompt"),
-        ({"model": "cruise"}, "model"),
-        ({"points": ()}, "conditions, channels"),
-        ({"limit": 4}, "limit of the world"),
-        ({"prompt": "v1", "seeds": (7,)}, "prompt, seeds"),
+        ({"seeds": (0, 2)}, "--seeds 0,1, and not with --seeds 0,2"),
+        ({"batch_size": 3}, "--batch-size 8, and not with --batch-size 3"),
+        ({"prompt": "v1"}, "--prompt v2, and not with --prompt v1"),
+        ({"model": "cruise"}, "--model proxy, and not with --model cruise"),
+        ({"points": ()}, "--condition .*, and not with no --condition"),
+        ({"limit": 4}, "no --limit, and not with --limit 4"),
+        ({"prompt": "v1", "seeds": (7,)}, "--prompt v2 --seeds 0,1, and not with --prompt v1 --seeds 7:8"),
     ],
 )
 @pytest.mark.parametrize("finished", [True, False])
@@ -180,7 +180,7 @@ def test_other_settings_are_refused_by_name_and_change_nothing(
     else:
         unfinished(spec_of(small), out, answers[:5000])
     before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
-    with pytest.raises(UserError, match=f"was begun with another {named}; repeat its settings"):
+    with pytest.raises(UserError, match=f"was begun with {named}; repeat its settings, delete"):
         run(spec_of(small, **other), out)
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
 

@@ -90,6 +90,7 @@ def test_a_run_is_repeated_by_its_file(harness: Callable[..., Said], small_path:
     assert harness(*asked, "--tag", "first", "--out", "a")[0] == 0
     stated = tomllib.loads(Path("a/run.toml").read_text())
     assert (stated["model"], stated["prompt"], stated["seeds"]) == ("proxy", "v2", "3,7")
+    assert stated["ties"] == "drawn", "its default is another than that of older versions"
     assert stated["world"] == {"kind": "frozen", "dataset": str(small_path), "limit": 2, "sample_seed": 0}
     for file in ("a/run.toml", "a"):
         assert harness("eval", file, "--quiet", "--out", f"of-{Path(file).name}") == (0, "", "")
@@ -98,12 +99,16 @@ def test_a_run_is_repeated_by_its_file(harness: Callable[..., Said], small_path:
     changed: Any = read_run(Path("b")).manifest
     assert (changed.world.limit, changed.prompt["version"], changed.tags) == (1, "v4", ("first",))
     assert [point["name"] for point in changed.conditions] == ["6g:tau=0.5"]
+    assert harness("eval", "a", "--model", "replay:a", "--ties", "first", "--quiet", "--out", "c")[0] == 0
+    assert harness("eval", "c", "--quiet", "--out", "of-c") == (0, "", ""), "it replays what that replayed"
+    assert same_decisions(Path("c"), Path("of-c"))
+    assert read_run(Path("of-c")).manifest.ties == "first"
 
 
 HOSTILE = {
     'model = "./theirs"': "./theirs is none of your cards, and a file names no other model to open; give "
     "it by --model",
-    'model = "replay:theirs"': "replay:theirs is none of your cards",
+    'model = "replay:theirs"': "theirs is no finished run: it has no run.json",
     'model = "theirs/on-the-hub"': "theirs/on-the-hub is none of your cards",
     '[helpers]\nmodel = "proxy, ./theirs"': "give it by --helper-model",
     'server = ["http://theirs:1/v1"]': "a file names no server to ask; give --server, or take the line out",

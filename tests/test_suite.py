@@ -141,7 +141,9 @@ def test_other_settings_do_not_go_on(evaluated: Harness) -> None:
     (DONE / "suite.json").unlink()
     code, _, err = evaluated(*EVAL[:-1], "0:1", "--out", DONE)
     assert code == 2
-    assert err.startswith(f"harness: --out {DONE / 'small'} was begun with another seeds")
+    assert err.startswith(
+        f"harness: --out {DONE / 'small'} was begun with --seeds 0,1, and not with --seeds 0:1"
+    )
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ with; without that file there is nothing to resume. A lock keeps the folder to o
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -82,18 +82,24 @@ def _nothing_done(work: Path) -> bool:
     return {path.name for path in work.iterdir()} <= {CONFIG, LOCK, UNANSWERED}
 
 
-def same(out: Path, now: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Raise UserError, naming what differs and what it was, unless work began with these settings."""
+def same(
+    out: Path, now: Mapping[str, Any], stored: Mapping[str, Any], typed: Callable[[], str] = lambda: ""
+) -> None:
+    """Raise UserError, naming what differs and what it was, unless work began with these settings.
+
+    `typed` says what it began with, and what was typed now; it is empty where nobody typed what differs.
+    """
     now = msgspec.json.decode(msgspec.json.encode(now))  # turns tuples into lists, as they are stored
     if differing := [key for key in {**now, **stored} if now.get(key) != stored.get(key)]:
         words = {
             key: str(value) for key in differing if isinstance(value := stored.get(key), str | int | float)
         }
         short = ", ".join(f"{key} {value}" for key, value in words.items() if len(value) <= SHORT)
+        what = typed() or f"another {', '.join(differing)}"
+        repeated = f" ({short})" if short and what.startswith("another ") else ""
         raise UserError(
-            f"--out {printable(out)} was begun with another {printable(', '.join(differing))}; "
-            f"repeat its settings{printable(f' ({short})') if short else ''}, delete it, or choose another "
-            "folder"
+            f"--out {printable(out)} was begun with {printable(what)}; repeat its "
+            f"settings{printable(repeated)}, delete it, or choose another folder"
         )
 
 

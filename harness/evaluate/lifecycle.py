@@ -1,8 +1,11 @@
 """Begin, resume and finish a run in its folder; a stopped run resumes with the same command."""
 
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,7 @@ from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
-from harness.evaluate.settings import words
+from harness.evaluate.settings import difference, of_words, words
 from harness.evaluate.spec import Spec
 from harness.runs import folder, formats
 from harness.runs.records import Latency, Manifest, Score
@@ -91,8 +94,16 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
     if begun:
         now = {**_comparable(spec.settings()), "shard": shard, **_rules(versions())}
         stored = {**_comparable(begun.settings), "shard": begun.shard, **_rules(begun.versions)}
-        work.same(out, now, stored)
+        work.same(out, now, stored, partial(_options, spec, shlex.join(begun.command)))
     return begun
+
+
+def _options(spec: Spec, command: str) -> str:
+    """Return in which options a run's command differs from this one; empty for none, or no such command."""
+    with suppress(UserError, ValueError):  # a stranger's run may state any command
+        before, now = difference(of_words(shlex.split(command)), spec.stated())
+        return before and f"{before}, and not with {now}"
+    return ""
 
 
 def _rules(versions: Mapping[str, str]) -> dict[str, str]:
@@ -118,14 +129,21 @@ def refuse_finished(out: Path) -> None:
 
 def finished(spec: Spec, out: Path) -> Evaluated:
     """Return the finished run in a folder. Raises UserError if it is another run, or damaged."""
-    return finished_with(spec.settings(), out)
+    return finished_with(spec.settings(), out, partial(_options, spec))
 
 
-def finished_with(settings: Mapping[str, Any], out: Path) -> Evaluated:
-    """Return the finished run in a folder, checked against settings. Raises UserError as `finished`."""
+def finished_with(
+    settings: Mapping[str, Any], out: Path, typed: Callable[[str], str] = lambda command: ""
+) -> Evaluated:
+    """Return the finished run in a folder, checked against settings. Raises UserError as `finished`.
+
+    `typed` says of the run's command in which options this one differs.
+    """
     run = folder.read(out)
     stored = msgspec.json.decode(msgspec.json.encode(run.manifest))
-    work.same(out, _comparable(settings), _comparable({key: stored[key] for key in settings}))
+    command = run.manifest.command.rpartition(" --out ")[0]
+    now, before = _comparable(settings), _comparable({key: stored[key] for key in settings})
+    work.same(out, now, before, partial(typed, command))
     return Evaluated(out, run.manifest, run.scores)
 
 

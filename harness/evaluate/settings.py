@@ -309,6 +309,13 @@ class Option(NamedTuple):
             settings = getattr(settings, name)
         return settings
 
+    def words(self, value: Any) -> list[str]:
+        """Return the words that are typed for a value; none for None."""
+        if isinstance(value, bool):
+            return [self.flag if value else self.off]
+        values = value if isinstance(value, tuple) else () if value is None else (value,)
+        return [word for part in values for word in (self.flag, str(part))]
+
 
 def options(world: type[Struct]) -> list[Option]:
     """Return the options of the command that walks a world, in the order of the fields."""
@@ -361,17 +368,27 @@ def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
 
 def words(settings: Settings) -> tuple[str, ...]:
     """Return the words of a command with these settings, without `--out`; defaults are left out."""
-    typed: list[str] = []
-    for each in options(type(settings.world)):
-        value = each.of(settings)
-        if value is None or value == each.default:
-            continue
-        if isinstance(value, bool):
-            typed.append(each.flag if value else each.off)
-        else:
-            values = value if isinstance(value, tuple) else (value,)
-            typed += [word for part in values for word in (each.flag, str(part))]
+    stated = ((each, each.of(settings)) for each in options(type(settings.world)))
+    typed = [word for each, value in stated if value != each.default for word in each.words(value)]
     return ("harness", COMMANDS[kind_of(settings)], *typed)
+
+
+def difference(before: Settings, now: Settings) -> tuple[str, str]:
+    """Return the options that differ, as they are typed before and now; empty between two commands.
+
+    Tags, servers and a device may differ in one run.
+    """
+    if type(before.world) is not type(now.world):
+        return "", ""
+    differing = [
+        each for each in options(type(now.world))
+        if each.of(before) != each.of(now) and each.name not in ("tag", "server", "device")
+    ]  # fmt: skip
+    typed = (
+        " ".join(" ".join(each.words(each.of(settings))) or f"no {each.flag}" for each in differing)
+        for settings in (before, now)
+    )
+    return next(typed), next(typed)
 
 
 def of_words(typed: Sequence[str]) -> Settings:
@@ -417,7 +434,7 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     """Return the settings of a file, or of a run's folder, with what the user typed beside it.
 
     A file names no model to open and no server to ask: it may come from a stranger. Cards, prompts, devices
-    and datasets are looked up by name.
+    and datasets are looked up by name; a replay only reads another run's answers.
 
     Raises:
         UserError: the file cannot be read, is of another command, or names what only a user may.
@@ -434,7 +451,7 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
         raise UserError(f"{where} are of `harness {COMMANDS[kind_of(settings)]}`; type that")
     for name, models in {"model": settings.model, "helper_model": settings.helpers.model or ""}.items():
         for model in filter(None, map(str.strip, models.split(","))):
-            if name not in given and not _is_card(model):
+            if name not in given and not model.startswith("replay:") and not _is_card(model):
                 raise UserError(
                     f"{where}: {printable(model)} is none of your cards, and a file names no other model to "
                     f"open; give it by --{name.replace('_', '-')}"

@@ -345,7 +345,7 @@ class Spec:
             sampling_seed=self.sampling_seed, latency=self.latency,
             device_profile=self.device_profile.name if self.device_profile else None,
             device_model=self.device_model,
-            ask=self.ask, ties=None if self.ties == TIES[0] else self.ties, tag=self.tags,
+            ask=self.ask, ties=self.ties, tag=self.tags,
         )  # fmt: skip
 
     @property

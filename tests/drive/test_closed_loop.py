@@ -64,4 +64,4 @@ def test_a_folder_of_another_study_is_refused(harness: Callable[..., Said]) -> N
     assert len(told["panels"]["tau"]) == 16
     code, out, err = harness(*OPTIONS, "--prompt", "v1")
     assert (code, out) == (2, "")
-    assert "was begun with another prompt" in err
+    assert "was begun with --prompt v2, and not with --prompt v1" in err

@@ -94,7 +94,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
     for n in places:
         out = tmp_path / f"at-{n}"
         if (out / ".work" / "config.json").is_file() and not (out / "run.json").is_file():
-            with pytest.raises(UserError, match="begun with another seeds"):
+            with pytest.raises(UserError, match=r"begun with --seeds .*, and not with --seeds"):
                 evaluate(spec("cruise", seeds=(1,), episodes=EPISODES), out, lambda done: None)
             resumed += 1
         if not (out / "run.json").exists() or (out / ".work").exists():

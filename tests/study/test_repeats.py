@@ -205,7 +205,7 @@ def test_a_stopped_one_goes_on_as_if_it_had_not_been(
     wanderer.asked.clear()
     assert repeated(hot(small), tmp_path / "stopped").scores == whole.scores
     assert 0 < len(wanderer.asked) < asked / 2
-    with pytest.raises(UserError, match="begun with another temperature"):
+    with pytest.raises(UserError, match="begun with --temperature"):
         repeated(hot(small, temperature=0.8), tmp_path / "stopped")
 
 

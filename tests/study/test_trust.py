@@ -193,7 +193,7 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
     assert Path("bench/cells.jsonl").read_bytes() == cells
     code, _, err = harness(*typed, "--seeds", "0:1")
     assert code == 2
-    assert "was begun with another seeds" in err
+    assert "was begun with --seeds" in err
     for wrong in (
         (
             "study",
