@@ -4,10 +4,9 @@ LiDAR: all round, 80 m; position to 0.1 m on each axis, heading to 2°, speed fr
 Radar: 60° to either side of the front and of the rear, 150 m; range to 0.4 m, bearing to 1°, range rate
 to 0.15 m/s, and tracking with it gives speed to 0.2 m/s.
 Camera: 60° to either side of the front and of the rear, 60 m by day and else as `harness.world.ambient`
-says; class and turn indicator. It never adds to a
-position, because the LiDAR sees all that it sees and places it better.
-Noise is Gaussian with those standard deviations (declared for this harness, typical of automotive
-data sheets, no particular product), keyed by episode, step, viewer and object.
+says; class and turn indicator. It never adds to a position, because the LiDAR sees all that it sees and
+places it better. Noise is Gaussian with those standard deviations (declared for this harness, typical of
+automotive data sheets, no particular product), keyed by episode, step, viewer and object.
 """
 
 from collections.abc import Sequence
@@ -83,20 +82,18 @@ def detections(
     lidar = distance <= LIDAR_RANGE_M
     radar = in_field & (distance <= RADAR_RANGE_M)
     reported = camera | lidar | radar
-    keys = [
-        ("sensors", state.episode_seed, state.step, viewer.id, v.id)
-        for (state, viewer, v), there in zip(pairs, reported.tolist(), strict=True) if there
-    ]  # fmt: skip
     z = np.zeros((8, len(pairs)))
-    z[:, reported] = noise.normals(8, keys).T
+    for k in np.flatnonzero(reported).tolist():
+        state, viewer, v = pairs[k]
+        draws = noise.generator("sensors", state.episode_seed, state.step, viewer.id, v.id)
+        z[:, k] = draws.standard_normal(8)
 
     # Across the bearing the radar is far coarser than the LiDAR, whose position is taken if both see.
     r, b = distance + RADAR_NOISE_M * z[0], bearing + np.radians(1.0) * z[1]
     x_m = np.where(lidar, x + LIDAR_NOISE_M * z[0], its_x + r * np.cos(b))
     y_m = np.where(lidar, y + LIDAR_NOISE_M * z[1], its_y + r * np.sin(b))
-    parting = [
-        speed * turn(heading) - its_speed * turn(its_heading) for turn in (np.cos, np.sin)
-    ]  # velocity relative to the viewer
+    # The velocity relative to the viewer.
+    parting = [speed * turn(heading) - its_speed * turn(its_heading) for turn in (np.cos, np.sin)]
     ways = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
     rate = np.vecdot(np.stack(parting, axis=-1), ways) + 0.15 * z[2]
     its_heading_rad = heading + np.radians(2.0) * z[3]
