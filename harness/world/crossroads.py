@@ -98,7 +98,7 @@ def _southern(route: str) -> Floats:
 def _approach(path: Path) -> Floats:
     """Return the watched points of an approach lane, (15, 2) m."""
     back_m = np.linspace(*SECTOR_REACH_M, 15)
-    return np.array([path.at(path.ends_m[0] + JUNCTION_M - back)[:2] for back in back_m])
+    return path.points_at(path.ends_m[0] + JUNCTION_M - back_m)
 
 
 @cache

@@ -121,6 +121,10 @@ class Path:
         x, y = (np.interp(arc_m, self.arc_m, along) for along in self.columns)
         return x, y, self.headings_rad[np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1)]
 
+    def points_at(self, arc_m: Floats) -> Floats:
+        """Return the positions (n, 2) m at arc lengths (n,)."""
+        return np.stack(self.places(arc_m)[:2], axis=-1)
+
     def section(self, arc_m: float) -> int:
         return bisect_right(self.ends_m, arc_m)
 
@@ -179,8 +183,6 @@ class Road:
     sectors: Mapping[str, Floats]
     # returns highway-env's network, always the same object, which must not be written to
     network: Callable[[], Any]
-    # returns the ground for a picture that reaches so many metres from the origin
-    ground: Callable[[float], Ground]
     # paths that the ego reaches by changing lane, from left to right, `ego` among them; they lie side by side
     # and are equally long
     ways: tuple[PathKey, ...] = ()
@@ -191,6 +193,13 @@ class Road:
     # returns, for the scenario's parameters, the arc length of the ego's path at which the episode ends;
     # vehicles beyond do not matter. None if the goal is not a place on its path
     goal_m: Callable[[Any], float] | None = None
+    # returns the ground for a picture that reaches so many metres from the origin; None if it is that of the
+    # network's lanes
+    ground: Callable[[float], Ground] | None = None
+
+    def ground_within(self, far_m: float) -> Ground:
+        """Return the ground for a picture that reaches so many metres from the origin."""
+        return self.ground(far_m) if self.ground else ground(self.network(), far_m, self.origin_m)
 
     def beside(self, key: PathKey, arc_m: float | None = None) -> dict[Side, PathKey]:
         """Return the way that the ego is on, `own`, and those to its `left` and `right` if there are any.
@@ -343,6 +352,16 @@ def _bends(points: Floats) -> tuple[float, float]:
     if not 0 < least < np.inf:
         return 0.0, 1.0  # no bound
     return float(longest.max() ** 2 / least), float(3 * bend.max() / least)
+
+
+def paths_along(
+    network: Any, ways: Mapping[PathKey, tuple[Sequence[Lane], Sequence[str], int]]
+) -> dict[PathKey, Path]:
+    """Build paths by approach and route, each of consecutive lanes, with their roles and its right of way."""
+    return {
+        key: Path.along(network, *key, lanes, roles, priority)
+        for key, (lanes, roles, priority) in ways.items()
+    }
 
 
 def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Crossing]:

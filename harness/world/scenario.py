@@ -1,6 +1,6 @@
 """The interface of a scenario: parameters, layout, road, goal. Other code takes a scenario as an argument."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,13 +24,13 @@ class Draws:
     def between(self, what: str, bounds: tuple[float, float]) -> float:
         return bounds[0] + self.share(what) * (bounds[1] - bounds[0])
 
-    def numbers(self, count: int) -> list[int]:
-        """Draw numbers for the ids of vehicles, so that an id tells nothing about its vehicle.
+    def ids(self, names: Collection[str]) -> dict[str, str]:
+        """Draw ids, after those of the ego and three helpers, so that an id tells nothing about its vehicle.
 
-        Absent vehicles have numbers, too, so a gap between two ids tells nothing either.
+        Absent vehicles have ids, too, so a gap between two ids tells nothing either.
         """
-        order: list[int] = noise.generator(self.scenario, self.seed, "ids").permutation(count).tolist()
-        return order
+        order = noise.generator(self.scenario, self.seed, "ids").permutation(len(names)).tolist()
+        return {name: f"v{5 + number}" for name, number in zip(names, order, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,14 @@ class Layout:
     buildings: tuple[Building, ...]  # obstacles to sight besides vehicles
     danger: str | None  # sector that the danger comes from; None without a danger
     danger_id: str | None  # id of the dangerous vehicle; None without a danger
+
+    @classmethod
+    def arranged(
+        cls, spawns: Iterable[Spawn], danger: str | None, danger_id: str, buildings: Iterable[Building] = ()
+    ) -> "Layout":
+        """Return a layout with vehicles in the order of their ids; without a danger nobody is `danger_id`."""
+        order = sorted(spawns, key=lambda spawn: int(spawn.id[1:]))
+        return cls(tuple(order), tuple(buildings), danger, danger_id if danger else None)
 
 
 @dataclass(frozen=True)

@@ -36,12 +36,12 @@ def conflict_points(state: WorldState, graph: SceneGraph) -> tuple[list[Conflict
 
 def ground_of(scenario: Scenario) -> Ground:
     """Return what is drawn of a scenario's road, to beyond the edge."""
-    return scenario.road().ground(VIEW_M + BEYOND_M)
+    return scenario.road().ground_within(VIEW_M + BEYOND_M)
 
 
 def shape_of(scenario: Scenario) -> float:
     """Height by width of a picture of where it is decided: a road from west to east needs no square."""
-    outlines = scenario.road().ground(VIEW_M).outlines
+    outlines = scenario.road().ground_within(VIEW_M).outlines
     return LOW_SHAPE if np.ptp(np.concatenate(outlines)[:, 1]) <= LOW_M else 1.0
 
 

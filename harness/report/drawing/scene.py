@@ -80,7 +80,7 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
         artist.set_zorder(0.1 * (1 + order))
         axes.add_artist(artist)
     labels = Labels(axes, SIDE_IN * 72 / view.width_m, TEXT_PT, view)
-    for box in road.ground(float(np.abs(view.edges).max())).boxes:
+    for box in road.ground_within(float(np.abs(view.edges).max())).boxes:
         labels.discourage(box)
     _sight_lines(axes, scene, viewer, seen)
     for vehicle in state.vehicles:

@@ -13,7 +13,7 @@ from harness.world.environments import environment
 from harness.world.environments.environment import lane_of, reset
 from harness.world.environments.routes import Routes, routes
 from harness.world.parameters import Parameters as Common
-from harness.world.road import ONE_LANE_M, Lane, Path, PathKey, Road, crossings, ground, lanes_of
+from harness.world.road import ONE_LANE_M, Lane, Path, PathKey, Road, crossings, lanes_of
 
 CAREFUL_FIRST = ("SLOWER", "IDLE", "FASTER", "LANE_LEFT", "LANE_RIGHT")
 MOST_HZ = 1000
@@ -101,7 +101,6 @@ def place(name: str) -> Place:
         zone_m=near.paths[key].at(zone_m)[:2],
         sectors=_sectors(near.paths, ways, meetings, (begin_m - BEHIND_M, goal_m + BEYOND_M)),
         network=lambda: network,
-        ground=partial(ground, network, origin_m=origin),
         ways=ways,
         origin_m=origin,
         goal_m=partial(goal, begin_m),
@@ -151,16 +150,12 @@ def _sectors(
     """Return the points that must be seen: of the ego's ways, and of paths before they meet it."""
     sectors: dict[str, Floats] = {}
     for key in ways:
-        points = _points(paths[key], np.linspace(*watched_m, 15))
+        points = paths[key].points_at(np.linspace(*watched_m, 15))
         before = np.concatenate([*sectors.values(), np.full((1, 2), np.inf)])
         apart_m = np.hypot(*(points[:, None] - before).T).min(axis=0)
         if (own := points[apart_m > ONE_LANE_M]).size:  # of a way that parts later only what is its own
             sectors[key[1]] = own
     for key, at in meetings.items():
         if key[0] not in sectors:
-            sectors[key[0]] = _points(paths[key], at.other_arc_m - np.linspace(*BEFORE_M, 9))
+            sectors[key[0]] = paths[key].points_at(at.other_arc_m - np.linspace(*BEFORE_M, 9))
     return sectors
-
-
-def _points(path: Path, arcs_m: Floats) -> Floats:
-    return np.array([path.at(arc_m)[:2] for arc_m in arcs_m])

@@ -286,7 +286,7 @@ def _dazzling(pixels: Pixels, sun_rad: float, ambient: Ambient) -> Pixels:
 @lru_cache(maxsize=8)
 def _ground_map(scenario: Scenario) -> Pixels:
     """Map the ground in cells of `CELL_M`, (y, x) from the north-west: 0 grass, 1 asphalt, 2 paint."""
-    ground = scenario.road().ground(REACH_M)
+    ground = scenario.road().ground_within(REACH_M)
     middles = (np.arange(round(2 * REACH_M / CELL_M)) + 0.5) * CELL_M - REACH_M
     edges = [shapely.Polygon(edge * NORTH) for edge in ground.outlines]
     marks = [dash for mark in ground.marks for dash in _dashes(shapely.LineString(mark * NORTH))]

@@ -12,16 +12,16 @@ without knowing of the danger.
 """
 
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.parameters import Parameters as Common
-from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, straights, to_the_left
+from harness.world.road import Road, crossings, paths_along, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
-from harness.world.state import Building
+from harness.world.state import Building, Kind, Part
 
 NAME = "blind-merge"
 LANE_WIDTH_M = 4.0
@@ -87,7 +87,7 @@ def network() -> Any:
 def road() -> Road:
     """Return the main road and its ramp; the conflict zone is where the ramp has run into the right lane."""
     ego, main = ("ramp", "merge"), ("main", "straight")
-    ways: dict[PathKey, tuple[list[Lane], list[str], int]] = {
+    paths = paths_along(network(), {
         main: ([("a", "b", 1), ("b", "c", 1)], ["right lane behind", "right lane"], 1),
         ("main left", "straight"): ([("a", "b", 0), ("b", "c", 0)], ["left lane behind", "left lane"], 1),
         ego: (
@@ -95,11 +95,7 @@ def road() -> Road:
             ["ramp", "merge", "merge", "right lane"],
             0,
         ),
-    }
-    paths = {
-        key: Path.along(network(), *key, lanes, roles, priority)
-        for key, (lanes, roles, priority) in ways.items()
-    }
+    })  # fmt: skip
     back_m = np.linspace(*SECTOR_REACH_M, 16)
     return Road(
         facts={"kind": "ramp that merges", "lane_width_m": LANE_WIDTH_M, "ego": "/".join(ego)},
@@ -109,7 +105,6 @@ def road() -> Road:
         zone_m=(0.0, 0.0),
         sectors={"main": np.column_stack([-back_m, np.zeros(len(back_m))])},
         network=network,
-        ground=partial(ground, network()),
     )
 
 
@@ -120,16 +115,15 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     start = draws.between("ego_start", p.ego_start_m)
 
-    def arc_m(speed: float, late_s: float) -> float:
-        """Return the arc length from which a car is beside the merge so long after a cruising ego."""
-        return at.other_arc_m - speed * (start / p.ego_speed_mps + late_s)
+    def timed(id_: str, kind: Kind, part: Part, approach: str, speed: float, late_s: float) -> Spawn:
+        """Return a vehicle that is beside the merge so long after a cruising ego."""
+        arc = at.other_arc_m - speed * (start / p.ego_speed_mps + late_s)
+        return Spawn(id_, kind, part, approach, "straight", arc, speed)
 
-    truck = arc_m(
-        speed := draws.between("truck_speed", p.truck_mps), draws.between("truck_offset", p.truck_offset_s)
-    )
+    truck = draws.between("truck_speed", p.truck_mps), draws.between("truck_offset", p.truck_offset_s)
     spawns = [
         Spawn("v1", "car", "ego", "ramp", "merge", at.ego_arc_m - start, p.ego_speed_mps),
-        Spawn("v2", "truck", "helper", "main left", "straight", truck, speed),
+        timed("v2", "truck", "helper", "main left", *truck),
     ]
     for id_, approach in (("v3", "main"), ("v4", "main left")):
         arc = at.other_arc_m + draws.between(f"{id_}_ahead", p.ahead_m)
@@ -141,19 +135,15 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         "before": ("main", p.before_share, p.before_offset_s),
         "late": ("main", p.late_share, p.late_offset_s),
     }
-    numbers = draws.numbers(len(cars))
-    ids = {what: f"v{5 + int(number)}" for what, number in zip(cars, numbers, strict=True)}
-    traffic = []
-    for what, (approach, share, offset_s) in cars.items():
-        if draws.share(what) < share:
-            speed = draws.between(f"{what}_speed", p.main_mps)
-            arc = arc_m(speed, draws.between(f"{what}_offset", offset_s))
-            traffic.append(Spawn(ids[what], "car", "other", approach, "straight", arc, speed))
-    spawns += sorted(traffic, key=lambda spawn: spawn.id)
-
+    ids = draws.ids(cars)
+    for name, (approach, share, offset_s) in cars.items():
+        if draws.share(name) < share:
+            speed = draws.between(f"{name}_speed", p.main_mps)
+            late_s = draws.between(f"{name}_offset", offset_s)
+            spawns.append(timed(ids[name], "car", "other", approach, speed, late_s))
+    danger = "main" if draws.share("danger") < p.danger_share else None
     wall = Building("b1", BEGIN_M, WALL_M[0], -draws.between("wall_end", p.wall_end_m), WALL_M[1])
-    danger_id = ids["danger"] if any(spawn.id == ids["danger"] for spawn in traffic) else None
-    return Layout(tuple(spawns), (wall,), "main" if danger_id else None, danger_id)
+    return Layout.arranged(spawns, danger, ids["danger"], [wall])
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:

@@ -21,7 +21,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.parameters import Parameters as Common
-from harness.world.road import Path, PathKey, Road, ground, straights
+from harness.world.road import Road, paths_along, straights
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, Kind
 
@@ -62,11 +62,11 @@ class Parameters(Common):
 @cache
 def road() -> Road:
     """Return a lane to the east and one to the west, as in highway-env's `TwoWayEnv`."""
-    paths: dict[PathKey, Path] = {
-        ("own", BESIDE): Path.along(network(), "own", BESIDE, [("a", "b", 0)], [BESIDE], 0),
-        ("own", OWN): Path.along(network(), "own", OWN, [("a", "b", 1)], [OWN], 1),
-        ("oncoming", "straight"): Path.along(network(), "oncoming", "straight", [("b", "a", 0)], [BESIDE], 2),
-    }
+    paths = paths_along(network(), {
+        ("own", BESIDE): ([("a", "b", 0)], [BESIDE], 0),
+        ("own", OWN): ([("a", "b", 1)], [OWN], 1),
+        ("oncoming", "straight"): ([("b", "a", 0)], [BESIDE], 2),
+    })  # fmt: skip
     ahead = np.linspace(-10.0, 100.0, 12)
     return Road(
         facts={"kind": "two-way road", "lane_width_m": LANE_WIDTH_M},
@@ -76,7 +76,6 @@ def road() -> Road:
         zone_m=(0.0, LANE_WIDTH_M),
         sectors={"oncoming": np.column_stack([ahead, np.zeros(len(ahead))])},
         network=network,
-        ground=lambda far_m: ground(network(), far_m),
         ways=(("own", BESIDE), ("own", OWN)),
     )
 
@@ -118,14 +117,13 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         arc = END_M - BEGIN_M - ego - speed * after_s
         return Spawn(id_, "car", "other", "oncoming", "straight", arc, speed)
 
-    numbers = draws.numbers(2)
-    danger_id, late_id = (f"v{5 + int(n)}" for n in numbers)
-    danger = draws.share("danger") < p.danger_share
-    traffic = [oncoming(danger_id, draws.between("danger_s", p.danger_s))] if danger else []
+    ids = draws.ids(("danger", "late"))
+    danger = "oncoming" if draws.share("danger") < p.danger_share else None
+    if danger:
+        spawns.append(oncoming(ids["danger"], draws.between("danger_s", p.danger_s)))
     if draws.share("late") < p.late_share:
-        traffic.append(oncoming(late_id, draws.between("late_s", p.late_s)))
-    spawns += sorted(traffic, key=lambda spawn: spawn.id)
-    return Layout(tuple(spawns), (), "oncoming" if danger else None, danger_id if danger else None)
+        spawns.append(oncoming(ids["late"], draws.between("late_s", p.late_s)))
+    return Layout.arranged(spawns, danger, ids["danger"])
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:

@@ -21,7 +21,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.parameters import Parameters as Common
-from harness.world.road import Path, PathKey, Road, ground
+from harness.world.road import Road, paths_along
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, Kind
 
@@ -63,9 +63,7 @@ class Parameters(Common):
 def road() -> Road:
     """Return two lanes to the east."""
     lanes = {RIGHT: ("0", "1", 1), LEFT: ("0", "1", 0)}
-    paths: dict[PathKey, Path] = {
-        ("own", name): Path.along(network(), "own", name, [lane], [name], 0) for name, lane in lanes.items()
-    }
+    paths = paths_along(network(), {("own", name): ([lane], [name], 0) for name, lane in lanes.items()})
     ahead = ZONE_M + np.linspace(-60.0, 40.0, 11)
     return Road(
         facts={"kind": "motorway of two lanes", "lane_width_m": LANE_WIDTH_M},
@@ -78,7 +76,6 @@ def road() -> Road:
             "left ahead": np.column_stack([ahead, np.zeros(11)]),
         },
         network=network,
-        ground=lambda far_m: ground(network(), far_m),
         ways=(("own", LEFT), ("own", RIGHT)),
     )
 
@@ -111,15 +108,15 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         ego + draws.between(what, bounds)
         for what, bounds in (("beside", p.beside_m), ("front", p.front_m), ("slow_m", p.slow_m))
     )
-    spawns = (
+    spawns = [
         spawn("v1", "car", "ego", RIGHT, ego),
         spawn("v2", "van", "helper", RIGHT, before),
         spawn("v3", "car", "helper", LEFT, beside),
         spawn("v4", "car", "helper", LEFT, front),
         spawn("v5", "car", "other", RIGHT, lead, *(brakes if danger else ())),
         spawn("v6", "car", "other", LEFT, slow, *(eases if slows else ())),
-    )
-    return Layout(spawns, (), "ahead" if danger else None, "v5" if danger else None)
+    ]
+    return Layout.arranged(spawns, "ahead" if danger else None, "v5")
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:

@@ -109,11 +109,8 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         speed = draws.between(f"helper_speed_{exit_name}", p.helper_speed_mps)
         spawns.append(Spawn(f"v{n + 2}", "car", "helper", approach, "straight", arc, speed))
 
-    numbers = draws.numbers(3)
-    roles = ("danger", "truck", "late")
-    ids = {role: f"v{5 + int(number)}" for role, number in zip(roles, numbers, strict=True)}
-    for name in sorted(traffic, key=ids.__getitem__):
-        kind, approach, route, arc, speed = traffic[name]
+    ids = draws.ids(("danger", "truck", "late"))
+    for name, (kind, approach, route, arc, speed) in traffic.items():
         spawns.append(Spawn(ids[name], kind, "other", approach, route, arc, speed))
 
     buildings = []
@@ -121,7 +118,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         xs = sorted((east * draws.between(f"corner_{n}_x", p.corner_m), east * BUILDING_END_M))
         ys = sorted((south * draws.between(f"corner_{n}_y", p.corner_m), south * BUILDING_END_M))
         buildings.append(Building(f"b{n + 1}", xs[0], ys[0], xs[1], ys[1]))
-    return Layout(tuple(spawns), tuple(buildings), danger, ids["danger"] if danger else None)
+    return Layout.arranged(spawns, danger, ids["danger"], buildings)
 
 
 def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mps: float) -> float:

@@ -13,14 +13,14 @@ without knowing of the danger.
 """
 
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.parameters import Parameters as Common
-from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, straights, to_the_left
+from harness.world.road import Road, crossings, paths_along, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, Kind, Part
 
@@ -91,17 +91,13 @@ def road() -> Road:
     """Return the street. Its conflict zone is where the ego's way has come into the lane."""
     ego, behind = ("own", "pull-out"), ("behind", "straight")
     own = [("space", "pull", 0), ("pull", "swing", 0), ("swing", "out", 0), ("out", "east", 0)]
-    ways: dict[PathKey, tuple[list[Lane], list[str], int]] = {
+    paths = paths_along(network(), {
         behind: ([("west", "out", 0), own[-1]], ["lane behind", "lane ahead"], 1),
         ("oncoming", "straight"): ([("east", "west", 0)], ["oncoming lane"], 1),
         ("kerb", "parked"): ([("kerb", "end", 0)], ["kerb"], 0),
         ("opposite", "parked"): ([("opposite", "far", 0)], ["opposite kerb"], 0),
         ego: (own, ["own space", "pull-out", "pull-out", "lane ahead"], 0),
-    }
-    paths = {
-        key: Path.along(network(), *key, lanes, roles, priority)
-        for key, (lanes, roles, priority) in ways.items()
-    }
+    })  # fmt: skip
     at = crossings(paths, ego)[behind]
     back_m = np.linspace(*SECTOR_REACH_M, 13)
     return Road(
@@ -112,7 +108,6 @@ def road() -> Road:
         zone_m=(OUT_M, 0.0),
         sectors={"behind": np.column_stack([OUT_M - back_m, np.zeros(len(back_m))])},
         network=network,
-        ground=partial(ground, network()),
     )
 
 
@@ -132,12 +127,14 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     def standing(id_: str, kind: Kind, part: Part, x_m: float, side: str = "kerb") -> Spawn:
         return Spawn(id_, kind, part, side, "parked", x_m - BEGIN_M if side == "kerb" else END_M - x_m, 0.0)
 
-    def coming(id_: str, what: str, bounds: tuple[float, float]) -> Spawn:
+    def coming(name: str, bounds: tuple[float, float]) -> Spawn:
         """Return a car from behind that is where the ego enters the lane so long after a cruising ego."""
-        speed = draws.between(f"{what}_speed", p.lane_mps)
-        after_s = (at.ego_arc_m - ego) / p.ego_speed_mps + draws.between(f"{what}_offset", bounds)
-        return Spawn(id_, "car", "other", "behind", "straight", at.other_arc_m - speed * after_s, speed)
+        speed = draws.between(f"{name}_speed", p.lane_mps)
+        after_s = (at.ego_arc_m - ego) / p.ego_speed_mps + draws.between(f"{name}_offset", bounds)
+        arc = at.other_arc_m - speed * after_s
+        return Spawn(ids[name], "car", "other", "behind", "straight", arc, speed)
 
+    ids = draws.ids(("danger", "late", "oncoming", "first van", "second van", "van ahead"))
     passed = at.other_arc_m + draws.between("passed", p.passed_m)
     passed_mps = draws.between("passed_speed", p.passed_mps)
     spawns = [
@@ -145,27 +142,20 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         standing("v2", "van", "helper", row[-1]),
         standing("v3", "car", "helper", OUT_M - draws.between("opposite", p.opposite_m), "opposite"),
         Spawn("v4", "car", "helper", "behind", "straight", passed, passed_mps),
+        standing(ids["first van"], "van", "other", row[0]),
+        standing(ids["second van"], "van", "other", row[1]),
+        standing(ids["van ahead"], "van", "other", ahead),
     ]
-    numbers = draws.numbers(6)
-    danger_id, late_id, oncoming_id, *parked = (f"v{5 + int(n)}" for n in numbers)
-    traffic = [
-        standing(parked[0], "van", "other", row[0]),
-        standing(parked[1], "van", "other", row[1]),
-        standing(parked[2], "van", "other", ahead),
-    ]
-    danger = draws.share("danger") < p.danger_share
+    danger = "behind" if draws.share("danger") < p.danger_share else None
     if danger:
-        traffic.append(coming(danger_id, "danger", p.danger_offset_s))
+        spawns.append(coming("danger", p.danger_offset_s))
     if draws.share("late") < p.late_share:
-        traffic.append(coming(late_id, "late", p.late_offset_s))
+        spawns.append(coming("late", p.late_offset_s))
     if draws.share("oncoming") < p.oncoming_share:
-        arc, speed = (
-            END_M - start - draws.between("oncoming", p.oncoming_m),
-            draws.between("oncoming_speed", p.lane_mps),
-        )
-        traffic.append(Spawn(oncoming_id, "car", "other", "oncoming", "straight", arc, speed))
-    spawns += sorted(traffic, key=lambda spawn: int(spawn.id[1:]))
-    return Layout(tuple(spawns), (), "behind" if danger else None, danger_id if danger else None)
+        arc = END_M - start - draws.between("oncoming", p.oncoming_m)
+        speed = draws.between("oncoming_speed", p.lane_mps)
+        spawns.append(Spawn(ids["oncoming"], "car", "other", "oncoming", "straight", arc, speed))
+    return Layout.arranged(spawns, danger, ids["danger"])
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:

@@ -14,7 +14,7 @@ later) is drawn without knowing of the danger.
 
 import math
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.parameters import Parameters as Common
-from harness.world.road import Lane, Path, PathKey, Road, crossings, ground
+from harness.world.road import Lane, Path, PathKey, Road, crossings
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import Building
 
@@ -97,14 +97,12 @@ def network() -> Any:
             return CircularLane(centre, ENTRY_M, turn + begin, turn + end, True, line_types=(edge, edge))
 
         far = ARC_Y_M + ARM_M
-        way_in, way_out = (
-            (at(BESIDE_M, y) for y in (far, ARC_Y_M)),
-            (at(-BESIDE_M, y) for y in (ARC_Y_M, far)),
-        )
-        streets.add_lane(f"{c}er", f"{c}es", StraightLane(*way_in, line_types=(edge, edge)))
+        way_in = StraightLane(at(BESIDE_M, far), at(BESIDE_M, ARC_Y_M), line_types=(edge, edge))
+        way_out = StraightLane(at(-BESIDE_M, ARC_Y_M), at(-BESIDE_M, far), line_types=(edge, edge))
+        streets.add_lane(f"{c}er", f"{c}es", way_in)
         streets.add_lane(f"{c}es", f"{c}e", arc(1, math.pi, math.pi + TOUCH_RAD))
         streets.add_lane(f"{c}x", f"{c}xs", arc(-1, -TOUCH_RAD, 0.0))
-        streets.add_lane(f"{c}xs", f"{c}xr", StraightLane(*way_out, line_types=(edge, edge)))
+        streets.add_lane(f"{c}xs", f"{c}xr", way_out)
     for n, (begin, end) in enumerate(zip(RING, RING[1:] + RING[:1], strict=True)):
         start_rad, end_rad = _ring_rad(n), _ring_rad(n + 1)
         lane = CircularLane((0.0, 0.0), RING_M, start_rad, end_rad, False, line_types=(none, edge))
@@ -153,9 +151,7 @@ def road() -> Road:
     at = meetings["left", "straight"]
     back_m = np.linspace(*SECTOR_REACH_M, 15)
     watched = {
-        sector: np.array(
-            [paths[sector, "straight"].at(meetings[sector, "straight"].other_arc_m - b)[:2] for b in back_m]
-        )
+        sector: paths[sector, "straight"].points_at(meetings[sector, "straight"].other_arc_m - back_m)
         for sector in SECTORS
     }
     return Road(
@@ -166,7 +162,6 @@ def road() -> Road:
         zone_m=(at.x_m, at.y_m),
         sectors=watched,
         network=network,
-        ground=partial(ground, network()),
     )
 
 
@@ -192,35 +187,30 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         helper("v4", enters, road().zone_arc_m, "ahead", p.helper_ahead_m),
     ]
 
-    def car(what: str, sector: str, route: str, bounds: tuple[float, float]) -> Spawn:
+    def car(name: str, sector: str, route: str, bounds: tuple[float, float]) -> Spawn:
         """Return a car that is, or would be, where the ego enters so long after a cruising ego."""
-        late_s = draws.between(f"{what}_offset", bounds)
-        back_m = ring_mps * (start / p.ego_speed_mps + late_s)
-        arc = meetings[sector, "straight"].other_arc_m - back_m
-        return Spawn(ids[what], "car", "other", sector, route, arc, ring_mps)
+        late_s = draws.between(f"{name}_offset", bounds)
+        arc = meetings[sector, "straight"].other_arc_m - ring_mps * (start / p.ego_speed_mps + late_s)
+        return Spawn(ids[name], "car", "other", sector, route, arc, ring_mps)
 
-    numbers = draws.numbers(3)
-    ids = {what: f"v{5 + int(n)}" for what, n in zip(("round", "before", "late"), numbers, strict=True)}
+    ids = draws.ids(("round", "before", "late"))
     danger = arm("sector") if draws.share("danger") < p.danger_share else None
-    traffic = []
     if danger:
-        traffic.append(car("round", danger, "straight", p.danger_offset_s))
+        spawns.append(car("round", danger, "straight", p.danger_offset_s))
     elif draws.share("leaver") < p.leaver_share:
-        traffic.append(car("round", arm("sector"), "right", p.danger_offset_s))
+        spawns.append(car("round", arm("sector"), "right", p.danger_offset_s))
     if draws.share("before") < p.before_share:
-        traffic.append(car("before", arm("before_sector"), "right", p.before_offset_s))
+        spawns.append(car("before", arm("before_sector"), "right", p.before_offset_s))
     if draws.share("late") < p.late_share:
-        traffic.append(car("late", arm("late_sector"), "straight", p.late_offset_s))
-    spawns += sorted(traffic, key=lambda spawn: spawn.id)
+        spawns.append(car("late", arm("late_sector"), "straight", p.late_offset_s))
 
     half, mound = p.hedge_half_m, draws.between("mound", p.mound_m)
-    hedge = -half, draws.between("hedge_end", p.hedge_end_m), half, ARC_Y_M + ARM_M
-    boxes = [hedge]
+    boxes = [(-half, draws.between("hedge_end", p.hedge_end_m), half, ARC_Y_M + ARM_M)]
     for degrees in (22.5, 45.0, 67.5):  # three boxes whose corners lie on a circle
         x, y = mound * math.cos(math.radians(degrees)), mound * math.sin(math.radians(degrees))
         boxes.append((-x, -y, x, y))
-    buildings = tuple(Building(f"b{n + 1}", *box) for n, box in enumerate(boxes))
-    return Layout(tuple(spawns), buildings, danger, ids["round"] if danger else None)
+    buildings = [Building(f"b{n}", *box) for n, box in enumerate(boxes, 1)]
+    return Layout.arranged(spawns, danger, ids["round"], buildings)
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
