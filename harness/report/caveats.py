@@ -60,6 +60,12 @@ def unread(scores: Sequence[Score]) -> Iterator[str]:
             yield f"{share} of {whose} {score.n} answers could be read: {instead}."
 
 
+def void(run: Run) -> Iterator[str]:
+    """Yield why the numbers of a run are no result."""
+    yield from unanswered(run)
+    yield from unread(run.scores)
+
+
 def causes(run: Run) -> Iterator[str]:
     """Yield how many of each role's answers could not be read, and the commonest cause of it."""
     meanings = {str(status): status.meaning for status in Status}

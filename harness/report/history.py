@@ -9,8 +9,10 @@ from pathlib import Path
 from harness.core.errors import UserError, printable, unknown
 from harness.report.compare.page import Place, beside
 from harness.report.compare.pair import scenes_of, where
+from harness.report.document import Section, Table, document, linked
 from harness.report.forest import forest, reach
-from harness.report.page import environment, save
+from harness.report.page import save
+from harness.report.words import cell
 from harness.runs.folder import Run, read
 from harness.runs.listing import runs as listed
 from harness.runs.metrics import ALL, entry
@@ -99,12 +101,25 @@ def _group(lines: Sequence[Line], metric: str, condition: str | None) -> Group:
 
 def write(groups: Sequence[Group], metric: str, out: Path) -> None:
     """Write the page. Raises UserError if `out` cannot be written."""
-    save([render(groups, metric, beside(out))], out, "--html")
+    place, label = beside(out), entry(metric).label
+    about = (
+        "Runs by date, the oldest first, with 95 % intervals; n is the number of episodes or answers that a "
+        "value is the mean of. Only runs in one table compare, since they have the same scenes; a run with "
+        "fewer episodes has other scenes."
+    )
+    tables = [_table(group, label, place) for group in groups]
+    save([document([Section(f"{label} over runs", about=[about], tables=tables)])], out, "--html")
 
 
-def render(groups: Sequence[Group], metric: str, place: Place) -> str:
-    """Return the page; `place` gives the link to a run's own."""
-    return environment().get_template("history.html.j2").render(
-        groups=[(group, reach(line.score for line in group.lines if line.score)) for group in groups],
-        forest=forest, metric=entry(metric).label, place=place,
-    )  # fmt: skip
+def _table(group: Group, label: str, place: Place) -> Table:
+    scale = reach(line.score for line in group.lines if line.score)
+    heads = ("run", "started", "model", "prompt", "answer", label, "interval, on one scale", "n")
+    rows = []
+    for line in group.lines:
+        variant, score = line.run.manifest.variant, line.score
+        drawn = (forest(score, *scale), str(score.n)) if score else ("", "")
+        rows.append((
+            linked(line.name, place(line.run)), f"{line.date:%Y-%m-%d %H:%M} UTC", variant.model,
+            variant.prompt, variant.answer, cell(score), *drawn,
+        ))  # fmt: skip
+    return Table(f"{group.of}, {group.condition}", heads, rows, left=True)

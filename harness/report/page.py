@@ -116,10 +116,7 @@ def _pieces(
     charts = list(panels(runs))
     alone = len(runs.names) == 1
     by_name = dict(zip(runs.names, runs.runs, strict=True))
-    unread = [
-        *caveats.merged(by_name, caveats.unanswered),
-        *caveats.merged(by_name, lambda run: caveats.unread(run.scores)),
-    ]
+    void = caveats.merged(by_name, caveats.void)
     warnings = [
         sentence
         for of in (ignores_input, caveats.causes, caveats.of_run)
@@ -130,8 +127,8 @@ def _pieces(
         title=runs.names[0] if alone else f"{len(runs.names)} runs",
         policy=library.policy(library.vega(), library.script()),
         lacks=" ".join(decisions.lacks()),
-        warnings=[*unread, *caveats.no_prompt(run.manifest for run in runs.runs), *warnings],
-        unread=len(unread),
+        warnings=[*void, *caveats.no_prompt(run.manifest for run in runs.runs), *warnings],
+        void=len(void),
         size=contents.size(runs),
         headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),
         key_figures=[*words.figures(runs.runs[0]), *tile(runs.runs[0])] if alone else matrix.figures(lines),
@@ -222,7 +219,7 @@ def environment(*more: Path) -> Environment:
     templates.globals["palette"] = Markup(colours.variables())
     templates.filters |= {
         "number": lambda value, decimals: Unit(decimals=decimals).number(value),
-        "facts": words.facts, "shown": words.shown, "p_value": words.p_value,
+        "facts": words.facts, "shown": words.shown, "cell": words.cell, "p_value": words.p_value,
         "latency_source": words.latency_source, "answer_times": words.answer_times, "pace": words.pace,
         "mapping": _mapping, "columns": _table, "nameless": text,
     }  # fmt: skip

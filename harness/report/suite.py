@@ -12,8 +12,9 @@ from harness.dataset.load import Dataset
 from harness.report import caveats, words
 from harness.report.compare.page import Place, beside
 from harness.report.constancy import ignores_input
+from harness.report.document import Section, Table, document, linked
 from harness.report.drawing import colours
-from harness.report.page import environment, save
+from harness.report.page import save
 from harness.report.references import in_trees
 from harness.runs.folder import Run, dataset_of
 from harness.runs.metrics import BASELINE, GAIN, SUCCESS, entry
@@ -95,32 +96,28 @@ def write(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], out: Path) -> Path:
 
 def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> str:
     """The page of one suite's run, or of several; `place` gives the link to the page of a family's run."""
-    parts = [
-        {
-            "suite": suite,
-            "lines": rows,
-            "unread": [
-                *caveats.merged(suite.runs, caveats.unanswered),
-                *caveats.merged(suite.runs, lambda run: caveats.unread(run.scores)),
-            ],
-            "warnings": [
-                *caveats.no_prompt(run.manifest for run in suite.runs.values()),
-                *caveats.merged(suite.runs, ignores_input),
-                *caveats.merged(suite.runs, caveats.of_run),
-            ],
-            "headline": words.headline(suite),
-            "figures": _figures(suite),
-            "metrics": _metrics(suite),
-            "colours": colours.conditions(suite.conditions),
-        }
-        for suite, rows in suites
-    ]
-    return environment().get_template("suite.html.j2").render(
-        parts=parts, place=place, picture=_picture, seeds_of=seeds_of, baseline=BASELINE,
+    return document([_section(suite, rows, place) for suite, rows in suites])
+
+
+def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
+    return Section(
+        f"{suite.variant} on {suite.name}",
+        [words.headline(suite)],
+        [
+            f"{suite.description}. {len(suite.runs)} families × {len(suite.manifest.seeds)} channel seeds; "
+            "figures are means over families, with 95 % intervals over episodes."
+        ],
+        [_families(lines, place), _metrics(suite)],
+        warnings=caveats.merged(suite.runs, caveats.void),
+        caveats=[
+            *caveats.no_prompt(run.manifest for run in suite.runs.values()),
+            *caveats.merged(suite.runs, ignores_input), *caveats.merged(suite.runs, caveats.of_run),
+        ],
+        numbers=_numbers(suite),
     )  # fmt: skip
 
 
-def _figures(suite: SuiteRun) -> list[dict[str, str]]:
+def _numbers(suite: SuiteRun) -> list[dict[str, str]]:
     """Return success under each condition, and the gain of the best."""
     best, base = words.compared(suite)
     scores = {f"success with {c}": suite.score(c, SUCCESS) for c in suite.conditions}
@@ -128,10 +125,65 @@ def _figures(suite: SuiteRun) -> list[dict[str, str]]:
     return [{"what": what, **words.shown(score)} for what, score in scores.items() if score]
 
 
-def _metrics(suite: SuiteRun) -> list[tuple[str, str, list[Score | None]]]:
-    """Return means over families of every metric: its name, its meaning, its value in each condition."""
-    names = dict.fromkeys(s.metric for s in suite.scores if s.condition != "all")
-    return [(entry(m).label, entry(m).meaning, [suite.score(c, m) for c in suite.conditions]) for m in names]
+def _families(lines: Sequence[Line], place: Place) -> Table:
+    mean = lines[-1]
+    of_conditions = colours.conditions(mean.cells)
+    key = Markup('<span class="key-colour" style="background:{}"></span>{}')
+    conditions = [key.format(colour, name) for name, colour in of_conditions.items()]
+    rows = [
+        (
+            _named(line, place), *map(_cell, line.cells.values()), _picture(line, of_conditions),
+            *(words.cell(line.drivers[name]) for name in mean.drivers),
+        )
+        for line in lines
+    ]  # fmt: skip
+    gains = (
+        f"; below it the gain over {BASELINE}, paired by episode. ✓ and ✗ mark a gain and a loss beyond "
+        "chance: p of the gain, from its interval, is at most 0.05 after Holm's correction, which is for all "
+        "families and conditions of this table, and for the means for all conditions"
+    )
+    note = (
+        f"Success rate with its 95 % interval{gains * any(cell.gain for cell in mean.cells.values())}. The "
+        "mean gives each family the same weight, however many episodes it has. Its interval is combined from "
+        "the intervals of the families (Zou and Donner 2008). It is about other episodes of these families, "
+        "not about other families. Dashed lines and the last columns: references, which need no model, in "
+        "the same episodes; constant always takes the action that did best in the family's tune layouts, and "
+        "uniform takes every action equally often. Below each family: the number of episodes, and what its "
+        "layout seeds are for; quote only numbers of report seeds."
+    )
+    heads = ["family", *conditions, "0 to 100 %", *mean.drivers]
+    return Table("Families × conditions", heads, rows, note, left=True, total=True)
+
+
+def _named(line: Line, place: Place) -> Markup:
+    if line.run is None:
+        return Markup(line.name)
+    size = f"n = {len(line.run.grid.episodes)}, {seeds_of(line.run)} seeds"
+    return Markup("{}<small>{}</small>").format(linked(line.name, place(line.run)), size)
+
+
+def _cell(cell: Cell) -> Markup:
+    success = words.cell(cell.success)
+    if cell.gain is None:
+        return success
+    text, sign = words.shown(cell.gain), {"better": "✓ ", "worse": "✗ ", "": ""}[cell.verdict]
+    value = f"{sign}{'+' if (cell.gain.value or 0.0) > 0 else ''}{text['value']}"
+    interval = Markup("<small>{}</small>").format(text["interval"]) if text["interval"] else ""
+    return Markup('{}<span class="gain {}">{}</span>{}').format(success, cell.verdict, value, interval)
+
+
+def _metrics(suite: SuiteRun) -> Table:
+    """Return the means over families of every metric, with its meaning."""
+    metrics = [entry(m) for m in dict.fromkeys(s.metric for s in suite.scores if s.condition != "all")]
+    rows = [
+        (
+            Markup("{}<small>{}</small>").format(metric.label, metric.meaning),
+            *(words.cell(suite.score(c, metric.name)) for c in suite.conditions),
+        )
+        for metric in metrics
+    ]
+    note = "A dash means that at least one family has no value."
+    return Table("All metrics, means over families", ["metric", *suite.conditions], rows, note, folded=True)
 
 
 def _picture(line: Line, of_conditions: Mapping[str, str]) -> Markup:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from harness.core import multiplicity
 from harness.core.errors import printable
@@ -24,6 +25,15 @@ def shown(score: Score) -> dict[str, str]:
     if score.n_excluded:
         n += f", {score.n_excluded} excluded"
     return {"value": unit.text(score.value), "interval": unit.ends(score), "n": n}
+
+
+def cell(score: Score | None) -> Markup:
+    """Return value and interval of a score as a cell of a page; a dash where there is none."""
+    if score is None:
+        return Markup("–")
+    text = shown(score)
+    small = Markup("<small>{}</small>").format(text["interval"]) if text["interval"] else ""
+    return Markup("<strong>{}</strong>{}").format(text["value"], small)
 
 
 def headline(run: Run | SuiteRun) -> str:

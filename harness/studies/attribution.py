@@ -30,9 +30,10 @@ from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.walk import Decided, Memory, shown, walk
 from harness.prompts.versions import listed as listing
+from harness.report.document import Table
 from harness.runs.attribution import FILE, Attribution, LeftOut
 from harness.studies.replayed_run import ReplayedRun
-from harness.studies.study import Study, Table
+from harness.studies.study import Study
 from harness.studies.twins.scoring import distance
 from harness.world.perception.graph import scene_graph
 

@@ -15,11 +15,12 @@ from msgspec.structs import asdict
 from harness.core.errors import UserError
 from harness.core.statistics import rate_difference
 from harness.core.versions import versions
+from harness.report.document import Table
 from harness.runs.folder import read
 from harness.runs.metrics import World, over_episodes
 from harness.runs.records import Variant
 from harness.studies.figures.points import scatter
-from harness.studies.study import Study, Table, percent
+from harness.studies.study import Study, percent
 
 if TYPE_CHECKING:
     import pandas as pd

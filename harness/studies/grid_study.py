@@ -5,18 +5,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from markupsafe import Markup
 
 from harness.core.figures import PLAIN, shown
 from harness.core.versions import versions
 from harness.evaluate.spec import Spec
 from harness.report.compare.page import beside
+from harness.report.document import Table, linked
 from harness.report.drawing.colours import conditions
 from harness.runs.metrics import LATENCY, SUCCESS
 from harness.studies.figures.heat_map import heat_map
 from harness.studies.figures.points import Steps, fronts
 from harness.studies.grid import FIELDS, HALVES, Cell, Grid, Halves
-from harness.studies.study import Study, Table, ends, p_cell
+from harness.studies.study import Study, ends, p_cell
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -137,7 +137,7 @@ def _cells(grid: Grid, condition: str, out: Path, terminal: bool) -> Table:
         rows.append((
             pair(grid, cell), shown(cell.estimate(SUCCESS, condition)), latency,
             PLAIN.number(cell.estimate("tokens", condition).value), f"{cell.ego.name} + {cell.helper.name}",
-            Markup('<a href="{}">{}</a>').format(report, run) if report else run,
+            linked(run, report),
         ))  # fmt: skip
     heads = ("ego + helpers", "success %, 95 % CI", "latency, ms", "tokens a decision", "agents", "run")
     note = "Tokens: of prompts and answers of the ego and every asked helper; a dash: a model counts none."

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from harness.core.figures import PLAIN
 from harness.core.files import text_of
+from harness.report.document import Table, strong
 from harness.studies.calibrated import FITTED_ON
-from harness.studies.study import Table, strong
 
 if TYPE_CHECKING:
     import pandas as pd

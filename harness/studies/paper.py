@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING
 
 from harness.coordination.operating_point import POINTS
 from harness.core.versions import versions
+from harness.report.document import Table
 from harness.studies.axes import AXES, CORE, Setting, axis_of, described, grid
 from harness.studies.calibrated import Calibrated
 from harness.studies.figures.bars import operating_points
 from harness.studies.figures.lines import along
 from harness.studies.ledger import headline, ledger, marks, tables
 from harness.studies.play import joined, play
-from harness.studies.study import Study, Table, percent
+from harness.studies.study import Study, percent
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,9 +11,10 @@ from harness.core.statistics import Estimate
 from harness.core.versions import versions
 from harness.report.caveats import caveats, merged
 from harness.report.compare.page import beside
+from harness.report.document import Table
 from harness.runs.metrics import ALL, SUCCESS
 from harness.studies.repeats import BETWEEN, DOUBT, FLIPS, SAMPLED, STABLE, STATED, Repeats
-from harness.studies.study import Study, Table
+from harness.studies.study import Study
 
 MARKER, FIGURES, PAGE = "repeats.json", "repeats.csv", "index.html"
 MOST_POINTS = 12  # of those at which repeats disagree

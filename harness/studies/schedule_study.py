@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 from harness.core.figures import shown
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
+from harness.report.document import Table
 from harness.report.drawing.colours import COLOURS, INK, MARKERS
 from harness.studies.figures.points import Steps, fronts
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.schedules import NEVER, Chosen, Compared, Play
-from harness.studies.study import Study, Table, p_cell
+from harness.studies.study import Study, p_cell
 
 if TYPE_CHECKING:
     import pandas as pd

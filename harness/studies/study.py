@@ -17,15 +17,13 @@ from harness.core.figures import PERCENT
 from harness.core.files import bytes_of, neutral, replacing, text_of, write_whole
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
+from harness.report.document import Section, Table, document, strong
 from harness.report.drawing.pictures import FORMATS, save
 from harness.report.library import picture
-from harness.report.page import environment
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TEMPLATES = Path(__file__).parent / "templates"
-LONGEST_NUMBER = 40  # characters of a cell at the right of its column, such as a number with its interval
 WIDEST_REM, REM_PER_INCH = 66, 10.5
 SOURCE = ("name", "latency")  # of a source, what makes a study another one
 # What else may lie in a folder, each as `<name>.json`; some of their files have the names of a study's.
@@ -33,35 +31,6 @@ MANIFESTS = (
     "run", "suite", "sweep", "grid", "repeats", "trust", "schedule", "fidelity", "twins", "study",
     "closed-loop",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Table:
-    """Text in columns, for a page and a terminal."""
-
-    title: str  # what stands above it
-    heads: Sequence[str]  # of the columns; the first column names the rows
-    # the cells of each; `Markup` is shown as it is on the page, and as text in a terminal
-    rows: Sequence[Sequence[str]]
-    note: str = ""  # what stands below it on the page
-    # the columns that a terminal has room for; none where only the page shows the table
-    terminal: Sequence[int] = ()
-    most: int | None = None  # how many rows a terminal shows; None for all
-
-    @property
-    def words(self) -> list[bool]:
-        """Whether each column has sentences, which begin at the left and wrap on the page."""
-        return [
-            any(len(Markup(row[n]).striptags()) > LONGEST_NUMBER for row in self.rows)
-            for n in range(len(self.heads))
-        ]
-
-    @property
-    def in_terminal(self) -> tuple[list[str], list[list[str]]]:
-        """Heads and rows of the columns that a terminal has room for, as plain text."""
-        rows = [[self.heads[n] for n in self.terminal]]
-        rows += [[_plain(row[n]) for n in self.terminal] for row in self.rows[: self.most]]
-        return rows[0], rows[1:]
 
 
 @dataclass(frozen=True)
@@ -80,11 +49,6 @@ class Study:
     figures: Mapping[str, Figure] = field(default_factory=dict)  # by file name
     caveats: Sequence[str] = ()  # what a reader must know first
     more: Markup = field(default_factory=Markup)  # what else the page shows, below the tables
-
-
-def strong(text: str, when: bool = True) -> str:
-    """Return text that stands out on a page, where it should."""
-    return Markup("<strong>{}</strong>").format(text) if when else text
 
 
 def p_cell(p: float | None) -> str:
@@ -121,8 +85,11 @@ def write_study(study: Study, out: Path) -> Path:
         )
         for stem, figure in study.figures.items()
     }
-    page = environment(TEMPLATES).get_template("study.html.j2").render(study=study, pictures=pictures)
-    write_whole(out / "index.html", page)
+    section = Section(
+        study.title, study.headline, study.about, study.tables, caveats=study.caveats, pictures=pictures,
+        more=study.more,
+    )  # fmt: skip
+    write_whole(out / "index.html", document([section]))
     write_manifest(out, study.kind, study.manifest)
     return out / "index.html"
 
@@ -243,7 +210,3 @@ def _lasting(key: str, value: Any) -> Any:
     if key != "sources" or not isinstance(value, list):
         return value
     return [{k: of.get(k) for k in SOURCE} if isinstance(of, dict) else of for of in value]
-
-
-def _plain(cell: str) -> str:
-    return cell.striptags() if isinstance(cell, Markup) else cell

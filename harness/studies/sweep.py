@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions
+from harness.report.document import Table
 from harness.runs.metrics import SUCCESS
 from harness.studies.axes import AXES, CORE, CROSS, Axis, Setting, Value, axis_of, crossed, described, grid
 from harness.studies.figures.bars import operating_points
@@ -18,7 +19,7 @@ from harness.studies.figures.heat_map import heat_map
 from harness.studies.figures.lines import along
 from harness.studies.play import Source, joined, play
 from harness.studies.replayed_run import ReplayedRun
-from harness.studies.study import Study, Table, percent, refuse_other
+from harness.studies.study import Study, percent, refuse_other
 
 if TYPE_CHECKING:
     import pandas as pd

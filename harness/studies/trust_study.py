@@ -7,9 +7,10 @@ import numpy as np
 
 from harness.core.figures import as_mapping, shown
 from harness.core.versions import versions
+from harness.report.document import Table, strong
 from harness.runs.metrics import SUCCESS, over_episodes
 from harness.studies.figures.heat_map import heat_map
-from harness.studies.study import Study, Table, ends, strong
+from harness.studies.study import Study, ends
 from harness.studies.trust import BASE, EXCLUDED, PEACE, Bench, Cell
 
 LOSES, COSTS = 2.0, 1.0  # points: what a robust rule may lose under an attack, and cost in peace

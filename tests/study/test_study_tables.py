@@ -9,16 +9,8 @@ import pytest
 from markupsafe import Markup
 
 from harness.core.errors import UserError
-from harness.studies.study import (
-    Cells,
-    Study,
-    Table,
-    p_cell,
-    refuse_other,
-    strong,
-    write_study,
-    write_table,
-)
+from harness.report.document import Table, strong
+from harness.studies.study import Cells, Study, p_cell, refuse_other, write_study, write_table
 
 HOSTILE = "=cmd()</script>\u202e"
 

@@ -8,7 +8,7 @@ from harness.core.errors import printable
 from harness.core.multiplicity import LEVEL
 from harness.prompts.difference import marked
 from harness.prompts.versions import as_it_was
-from harness.report.caveats import no_prompt, unanswered, unread
+from harness.report.caveats import no_prompt, void
 from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.flips import LOST_BY, DecisionFlip
 from harness.report.compare.gate import Verdict
@@ -132,7 +132,7 @@ def caveats(pair: Pair) -> list[str]:
     """Return what must be said of the runs before their numbers, with the run's letter where it is of one."""
     sides = (("A", pair.a.run), ("B", pair.b.run))
     return [
-        *(f"{name}: {text}" for name, run in sides for text in (*unanswered(run), *unread(run.scores))),
+        *(f"{name}: {text}" for name, run in sides for text in void(run)),
         *no_prompt(run.manifest for _, run in sides),
     ]
 

@@ -14,8 +14,9 @@ from harness.core.files import write_whole
 from harness.core.versions import versions
 from harness.report.compare.gate import Verdict
 from harness.report.compare.words import judged
+from harness.report.document import Table
 from harness.report.page import visible
-from harness.studies.study import Study, Table
+from harness.studies.study import Study
 from harness.studies.twins.asking import Questions, lack
 from harness.studies.twins.declared import TWINS, Twin
 from harness.studies.twins.scoring import METRICS, Pair, Row, headline

@@ -1,0 +1,77 @@
+"""A page of sentences, figures and tables that runs no script: of a study, a suite, or runs by date."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from markupsafe import Markup
+
+from harness.report.page import environment, visible
+
+LONGEST_NUMBER = 40  # characters of a cell at the right of its column, such as a number with its interval
+
+
+@dataclass(frozen=True)
+class Table:
+    """Text in columns, for a page and a terminal."""
+
+    title: str  # what stands above it
+    heads: Sequence[str]  # of the columns; the first column names the rows
+    # the cells of each; `Markup` is shown as it is on the page, and as text in a terminal
+    rows: Sequence[Sequence[str]]
+    note: str = ""  # what stands below it on the page
+    # the columns that a terminal has room for; none where only the page shows the table
+    terminal: Sequence[int] = ()
+    most: int | None = None  # how many rows a terminal shows; None for all
+    left: bool = False  # whether all columns begin at the left and none wraps: text, or several lines a cell
+    folded: bool = False  # whether the page shows it after a click
+    total: bool = False  # whether the last row is about all others
+
+    @property
+    def words(self) -> list[bool]:
+        """Whether each column has sentences, which begin at the left and wrap on the page."""
+        return [
+            any(len(Markup(row[n]).striptags()) > LONGEST_NUMBER for row in self.rows)
+            for n in range(len(self.heads))
+        ]
+
+    @property
+    def in_terminal(self) -> tuple[list[str], list[list[str]]]:
+        """Heads and rows of the columns that a terminal has room for, as plain text."""
+        rows = [[self.heads[n] for n in self.terminal]]
+        rows += [[_plain(row[n]) for n in self.terminal] for row in self.rows[: self.most]]
+        return rows[0], rows[1:]
+
+
+@dataclass(frozen=True)
+class Section:
+    """What a page says of one thing."""
+
+    title: str  # what was played
+    headline: Sequence[str] = ()  # the outcome in sentences
+    # how it was made: n, what the intervals are over, and what the outcome is conditional on
+    about: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    warnings: Sequence[str] = ()  # why the outcome is none; they stand above it
+    caveats: Sequence[str] = ()  # what a reader must know first
+    numbers: Sequence[Mapping[str, str]] = ()  # what is read first, as `words.figures` gives it
+    pictures: Mapping[str, tuple[str, int]] = field(default_factory=dict)  # by name: address, width in rem
+    more: Markup = field(default_factory=Markup)  # below the tables
+
+
+def document(sections: Sequence[Section]) -> str:
+    """Return the page of some sections; the title of the first is its own."""
+    return environment().get_template("sections.html.j2").render(sections=sections)
+
+
+def strong(text: str, when: bool = True) -> str:
+    """Return text that stands out on a page, where it should."""
+    return Markup("<strong>{}</strong>").format(text) if when else text
+
+
+def linked(text: str, href: str | None) -> Markup:
+    """Return text with a link to an address, if there is one."""
+    return Markup('<a href="{}">{}</a>' if href else "{1}").format(href, visible(text))
+
+
+def _plain(cell: str) -> str:
+    return cell.striptags() if isinstance(cell, Markup) else cell
