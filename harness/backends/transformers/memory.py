@@ -1,7 +1,4 @@
-"""The keys and values of a transformers model: memory that grows by pages, and beginnings of earlier prompts.
-
-A `DynamicCache` copies everything it holds for each token that is added. Here a step writes its own columns,
-and copies only where a page is full.
+"""The keys and values of a transformers model: those of several batches as one, and of earlier prompts.
 
 Importing this imports torch.
 """
@@ -10,93 +7,30 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from transformers.cache_utils import Cache, DynamicLayer
+from torch.nn.functional import pad
+from transformers.cache_utils import Cache
 
 from harness.backends.engine import common_length
 
-PAGE = 64  # columns by which memory grows
 LEAST_TOKENS = 16  # a shorter beginning is cheaper to read again than to keep
 MOST_TOKENS = 2048  # most tokens kept in total: 0.3 GB for a 4B model with grouped-query attention
 
 
-class PagedLayer(DynamicLayer):  # type: ignore[misc]  # transformers is untyped here
-    """One layer's keys and values, (n, heads, columns, dim): views of memory with room for more columns."""
-
-    keys: Any
-    values: Any
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._memory: list[Any] = []  # of keys and of values; empty if what is held is not ours
-
-    def update(self, key_states: Any, value_states: Any, *_: Any, **__: Any) -> tuple[Any, Any]:
-        """Append columns and return all. What is returned stays as it is when more are appended."""
-        if not self.is_initialized:
-            self.hold(key_states, value_states)
-            return self.keys, self.values
-        start, end = self.keys.shape[-2], self.keys.shape[-2] + key_states.shape[-2]
-        if not self._memory or end > self._memory[0].shape[-2]:
-            self._memory = [_with_room(held, end) for held in (self.keys, self.values)]
-        for memory, states in zip(self._memory, (key_states, value_states), strict=True):
-            memory[:, :, start:end] = states
-        self.keys, self.values = (memory[:, :, :end] for memory in self._memory)
-        return self.keys, self.values
-
-    def hold(self, keys: Any, values: Any) -> None:
-        """Take columns as they are, without a copy."""
-        self.dtype, self.device = keys.dtype, keys.device
-        self.keys, self.values, self.is_initialized = keys, values, True
-
-    def place(self, rows: Sequence[int], keys: Any, values: Any, n: int, columns: int) -> None:
-        """Copy columns to the beginning of some rows of n."""
-        if not self._memory:
-            _, heads, _, dim = keys.shape
-            # Zeros and not just any memory: a NaN under the mask would reach what is not masked.
-            self._memory = [keys.new_zeros(n, heads, _paged(columns), dim) for _ in range(2)]
-            self.hold(*(memory[:, :, :columns] for memory in self._memory))
-        index = torch.tensor(rows, device=keys.device)
-        for memory, states in zip(self._memory, (keys, values), strict=True):
-            memory[index, :, : states.shape[-2]] = states
-
-    def reset(self) -> None:
-        self._memory = []
-        super().reset()
-
-    def batch_select_indices(self, indices: Any) -> None:
-        end = self.keys.shape[-2]
-        held = [memory[indices] for memory in self._memory or (self.keys, self.values)]
-        self._memory = held if self._memory else []
-        self.keys, self.values = (memory[:, :, :end] for memory in held)
-
-
-def _with_room(held: Any, columns: int) -> Any:
-    """Copy keys or values to memory with room for `columns`, rounded up to whole pages."""
-    n, heads, filled, dim = held.shape
-    memory = held.new_empty(n, heads, _paged(columns), dim)
-    memory[:, :, :filled] = held
-    return memory
-
-
-def _paged(columns: int) -> int:
-    return -(-columns // PAGE) * PAGE
-
-
 def join_caches(parts: Sequence[tuple[Sequence[int], Cache]]) -> Cache:
-    """Return one cache of the rows of several, which are emptied. Rows with fewer columns end in zeros.
+    """Return one cache of the rows of several, which are emptied.
 
-    Each cache has paged layers, and comes with the places of its rows among all.
+    Each cache comes with the places of its rows among all. Rows with fewer columns end in zeros.
     """
-    n = sum(len(places) for places, _ in parts)
+    order = torch.tensor([place for places, _ in parts for place in places]).argsort()
     columns = max(cache.get_seq_length() for _, cache in parts)
-    layers = [PagedLayer() for _ in parts[0][1].layers]
-    for i, layer in enumerate(layers):
-        for places, cache in parts:
-            part = cache.layers[i]
-            layer.place(places, part.keys, part.values, n, columns)
-            part.reset()
-    whole = parts[0][1]
-    whole.layers = layers
-    return whole
+    for layers in zip(*(cache.layers for _, cache in parts), strict=True):
+        for name in ("keys", "values"):
+            held = [getattr(layer, name) for layer in layers]
+            wide = torch.cat([pad(each, (0, 0, 0, columns - each.shape[-2])) for each in held])
+            for layer in layers:
+                setattr(layer, name, None)  # so that no more than one layer is in memory twice
+            setattr(layers[0], name, wide[order.to(wide.device)])
+    return parts[0][1]
 
 
 class Prefix(NamedTuple):

@@ -23,7 +23,7 @@ from transformers.cache_utils import Cache, DynamicCache, DynamicLayer
 
 from harness.backends.engine import Session, check_logits, common_beginning, group_by_beginning
 from harness.backends.transformers.eyes import Eyes
-from harness.backends.transformers.memory import LEAST_TOKENS, PagedLayer, Prefix, Prefixes, join_caches
+from harness.backends.transformers.memory import LEAST_TOKENS, Prefix, Prefixes, join_caches
 from harness.core.arrays import Floats
 
 CPU_TOKENS = 1024  # most tokens that a CPU reads together: what more of them need does not stay in its cache
@@ -119,10 +119,7 @@ class Reader:
         return [sorted(piece) for piece in pieces]
 
     def cache(self) -> Cache:
-        cache = DynamicCache(config=self._model.config)
-        if self.together:
-            cache.layers = [PagedLayer() for _ in cache.layers]
-        return cache
+        return DynamicCache(config=self._model.config)
 
     def positions(self, prompts: Sequence[Sequence[int]]) -> list[Any] | None:
         """Return the positions of each prompt's tokens, (3, tokens); None if they are consecutive."""
