@@ -16,6 +16,7 @@ from pathlib import Path
 
 from harness.backends import cards
 from harness.backends.base import Request
+from harness.backends.card import Card
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.evaluate.agent import Agent
@@ -67,7 +68,7 @@ def described(request: Request) -> dict[str, object]:
     }  # fmt: skip
 
 
-def questions(card: cards.Card, count: int) -> Iterator[list[Request]]:
+def questions(card: Card, count: int) -> Iterator[list[Request]]:
     """Yield each question with its draws: every prompt and role once, then those with examples again.
 
     A model that is shown examples answers in many forms, and one that is not mostly in prose: each fifth time

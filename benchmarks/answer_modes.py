@@ -31,6 +31,7 @@ import shapes
 
 from harness.backends import cards
 from harness.backends.base import Request
+from harness.backends.card import Card
 from harness.backends.engine import common_length
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import open_backend
@@ -99,7 +100,7 @@ def main() -> None:
     print(json.dumps({"rates": rates, "limits": limits, **vars(given)}, default=str))
 
 
-def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[Request]:
+def asked_of(card: Card, mode: str, count: int, most: int | None) -> list[Request]:
     """The ego's requests, spread over the shipped dataset."""
     dataset = load.load(load.find(DATASET))
     source, points = FrozenSource(dataset), tuple(POINTS.values())
@@ -112,7 +113,7 @@ def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[
     return [replace(r, max_tokens=most) for r in egos] if most and mode == "json" else egos
 
 
-def measure(card: cards.Card, given: argparse.Namespace) -> tuple[dict[str, float], dict[str, Any]]:
+def measure(card: Card, given: argparse.Namespace) -> tuple[dict[str, float], dict[str, Any]]:
     """Rates of transformers, plain, by lm-evaluation-harness and by ours; and the `limit` of each mode."""
     most = JSON_TOKENS if given.shape else None
     asked = {mode: asked_of(card, mode, given.prompts, most) for mode in given.modes}
@@ -180,7 +181,7 @@ def limit(backend: Any, asked: Sequence[Request], flops_per_s: float) -> tuple[f
     return len(asked) * flops_per_s / flops, mean - known, mean
 
 
-def of_llama(card: cards.Card, given: argparse.Namespace) -> dict[str, float]:
+def of_llama(card: Card, given: argparse.Namespace) -> dict[str, float]:
     """Rates of llama.cpp, one at a time, by the answers' own seconds."""
     backend = open_backend(card, device="cpu", batch_size=1)
     found = {}

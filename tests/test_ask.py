@@ -8,6 +8,7 @@ import pytest
 
 from harness.backends import cards
 from harness.backends.base import Backend, Request
+from harness.backends.card import Card
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
@@ -89,7 +90,7 @@ def test_a_stopped_run_asks_the_same_in_the_same_batches(tmp_path: Path) -> None
     batches: dict[str, list[tuple[str, ...]]] = {}
 
     def opening(into: str, most: int):
-        def opens(card: cards.Card, **options: object) -> Backend:
+        def opens(card: Card, **options: object) -> Backend:
             backend = open_backend(card, **options)  # type: ignore[arg-type]
             complete = backend.complete
 

@@ -20,7 +20,7 @@ from run_on_disk import UNTIMED, answers_of
 from harness.backends import cards
 from harness.backends.base import Completion, Request
 from harness.backends.cache import NOT_IN_KEY, Cached, CompletionFile, cached, default_file, key
-from harness.backends.cards import Latency
+from harness.backends.card import Latency
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest

@@ -10,6 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from harness.backends import cards
+from harness.backends.card import Latency
 from harness.backends.failures import Failures
 from harness.backends.registry import capabilities
 from harness.backends.servers import Server
@@ -143,7 +144,7 @@ def test_only_full_view_sees_the_truth() -> None:
 
 
 def test_the_proxy_cites_the_papers_latency_and_the_language_model_declares_none() -> None:
-    assert cards.load("proxy").latency == cards.Latency(
+    assert cards.load("proxy").latency == Latency(
         "card", 0.145, "cited: SwarmDrive paper, single local 145.0 ms"
     )
     qwen = cards.load("qwen3-4b")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from misbehaving import Asked, completion, serving
 
 from harness.backends.base import Completion, Request
-from harness.backends.cards import Card, Latency
+from harness.backends.card import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai.constraint import broken, constraint
 from harness.backends.servers import KINDS, Kind, Server

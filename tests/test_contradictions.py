@@ -11,7 +11,7 @@ pytest.importorskip("gguf", reason="needs the transformers extra")
 import tiny_llama
 
 from harness.backends import cards
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.weights import contradictions
 
 

@@ -19,7 +19,7 @@ from evaluating import Scripted, run, says, scenes_of, spec_of, with_ego
 from run_on_disk import answers_of
 
 from harness.backends.base import Completion, Request
-from harness.backends.cards import Latency as CardLatency
+from harness.backends.card import Latency as CardLatency
 from harness.backends.cards import resolve
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.config import LONGEST_S

@@ -23,7 +23,7 @@ from test_transformers_engine import COMMIT, REQUESTS, ask, open_tiny, said
 
 from harness.backends import registry
 from harness.backends.base import Request
-from harness.backends.cards import Card, Latency
+from harness.backends.card import Card, Latency
 from harness.backends.llama_cpp.backend import LlamaBackend
 from harness.backends.llama_cpp.engine import LlamaEngine, LlamaSession
 from harness.backends.llama_cpp.model import LlamaModel

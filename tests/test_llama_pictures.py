@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 from test_eyes import drawn
 
 from harness.backends.base import Request
-from harness.backends.cards import Card, Latency
+from harness.backends.card import Card, Latency
 from harness.backends.llama_cpp.engine import LlamaEngine
 from harness.backends.llama_cpp.model import LlamaModel
 from harness.backends.llama_cpp.projector import Projector

@@ -24,7 +24,7 @@ from misbehaving import Asked, Play, completion, read_out, serving
 
 from harness import cli
 from harness.backends.base import AnswerMode, Completion, Request
-from harness.backends.cards import Card, Latency, Thinking
+from harness.backends.card import Card, Latency, Thinking
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai import pool as openai_pool
 from harness.backends.openai.shapes import body, read

@@ -16,7 +16,7 @@ from evaluating import FILES, run, scenes_of, spec_of, with_ego
 from run_on_disk import answers_of
 
 from harness.backends.base import AnswerMode, Completion, Request
-from harness.backends.cards import Card, Latency
+from harness.backends.card import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.registry import open_backend
 from harness.backends.servers import Server

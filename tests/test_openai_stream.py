@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from misbehaving import Asked, Play, completion, event, pieces, read_out, serving
 
 from harness.backends.base import AnswerMode, Completion, Request
-from harness.backends.cards import Card, Latency
+from harness.backends.card import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai import http as openai_http
 from harness.backends.openai import pool as openai_pool

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from small_hub import COMMIT, serving
 
-from harness.backends.cards import Card, Latency
+from harness.backends.card import Card, Latency
 from harness.backends.weights import check_digest
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes

@@ -30,7 +30,7 @@ from evaluating import (
 from run_on_disk import UNTIMED, answers_of, rows_of
 
 from harness.backends import cards
-from harness.backends.cards import Latency
+from harness.backends.card import Latency
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.core.errors import Unanswered, UserError

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.backends.base import AnswerMode, Request
-from harness.backends.cards import Card, Latency, resolve
+from harness.backends.card import Card, Latency
+from harness.backends.cards import resolve
 from harness.backends.registry import open_backend
 from harness.backends.sampling import drawn
 from harness.backends.servers import Server

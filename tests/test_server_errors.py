@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from misbehaving import LISTED, Asked, completion, pieces, serving
 
 from harness.backends.base import Completion, Request
-from harness.backends.cards import Card, Latency
+from harness.backends.card import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai import pool as openai_pool
 from harness.backends.openai.faults import Fault, fault_in

@@ -12,7 +12,7 @@ from misbehaving import Asked, completion, serving
 
 from harness.backends.base import Request, same_model
 from harness.backends.cache import cached
-from harness.backends.cards import Card, Latency
+from harness.backends.card import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai.statements import Model, _flat, read_statement
 from harness.backends.servers import Kind, Server

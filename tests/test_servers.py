@@ -23,7 +23,7 @@ from misbehaving import Asked, Play, Server, completion, serving
 from served import served
 
 from harness.backends.base import Request, Served
-from harness.backends.cards import Card, Latency
+from harness.backends.card import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai import pool as openai_pool
 from harness.backends.openai.http import Client

@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 
 from harness.backends import cards, registry
 from harness.backends.base import Completion, Request
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.coordination.coordinate import TIE, Fusion, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, named_point

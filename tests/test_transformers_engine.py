@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 
 from harness.backends import checkup
 from harness.backends.base import Completion, Request
-from harness.backends.cards import Card, Latency, load, resolve
+from harness.backends.card import Card, Latency
+from harness.backends.cards import load, resolve
 from harness.backends.chat import HubTokenizer
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import missing, open_backend

@@ -17,6 +17,7 @@ import tiny_llama
 
 from harness.backends import cards, weights
 from harness.backends.base import Request
+from harness.backends.card import Card
 from harness.backends.registry import missing
 from harness.backends.registry import open_backend as _open
 from harness.backends.tokens import counter
@@ -32,7 +33,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache" / "checkpoints"
 
 
-def open_backend(card: cards.Card, **options: Any) -> Any:
+def open_backend(card: Card, **options: Any) -> Any:
     return _open(card, **options)
 
 

@@ -1,22 +1,34 @@
-"""The model card: a record of a model, its engine, its weights and its latency."""
+"""The model card: a record of a model, its engine, its weights and its latency, and the file that holds it.
 
-from dataclasses import asdict, dataclass, replace
+A file, `models/<name>.toml`, may list further engines: `<name>:<engine>` is the same model on that one.
+"""
+
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
 from harness.backends.base import Letters
 from harness.backends.failures import Failures
+from harness.backends.registry import ENGINES
 from harness.backends.servers import Server
 from harness.backends.vision import Vision
-from harness.core.config import Count, Seconds
-from harness.core.errors import printable
+from harness.core.config import Count, Seconds, convert, toml
+from harness.core.errors import UserError, printable, unknown
 
 Dtype = Literal["float32", "bfloat16", "auto"]
 Thinking = Literal["none", "switch", "always"]
 System = Literal["first-user"]
 LatencySource = Literal["card", "paper"]
 Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z", description="64 digits 0-9 a-f")]
+
+# Keys that only some engines understand; a `Registration` says which.
+_ENGINE_KEYS = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation",
+                "failures", "privileged", "vision", "projector", "system")  # fmt: skip
+# Keys that a model may set again for each further engine.
+_PER_ENGINE = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
+               "server", "projector")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -87,3 +99,71 @@ class Card:
                 server["fields"] = dict(self.server.fields.changed)
             record["server"] = server
         return record
+
+
+@dataclass(frozen=True)
+class _File(Card):
+    """The content of a card file: a card, and what is different on other engines."""
+
+    engines: dict[str, Any] = field(default_factory=dict)
+
+
+def read_cards(path: Path) -> list[Card]:
+    """Read a file's card on each of its engines, the default one first. Raises UserError on a mistake."""
+    where = f"model card {path}"
+    table = _with_latency(toml(path, where))
+    engines = convert(table, _File, where, name=path.stem).engines
+    table.pop("engines", None)
+    cards = [_card(table, where, path.stem)]
+    shared = {key: value for key, value in table.items() if key not in _PER_ENGINE}
+    if cards[0].latency.source == "paper":  # a declared latency does not hold for another engine
+        shared["latency"] = table["latency"]
+    for engine, settings in engines.items():
+        at = f"{where} [engines.{printable(engine)}]"
+        registered = None if engine == table["engine"] else ENGINES.get(engine)
+        if registered is None or "weights" not in registered.allowed_keys:
+            allowed = [name for name in _engines_with("weights") if name != table["engine"]]
+            raise unknown(f"engine in {where}", engine, allowed)
+        if not isinstance(settings, dict):
+            raise UserError(f"{at} = {printable(settings)!r}; allowed: a table")
+        for key in settings:
+            if key not in _PER_ENGINE:
+                raise unknown(f"key in {at}", key, _PER_ENGINE)
+        whole = _with_latency({**shared, **settings, "engine": engine})
+        cards.append(_card(whole, at, f"{path.stem}:{engine}"))
+    return cards
+
+
+def _with_latency(table: dict[str, Any]) -> dict[str, Any]:
+    """Add to a card's table the `inference_s` that is left out if no time is declared."""
+    latency = table.get("latency")
+    return {**table, "latency": {"inference_s": None, **latency}} if isinstance(latency, dict) else table
+
+
+def _card(table: dict[str, Any], where: str, name: str) -> Card:
+    card = convert(table, Card, where, name=name)
+    if (engine := ENGINES.get(card.engine)) is None:
+        raise unknown(f"engine in {where}", card.engine, ENGINES)
+    for key in _ENGINE_KEYS:
+        lacking = key in engine.required_keys and key not in table
+        if lacking or (key in table and key not in engine.allowed_keys):
+            shown = f"[{key}]" if key in ("server", "failures", "vision") else key
+            takers = " or ".join(_engines_with(key))
+            raise UserError(f"{where}: {shown} goes with engine = {takers}, and only with it")
+    if "projector" in engine.allowed_keys and bool(card.vision) != bool(card.projector):
+        raise UserError(
+            f"{where}: [vision] and projector go together on {card.engine}: give the name of its mmproj "
+            "file, or leave both out"
+        )
+    if card.server and card.thinking == "switch" and not card.server.tells_thinking:
+        raise UserError(
+            f'{where} [server]: thinking = "switch" needs the kind vllm or llama-server, which a request can '
+            "tell; else set it at the server, and here none or always"
+        )
+    if card.failures and card.failures.slow_tail and card.latency.source != "card":
+        raise UserError(f'{where} [failures]: a slow tail goes with a latency whose source = "card"')
+    return card
+
+
+def _engines_with(key: str) -> list[str]:
+    return [engine for engine, registered in ENGINES.usable().items() if key in registered.allowed_keys]

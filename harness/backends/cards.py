@@ -1,30 +1,32 @@
-"""The model cards by name: read their files, and find the card that a user or a run names.
+"""The model cards by name: those of files, and those made for a model that has none.
 
-A card is one file, `models/<name>.toml`; `<name>:<engine>` is the same model on another engine that the file
-lists. A model without a file gets its card from `harness.backends.local_cards`.
+A model without a file is a directory, a GGUF file, a hub id or `replay:RUN_DIR`.
 """
 
+import json
+import os.path
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from contextlib import suppress
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from harness.backends.card import Card, Dtype, Latency, LatencySource, Thinking
-from harness.backends.local_cards import local_card
-from harness.backends.registry import ENGINES, registration
+from harness.backends.base import Letters
+from harness.backends.card import Card, Latency, System, Thinking, read_cards
+from harness.backends.gguf import read_facts
+from harness.backends.registry import registration
+from harness.backends.vision import Vision, read_vision
 from harness.core import resources
-from harness.core.config import convert, toml
+from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import bytes_of, text_of
 
-__all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", "each_engine", "load",
-           "load_all", "names", "own", "resolve"]  # fmt: skip
-
-# Keys that only some engines understand; a `Registration` says which.
-_ENGINE_KEYS = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation",
-                "failures", "privileged", "vision", "projector", "system")  # fmt: skip
-# Keys that a model may set again for each further engine.
-_PER_ENGINE = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
-               "server", "projector")  # fmt: skip
+DISTILLED = "training.json"  # stands beside weights that were distilled here
+PROJECTOR = "mmproj-"  # prefix of a projector's GGUF file
+_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+_TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
+_SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
 # Keys that decide no answer, or whose effect is in the identity of the opened model.
 _PLACE = ("description", "latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
           "licence", "projector", "letters")  # fmt: skip
@@ -34,6 +36,11 @@ _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 def names() -> list[str]:
     """Return the sorted names of all card files."""
     return resources.names("models")
+
+
+def each_engine(stem: str) -> list[Card]:
+    """Return a file's card on each of its engines, the default one first. Raises UserError on a mistake."""
+    return read_cards(resources.find("models", f"{stem}.toml"))
 
 
 def load(name: str) -> Card:
@@ -63,7 +70,7 @@ def resolve(text: str, engine: str | None = None) -> Card:
     stem, _, named = text.partition(":")
     if stem in names():
         card = load(f"{stem}:{engine}" if engine and not named else text)
-    elif (local := local_card(text, engine)) is not None:
+    elif (local := _local_card(text, engine)) is not None:
         card = local
     else:
         hint = (
@@ -118,73 +125,140 @@ def _differing(card: Card, stated: Card) -> list[str]:
     return [f.name for f in fields(Card) if getattr(card, f.name) != getattr(stated, f.name)]
 
 
-@dataclass(frozen=True)
-class _File(Card):
-    """The content of a card file: a card, and what is different on other engines."""
+def _local_card(text: str, engine: str | None) -> Card | None:
+    """Return the card of `replay:RUN_DIR`, a path or a hub id, on `engine` if there is a choice, or None.
 
-    engines: dict[str, Any] = field(default_factory=dict)
-
-
-def each_engine(stem: str) -> list[Card]:
-    """Read a file's card on each of its engines, the default one first. Raises UserError on a mistake."""
-    return _read(resources.find("models", f"{stem}.toml"))
-
-
-def _read(path: Path) -> list[Card]:
-    where = f"model card {path}"
-    table = _with_latency(toml(path, where))
-    engines = convert(table, _File, where, name=path.stem).engines
-    table.pop("engines", None)
-    cards = [_card(table, where, path.stem)]
-    shared = {key: value for key, value in table.items() if key not in _PER_ENGINE}
-    if cards[0].latency.source == "paper":  # a declared latency does not hold for another engine
-        shared["latency"] = table["latency"]
-    for engine, settings in engines.items():
-        at = f"{where} [engines.{printable(engine)}]"
-        registered = None if engine == table["engine"] else ENGINES.get(engine)
-        if registered is None or "weights" not in registered.allowed_keys:
-            allowed = [name for name in _engines_with("weights") if name != table["engine"]]
-            raise unknown(f"engine in {where}", engine, allowed)
-        if not isinstance(settings, dict):
-            raise UserError(f"{at} = {printable(settings)!r}; allowed: a table")
-        for key in settings:
-            if key not in _PER_ENGINE:
-                raise unknown(f"key in {at}", key, _PER_ENGINE)
-        whole = _with_latency({**shared, **settings, "engine": engine})
-        cards.append(_card(whole, at, f"{path.stem}:{engine}"))
-    return cards
-
-
-def _with_latency(table: dict[str, Any]) -> dict[str, Any]:
-    """Add to a card's table the `inference_s` that is left out if no time is declared."""
-    latency = table.get("latency")
-    return {**table, "latency": {"inference_s": None, **latency}} if isinstance(latency, dict) else table
-
-
-def _card(table: dict[str, Any], where: str, name: str) -> Card:
-    card = convert(table, Card, where, name=name)
-    if (engine := ENGINES.get(card.engine)) is None:
-        raise unknown(f"engine in {where}", card.engine, ENGINES)
-    for key in _ENGINE_KEYS:
-        lacking = key in engine.required_keys and key not in table
-        if lacking or (key in table and key not in engine.allowed_keys):
-            shown = f"[{key}]" if key in ("server", "failures", "vision") else key
-            takers = " or ".join(_engines_with(key))
-            raise UserError(f"{where}: {shown} goes with engine = {takers}, and only with it")
-    if "projector" in engine.allowed_keys and bool(card.vision) != bool(card.projector):
+    Raises UserError if there is no such file or run, or it does not say how to open it.
+    """
+    kind, _, rest = text.partition(":")
+    if kind == "replay":
+        run = _path(rest)
+        if run is None or not run.is_dir():
+            raise UserError(
+                f"model {printable(text)!r}: no such run directory; give replay: and the directory of a run"
+            )
+        return _run_card(run)
+    path = _path(text)
+    if path is not None and path.is_dir():
+        return _directory_card(text, path, engine)
+    if path is not None and path.suffix == ".gguf":
+        return _gguf_card(text, path, engine)
+    if _HUB_ID.fullmatch(text) and not text.endswith(".gguf"):
+        return _new_card(text, "transformers", text, "Hub model without a card")
+    if "/" in text:
         raise UserError(
-            f"{where}: [vision] and projector go together on {card.engine}: give the name of its mmproj "
-            "file, or leave both out"
+            f"model {printable(text)!r} is no directory, no .gguf file and no hub id; "
+            "give an existing path, or an id such as Qwen/Qwen3-4B"
         )
-    if card.server and card.thinking == "switch" and not card.server.tells_thinking:
+    return None
+
+
+def _new_card(name: str, engine: str, weights: str, description: str, **settings: Any) -> Card:
+    latency = Latency("paper", None, "none declared: the paper's")
+    return Card(name, engine, description, latency, weights=weights, **settings)
+
+
+def _run_card(run: Path) -> Card:
+    """Return the card of a run's answers; an unreadable run fails only when it is opened."""
+    stated: dict[str, Any] = {}
+    vision: Vision | None = None
+    letters: Letters = "raw"
+    with suppress(OSError, ValueError, UserError):
+        stated = json.loads(text_of(run / "run.json", "record"))
+    with suppress(TypeError, ValueError, LookupError, UserError):
+        table = stated["model"]["vision"]
+        vision = table and convert(table, Vision, "vision")
+    with suppress(AttributeError):
+        letters = "cyclic" if stated.get("letters") == "cyclic" else "raw"
+    name = f"replay:{run.name}"
+    return _new_card(name, "replay", str(run), "Answers of a run", vision=vision, letters=letters)
+
+
+def _directory_card(text: str, where: Path, engine: str | None) -> Card:
+    files = sorted(file for file in where.glob("*.gguf") if not file.name.startswith(PROJECTOR))
+    if (where / "config.json").is_file() and engine != "llama-cpp":
+        return _new_card(
+            where.name, "transformers", str(where), "Local directory", thinking=_thinking(where),
+            vision=_vision(text, where), system=_system(_template(where)), letters=_letters(where),
+        )  # fmt: skip
+    if len(files) == 1:
+        return _gguf_card(text, files[0], engine)
+    if files:
         raise UserError(
-            f'{where} [server]: thinking = "switch" needs the kind vllm or llama-server, which a request can '
-            "tell; else set it at the server, and here none or always"
+            f"model directory {printable(text)!r} holds {len(files)} .gguf files; give one of them"
         )
-    if card.failures and card.failures.slow_tail and card.latency.source != "card":
-        raise UserError(f'{where} [failures]: a slow tail goes with a latency whose source = "card"')
-    return card
+    raise UserError(
+        f"model directory {printable(text)!r} holds no config.json and no .gguf file; "
+        "give the directory of a transformers checkpoint, or a .gguf file"
+    )
 
 
-def _engines_with(key: str) -> list[str]:
-    return [engine for engine, registered in ENGINES.usable().items() if key in registered.allowed_keys]
+def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
+    """Make the card of a GGUF file, of what the file says of itself.
+
+    On llama-cpp the projector beside it goes with it, which has the same name behind its prefix.
+    """
+    stated = read_facts(file)
+    engine = "transformers" if engine == "transformers" else "llama-cpp"
+    projector = file.with_name(f"{PROJECTOR}{file.name}")
+    vision = _vision(text, file.parent) if engine == "llama-cpp" and projector.is_file() else None
+    return _new_card(
+        file.stem,
+        engine,
+        str(file),
+        f"Local GGUF file{f': {printable(stated.name)}' if stated.name else ''}",
+        thinking="switch" if _SWITCH in (stated.template or "").encode() else "none",
+        licence=stated.licence and printable(stated.licence),
+        system=_system(stated.template),
+        letters=_letters(file.parent),
+        vision=vision,
+        projector=projector.name if vision else None,
+    )
+
+
+def _path(text: str) -> Path | None:
+    path = os.path.expanduser(text)
+    return Path(path).resolve() if os.path.exists(path) else None
+
+
+def _thinking(checkpoint: Path) -> Thinking:
+    """Return `switch` if a checkpoint's chat template has the thinking switch; reads the file's text only."""
+    files = (checkpoint / name for name in _TEMPLATE_FILES)
+    return "switch" if any(_SWITCH in bytes_of(f, "record") for f in files if f.is_file()) else "none"
+
+
+def _letters(weights: Path) -> Letters | None:
+    """Return `raw` for what was distilled here: its training used one order of the letters."""
+    return "raw" if (weights / DISTILLED).is_file() else None
+
+
+def _vision(text: str, checkpoint: Path) -> Vision | None:
+    """Return how a checkpoint takes pictures, from its config files. Raises UserError if they do not say."""
+    try:
+        config, processor = (
+            json.loads(text_of(file, "record")) if file.is_file() else {}
+            for file in (checkpoint / "config.json", checkpoint / "preprocessor_config.json")
+        )
+        return read_vision(config, processor)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"model directory {printable(text)!r}: its config does not say how it takes pictures "
+            f"({printable(repr(error), 120)}); write a card with a [vision] for it"
+        ) from None
+
+
+def _system(template: str | None) -> System | None:
+    """Return how a card made on the spot gives the system text, so that its chat template takes it."""
+    from harness.backends.chat_template import needs_first_user  # imports Jinja, as few cards do
+
+    return "first-user" if template and needs_first_user(template) else None
+
+
+def _template(checkpoint: Path) -> str | None:
+    """Return a checkpoint's chat template; None if its files do not say, which opening it reports."""
+    with suppress(OSError, ValueError):
+        if (file := checkpoint / _TEMPLATE_FILES[0]).is_file():
+            return text_of(file)
+        template = json.loads(text_of(checkpoint / _TEMPLATE_FILES[1], "record")).get("chat_template")
+        return template if isinstance(template, str) else None
+    return None

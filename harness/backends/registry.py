@@ -10,13 +10,15 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from harness.backends.base import AnswerMode, Backend
-from harness.backends.card import Card
 from harness.core import extras
 from harness.core.errors import UserError, unknown
 from harness.core.plugins import Plugins
+
+if TYPE_CHECKING:
+    from harness.backends.card import Card
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ def capabilities(engine: str) -> Capabilities:
 
 
 def open_backend(
-    card: Card, *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
+    card: "Card", *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> Backend:
     """Open the backend of a card and load its weights; engines without weights ignore the options.
 
@@ -132,7 +134,7 @@ def open_backend(
     return backend
 
 
-def opened(card: Card, device: str | None, dtype: str | None, batch_size: int) -> Backend:
+def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> Backend:
     """Return this process's backend of a card, opened once (see `open_backend`)."""
     return _opened_in(os.getpid(), card, device, dtype, batch_size)
 
@@ -140,7 +142,7 @@ def opened(card: Card, device: str | None, dtype: str | None, batch_size: int) -
 # Keyed by the process: a forked one inherits its parent's backend, and two that use one pipe would read each
 # other's answers.
 @lru_cache(maxsize=8)
-def _opened_in(process: int, card: Card, device: str | None, dtype: str | None, batch_size: int) -> Backend:
+def _opened_in(process: int, card: "Card", device: str | None, dtype: str | None, batch_size: int) -> Backend:
     return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
 
 
@@ -156,7 +158,7 @@ def missing_package(engine: str) -> str | None:
     return next((package for module, package in packages.items() if find_spec(module) is None), None)
 
 
-def missing(card: Card) -> str | None:
+def missing(card: "Card") -> str | None:
     """Return what a card lacks to run here: the name of a package or `weights`; None if nothing."""
     if package := missing_package(card.engine):
         return package
@@ -168,7 +170,7 @@ def missing(card: Card) -> str | None:
     return None
 
 
-def processor_tokens(card: Card) -> int | None:
+def processor_tokens(card: "Card") -> int | None:
     """Return how many tokens a card's image processor makes of a picture of the card's size.
 
     None if the processor is not installed here.

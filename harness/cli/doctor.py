@@ -17,7 +17,7 @@ from harness.core.errors import UserError, printable
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from harness.backends.cards import Card
+    from harness.backends.card import Card
 
 WIDTH, MARGIN = 80, 10
 PACKAGES = (

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from harness.backends.base import AnswerMode, Completion, Request
-    from harness.backends.cards import Card
+    from harness.backends.card import Card
     from harness.backends.checkup import Checkup
     from harness.backends.findings import Findings
     from harness.evaluate.pace import Pace

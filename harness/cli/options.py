@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from harness.backends.base import AnswerMode
     from harness.backends.base import Letters as LettersMode
-    from harness.backends.cards import Card
+    from harness.backends.card import Card
     from harness.core import parallel, shards
     from harness.dataset.load import Dataset as Frozen  # Dataset is an option here
 else:  # typer takes any text; what is evaluated says which are allowed

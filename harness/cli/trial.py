@@ -11,7 +11,7 @@ from harness.core.errors import UserError, printable
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from harness.backends.cards import Card
+    from harness.backends.card import Card
     from harness.backends.findings import Findings, Moved
     from harness.evaluate.trial import Trial
     from harness.prompts.versions import Prompt

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from harness.backends.base import AnswerMode, Letters, Request, Role, Sums
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.registry import Capabilities, capabilities
 from harness.core.errors import UserError, printable, unknown
 from harness.parsing.parse import Status, parse

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from harness.backends.cards import Card, each_engine, names
+from harness.backends.card import Card
+from harness.backends.cards import each_engine, names
 from harness.backends.registry import missing, open_backend
 from harness.backends.weights import locate
 from harness.core.errors import Unanswered

@@ -6,7 +6,8 @@ from typing import Any, Protocol
 
 import msgspec
 
-from harness.backends.cards import Card, argument
+from harness.backends.card import Card
+from harness.backends.cards import argument
 from harness.backends.registry import ENGINES
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint

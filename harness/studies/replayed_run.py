@@ -14,7 +14,8 @@ import numpy as np
 
 from harness.backends.base import AnswerMode, Backend, Letters, Request, Sums, same_model
 from harness.backends.cache import default_file
-from harness.backends.cards import Card, own
+from harness.backends.card import Card
+from harness.backends.cards import own
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
 from harness.coordination.exchange import Exchange

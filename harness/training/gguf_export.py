@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.backends.local_cards import PROJECTOR
+from harness.backends.cards import PROJECTOR
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing
 from harness.training import projector

@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from harness.backends.base import Backend, Request
-from harness.backends.cards import Card
+from harness.backends.card import Card
 from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp import backend as llama_backend
 from harness.backends.llama_cpp.backend import LlamaBackend

@@ -10,7 +10,8 @@ import pytest
 from misbehaving import Server, completion, serving
 
 from harness.backends import cards
-from harness.backends.cards import Card, Latency, own
+from harness.backends.card import Card, Latency
+from harness.backends.cards import own
 from harness.backends.servers import Server as Place
 from harness.core.errors import UserError
 from harness.core.resources import folder
