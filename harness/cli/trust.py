@@ -72,8 +72,7 @@ def command(
     from harness.evaluate.run import read_or_evaluate
     from harness.studies.axes import USUAL_ATTACKS
     from harness.studies.replayed_run import ReplayedRun
-    from harness.studies.trust import CAPPED, names_of, run_bench, shares_of
-    from harness.studies.trust_study import trust_study
+    from harness.studies.trust import CAPPED, names_of, run_bench, shares_of, trust_study
 
     attack_names = names_of("--attacks", attacks, USUAL_ATTACKS, tuple(ATTACKS))
     rule_names, shares = names_of("--rules", rules, (*RULES, CAPPED), tuple(RULES)), shares_of(share)

@@ -10,7 +10,7 @@ import numpy as np
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats, Ints
 from harness.core.statistics import Estimate, known_mean, seed_interval
-from harness.evaluate.walk import Ask, World, columns, walk
+from harness.evaluate.walk import Ask, Decided, World, columns, walk
 from harness.runs.decisions import DECIMALS
 from harness.runs.metrics import (
     METRICS,
@@ -36,6 +36,7 @@ PER_DECISION = (
     "observed_reply_loss",
 )  # fmt: skip
 COLUMNS = ("latency_ms", "deadline_missed", "triggered", "messages", "effective_loss", "observed_loss")
+Read = Callable[[Decided[Any]], dict[str, Floats]]  # columns of decisions, (n, ...)
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,7 @@ class WalkResult:
 
     episodes: Ints  # their numbers, (E,)
     ends: Mapping[str, Floats]  # each of `ENDS`, (S, E); NaN where an episode was left out
-    # numbers of the decisions (n,) by name, `COLUMNS`, which these metrics are of
-    columns: Mapping[str, Floats]
+    columns: Mapping[str, Floats]  # what was read of the decisions by name, (n, ...)
     places: Ints  # the episode of each decision, counted row by row in (S, E), (n,)
 
 
@@ -68,26 +68,42 @@ class Source(Protocol):
         ...
 
 
+def metric_columns(part: Decided[Any]) -> dict[str, Floats]:
+    """Return `COLUMNS`, which the metrics of a panel are of."""
+    every = columns(part)
+    return {name: every[name] for name in COLUMNS}
+
+
 def walk_through(
     world: World[Any], points: Sequence[OperatingPoint], ask: Ask[Any], seeds: Sequence[int],
-    episodes: Ints, ties: str,
+    episodes: Ints, ties: str, read: Read = metric_columns,
 ) -> Iterator[tuple[dict[str, Floats], Ints]]:  # fmt: skip
-    """Yield `COLUMNS` and `places` of each point's decisions, rounded as rows; `episodes` (E,) ascending."""
+    """Yield what is read of each point's decisions, rounded as rows, and `places`.
+
+    `episodes` (E,) are ascending. What is read of messages, (n, H), is NaN where a step has fewer helpers.
+    """
     parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
     places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
     ascending = np.argsort(seeds)
     for decided in walk(world, points, ask, ties):
         for part in decided:
-            every = columns(part)
-            parts[part.point].append({name: every[name] for name in COLUMNS})
+            parts[part.point].append(read(part))
             row = ascending[np.searchsorted(seeds, part.due.seed, "right", sorter=ascending) - 1]
             place = row * len(episodes) + np.searchsorted(episodes, part.due.episode)
             places[part.point].append(place)
     for point, steps in parts.items():
-        joint = {column: np.concatenate([step[column] for step in steps]) for column in steps[0]}
+        joint = {column: _below([step[column] for step in steps]) for column in steps[0]}
         for column in joint.keys() & DECIMALS.keys():
             joint[column] = joint[column].round(DECIMALS[column])
         yield joint, np.concatenate(places[point])
+
+
+def _below(arrays: Sequence[Floats]) -> Floats:
+    if arrays[0].ndim == 1:
+        return np.concatenate(arrays)
+    wide = max(array.shape[1] for array in arrays)
+    rows = [np.pad(a, ((0, 0), (0, wide - a.shape[1])), constant_values=np.nan) for a in arrays]
+    return np.concatenate(rows)
 
 
 @dataclass(frozen=True)

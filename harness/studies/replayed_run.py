@@ -35,7 +35,7 @@ from harness.evaluate.asking import EGO, Asker, wanted_in
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
-from harness.evaluate.walk import Ask, Fuses
+from harness.evaluate.walk import Fuses
 from harness.prompts import versions
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
@@ -44,7 +44,7 @@ from harness.runs.records import Answer
 from harness.runs.sources import PROMPTS, prompt_of
 from harness.runs.unanswered import tally
 from harness.studies.axes import Setting
-from harness.studies.play import WalkResult, walk_through
+from harness.studies.play import Read, WalkResult, metric_columns, walk_through
 
 WALKS = 1 << 17  # most that are walked together, unless one grid point has more: some 120 MB
 _GIVE_IT = "to ask it, give --model with its folder, .gguf file or hub id, or write a card models/NAME.toml"
@@ -171,8 +171,10 @@ class ReplayedRun:
             "decision_points_without_answer": sorted(self.left_out),
         }  # fmt: skip
 
-    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Sequence[WalkResult]]:
-        """Walk all episodes, with the ego and so many of the nearest vehicles.
+    def walked(
+        self, settings: Sequence[Setting], seeds: Sequence[int], read: Read = metric_columns
+    ) -> Iterator[Sequence[WalkResult]]:
+        """Walk all episodes, with the ego and so many of the nearest vehicles; `read` has their columns.
 
         Raises:
             UserError: a point has the run's model fuse, and it cannot.
@@ -183,30 +185,24 @@ class ReplayedRun:
         for vehicles, alike in groupby(settings, lambda setting: setting.vehicles):
             points = [setting.point for setting in alike]
             for first in range(0, len(points), at_once):
-                yield from self._walked(points[first : first + at_once], vehicles, seeds)
+                yield from self._walked(points[first : first + at_once], vehicles, seeds, read)
 
     def _walked(
-        self, points: Sequence[OperatingPoint], vehicles: int, seeds: Sequence[int]
+        self, points: Sequence[OperatingPoint], vehicles: int, seeds: Sequence[int], read: Read
     ) -> Iterator[Sequence[WalkResult]]:
         """Yield the same at points that are walked together."""
         different = list(dict.fromkeys(points))
         world = FrozenWorld(self.dataset, different, seeds)
-        ask = self.asked_in(world, different, vehicles - 1)
-        walks = walk_through(world, different, ask, seeds, world.numbers, self.spec.ties)
+
+        def leave_out(moments: Bools) -> None:
+            for point in different:
+                world.leave_out(point, moments)
+
+        ask = _Nearest(self, vehicles - 1, leave_out)
+        walks = walk_through(world, different, ask, seeds, world.numbers, self.spec.ties, read)
         walked = dict(zip(different, walks, strict=True))
         for point in points:
             yield [WalkResult(world.numbers, world.ends(point), *walked[point])]
-
-    def asked_in(
-        self, world: FrozenWorld, points: Sequence[OperatingPoint], helpers: int | None = None
-    ) -> Ask[Scene]:
-        """Return what answers a walk of this world, with so many of the nearest helpers; None for all."""
-
-        def leave_out(moments: Bools) -> None:
-            for point in points:
-                world.leave_out(point, moments)
-
-        return _Nearest(self, self.vehicles - 1 if helpers is None else helpers, leave_out)
 
     def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> Floats:
         """Return joules of each vehicle's answer, (n, 1+H); NaN where unknown."""

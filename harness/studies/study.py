@@ -11,7 +11,6 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT
 from harness.core.files import bytes_of, neutral, replacing, text_of, write_whole
@@ -174,22 +173,21 @@ class Cells:
     def _read(self, data: bytes) -> Iterator[tuple[tuple[Any, ...], dict[str, Any]]]:
         for line in data.splitlines():
             try:
-                cell = json.loads(line)
-                if cell["of"] == self._of:
-                    yield tuple(cell["key"]), {k: _array(v) for k, v in cell["values"].items()}
-            except (ValueError, KeyError, TypeError):
+                kept = json.loads(line)
+                if kept["of"] == self._of:
+                    yield tuple(kept["key"]), {k: _array(v) for k, v in kept["cell"].items()}
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
                 continue
 
     def part(self, key: Sequence[Any], compute: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
-        """Return a part as it was kept, to the last bit, or else compute it and keep it."""
+        """Return a part as it was kept, to the last bit, or else compute it and keep it.
+
+        Its values are plain, or arrays of two axes.
+        """
         if (kept := self._cells.get(tuple(key))) is not None:
             return kept
         values = compute()
-        plain = {
-            name: {"array": _exact(value)} if isinstance(value, np.ndarray) else value
-            for name, value in values.items()
-        }
-        line = json.dumps({"of": self._of, "key": key, "values": plain})
+        line = json.dumps({"of": self._of, "key": key, "cell": values}, default=np.ndarray.tolist)
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("ab") as file:
             file.write(b"\n" * self._torn + line.encode() + b"\n")
@@ -197,12 +195,9 @@ class Cells:
         return values
 
 
-def _exact(rows: Floats) -> list[list[float | None]]:
-    return [[None if np.isnan(x) else float(x) for x in row] for row in rows]
-
-
 def _array(value: Any) -> Any:
-    return np.array(value["array"], dtype=float) if isinstance(value, dict) else value
+    nested = isinstance(value, list) and value and isinstance(value[0], list)
+    return np.array(value, dtype=float) if nested else value
 
 
 def _lasting(key: str, value: Any) -> Any:

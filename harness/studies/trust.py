@@ -4,7 +4,7 @@ A run's stored answers are played again under each rule, attack and share of att
 same episodes, channel draws and attackers, so differences are paired by episode.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property, partial
@@ -19,17 +19,21 @@ from harness.coordination.rules import EGO_PROMPT
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
+from harness.core.figures import as_mapping, shown
 from harness.core.files import digest
-from harness.core.multiplicity import LEVEL, holm
+from harness.core.multiplicity import LEVEL
 from harness.core.statistics import Estimate, negative_log_likelihood, resampled, resampled_estimate
 from harness.core.versions import versions
 from harness.dataset.load import Scene
-from harness.evaluate.frozen_world import FrozenWorld
-from harness.evaluate.walk import Decided, walk
+from harness.evaluate.walk import Decided
 from harness.radio.profiles import CHANNELS
+from harness.report.document import Table, strong
 from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
+from harness.studies.axes import Setting
+from harness.studies.figures.heat_map import heat_map
+from harness.studies.play import WalkResult
 from harness.studies.replayed_run import ReplayedRun
-from harness.studies.study import Cells, refuse_other
+from harness.studies.study import Cells, Study, corrected, ends, refuse_other
 from harness.studies.sweep import point_of
 
 RESAMPLES = 2000
@@ -38,6 +42,7 @@ TRUSTED = 0.5  # of trust; below it a helper is taken for an attacker
 PEACE, EXCLUDED = "", "absent"
 BASE = "linear"
 CAPPED = "linear:weight_cap=0.3"
+LOSES, COSTS = 2.0, 1.0  # points: what a robust rule may lose under an attack, and cost in peace
 
 
 @dataclass(frozen=True)
@@ -55,13 +60,13 @@ class Cell:
     flagged: Floats | None  # (4, E); None of a rule that judges nobody
     first: Sequence[int]  # messages until an attacker was suspected, by attacker, episode and seed; 0: never
 
-    def detection(self) -> Mapping[str, Estimate] | None:
-        """Return precision, recall, F1 and false alarms of messages; None if the rule judges nobody.
+    def detection(self) -> dict[str, Estimate]:
+        """Return precision, recall, F1 and false alarms of messages; nothing if the rule judges nobody.
 
         False alarms are the share of honest messages that were suspected. Intervals resample episodes.
         """
         if self.flagged is None:
-            return None
+            return {}
         n = self.flagged.shape[1]
         times = resampled(noise.generator("trust", "detection"), n, RESAMPLES)
         hits, misses, wrongs, rights = (times @ counts for counts in self.flagged)
@@ -75,9 +80,14 @@ class Cell:
         return {name: resampled_estimate(values, n) for name, values in shares.items()}
 
     @property
+    def caught(self) -> list[int]:
+        """Messages until an attacker was suspected, of those that were."""
+        return [n for n in self.first if n]
+
+    @property
     def time_to_detection(self) -> float:
-        """Median of the messages until an attacker is suspected, of those that are; NaN if none is."""
-        return float(np.median(caught)) if (caught := [n for n in self.first if n]) else float("nan")
+        """Median of `caught`; NaN if no attacker is."""
+        return float(np.median(self.caught)) if self.caught else np.nan
 
 
 def under(point: OperatingPoint, rule: str, attack: str, share: float) -> OperatingPoint:
@@ -123,41 +133,42 @@ def shares_of(text: str) -> tuple[float, ...]:
 
 def play(run: ReplayedRun, point: OperatingPoint, seeds: Sequence[int], key: Key) -> Cell:
     """Play one cell: a rule, an attack and a share."""
-    at = under(point, *key)
-    world = FrozenWorld(run.dataset, [at], seeds)
-    parts = [part for [part] in walk(world, [at], run.asked_in(world, [at]), run.spec.ties)]
-    ends, shape = world.ends(at), (len(seeds), len(world.numbers))
-    row, column = ({number: n for n, number in enumerate(of)} for of in (seeds, world.numbers.tolist()))
-    places = [row[seed] * shape[1] + column[episode] for part in parts for episode, seed in part.due.episodes]
-    nats = mean_by_place(
-        np.concatenate([_nats(run, p) for p in parts]), np.array(places), shape[0] * shape[1]
-    )
-    nats = np.where(np.isnan(ends[SUCCESS]), np.nan, nats.reshape(shape))  # left out
-    return Cell(*key, ends[SUCCESS], ends["unsafe_rate"], nats, *_flagged(parts, column))
+    setting = Setting(point.name, under(point, *key), run.vehicles)
+    [[result]] = run.walked([setting], seeds, partial(_judged, run))
+    success = result.ends[SUCCESS]
+    nats = mean_by_place(result.columns["nats"], result.places, success.size).reshape(success.shape)
+    nats[np.isnan(success)] = np.nan  # left out
+    return Cell(*key, success, result.ends["unsafe_rate"], nats, *_flagged(result))
 
 
-def _nats(run: ReplayedRun, part: Decided[Scene]) -> Floats:
-    """-ln of what each decision's policy gives to safe actions, (n,); NaN where none is safe."""
-    forest = run.dataset.forest
+def _judged(run: ReplayedRun, part: Decided[Scene]) -> dict[str, Floats]:
+    """Return the columns of a cell's decisions: `nats`, (n,), and of their messages, (n, H).
+
+    `suspected` is NaN where nobody was heard or the rule judges nobody.
+    """
+    forest, trust = run.dataset.forest, part.result.trust
     at = np.array([forest.place[scene.id] for scene in part.moments])[part.due.at]
-    return negative_log_likelihood(part.result.fused, forest.safe[at])
+    return {
+        "nats": negative_log_likelihood(part.result.fused, forest.safe[at]),
+        "suspected": np.where(np.isnan(trust), np.nan, trust < TRUSTED),
+        "attacks": part.said.attackers.astype(float),
+    }
 
 
-def _flagged(parts: Sequence[Decided[Scene]], column: Mapping[int, int]) -> tuple[Floats | None, list[int]]:
-    counts, judged = np.zeros((4, len(column))), False
-    heard: dict[tuple[int, int, int], int] = {}
-    first: dict[tuple[int, int, int], int] = {}
-    for part in parts:
-        trust, attackers = part.result.trust, part.said.attackers
-        for n, h in zip(*np.nonzero(~np.isnan(trust)), strict=True):
-            judged, helper = True, (*part.due.episodes[n], int(h))
-            suspected, attacks = bool(trust[n, h] < TRUSTED), bool(attackers[n, h])
-            counts[2 * (not attacks) + (not suspected), column[helper[0]]] += 1
-            if attacks:
-                heard[helper] = heard.get(helper, 0) + 1
-                if suspected:
-                    first.setdefault(helper, heard[helper])
-    return (counts if judged else None), [first.get(helper, 0) for helper in heard]
+def _flagged(result: WalkResult) -> tuple[Floats | None, list[int]]:
+    import pandas as pd
+
+    suspected, attacks = result.columns["suspected"], result.columns["attacks"]
+    if np.isnan(suspected).all():
+        return None, []
+    episode, n = result.places % len(result.episodes), len(result.episodes)
+    kinds = [(suspected == s) & (attacks == a) for a, s in product((1.0, 0.0), repeat=2)]
+    counts = np.array([np.bincount(episode, kind.sum(axis=1), n) for kind in kinds])
+    decision, helper = np.nonzero(~np.isnan(suspected) & (attacks == 1))
+    sender = pd.Series(result.places[decision] * attacks.shape[1] + helper)
+    number = sender.groupby(sender).cumcount() + 1
+    first = number.where(suspected[decision, helper] == 1).groupby(sender).min().fillna(0)
+    return counts, first.astype(int).tolist()
 
 
 @dataclass(frozen=True)
@@ -204,19 +215,15 @@ class Bench:
         return difference(SUCCESS, self.at(rule, attack, share).success.T, self.at(rule).success.T)
 
     @cached_property
-    def holm(self) -> Mapping[Key, float]:
+    def holm(self) -> Mapping[Key, float | None]:
         """P of no difference to the linear pool under the same attack, by Holm's method over the grid."""
-        p_values = {
-            key: p_value(SUCCESS, cell.success.T, self.at(BASE, *key[1:]).success.T)
-            for key, cell in self.cells.items()
-            if cell.rule != BASE and cell.attack not in (PEACE, EXCLUDED)
-        }
-        known = {key: p for key, p in p_values.items() if p is not None}
-        return dict(zip(known, holm(list(known.values())), strict=True))
+        keys = [key for key in self.cells if key[0] != BASE and key[1] not in (PEACE, EXCLUDED)]
+        pairs = ((self.cells[key].success.T, self.at(BASE, *key[1:]).success.T) for key in keys)
+        return dict(zip(keys, corrected([p_value(SUCCESS, *pair) for pair in pairs]), strict=True))
 
     def clear(self, *key: Any) -> bool:
         """Return whether a rule differs from the linear pool under an attack by more than chance explains."""
-        return self.holm.get(key, 1.0) <= LEVEL
+        return (self.holm.get(key) or 1.0) <= LEVEL
 
     def worst(self, rule: str, share: float) -> str:
         """Return the attack under which a rule succeeds least."""
@@ -261,10 +268,11 @@ def run_bench(
     refuse_other(
         out, "trust", {"sources": [{"name": run.name}], "dataset": run.run.source, "condition": condition}
     )
-    every = [
-        *((rule, PEACE, 0.0) for rule in dict.fromkeys([BASE, *rules])),
+    every_rule = dict.fromkeys([BASE, *rules])
+    every: list[Key] = [
+        *((rule, PEACE, 0.0) for rule in every_rule),
         *((BASE, EXCLUDED, share) for share in shares),
-        *product(dict.fromkeys([BASE, *rules]), attacks, shares),
+        *product(every_rule, attacks, shares),
     ]
     depends_on = [
         run.manifest(), str(run.run.manifest.identity), point.record(), list(seeds),
@@ -272,18 +280,158 @@ def run_bench(
     ]  # fmt: skip
     kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[Key, Cell]()
 
-    def compute(key: Key) -> Mapping[str, Any]:
-        values = vars(play(run, point, seeds, key))
+    def compute(key: Key) -> dict[str, Any]:
+        cell = play(run, point, seeds, key)
         run.settle()
-        return {name: value for name, value in values.items() if name not in ("rule", "attack", "share")}
+        return vars(cell)
 
     more(len(every))
     for key in every:
-        cells[key] = Cell(*key, **kept.part(key, partial(compute, key)))
+        cells[key] = Cell(**kept.part(key, partial(compute, key)))
         progress(1)
-    never = FrozenWorld(run.dataset, [alone := OperatingPoint.of("never asks")], seeds)
-    for _ in walk(never, [alone], run.asked_in(never, [alone]), run.spec.ties):
-        pass
+    [[alone]] = run.walked([Setting(condition, OperatingPoint.of("never asks"), run.vehicles)], seeds)
     run.settle()
-    success = never.ends(alone)[SUCCESS]
-    return Bench(run.name, run.run.source, condition, tuple(seeds), cells, success, run.caveats)
+    return Bench(run.name, run.run.source, condition, tuple(seeds), cells, alone.ends[SUCCESS], run.caveats)
+
+
+def trust_study(bench: Bench) -> Study:
+    """Declare the study of a bench: a heat map, tables of rules and of success a share, and of detection."""
+    import pandas as pd
+
+    attacks = (PEACE, *bench.attacks)
+    panels = {
+        _title(share): np.array([
+            [100 * bench.success(rule, attack, share * bool(attack)).value for rule in bench.rules]
+            for attack in attacks
+        ])
+        for share in bench.shares
+    }  # fmt: skip
+    rows = [row for cell in bench.cells.values() for row in _rows(bench, cell)]
+    cells = [
+        {"rule": c.rule, "attack": c.attack or None, "share": c.share,
+         "success": as_mapping(over_episodes(SUCCESS, c.success)),
+         "detection": {k: as_mapping(e) for k, e in c.detection().items()} or None}
+        for c in bench.cells.values()
+    ]  # fmt: skip
+    n = bench.price(BASE).n
+    return Study(
+        "trust", f"Consensus rules under attack: {bench.name} on {bench.source}", headline(bench),
+        [
+            f"n = {n} episodes × {len(bench.seeds)} channel seeds under {bench.condition}. All cells have "
+            "the same episodes, channel draws and attackers, so differences are paired by episode; 95 % "
+            "intervals are over episodes. Price in peace: the difference in success from linear while "
+            "nobody attacks, in points. All figures are in figures.csv."
+        ],
+        [table for share in bench.shares for table in _tables(bench, share)] + [*_detections(bench)],
+        {"figures": pd.DataFrame(rows)},
+        {
+            "sources": [{"name": bench.name}], "dataset": bench.source, "condition": bench.condition,
+            "rules": list(bench.rules), "attacks": list(bench.attacks), "shares": list(bench.shares),
+            "versions": versions(),
+        },
+        {"run": bench.name, "dataset": bench.source, "condition": bench.condition, "cells": cells},
+        {"heat-map": heat_map(panels, ["nobody attacks", *bench.attacks], bench.rules)}, bench.caveats,
+    )  # fmt: skip
+
+
+def headline(bench: Bench) -> list[str]:
+    """Say what asking is worth in peace, what the worst attack takes from linear, and who withstands it."""
+    share, peace = bench.shares[0], bench.success(BASE)
+    alone, worst = over_episodes(SUCCESS, bench.alone), bench.worst(BASE, share)
+    best = max(bench.rules, key=lambda rule: bench.mean(rule, share).value)
+    sentences = [
+        f"While nobody attacks, {shown(peace)} % of episodes succeed under the linear pool, and "
+        f"{shown(alone)} % with an ego that never asks.",
+        f"If {100 * share:.0f} % of the helpers attack, {worst} harms the linear pool most: "
+        f"{shown(bench.success(BASE, worst, share))} % succeed.",
+        f"On average over all {len(bench.attacks)} attacks, {best} succeeds most often, in "
+        f"{shown(bench.mean(best, share))} % (linear: {shown(bench.mean(BASE, share))}); its price in "
+        f"peace, in points: {_price(bench, best)}.",
+    ]
+    if "liar+spoof" in bench.attacks:
+        robust = [
+            rule
+            for rule in bench.rules
+            if 100 * bench.price(rule).value >= -COSTS
+            and 100 * bench.loss(rule, "liar+spoof", share).value >= -LOSES
+        ]
+        sentences.append(
+            f"Rules that lose {LOSES:g} points or less to a liar at a spoofed place, and cost {COSTS:g} "
+            f"point or less in peace: {', '.join(robust) or 'none'}."
+        )
+    return sentences
+
+
+def _price(bench: Bench, rule: str) -> str:
+    return "–" if rule == BASE else shown(bench.price(rule))
+
+
+def _title(share: float) -> str:
+    return f"{100 * share:.0f} % of the helpers attack"
+
+
+def _tables(bench: Bench, share: float) -> Iterator[Table]:
+    rows: list[Sequence[str]] = [
+        (
+            rule, _price(bench, rule), shown(bench.mean(rule, share)), attack := bench.worst(rule, share),
+            shown(bench.success(rule, attack, share)),
+        )
+        for rule in bench.rules
+    ]  # fmt: skip
+    heads = ("rule", "price in peace", "mean of attacks %", "worst attack", "there %")
+    yield Table(_title(share), heads, rows, terminal=range(len(heads)))
+    rows = [("nobody attacks", *(shown(bench.success(rule)) for rule in bench.rules))]
+    rows += [
+        (attack, *(
+            strong(shown(bench.success(rule, attack, share)), bench.clear(rule, attack, share))
+            for rule in bench.rules
+        ))
+        for attack in bench.attacks
+    ]  # fmt: skip
+    yield Table(
+        f"{_title(share)}: success, %", ("attack", *bench.rules), rows,
+        "Bold: the rule differs from the linear pool under the same attack, with p at most 0.05 after Holm's "
+        "correction over the grid. For comparison, a linear pool that knows the attackers and does not hear "
+        f"them succeeds in {shown(bench.success(BASE, EXCLUDED, share))} %.",
+    )  # fmt: skip
+
+
+def _detections(bench: Bench) -> Iterator[Table]:
+    """Yield how rules that judge helpers find attackers, and whom they take for one in peace."""
+    for rule in bench.rules:
+        rows = [
+            (
+                c.attack or "nobody attacks", f"{c.share:.2f}", *map(shown, c.detection().values()),
+                "–" if not c.caught else f"{c.time_to_detection:.0f}", f"{len(c.caught)} of {len(c.first)}",
+            )
+            for c in bench.cells.values() if c.rule == rule and c.flagged is not None
+        ]  # fmt: skip
+        if rows:
+            yield Table(
+                f"How well {rule} finds attackers",
+                ("attack", "share", "precision %", "recall %", "F1 %", "false alarms %",
+                 "messages until an attacker is found, median", "attackers found"), rows,
+                "Counted over messages that were heard. An attack that leaves a message unchanged cannot be "
+                "found in it. The rule's parameters were chosen on tune layouts.",
+            )  # fmt: skip
+
+
+def _rows(bench: Bench, cell: Cell) -> Iterator[dict[str, Any]]:
+    key = cell.rule, cell.attack, cell.share
+    place = {"rule": cell.rule, "attack": cell.attack or "none", "share": cell.share}
+    estimates = {
+        SUCCESS: over_episodes(SUCCESS, cell.success),
+        "unsafe_rate": over_episodes("unsafe_rate", cell.unsafe),
+        "nats": over_episodes("nats", cell.nats),
+        **{f"detection_{name}": e for name, e in cell.detection().items()},
+    }
+    if cell.attack == PEACE:
+        estimates["price_in_peace"] = bench.price(cell.rule)
+    elif cell.attack != EXCLUDED:
+        estimates["loss_to_attack"] = bench.loss(*key)
+    for name, e in estimates.items():
+        p = bench.holm.get(key) if name == SUCCESS else None
+        yield {**place, "metric": name, **ends(e), "p_holm_against_linear": p}
+    if cell.flagged is not None:
+        found = {"value": cell.time_to_detection, "n": len(cell.caught)}
+        yield {**place, "metric": "messages_to_detection", **found}

@@ -24,11 +24,12 @@ from harness.studies.trust import (
     EXCLUDED,
     PEACE,
     Bench,
+    headline,
     names_of,
     run_bench,
     shares_of,
+    trust_study,
 )
-from harness.studies.trust_study import headline, trust_study
 
 ATTACKED = named_point("6g:attack=liar:share=1/3+spoof:share=1/3")
 RULES, ATTACKS, THIRD = ("linear", "trust", "linear:weight_cap=0.3"), ("liar+spoof", "stale"), 1 / 3
@@ -67,13 +68,12 @@ def test_every_rule_meets_every_attack_and_peace_and_the_reference_is_there(benc
 
 def test_a_liar_at_a_false_place_is_found_and_nobody_is_while_nobody_lies(bench: Bench) -> None:
     found = bench.at("trust", "liar+spoof", THIRD).detection()
-    assert found is not None
     assert found["recall"].value > 0.5
     assert found["precision"].value > 0.5
     peace = bench.at("trust").flagged
     assert peace is not None
     assert peace[:2].sum() == 0
-    assert bench.at("linear", "liar+spoof", THIRD).detection() is None
+    assert bench.at("linear", "liar+spoof", THIRD).detection() == {}
 
 
 def test_a_loss_is_paired_with_the_same_rule_in_peace(bench: Bench) -> None:
