@@ -12,10 +12,10 @@ from harness.cli.estimates import console, echo_json, table
 from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.core.errors import UserError, printable
-from harness.core.figures import PLAIN, as_mapping, shown
+from harness.core.figures import as_mapping, shown
 
 if TYPE_CHECKING:
-    from harness.studies.rank import Standing
+    from harness.core.statistics import Estimate
 
 
 Dataset = Annotated[
@@ -146,7 +146,7 @@ def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: opti
 
     who = options.workers_of(workers)
     data = load.load(load.find(dataset))
-    from harness.studies.rank import rank
+    from harness.studies.fidelity import rank
 
     episodes = data.manifest.episodes
     with bar(f"driving {printable(data.name, 30)}", episodes) as progress:
@@ -157,21 +157,25 @@ def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: opti
         _table(episodes, standings)
 
 
-def _as_mapping(name: str, episodes: int, standings: dict[str, "Standing"]) -> dict[str, Any]:
-    drivers = {
-        driver: {k: as_mapping(getattr(s, k)) for k in ("frozen", "live", "difference_points", "agreement")}
-        for driver, s in standings.items()
-    }
+def _as_mapping(name: str, episodes: int, standings: dict[str, dict[str, "Estimate"]]) -> dict[str, Any]:
+    drivers = {}
+    for driver, s in standings.items():
+        points = {end: 100 * getattr(s["difference"], end) for end in ("value", "low", "high")}
+        estimates = {
+            "frozen": s["frozen"], "live": s["closed"],
+            "difference_points": replace(s["difference"], **points), "agreement": s["agreement"],
+        }  # fmt: skip
+        drivers[driver] = {name: as_mapping(each) for name, each in estimates.items()}
     return {"dataset": name, "episodes": episodes, "drivers": drivers}
 
 
-def _table(episodes: int, standings: dict[str, "Standing"]) -> None:
+def _table(episodes: int, standings: dict[str, dict[str, "Estimate"]]) -> None:
     heads = ("driver", "frozen % [95 % CI]", "closed loop % [95 % CI]", "difference, pts", "same %")
-    rows = []
-    for driver, s in standings.items():
-        agreement = f"{100 * s.agreement.value:.0f}"
-        rows.append((driver, shown(s.frozen), shown(s.live), shown(s.difference_points, PLAIN), agreement))
-    table(heads, rows)
+    table(heads, [
+        (driver, *(shown(s[name]) for name in ("frozen", "closed", "difference")),
+         f"{100 * s['agreement'].value:.0f}")
+        for driver, s in standings.items()
+    ])  # fmt: skip
     text = console()
     text.print(f"n = {episodes} episodes; same: share of them that end alike, frozen and in closed loop")
     text.print(

@@ -1,10 +1,10 @@
-"""`harness study fidelity`: how far success on frozen scenes is success in closed loop.
+"""How far success on frozen scenes is success in closed loop, of models' runs and of the reference drivers.
 
 Runs of the same model, prompt and answer mode are compared episode by episode: the same layout, condition and
 channel seed.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,18 +12,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec.structs import asdict
 
+from harness.core.arrays import Floats
 from harness.core.errors import UserError
-from harness.core.statistics import rate_difference
+from harness.core.parallel import Workers
+from harness.core.statistics import Estimate
 from harness.core.versions import versions
+from harness.dataset.load import Dataset
 from harness.report.document import Table
 from harness.runs.folder import read
-from harness.runs.metrics import World, over_episodes
+from harness.runs.metrics import SUCCESS, World, difference, over_episodes
 from harness.runs.records import Variant
-from harness.studies.figures.points import scatter
-from harness.studies.study import Study, percent
+from harness.world.drivers import DRIVERS
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from harness.studies.study import Study
 
 WHO = Variant.__struct_fields__
 KEY = (*WHO, "condition", "seed", "layout_seed")
@@ -104,16 +108,30 @@ def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
     for place, group in both.groupby([*WHO, "condition"], sort=False):
         wide = group.pivot(index="seed", columns="layout_seed", values=["success_frozen", "success_closed"])
         frozen, closed = (wide[f"success_{kind}"].to_numpy(dtype=float) for kind in ("frozen", "closed"))
-        estimates = {
-            "frozen": over_episodes("success_rate", frozen),
-            "closed": over_episodes("success_rate", closed),
-            "difference": rate_difference(frozen.T, closed.T),
-            "agreement": over_episodes("agreement_rate", (frozen == closed).astype(float)),
-        }
         row = dict(zip((*WHO, "condition"), place, strict=True))
-        for name, e in estimates.items():
+        for name, e in compared(frozen, closed).items():
             row |= {f"{name}{end}": value for end, value in zip(ENDS, (e.value, e.low, e.high), strict=True)}
         yield {**row, "n": group.layout_seed.nunique()}
+
+
+def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
+    """Return the estimates of `COMPARED` from the success of the same episodes in both worlds, (S, E)."""
+    both = difference(SUCCESS, frozen.T, closed.T)
+    same = over_episodes("agreement_rate", (frozen == closed).astype(float))
+    worlds = [over_episodes(SUCCESS, success) for success in (frozen, closed)]
+    return dict(zip(COMPARED, (*worlds, both, same), strict=True))
+
+
+def rank(
+    dataset: Dataset, workers: Workers, progress: Callable[[int], None]
+) -> dict[str, dict[str, Estimate]]:
+    """Return each reference driver's `COMPARED` over a dataset's episodes, every one of which it drives."""
+    from harness.world.reference import drive_apart
+
+    ends = drive_apart(dataset.scenario, dataset.seeds, workers, progress)
+    frozen = dataset.reference_success()
+    closed = {driver: np.array([[float(of[driver].success) for of in ends]]) for driver in DRIVERS}
+    return {driver: compared(frozen[driver][None], closed[driver]) for driver in DRIVERS}
 
 
 def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
@@ -128,8 +146,11 @@ def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
     return counts.sort_values("count", ascending=False, kind="stable")
 
 
-def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> Study:
+def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
     """Declare the study of a comparison."""
+    from harness.studies.figures.points import scatter
+    from harness.studies.study import Study, percent
+
     rows: list[dict[Any, Any]] = result.table.to_dict("records")
     differing = disagreements(result.episodes).head(SHOWN).to_dict("records")
     heads = (PLACE, "frozen %", "closed loop %", "difference, points", "same %", "n")
