@@ -35,9 +35,8 @@ from harness.coordination.trigger import entropy_nats, normalised_entropy, trigg
 from harness.core.arrays import Bools, Floats, Ints, any_of, count_of
 from harness.core.errors import UserError, printable
 from harness.core.statistics import known_mean
-from harness.radio.channel import Channel, Draws, Links, Physical
+from harness.radio.channel import Channel, Draws, Links
 from harness.radio.roadside import Consulted, by_unit
-from harness.radio.wrapped import innermost
 
 
 @dataclass(frozen=True)
@@ -153,11 +152,8 @@ def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
         return known.may_ask
     worth = _worth(point, known, intents, draws)
     asked = chosen(worth, point.ask.above, known.may_ask, intents.range_m, point.ask.max_helpers)
-    channel = innermost(point.channel)
-    loaded = (
-        getattr(channel, "density_coupled", not isinstance(channel, Physical)) or point.radio.helper_rounds
-    )
-    return any_of(asked)[..., None] & known.may_ask if loaded else asked
+    coupled = getattr(point.channel, "density_coupled", point.physical is None)
+    return any_of(asked)[..., None] & known.may_ask if coupled or point.radio.helper_rounds else asked
 
 
 def _infers(point: OperatingPoint, intents: Intents, asked: Bools) -> Bools:
@@ -183,11 +179,11 @@ def _ask_helpers(
         asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & opens_round,
         point.ask.request_bits, intents.site,
     )  # fmt: skip
-    if point.radio.edge == FUSION and point.unit and isinstance(point.channel, Physical):
+    if point.radio.edge == FUSION and point.physical and point.unit:
         until_s = np.maximum(point.fusion.window_s, request_s[..., 0])
         remaining_s = until_s - request_s[..., 0]
         outcome = by_unit(
-            point.channel, point.unit, point.radio.edge_delay_s, links, draws, ready, remaining_s
+            point.physical, point.unit, point.radio.edge_delay_s, links, draws, ready, remaining_s
         )
         return request_s, outcome, until_s
     return request_s, _ask_directly(point.channel, links, draws, ready), np.array(np.inf)

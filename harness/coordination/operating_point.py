@@ -167,6 +167,11 @@ class OperatingPoint:
             raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
         return channel
 
+    @cached_property
+    def physical(self) -> Physical | None:
+        """The channel if its losses follow from where vehicles are; None if it has one loss for all links."""
+        return self.channel if isinstance(self.channel, Physical) else None
+
     def _relayed(self, channel: Channel) -> Channel:
         """Return a channel without places, with the relay as a second path of the same kind."""
         profile = self.radio.profile
@@ -186,7 +191,7 @@ class OperatingPoint:
     @property
     def unit(self) -> Unit | None:
         """The roadside unit; None if there is none, or none with a place."""
-        return self._unit if self.radio.edge != "none" and isinstance(self.channel, Physical) else None
+        return self._unit if self.radio.edge != "none" and self.physical else None
 
     @cached_property
     def network(self) -> Network | None:

@@ -14,7 +14,6 @@ from harness.backends import devices
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError, printable
 from harness.evaluate.fusion import key_of
-from harness.radio.channel import Physical
 from harness.radio.wrapped import innermost
 from harness.runs.decisions import Decisions
 from harness.runs.devices import Constant, Device, DeviceRow, Speed
@@ -168,7 +167,7 @@ def radio_j(device: Device, point: "OperatingPoint", airtime_s: Floats, messages
     A radio model has frames of its own, with what they hold besides a message. A declared channel has bits
     and a bandwidth alone, so there each message takes a frame of the device profile at least.
     """
-    if device.frame_ms is not None and not isinstance(innermost(point.channel), Physical):
+    if device.frame_ms is not None and not point.physical:
         airtime_s = np.maximum(airtime_s, messages * device.frame_ms.value / 1000)
     return transmit_watts(device, point) * airtime_s
 

@@ -25,7 +25,7 @@ from harness.evaluate.attackers import Attackers, Said
 from harness.evaluate.claims import claims
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.outlook import outlook
-from harness.radio.channel import Draws, Physical, Site, Unit
+from harness.radio.channel import Draws, Site, Unit
 from harness.radio.fading import Trips
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
 from harness.world.scenario import Scenario
@@ -146,7 +146,7 @@ def walk(
     """
     memories = {point: Memory() for point in points}
     attackers = {point: Attackers(point) for point in points}
-    physical = {point for point in points if isinstance(point.channel, Physical)}
+    physical = {point for point in points if point.physical}
     while moments := world.observe():
         intents = ask(moments)
         due = {point: each for point in points if len((each := world.due(point)).at)}
@@ -350,8 +350,7 @@ def tie_draws(draws: Draws, ties: str) -> TieDraws | None:
 @lru_cache(maxsize=1 << 10)
 def busy_ratio(point: OperatingPoint) -> float:
     """Return the channel busy ratio under the background load; NaN if the channel has no such figure."""
-    channel = point.channel
-    return channel.busy_ratio() if isinstance(channel, Physical) else float("nan")
+    return point.physical.busy_ratio() if point.physical else float("nan")
 
 
 def columns(decided: Decided[Any]) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from harness.dataset.forest import Forest
 from harness.evaluate.device import helpers_j
 from harness.evaluate.outlook import outlook
 from harness.evaluate.walk import channel_draws, tie_draws
-from harness.radio.channel import Draws, Physical
+from harness.radio.channel import Draws
 from harness.studies.replayed_run import ReplayedRun
 from harness.world.sight_lines import site
 
@@ -178,7 +178,7 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
     scenario, shape = dataset.scenario, (len(seeds), len(at))
     scenes = dataset.scenes([forest.ids[n] for n in at.tolist()])
     intents = replace(stored.whole(scenes), outlook=outlook(scenario.road(), scenes))
-    if isinstance(point.channel, Physical):
+    if point.physical:
         moments = [(scene.state, scene.viewers) for scene in scenes]
         units = [point.unit] if point.unit else []
         intents = replace(intents, site=site(moments, units, scenario.road().zone_m))
