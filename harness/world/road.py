@@ -6,6 +6,7 @@ towards +y.
 
 import math
 from bisect import bisect_right
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -16,15 +17,13 @@ import numpy as np
 import shapely
 from shapely import LineString, intersection
 
-from harness.core.arrays import Floats, Ints
+from harness.core.arrays import Floats
 
 Side = Literal["own", "left", "right"]  # of the ego's ways, from the one that it is on
 PathKey = tuple[str, str]  # approach and route
 Lane = tuple[str, str, int]  # highway-env's lane index: two nodes, and a number from the left
 STEP_M = 0.25  # distance between the points of a path
 ONE_LANE_M = 1.0  # ways nearer to each other than this share a lane
-CELL = 16  # points of a path among which the nearest is looked for at once
-NEAR_M = 1e-6  # far more than distances are rounded by
 BEND_M = 3.0  # distance before and after a point over which its curvature is measured
 STRIPED = 1  # highway-env's LineType of a line that may be crossed
 NORTH = np.array([1.0, -1.0])  # factors from this frame to that of pictures
@@ -100,14 +99,27 @@ class Path:
     @lru_cache(maxsize=8192)  # noqa: B019 paths live as long as their road, which is never freed
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
         """Return arc length (m), unsigned lateral offset (m) and heading (rad) of the nearest point."""
-        x, y = self.columns
-        gap = np.hypot(x - x_m, y - y_m)
-        i = int(gap.argmin())
-        heading = float(self.headings_rad[i])
-        dx, dy = x_m - x[i], y_m - y[i]
-        along = dx * np.cos(heading) + dy * np.sin(heading)
-        lateral = float(np.sqrt(max(gap[i] ** 2 - along**2, 0.0)))
-        return float(self.arc_m[i] + along), lateral, heading
+        arc, lateral, heading = self.project_all(np.array([x_m]), np.array([y_m]))[:, 0].tolist()
+        return arc, lateral, heading
+
+    def project_all(self, x_m: Floats, y_m: Floats) -> Floats:
+        """Return what `project` does for points (n,), as (3, n)."""
+        nearest = self._tree.query_nearest(shapely.points(x_m, y_m), all_matches=False)[1]
+        # Of equally near points the first counts, whichever the tree's rounding takes.
+        beside = np.clip(nearest[:, None] + [-1, 0, 1], 0, len(self.points) - 1)
+        gaps = np.hypot(self.columns[0][beside] - x_m[:, None], self.columns[1][beside] - y_m[:, None])
+        at = np.arange(len(nearest)), gaps.argmin(axis=1)
+        point, gap = beside[at], gaps[at]
+        heading = self.headings_rad[point]
+        along = (x_m - self.columns[0][point]) * np.cos(heading)
+        along += (y_m - self.columns[1][point]) * np.sin(heading)
+        # Python's squares are rounded alike on every machine.
+        squares = [max(g**2 - a**2, 0.0) for g, a in zip(gap.tolist(), along.tolist(), strict=True)]
+        return np.stack([self.arc_m[point] + along, np.sqrt(squares), heading])
+
+    @cached_property
+    def _tree(self) -> shapely.STRtree:
+        return shapely.STRtree(shapely.points(self.points))
 
     @lru_cache(maxsize=8192)  # noqa: B019
     def at(self, arc_m: float) -> tuple[float, float, float]:
@@ -220,29 +232,14 @@ class Road:
             if side == "own" or self.paths[way].project(x, y)[1] > ONE_LANE_M
         }
 
-    @cached_property
-    def number(self) -> Mapping[PathKey, int]:
-        """Number of each path in `project`, which is its place among `paths`."""
-        return {key: n for n, key in enumerate(self.paths)}
-
-    @cached_property
-    def _cells(self) -> "_Cells":
-        return _Cells.of(list(self.paths.values()))
-
-    def project(self, path: Ints, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Project points on paths of these numbers, all (n,), as `Path.project` does one after the other.
-
-        Returns:
-            Arc length (m), unsigned lateral offset (m) and heading (rad) of the nearest point, (n,).
-        """
-        return self._cells.project(path, x_m, y_m)
-
-    def near(self, x_m: Floats, y_m: Floats, within_m: float) -> Ints:
-        """Return which points (n,) may lie within a lateral offset of which paths: both numbers, (2, pairs).
-
-        All others do not, and few of these do not.
-        """
-        return self._cells.near(x_m, y_m, within_m)
+    def project(self, keys: Sequence[PathKey], x_m: Floats, y_m: Floats) -> Floats:
+        """Return what `Path.project` does for points, each on a path of its own, all (n,), as (3, n)."""
+        projected, places = np.empty((3, len(keys))), defaultdict[PathKey, list[int]](list)
+        for n, key in enumerate(keys):
+            places[key].append(n)
+        for key, some in places.items():
+            projected[:, some] = self.paths[key].project_all(x_m[some], y_m[some])
+        return projected
 
     @cached_property
     def forks(self) -> frozenset[tuple[PathKey, int]]:
@@ -266,92 +263,6 @@ class Road:
     def watched(self) -> Floats:
         """The points of all sectors in order, (points, 2) m."""
         return np.concatenate(list(self.sectors.values()))
-
-
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Points of all paths, in cells of CELL successive ones, to find the nearest without asking all."""
-
-    middles: Floats  # x and y of a point of each cell, (2, paths, cells); inf after the last one of a path
-    reach: Floats  # distance from there to the farthest point of the cell, (paths, cells)
-    begins: Ints  # number of the first point of each path, and the number of all points, (paths + 1,)
-    points: Floats  # of every point x, y, arc length, heading, and its cosine and sine, (6, points)
-    bends: Floats  # `_bends` of each path, (2, paths)
-
-    @classmethod
-    def of(cls, paths: Sequence[Path]) -> "_Cells":
-        most = max(math.ceil(len(path.points) / CELL) for path in paths)
-        middles, reach = np.full((2, len(paths), most), np.inf), np.zeros((len(paths), most))
-        for n, path in enumerate(paths):
-            for cell, begin in enumerate(range(0, len(path.points), CELL)):
-                points = path.points[begin : begin + CELL]
-                middles[:, n, cell] = middle = points[len(points) // 2]
-                reach[n, cell] = np.hypot(*(points - middle).T).max()
-        headings = np.concatenate([path.headings_rad for path in paths])
-        arcs = np.concatenate([path.arc_m for path in paths])
-        return cls(
-            middles, reach, np.cumsum([0, *(len(path.points) for path in paths)]),
-            np.stack([
-                *np.concatenate([path.columns for path in paths], axis=1),
-                arcs, headings, np.cos(headings), np.sin(headings),
-            ]),
-            np.array([_bends(path.points) for path in paths]).T,
-        )  # fmt: skip
-
-    def near(self, x_m: Floats, y_m: Floats, within_m: float) -> Ints:
-        """Do what `Road.near` says."""
-        x, y = x_m[:, None, None], y_m[:, None, None]
-        away = np.sqrt((self.middles[0] - x) ** 2 + (self.middles[1] - y) ** 2)
-        first, last = self.points[:2, self.begins[:-1]], self.points[:2, self.begins[1:] - 1]
-        ends = [np.hypot(end[0] - x[..., 0], end[1] - y[..., 0]) for end in (first, last)]
-        # Beyond its ends, a path continues straight.
-        beyond = np.minimum(*ends) <= away.min(axis=2) + NEAR_M
-        base, share = self.bends
-        straight = np.where(share < 1, 1 - share**2, np.nan)
-        root = np.sqrt((base * share) ** 2 + straight * (base**2 + within_m**2))
-        gap = (base * share + root) / straight  # gap**2 - (base + share * gap)**2 = within_m**2
-        gap = np.where(share < 1, gap, np.inf)
-        return np.array(np.nonzero(beyond | ((away - self.reach).min(axis=2) <= gap + NEAR_M)))
-
-    def project(self, path: Ints, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Do what `Road.project` says."""
-        if not len(path):
-            return np.empty(0), np.empty(0), np.empty(0)
-        (x, y), most = self.middles.take(path, axis=1), self.reach.shape[1]
-        away = np.sqrt((x - x_m[:, None]) ** 2 + (y - y_m[:, None]) ** 2)
-        near = away - self.reach[path] <= (away.min(axis=1) + NEAR_M)[:, None]
-        first, last = near.argmax(axis=1), most - 1 - near[:, ::-1].argmax(axis=1)
-        begin = self.begins[path] + first * CELL
-        count = np.minimum(self.begins[path] + (last + 1) * CELL, self.begins[path + 1]) - begin
-        starts = np.cumsum(count) - count
-        asked = np.repeat(np.arange(len(path)), count)
-        point = np.arange(len(asked)) + (begin - starts)[asked]
-        gap = np.hypot(self.points[0][point] - x_m[asked], self.points[1][point] - y_m[asked])
-        nearest = np.flatnonzero(gap == np.minimum.reduceat(gap, starts)[asked])
-        first_nearest = nearest[np.searchsorted(nearest, starts)]  # the first of equally near ones
-        x, y, arc, heading, cos, sin = self.points[:, point[first_nearest]]
-        along = (x_m - x) * cos + (y_m - y) * sin
-        # The squares of Python are those of `Path.project`; NumPy's are rounded otherwise.
-        squares = [g**2 - a**2 for g, a in zip(gap[first_nearest].tolist(), along.tolist(), strict=True)]
-        return arc + along, np.sqrt(np.maximum(squares, 0.0)), heading
-
-
-def _bends(points: Floats) -> tuple[float, float]:
-    """Return b and c of the bound on how far along the heading a place lies from the nearest point of a path.
-
-    Let v lead from the nearest point, which is no end of the path, to the place, and d and e to that point
-    from the one before and on to the one after. Neither of these is nearer, so v*e <= e*e/2 and
-    -v*d <= d*d/2. The heading is that of d + e, so the place lies at most b + c |v| along it:
-    b = e*e / |d + e| and c = 3 |e - d| / |d + e|, with the largest e and e - d, and the smallest d + e.
-    """
-    steps = np.diff(points, axis=0)
-    longest, bend, chord = (
-        np.hypot(*each.T) for each in (steps, np.diff(steps, axis=0), steps[1:] + steps[:-1])
-    )
-    least = chord.min(initial=np.inf)
-    if not 0 < least < np.inf:
-        return 0.0, 1.0  # no bound
-    return float(longest.max() ** 2 / least), float(3 * bend.max() / least)
 
 
 def paths_along(

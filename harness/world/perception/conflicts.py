@@ -93,8 +93,9 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     x, y, own = np.array(
         [(d.x_m, d.y_m, np.nan if d.heading_rad is None else d.heading_rad) for d in detections]
     ).reshape(-1, 3).T  # fmt: skip
-    thing, path = road.near(x, y, ON_PATH_M)
-    arc, lateral, heading = road.project(path, x[thing], y[thing])
+    projected = np.stack([path.project_all(x, y) for path in road.paths.values()], axis=-1)  # (3, n, paths)
+    thing, path = np.nonzero(projected[1] <= ON_PATH_M)
+    arc, lateral, heading = projected[:, thing, path]
     cos = np.cos(own[thing] - heading)
     keys = list(road.paths)
     near: list[dict[PathKey, tuple[float, float]]] = [{} for _ in detections]
@@ -103,8 +104,6 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     for n, p, arc_m, lateral_m, to_rad, turned in zip(
         *(column.tolist() for column in (thing, path, arc, lateral, heading, cos)), strict=True
     ):
-        if lateral_m > ON_PATH_M:
-            continue
         key, d = keys[p], detections[n]
         near[n][key] = arc_m, to_rad
         if d.heading_rad is None:
@@ -202,15 +201,11 @@ def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Confli
 def _apart(road: Road, shared: Sequence[tuple[Known, PathKey]]) -> list[bool]:
     """Return whether each way is in another lane than the ego's where the vehicle is."""
     x, y = np.array([(known.d.x_m, known.d.y_m) for known, _ in shared]).reshape(-1, 2).T
-    own = np.array([road.number[known.own] for known, _ in shared], dtype=int)
-    way = np.array([road.number[key] for _, key in shared], dtype=int)
-    aside = np.flatnonzero(own != way)
-    arc, _, _ = road.project(own[aside], x[aside], y[aside])
-    at = _at(road, [(shared[n][0].own, arc_m) for n, arc_m in zip(aside.tolist(), arc.tolist(), strict=True)])
-    apart = np.zeros(len(shared), dtype=bool)
-    apart[aside] = road.project(way[aside], at[:, 0], at[:, 1])[1] > ONE_LANE_M
-    result: list[bool] = apart.tolist()
-    return result
+    own = [known.own for known, _ in shared]
+    at = _at(road, list(zip(own, road.project(own, x, y)[0].tolist(), strict=True)))
+    ways = [key for _, key in shared]
+    apart: list[bool] = (road.project(ways, at[:, 0], at[:, 1])[1] > ONE_LANE_M).tolist()
+    return apart
 
 
 def _at(road: Road, asked: Sequence[tuple[PathKey, float]]) -> Floats:

@@ -140,8 +140,7 @@ def _graphs(
 def _arcs(road: Road, vehicles: Sequence[VehicleState]) -> list[float]:
     """Return the arc length of each vehicle on its own path."""
     x, y = np.array([(v.x_m, v.y_m) for v in vehicles]).reshape(-1, 2).T
-    paths = np.array([road.number[v.approach, v.route] for v in vehicles], dtype=int)
-    arcs: list[float] = road.project(paths, x, y)[0].tolist()
+    arcs: list[float] = road.project([(v.approach, v.route) for v in vehicles], x, y)[0].tolist()
     return arcs
 
 
