@@ -145,7 +145,7 @@ def _sequences(
     order = sorted(range(len(sequences)), key=lambda n: [CALM[a] for a in sequences[n]])
     return Sequences(
         [s[0] for s in sequences],
-        _levels(sequences),
+        levels(sequences),
         ends[:, -1],
         np.argsort(order),
         _right_m(ends, parameters) if any(sides) else None,
@@ -153,7 +153,8 @@ def _sequences(
     )
 
 
-def _levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
+def levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
+    """Return the levels by which each decision of sequences changes the target speed, (n, decisions)."""
     return np.array([[SPEED.get(a, 0) for a in s] for s in sequences])
 
 
@@ -168,7 +169,7 @@ def _rollouts(
         tried = _sequences(actions, left, sides, parameters)
         speeds, targets = np.array([start[:2] for start in some]).T
         for start, travelled in zip(
-            some, _distances(tried.levels, speeds, targets, left, parameters), strict=True
+            some, travelled_m(tried.levels, speeds, targets, left, parameters), strict=True
         ):
             _, place = np.unique(travelled[:, -1], return_inverse=True)
             both = place * len(place) + tried.shift
@@ -181,21 +182,20 @@ def _rollouts(
 
 
 def travelled_m(
-    sequences: list[tuple[str, ...]], speed_mps: float, target_mps: float, left: int, parameters: Parameters
-) -> Floats:
-    """Return the distance travelled (m) in each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S).
-
-    Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
-    present speed, and IDLE keeps the target. `left` is the number of remaining decisions.
-    """
-    starts = np.array([speed_mps]), np.array([target_mps])
-    return np.asarray(_distances(_levels(sequences), *starts, left, parameters)[0])
-
-
-def _distances(
     moves: Ints, speeds_mps: Floats, targets_mps: Floats, left: int, parameters: Parameters
 ) -> Floats:
-    """Return `travelled_m` for speeds and targets (s,) and moves of the sequences (n, k), (s, n, steps)."""
+    """Return the distance travelled (m) from each start by each sequence, (starts, sequences, steps).
+
+    Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
+    present speed, and IDLE keeps the target.
+
+    Args:
+        moves: levels by which each decision changes the target speed, (sequences, decisions).
+        speeds_mps: speed of each start.
+        targets_mps: target speed of each start.
+        left: number of remaining decisions.
+        parameters: the scenario's.
+    """
     levels, shape = np.array(parameters.target_speeds_mps), (len(speeds_mps), len(moves))
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
     speed, target = (np.broadcast_to(each[:, None], shape) for each in (speeds_mps, targets_mps))

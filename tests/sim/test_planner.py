@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from harness.world import scenarios
+from harness.world import planner, scenarios
 from harness.world.drivers import DRIVERS, choose
 from harness.world.perception.graph import truth_graph, truth_graphs
 from harness.world.planner import (
@@ -15,10 +15,10 @@ from harness.world.planner import (
     Rollouts,
     cover,
     least_gap,
+    levels,
     plan,
     plans,
     predicted,
-    travelled_m,
 )
 from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import SIZES_M, VehicleState, WorldState
@@ -40,6 +40,11 @@ def graph(*others, ego=EGO, target_mps=14.0, step=1):
 
 def from_left(x_m, speed_mps=10.0):
     return VehicleState("v5", "car", "other", x_m, 2.0, 0.0, speed_mps, "left", "straight", False)
+
+
+def travelled_m(sequences, left):
+    """How far an ego at its target speed of 14 m/s comes by each sequence."""
+    return planner.travelled_m(levels(sequences), np.array([14.0]), np.array([14.0]), left, P)[0]
 
 
 def gap(travelled_m, scene):
@@ -76,7 +81,7 @@ def test_it_does_not_guess_at_what_the_graph_does_not_list():
 def test_where_every_way_ends_in_a_collision_it_takes_the_one_with_the_widest_gap():
     # 14 m before the crossing, with a car 10 m from it: too late for anything but the least of evils.
     scene = graph(from_left(2.0 - 10.0), ego=structs.replace(EGO, y_m=16.0))
-    gaps = {a: gap(travelled_m([(a,)], 14.0, 14.0, 5, P), scene)[0] for a in ACTIONS}
+    gaps = {a: gap(travelled_m([(a,)], 5), scene)[0] for a in ACTIONS}
     assert max(gaps.values()) < 0.0
     assert gaps[plan(SCENARIO, scene)] == max(gaps.values())
 
@@ -87,7 +92,7 @@ def test_its_model_of_motion_follows_the_simulator(first, second):
     """Where a decision acts at once: the model has no lag."""
     world = World.start(replace(SCENARIO, parameters=replace(P, decision_lag_s=0.0)), 0)
     start = world.state().ego.y_m
-    (travelled,) = travelled_m([(first, second)], 14.0, 14.0, P.decisions, P)
+    (travelled,) = travelled_m([(first, second)], P.decisions)
     for seconds, action in enumerate((first, second, "FASTER"), 1):
         world.act(action)
         model = travelled[round(seconds / STEP_S) - 1]

@@ -1,4 +1,4 @@
-"""Simulate an episode of an environment of highway-env, frame by frame.
+"""Simulate an episode of an environment of highway-env, frame by frame; make a scenario of an environment.
 
 `env.step` simulates a whole decision period and hides the frame in which something happened. So the frames
 are simulated here, as `env._simulate` does, and at the end of each period `env.step` is called without
@@ -8,7 +8,7 @@ simulating frames: whatever an environment adds to it (new traffic, rewards, end
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, cast
 
 import numpy as np
@@ -17,6 +17,7 @@ from harness.core.errors import UserError
 from harness.world import beacons
 from harness.world.environments.environment import Constants, lane_of, meta_actions, numbered, reset, shown
 from harness.world.environments.place import Parameters, ends_of, first_target_mps, place
+from harness.world.parameters import DIALS
 from harness.world.road import PathKey
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.simulator import DECIMALS, LAMPS_MPS2
@@ -222,3 +223,26 @@ def _buildings(env: Any, origin_m: tuple[float, float]) -> tuple[Building, ...]:
 
 def _apart_m(first: Any, second: Any) -> float:
     return float(np.hypot(*(first.position - second.position)))
+
+
+@lru_cache(maxsize=16)
+def scenario(name: str) -> Scenario:
+    """Make a scenario of an environment. Raises UserError if there is none, or it lacks something.
+
+    The harness knows neither an environment's layout nor a danger, and the environment says who has cleared.
+    """
+    here = place(name)
+    where = here.road.ego[1].partition(" lane ")[0]
+    return Scenario(
+        name=name,
+        description=f"Scenario {name}: {here.kind} of highway-env, with its own vehicles and traffic.\n",
+        actions=here.actions,
+        parameters=here.parameters,
+        road=lambda: here.road,
+        layout=lambda seed, parameters: Layout((), (), None, None),
+        cleared=lambda xy_m, approaches, parameters: np.zeros(xy_m.shape[:-2], dtype=bool),
+        words={"task": f"follow your road, {where}, and keep up speed", "hiding": "other vehicles"},
+        brake_lamps=True,
+        dials=(*DIALS, "decisions", "helpers", "time_limit_s", "delay_allowance_s"),
+        world=EnvironmentWorld,
+    )

@@ -59,7 +59,7 @@ def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
 
 def _named(name: str) -> Scenario:
     if name.startswith(environment.PREFIX):
-        from harness.world.environments.scenario import scenario as of_environment  # imports highway-env
+        from harness.world.environments.world import scenario as of_environment  # imports highway-env
 
         return of_environment(name)
     if is_here(name):
