@@ -1,8 +1,9 @@
 """`harness study grid`: every combination of ego and helper agents."""
 
-from collections.abc import Mapping
+from collections.abc import Collection
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -10,97 +11,60 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.run import file_name, first_folder
 from harness.cli.show import finish
-from harness.core import extras, resources
+from harness.core import extras
 from harness.core.errors import UserError, printable
-from harness.evaluate.settings import parse_seeds
+from harness.evaluate.settings import FrozenSettings, Settings, changed
 
 MOST_CELLS = 256
+HELPERS = ("helper_model", "helper_prompt", "helper_answer", "helper_thinking")
+HELP = {
+    "model": "Models of the ego, separated by commas.",
+    "prompt": "Prompt versions of the ego, such as v2,v3. Default: the scenario's usual one.",
+    "answer": "Answer modes of the ego, separated by commas: json, constrained, readout.",
+    "dataset": "Name of a shipped dataset, or a dataset's folder.",
+    "helper_model": "Models of the helpers. Default: the ego's models.",
+    "helper_prompt": "Prompt versions of the helpers. Default: the ego's versions.",
+    "helper_answer": "Answer modes of the helpers. Default: the ego's modes.",
+}
 
 
+@options.takes(FrozenSettings, HELP, without=("ask",))
 def command(
-    model: str = typer.Option("proxy", help="Models of the ego, separated by commas."),
-    prompt: str | None = typer.Option(
-        None, help="Prompt versions of the ego, such as v2,v3. Default: the scenario's usual one."
-    ),
-    answer: str = typer.Option(
-        "json", help="Answer modes of the ego, separated by commas: json, constrained, readout."
-    ),
-    helper_model: str | None = typer.Option(None, help="Models of the helpers. Default: the ego's models."),
-    helper_prompt: str | None = typer.Option(
-        None, help="Prompt versions of the helpers. Default: the ego's versions."
-    ),
-    helper_answer: str | None = typer.Option(
-        None, help="Answer modes of the helpers. Default: the ego's modes."
-    ),
-    letters: options.Letters = None,
-    dataset: options.Dataset = resources.DATASET,
-    condition: options.Conditions = None,
-    control: options.Controls = None,
-    attack: options.Attacks = None,
-    seeds: options.Seeds = "0:5",
-    limit: int | None = typer.Option(None, help="Use only this many episodes, from the first. Default: all."),
-    batch_size: options.BatchSize = 8,
-    device: options.Device = None,
-    dtype: options.Dtype = None,
-    latency: options.Latency = None,
+    settings: Settings,
     out: Path | None = typer.Option(None, help="Folder to write. Default: reports/grid-<models>-<dataset>."),
     no_cache: options.NoCache = False,
     as_json: options.Json = False,
-    quiet: options.Quiet = False,
+    quiet: options.QuietOutput = False,
 ) -> None:
     """Evaluate every combination of ego and helper agents.
 
     An agent is a model with a prompt version and an answer mode. Each agent is asked once in each role,
     however many combinations it is in. If the grid is stopped, the same command continues it.
     """
-    from harness.backends import cards
     from harness.backends.cache import default_file
-    from harness.coordination.operating_point import POINTS
     from harness.evaluate import resolve
-    from harness.evaluate.agent import Agent
-    from harness.evaluate.settings import FrozenSettings
-    from harness.evaluate.spec import Spec
-    from harness.prompts import versions
-
-    extras.need("harness study grid", "matplotlib")
-    source = resolve.frozen(FrozenSettings(limit=limit), dataset)
-    frozen = source.dataset
-    options.say_all(limit, [frozen])
-    prompt = prompt or frozen.scenario.prompt
-
-    def agents(choices: Mapping[str, str]) -> list[Agent]:
-        each = product(*(_several(option, text) for option, text in choices.items()))
-        # Agent checks the mode.
-        return [
-            Agent(cards.resolve(m), versions.load(p), a, letters=letters if a == "readout" else None)  # type: ignore[arg-type]
-            for m, p, a in each
-        ]
-
-    egos = agents({"--model": model, "--prompt": prompt, "--answer": answer})
-    with resolve.helper_options({"--answer": helper_answer}):
-        helpers = agents({
-            "--helper-model": helper_model or model, "--helper-prompt": helper_prompt or prompt,
-            "--helper-answer": helper_answer or answer,
-        })  # fmt: skip
-    if letters and not any(agent.answer == "readout" for agent in (*egos, *helpers)):
-        raise UserError(f"--letters {printable(letters)}: no agent reads out; add --answer readout")
-    if not 1 < (cells := len(egos) * len(helpers)) <= MOST_CELLS:
-        raise UserError(f"{cells} combinations: give 2 to {MOST_CELLS}, such as --model a,b")
-    spec = Spec(
-        ego=egos[0],
-        source=source,
-        points=resolve.points(condition or tuple(POINTS), control or (), attack or ()),
-        seeds=parse_seeds(seeds),
-        batch_size=batch_size,
-        device=device,
-        dtype=dtype,
-        latency=latency,
-        ask="all",  # combinations share answers: whom one does not ask, another does
-    )
     from harness.studies.grid import run_cells
     from harness.studies.grid_study import grid_study
     from harness.studies.study import refuse_taken
 
+    extras.need("harness study grid", "matplotlib")
+    world: Any = settings.world
+    source = resolve.frozen(world, world.dataset)
+    frozen = source.dataset
+    options.say_all(world.limit, [frozen])
+    # Combinations share answers: whom one does not ask, another does.
+    settings = changed(settings, {"prompt": settings.prompt or frozen.scenario.prompt, "ask": "all"})
+    theirs = _of_helpers(settings)
+    modes = {*_names("--answer", settings.answer), *_names("--helper-answer", theirs.answer)}
+    by_ego = _combinations(settings, "--", modes)
+    egos = [resolve.agents(each, frozen.scenario)[0] for each in by_ego]
+    with resolve.helper_options({"--answer": settings.helpers.answer, "--thinking": theirs.thinking}):
+        helpers = [
+            resolve.agents(each, frozen.scenario)[0] for each in _combinations(theirs, "--helper-", modes)
+        ]
+    if not 1 < (cells := len(egos) * len(helpers)) <= MOST_CELLS:
+        raise UserError(f"{cells} combinations: give 2 to {MOST_CELLS}, such as --model a,b")
+    spec = resolve.spec(by_ego[0], source)
     names = "-".join(dict.fromkeys(file_name(agent.card.name) for agent in (*egos, *helpers)))
     folder = out or first_folder(
         f"grid-{names}-{frozen.name}", lambda folder: not (folder / "grid.json").exists()
@@ -116,7 +80,32 @@ def command(
     finish(grid_study(grid, spec, folder), folder, as_json, quiet)
 
 
-def _several(option: str, text: str) -> list[str]:
+def _of_helpers(settings: Settings) -> Settings:
+    """Return settings whose model, prompt and modes are those of the helpers."""
+    own = settings.helpers
+    given = {"model": own.model, "prompt": own.prompt, "answer": own.answer, "thinking": own.thinking}
+    engine = {"engine": None} if own.model else {}
+    return changed(settings, {name: value for name, value in given.items() if value is not None} | engine)
+
+
+def _combinations(settings: Settings, flag: str, modes: Collection[str]) -> list[Settings]:
+    """Return the settings of each model with each prompt and answer mode.
+
+    A setting that concerns one answer mode is left out with others, if one of the grid's `modes` uses it.
+    """
+    lists = [_names(f"{flag}{name}", getattr(settings, name)) for name in ("model", "prompt", "answer")]
+    combinations = []
+    for model, prompt, answer in product(*lists):
+        given = {**dict.fromkeys(HELPERS), "model": model, "prompt": prompt, "answer": answer}
+        if "readout" in modes and answer != "readout":
+            given |= {"letters": None, "flip": False}
+        if "json" in modes and answer != "json":
+            given |= {"sums": "refuse"}
+        combinations.append(changed(settings, given))
+    return combinations
+
+
+def _names(option: str, text: str) -> list[str]:
     names = [name.strip() for name in text.split(",")]
     if "" in names or len(set(names)) < len(names):
         raise UserError(f"{option} {printable(text)}: give different names, such as a,b")

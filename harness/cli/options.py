@@ -1,7 +1,7 @@
 """Options that several commands have, and the options of an evaluation, which its settings state."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,12 +16,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from harness.backends.base import AnswerMode
-    from harness.backends.base import Letters as LettersMode
     from harness.backends.card import Card
     from harness.core import parallel, shards
     from harness.dataset.load import Dataset as Frozen  # Dataset is an option here
 else:  # typer takes any text; what is evaluated says which are allowed
-    AnswerMode = LettersMode = str
+    AnswerMode = str
 
 _RAY = "or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT."
 
@@ -66,14 +65,10 @@ RunsDataset = Annotated[
     ),
 ]
 Dataset = Annotated[str, Option(help="Name of a shipped dataset, or a dataset's folder.")]
-Conditions = Annotated[list[str] | None, Option(help=HELP["condition"])]
-Controls = Annotated[list[str] | None, Option("--control", help=HELP["control"])]
-Attacks = Annotated[list[str] | None, Option("--attack", help=HELP["attack"])]
 Seeds = Annotated[str, Option(help=HELP["seeds"])]
 FirstSeed = Annotated[int, Option(help="Layout seed of the first episode; the others follow.")]
 Thinking = Annotated[bool, Option("--thinking", help=HELP["thinking"])]
 Answer = Annotated[AnswerMode, Option(help=HELP["answer"])]
-Letters = Annotated[LettersMode | None, Option(help=HELP["letters"])]
 BatchSize = Annotated[int, Option(help=HELP["batch_size"])]
 Device = Annotated[str | None, Option(help=HELP["device"])]
 Dtype = Annotated[str | None, Option(help=HELP["dtype"])]
@@ -123,10 +118,18 @@ Quiet = Annotated[bool, Option("--quiet", help=_QUIET)]
 QuietOutput = Annotated[bool, Option("--quiet", help=_QUIET, rich_help_panel=stated.OUTPUT)]
 
 
-def takes(world: type[stated.FrozenSettings] | type[stated.DriveSettings]) -> Callable[[Any], Any]:
+def takes(
+    world: type[stated.FrozenSettings] | type[stated.DriveSettings], help: Mapping[str, str] = {},
+    without: Collection[str] = (),
+) -> Callable[[Any], Any]:  # fmt: skip
     """Give a command the options of an evaluation; the command's first parameter gets their `Settings`.
 
     A first argument names a file of settings, or a run's folder; options that are typed beside it win.
+
+    Args:
+        world: what is evaluated.
+        help: other help for some options, by name.
+        without: the options to leave out.
     """
 
     def decorate(command: Any) -> Any:
@@ -139,7 +142,11 @@ def takes(world: type[stated.FrozenSettings] | type[stated.DriveSettings]) -> Ca
                 return command(stated.read(file, world, given), **values)
             return command(stated.changed(stated.Settings(world=world()), given), **values)
 
-        settings = [_parameter(each) for each in stated.options(world)]
+        settings = [
+            _parameter(each._replace(help=help.get(each.name, each.help)))
+            for each in stated.options(world)
+            if each.name not in without
+        ]
         names = [each.name for each in settings]
         file = inspect.Parameter(
             "file",

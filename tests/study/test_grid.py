@@ -189,4 +189,20 @@ def test_letters_are_those_of_the_agents_that_read_out(
     stated = [json.loads(file.read_text()) for file in sorted((tmp_path / "grid").rglob("run.json"))]
     assert {(of["answer"], of.get("letters")) for of in stated} == {("json", "raw"), ("readout", "cyclic")}
     code, _, err = harness("study", "grid", "--prompt", "v1,v2", "--letters", "cyclic", *few)
-    assert (code, err) == (2, "harness: --letters cyclic: no agent reads out; add --answer readout\n")
+    assert code == 2
+    assert err == (
+        "harness: --letters cyclic: proxy answers in json; leave it out, or give a language model and "
+        "--answer readout\n"
+    )
+
+
+@pytest.mark.slow
+def test_a_grid_takes_every_setting_of_an_evaluation(
+    harness: Callable[..., Any], small_path: Path, tmp_path: Path
+) -> None:
+    few = ("--dataset", str(small_path), "--limit", "1", "--seeds", "0:1", "--condition", "single-local")
+    both = ("study", "grid", "--model", "proxy", "--prompt", "v2", "--helper-model", "proxy,proxy-faulty")
+    code, _, err = harness(*both, *few, "--sums", "divide", "--tag", "sums", "--out", str(tmp_path / "grid"))
+    assert code == 0, err
+    stated = [json.loads(file.read_text()) for file in sorted((tmp_path / "grid").rglob("run.json"))]
+    assert [(run["sums"], run["tags"], run["ask"]) for run in stated] == [("divide", ["sums"], "all")] * 2
