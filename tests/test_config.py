@@ -80,7 +80,7 @@ def test_a_record_is_made_of_nested_tables_and_what_the_program_gives() -> None:
         ({"link": 3}, "r: link = 3; allowed: a table"),
         ({"hops": 3}, "r: hops = 3; allowed: a list"),
         ({"link": {"model": "wires"}}, "unknown model in r [link] 'wires'; known: ideal, radio"),
-        ({"link": {"model": "radio", "loss": "x\n"}}, "r [link]: loss = 'x\\n'; allowed: float"),
+        ({"link": {"model": "radio", "loss": "x\n"}}, "r [link]: loss = 'x\\n'; allowed: a number"),
         (
             {"link": {"model": "radio", "loss": float("nan")}},
             "r [link]: loss = nan; allowed: a share, 0 to 1",
@@ -89,10 +89,10 @@ def test_a_record_is_made_of_nested_tables_and_what_the_program_gives() -> None:
             {"link": {"model": "radio", "loss": float("inf")}},
             "r [link]: loss = inf; allowed: a share, 0 to 1",
         ),
-        ({"size": True}, "r: size = True; allowed: int"),
-        ({"size": 0}, "r: size = 0; allowed: int >= 1"),
-        ({"size": "1"}, "r: size = '1'; allowed: int"),
-        ({"hops": [{"delay_s": 1}, {"delay_s": "x"}]}, "r [hops.1]: delay_s = 'x'; allowed: float"),
+        ({"size": True}, "r: size = True; allowed: a whole number"),
+        ({"size": 0}, "r: size = 0; allowed: a whole number >= 1"),
+        ({"size": "1"}, "r: size = '1'; allowed: a whole number"),
+        ({"hops": [{"delay_s": 1}, {"delay_s": "x"}]}, "r [hops.1]: delay_s = 'x'; allowed: a number"),
         ({"hops": [{"delay_s": -1}]}, "r [hops.0]: delay_s is negative; give seconds, 0 or more"),
     ],
 )

@@ -352,7 +352,7 @@ def test_a_projects_profile_lies_beside_those_that_ship(project: Path) -> None:
         (("billions", "bilions"), "did you mean 'billions'?"),
         (('source = "me" }\ndecode', 'source = "" }\ndecode'), "allowed: where the number comes from"),
         (('me = "my desk, today"', "me = 3"), "[sources]: give each source a name and a text"),
-        (('model = "swarm-tiny"', 'model = 3'), "model = 3; allowed: str"),
+        (('model = "swarm-tiny"', 'model = 3'), "model = 3; allowed: a text"),
         (("batch_size = 1", "batch_size = 0"), "batch_size = 0; allowed: 1 or more"),
     ],
 )  # fmt: skip

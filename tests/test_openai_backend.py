@@ -510,13 +510,13 @@ def test_a_card_leaves_out_and_renames_fields_and_limits_log_probabilities() -> 
         ('fields = { max_tokens = "seed", seed = false }', "max_tokens is sent as seed, the name of another"),
         ('fields = { top_p = "x", top_k = "x" }', "top_p is sent as x, the name of another field"),
         ('fields = { seed = "a b" }', "[fields]: seed = 'a b'; allowed: true, false or another name"),
-        ("fields = { seed = 3 }", "seed = 3; allowed: bool or str"),
+        ("fields = { seed = 3 }", "seed = 3; allowed: true or false or a text"),
         ("fields = { messages = false }", "unknown key in model card [fields] 'messages'"),
         ("fields = { model = false }", "unknown key in model card [fields] 'model'"),
         ("fields = { grammar = false }", "unknown key in model card [fields] 'grammar'"),
         ("top_logprobs = 0", "top_logprobs = 0; allowed: 1 to 20"),
         ("top_logprobs = 21", "top_logprobs = 21; allowed: 1 to 20"),
-        ("top_logprobs = true", "top_logprobs = True; allowed: int"),
+        ("top_logprobs = true", "top_logprobs = True; allowed: a whole number"),
     ],
 )  # fmt: skip
 def test_no_field_overrides_what_is_asked(fields: str, said: str) -> None:

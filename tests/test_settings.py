@@ -112,7 +112,7 @@ HOSTILE = {
     'model = "theirs/on-the-hub"': "theirs/on-the-hub is none of your cards",
     '[helpers]\nmodel = "proxy, ./theirs"': "give it by --helper-model",
     'server = ["http://theirs:1/v1"]': "a file names no server to ask; give --server, or take the line out",
-    "model = 3": "model = 3; allowed: str",
+    "model = 3": "model = 3; allowed: a text",
     'prompd = "v2"': "unknown key in settings stated.toml 'prompd'; did you mean 'prompt'?",
     '[world]\nkind = "frozen"\nlimti = 1': "unknown key in settings stated.toml [world] 'limti'; did you "
     "mean 'limit'?",

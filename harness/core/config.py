@@ -50,7 +50,10 @@ _OF_VALUES = ("Expected", "Invalid", "Number out of range", "Integer")
 _DOTS = 100
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+"""
 _LONG_KEY = re.compile(rf"(?<![\w.-])(?:{_PART}\.[ \t]*+){{{_DOTS}}}")
-_IN_WORDS = {"object": "a table", "array": "a list"}
+_IN_WORDS = {
+    "object": "a table", "array": "a list", "str": "a text", "int": "a whole number", "float": "a number",
+    "bool": "true or false",
+}  # fmt: skip
 
 
 def toml(path: Path, where: str) -> dict[str, Any]:
@@ -213,11 +216,17 @@ def _mistake(message: str, table: Mapping[str, Any], kind: Any, where: str) -> U
     if problem.startswith("Invalid") and (names := _names(hint)):
         return unknown(f"{key} in {_place(where, tables)}", str(value), names)
     expected, _, got = problem.removeprefix("Expected ").replace("`", "").partition(", got ")
-    kinds = " or ".join(_IN_WORDS.get(name, name) for name in expected.split(" | ") if name != "null")
-    allowed = kinds if got else _description(hint) or kinds
+    kinds = " or ".join(_in_words(name) for name in expected.split(" | ") if name != "null")
+    allowed = (" or ".join(_names(hint)) or kinds) if got else _description(hint) or kinds
     if not problem.startswith("Expected"):
         allowed = _description(hint) or "a number that a computer holds"
     return UserError(f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}")
+
+
+def _in_words(kind: str) -> str:
+    """Return msgspec's name of a type in words: `int >= 1` as `a whole number >= 1`."""
+    name, space, bound = kind.partition(" ")
+    return _IN_WORDS.get(name, name) + space + bound
 
 
 def _locate(value: Any, hint: Any, location: str) -> tuple[list[str], Any, Any]:

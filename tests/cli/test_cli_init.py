@@ -98,7 +98,7 @@ def test_a_card_with_a_mistake_is_what_a_doctor_tells(harness: Harness, project:
     code, out, err = harness("model", "doctor", "--json")
     [told] = [m for m in json.loads(out)["models"] if m["name"] == "my-model"]
     assert (code, err, told["missing"]) == (0, "", "a sound card")
-    assert "engine = 3; allowed: str" in told["remedy"]
+    assert "engine = 3; allowed: a text" in told["remedy"]
 
 
 def test_a_folder_that_is_not_empty_is_refused_and_left(harness: Harness, tmp_path: Path) -> None:
