@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,25 @@ def test_what_plug_ins_build_on_is_pinned() -> None:
     # A name that goes stays here for a release, with a warning: CONTRIBUTING.md.
     assert sorted(extend.__all__, key=str.lower) == sorted(names.split(), key=str.lower)
     assert all(getattr(extend, name) for name in extend.__all__)
+
+
+def test_spellings_of_0_2_work_with_a_warning(small: Dataset) -> None:
+    from harness.world import parameters, scenario
+    from harness.world.world import World
+
+    graph = next(iter(small.scenes(small.forest.ids[:1])[0].graphs.values()))
+    with pytest.warns(FutureWarning, match=r"\['self'\] is now \.itself; it works until 0\.4\.0"):
+        assert graph["self"] is graph.itself
+    for name in ("braking", "__class__", "plain"):
+        with pytest.raises(KeyError):
+            graph.itself[name]
+    with pytest.warns(FutureWarning, match=r"frames is now in harness\.world\.parameters"):
+        assert scenario.frames is parameters.frames  # type: ignore[attr-defined]
+    with pytest.warns(FutureWarning, match=r"is now Scenario\(world=Class\)"):
+        old = replace(small.scenario, start=World.begun)
+    assert old.is_environment
+    assert World.start(old, 3).state() == World.start(small.scenario, 3).state()
+    assert replace(old, name="other").world is old.world
 
 
 def test_a_run_is_evaluated_with_the_command_lines_names(small_path: Path, tmp_path: Path) -> None:

@@ -1,11 +1,13 @@
 """The interface of a scenario: parameters, layout, road, goal. Other code takes a scenario as an argument."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import InitVar, dataclass
+from typing import TYPE_CHECKING, Any
+from warnings import warn
 
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Texts
+from harness.world import parameters as _parameters
 from harness.world.parameters import DIALS, Parameters
 from harness.world.road import Road
 from harness.world.state import Building, Kind, Part
@@ -92,6 +94,12 @@ class Scenario:
     dials: tuple[str, ...] = DIALS  # parameters that a name may set: `NAME:beacon_loss=0.3`
     # subclass of `World` whose episodes an environment simulates; None for the harness's own simulator
     world: type[Any] | None = None
+    # spelling of 0.2, until 0.4.0: what starts an episode of such a world, `(scenario, seed)`
+    start: InitVar[Callable[["Scenario", int], Any] | None] = None
+
+    def __post_init__(self, start: Callable[["Scenario", int], Any] | None) -> None:
+        if start is not None:
+            object.__setattr__(self, "world", _world_of(start))
 
     @property
     def is_environment(self) -> bool:
@@ -110,3 +118,32 @@ class Scenario:
 
     def __hash__(self) -> int:
         return hash((self.name, self.parameters))
+
+
+def _world_of(start: Callable[[Scenario, int], Any]) -> type[Any]:
+    """Return a class of worlds that a function starts. It warns: the class is what a scenario states now."""
+
+    def resumed(cls: Any, *taken: Any) -> Any:
+        from harness.world.environments.world import EnvironmentWorld
+
+        return EnvironmentWorld.resumed.__func__(cls, *taken)  # type: ignore[attr-defined]
+
+    warn(
+        "Scenario(start=f) is now Scenario(world=Class), whose `begun` is f; it works until 0.4.0",
+        FutureWarning, stacklevel=4,
+    )  # fmt: skip
+    return type("Started", (), {"begun": staticmethod(start), "resumed": classmethod(resumed)})
+
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        """Return what stood here in 0.2; until 0.4.0, with a warning."""
+        if name.startswith("_") or not hasattr(_parameters, name):
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        warn(
+            f"{name} is now in harness.world.parameters; it works here until 0.4.0",
+            FutureWarning,
+            stacklevel=2,
+        )
+        return getattr(_parameters, name)

@@ -1,10 +1,11 @@
 """Records of a scene: vehicles, buildings, beacons, and the state of the whole world at one time."""
 
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
+from warnings import warn
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct
 from numpy.typing import NDArray
 
 from harness.core.arrays import Floats
@@ -30,6 +31,14 @@ def indicator(route: str) -> str:
 
 class Closed(Struct, frozen=True, forbid_unknown_fields=True):
     """A record with these members and no other; its bounds hold where it is read."""
+
+    def __getitem__(self, key: str) -> Any:
+        """Return a member by its name in a file: how plug-ins of 0.2 read it, until 0.4.0, with a warning."""
+        names = dict(zip(self.__struct_encode_fields__, self.__struct_fields__, strict=True))
+        if key not in names or (value := getattr(self, names[key])) is UNSET:
+            raise KeyError(key)
+        warn(f"[{key!r}] is now .{names[key]}; it works until 0.4.0", FutureWarning, stacklevel=2)
+        return value
 
 
 class VehicleState(Closed, frozen=True, omit_defaults=True):
