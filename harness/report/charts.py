@@ -27,16 +27,9 @@ NAME: Spec = {
 FOOT: Spec = {"y": {"value": "height"}}
 RUN = "run"  # name of the parameter that chooses one of several runs
 NUMBER: Spec = {"type": "quantitative"}
-BASE: Spec = {
-    "$schema": "https://vega.github.io/schema/vega-lite/v5.json",
-    "width": "container",
-}
+BASE: Spec = {"$schema": "https://vega.github.io/schema/vega-lite/v5.json", "width": "container"}
 REACTION_MS = (150, 250)  # the paper's reaction window in an urban intersection
-VERDICTS = {
-    "strict": [GOOD],
-    "recovered": [LATE],
-    "failed": FAILURES,
-}
+VERDICTS = {"strict": [GOOD], "recovered": [LATE], "failed": FAILURES}
 REPLIES = {"on time": GOOD, "late": LATE, "lost": BAD}
 ENERGIES = dict(zip(statistics.ENERGIES, (ROLES["ego"], ROLES["helper"], BAD), strict=True))
 TIMES = {

@@ -29,12 +29,7 @@ RING_M = 4.6  # from the middle of the dangerous vehicle to the corners of its d
 
 LOOKS: dict[str, dict[str, Any]] = {
     "ego": {"facecolor": ROLES["ego"], "edgecolor": INK, "linewidth": 1.0},
-    "helper": {
-        "facecolor": HATCHED[0],
-        "edgecolor": HATCHED[1],
-        "hatch": "//////",
-        "linewidth": 0.8,
-    },
+    "helper": {"facecolor": HATCHED[0], "edgecolor": HATCHED[1], "hatch": "//////", "linewidth": 0.8},
     "danger": {"facecolor": ROLES["danger"], "edgecolor": INK, "hatch": "xxxxxx", "linewidth": 0.8},
     "other": {"facecolor": "white", "edgecolor": INK, "linewidth": 0.8},
 }

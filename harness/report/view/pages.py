@@ -70,10 +70,7 @@ def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
     """Sorted by a column, those that have nothing there last."""
     of = COLUMNS[order.removeprefix("-")]
     known = [run for run in runs if of(run) is not None]
-    return [
-        *sorted(known, key=of, reverse=order.startswith("-")),
-        *(run for run in runs if of(run) is None),
-    ]
+    return [*sorted(known, key=of, reverse=order.startswith("-")), *(run for run in runs if of(run) is None)]
 
 
 def study(run: Listed, pictures: Sequence[str]) -> str:
