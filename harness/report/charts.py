@@ -43,10 +43,9 @@ PAPER = {"single-local": (145.0, 0.689), "v2x": (218.9, 0.835), "6g": (151.4, 0.
 
 def success_latency(rows: Rows, references: Mapping[str, float], window_ms: Sequence[float]) -> Spec:
     """Draw success over latency, a point a run and condition, and the paper's; references are lines."""
-    condition = condition_colours(rows)
-    condition["legend"] = {**condition["legend"], "title": None}
-    shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition")
-    shape["legend"] = {**shape["legend"], "title": None}
+    untitled = {"legend": {"orient": "top", "title": None}}
+    condition = condition_colours(rows) | untitled
+    shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition") | untitled
     x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", "success rate")
     present = {key for row in rows for key, value in row.items() if value is not None}
     along_x = {"x": {**x, "field": "latency_low"}, "x2": {"field": "latency_high"}, "y": y}
@@ -68,65 +67,50 @@ def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
     """Return what the paper reports for its own operating points, as a ring with its name."""
     values = [
         {"paper": f"paper: {name}", "latency_ms": PAPER[name][0], "success": PAPER[name][1]}
-        for name in conditions if name in PAPER
-    ]  # fmt: skip
-    if not values:
-        return []
-    ring = {"type": "point", "shape": "circle", "filled": False, "size": 60, "color": "currentColor"}
-    text = {
-        "type": "text",
-        "align": "left",
-        "dx": 7,
-        "color": "currentColor",
-        "opacity": 0.8,
-        "fontSize": 10.5,
-    }
-    tip = {"tooltip": [{"field": name} for name in ("paper", "latency_ms", "success")]}
-    return [
-        {
-            "data": {"values": values},
-            "layer": [
-                {"mark": ring, "encoding": {"x": x, "y": y, **tip}},
-                {"mark": text, "encoding": {"x": x, "y": y, "text": {"field": "paper"}}},
-            ],
-        }
+        for name in conditions
+        if name in PAPER
     ]
+    ring = {"type": "point", "shape": "circle", "filled": False, "size": 60, "color": "currentColor"}
+    text = {key: value for key, value in NAME.items() if key != "dy"} | {"dx": 7}
+    tip = {"tooltip": [{"field": name} for name in ("paper", "latency_ms", "success")]}
+    layer = [
+        {"mark": ring, "encoding": {"x": x, "y": y, **tip}},
+        {"mark": text, "encoding": {"x": x, "y": y, "text": {"field": "paper"}}},
+    ]
+    return [{"data": {"values": values}, "layer": layer}] if values else []
 
 
 def _references(success: Mapping[str, float], y: Spec) -> Spec:
     """Return a dashed line for each value; names of lines too near for one each stand above the highest."""
-    highest_first = sorted(success.items(), key=lambda of: -of[1])
-    lines = [{"reference": name, "success": value} for name, value in highest_first]
+    lines: list[dict[str, Any]] = [
+        {"reference": name, "success": success[name]} for name in sorted(success, key=lambda n: -success[n])
+    ]
     names: list[dict[str, Any]] = []
-    for n, (name, value) in enumerate(highest_first):
-        if n and highest_first[n - 1][1] - value < APART:
-            names[-1]["named"] += f", {name}"
+    for above, line in zip([None, *lines], lines, strict=False):
+        if above and above["success"] - line["success"] < APART:
+            names[-1]["named"] += f", {line['reference']}"
         else:
-            names.append({"named": name, "success": value})
+            names.append({"named": line["reference"], "success": line["success"]})
     text = {"type": "text", "align": "right", "dy": -5, "dx": -4, "color": "currentColor"}
     tip = {"tooltip": [{"field": name} for name in ("reference", "success")]}
+    named = {"y": y, "x": {"value": "width"}, "text": {"field": "named"}}
     return {
         "layer": [
             {"data": {"values": lines}, "mark": {**RULE, "opacity": 0.6}, "encoding": {"y": y, **tip}},
-            {
-                "data": {"values": names}, "mark": text,
-                "encoding": {"y": y, "x": {"value": "width"}, "text": {"field": "named"}},
-            },
-        ],
-    }  # fmt: skip
+            {"data": {"values": names}, "mark": text, "encoding": named},
+        ]
+    }
 
 
 def statuses(rows: Rows) -> Spec:
     """Draw statuses of answers, a stacked bar a run and role."""
     # A run's file may say anything; what is no verdict is no answer.
-    verdicts = [str(row["verdict"]) if row["verdict"] in VERDICTS else "failed" for row in rows]
-    met = list(dict.fromkeys((v, str(row["status"])) for v, row in zip(verdicts, rows, strict=True)))
-    met.sort(key=lambda status: list(VERDICTS).index(status[0]))
-    taken = dict.fromkeys(VERDICTS, 0)
-    colours = {}
-    for verdict, status in met:
-        colours[status] = VERDICTS[verdict][taken[verdict] % len(VERDICTS[verdict])]
-        taken[verdict] += 1
+    met = {(v if (v := row["verdict"]) in VERDICTS else "failed", str(row["status"])): None for row in rows}
+    colours = {
+        status: shades[n % len(shades)]
+        for verdict, shades in VERDICTS.items()
+        for n, status in enumerate(status for v, status in met if v == verdict)
+    }
     return stacked(rows, "role", "status", colours, "answers")
 
 
@@ -179,30 +163,24 @@ def stacked(
 
     Their lengths are shares, or another `amount` of the rows.
     """
-    several = len({row["run"] for row in rows}) > 1
+    several, order = len({row["run"] for row in rows}) > 1, list(colours)
     bars = [
-        {
-            **row,
-            "bar": f"{row['run']}: {row[by]}" if several else str(row[by]),
-            "order": list(colours).index(row[field]),
-        }
+        {**row, "bar": f"{row['run']}: " * several + str(row[by]), "order": order.index(row[field])}
         for row in rows
     ]
     x = {"field": amount, **NUMBER, "stack": "zero", "title": what}
     if amount == "share":
         x |= {"axis": {"format": "%"}, "scale": {"domain": [0, 1]}}
+    encoding = {
+        "y": {**names_axis("bar"), "axis": {"labelLimit": 260}}, "x": x, "color": colour(field, colours),
+        "order": {"field": "order"}, "tooltip": tooltip(bars),
+    }  # fmt: skip
     return {
         **BASE,
         "height": 26 * len({bar["bar"] for bar in bars}),
         "data": {"name": "values", "values": bars},
         "mark": {"type": "bar", "stroke": "white", "strokeWidth": 0.6},
-        "encoding": {
-            "y": {**names_axis("bar"), "axis": {"labelLimit": 260}},
-            "x": x,
-            "color": colour(field, colours),
-            "order": {"field": "order"},
-            "tooltip": tooltip(bars),
-        },
+        "encoding": encoding,
     }
 
 
@@ -258,16 +236,11 @@ def named(row: Mapping[str, Any]) -> dict[str, Any]:
 def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) -> Spec:
     """Return layers over one table, one run of which is chosen where there are several."""
     runs = list(dict.fromkeys(str(row["run"]) for row in rows if "run" in row))
-    chart: Spec = {
-        **BASE,
-        "height": height,
-        "data": {"name": "values", "values": list(rows)},
-        "layer": [*layers],
-    }
+    data = {"name": "values", "values": list(rows)}
+    chart: Spec = {**BASE, "height": height, "data": data, "layer": [*layers]}
     if choose and len(runs) > 1:
-        chart["params"] = [
-            {"name": RUN, "value": runs[0], "bind": {"input": "select", "options": runs, "name": "run "}}
-        ]
+        bind = {"input": "select", "options": runs, "name": "run "}
+        chart["params"] = [{"name": RUN, "value": runs[0], "bind": bind}]
         chart["transform"] = [{"filter": f"!isValid(datum.run) || datum.run === {RUN}"}]
     return chart
 
@@ -331,28 +304,21 @@ def interval(**encoding: Spec) -> Spec:
 def band(start: float, end: float, what: str, named: bool = False) -> Spec:
     """Return a shaded range of x, named at its top or by its tooltip alone."""
     x: Spec = {"x": {"field": "from", **NUMBER}}
+    data = {"data": {"values": [{"from": start, "to": end, "what": what}]}}
     shade: Spec = {
         "mark": {"type": "rect", "color": GREY, "opacity": 0.14},
         "encoding": {**x, "x2": {"field": "to"}, "tooltip": {"field": "what"}},
     }
-    return (
-        {
-            "data": {"values": [{"from": start, "to": end, "what": what}]},
-            "layer": [shade, {"mark": NAME, "encoding": {**x, **FOOT, "text": {"field": "what"}}}],
-        }
-        if named
-        else {"data": {"values": [{"from": start, "to": end, "what": what}]}, **shade}
-    )
+    name = {"mark": NAME, "encoding": {**x, **FOOT, "text": {"field": "what"}}}
+    return {**data, "layer": [shade, name]} if named else {**data, **shade}
 
 
 def rules_at(field: str, at: Sequence[float], what: str = "") -> list[Spec]:
     """Return vertical lines, named at their top where `what` they are is given, in ms."""
-    values = [{field: value, "what": f"{what}, {value:g} ms"} for value in at]
+    if not at:
+        return []
+    data = {"data": {"values": [{field: value, "what": f"{what}, {value:g} ms"} for value in at]}}
     x: Spec = {"x": {"field": field, **NUMBER}}
     line: Spec = {"mark": RULE, "encoding": x}
-    if not values:
-        return []
-    if not what:
-        return [{"data": {"values": values}, **line}]
     name = {"mark": {**NAME, "dy": -24}, "encoding": {**x, **FOOT, "text": {"field": "what"}}}
-    return [{"data": {"values": values}, "layer": [line, name]}]
+    return [{**data, "layer": [line, name]} if what else {**data, **line}]

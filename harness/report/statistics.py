@@ -37,17 +37,12 @@ def success(run: Run) -> Table:
 
 def statuses(run: Run) -> Table:
     """Return how many answers of each role have which status."""
-    count = Counter((a.role, a.status, a.verdict) for a in run.answers)
-    of: Counter[str] = Counter()
-    for (role, _, _), n in count.items():
-        of[role] += n
-    order = list(map(str, Status))
+    order = {status: n for n, status in enumerate(map(str, Status))}
+    count = Counter((a.role, order.get(a.status, -1), a.status, a.verdict) for a in run.answers)
+    of = Counter(a.role for a in run.answers)
     return [
         {"role": role, "status": status, "verdict": verdict, "count": n, "share": n / of[role], "n": of[role]}
-        for (role, status, verdict), n in sorted(
-            count.items(),
-            key=lambda item: (item[0][0], order.index(item[0][1]) if item[0][1] in order else -1),
-        )
+        for (role, _, status, verdict), n in sorted(count.items())
     ]
 
 
@@ -126,11 +121,14 @@ def energies(run: Run) -> Table:
         if total and helpers and radio:
             sent, thought = (radio.value or 0.0) / 1000, helpers.value or 0.0
             joules = ((total.value or 0.0) - thought - sent, thought, sent)
+            of_total = {
+                "total_j": total.value, "low": total.low, "high": total.high, "n": total.n,
+                "interval": total.interval,
+            }  # fmt: skip
             rows += [
-                {"condition": condition, "part": part, "joules": of_part, "total_j": total.value,
-                 "low": total.low, "high": total.high, "n": total.n, "interval": total.interval}
+                {"condition": condition, "part": part, "joules": of_part, **of_total}
                 for part, of_part in zip(ENERGIES, joules, strict=True)
-            ]  # fmt: skip
+            ]
     return rows
 
 

@@ -14,9 +14,10 @@ from matplotlib.patches import Patch, Polygon
 
 from harness.core.errors import printable
 from harness.dataset.load import Scene
-from harness.report.drawing.colours import BUILDING_NAME, GREY, HATCHED, INK, LIGHT, ROLES
+from harness.report.drawing import artists
+from harness.report.drawing.artists import HIDDEN, LOOKS, TEXT_PT
+from harness.report.drawing.colours import BUILDING_NAME, GREY, INK, LIGHT, ROLES
 from harness.report.drawing.geometry import conflict_points, north_up, shape_of
-from harness.report.drawing.ground import TEXT_PT, named, roads, scale_m, shade, walls
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import Format, save, styled
 from harness.report.drawing.view import View, spots, view_of
@@ -27,13 +28,6 @@ from harness.world.state import VehicleState
 SIDE_IN = 5.8  # how wide the picture is
 RING_M = 4.6  # from the middle of the dangerous vehicle to the corners of its diamond
 
-LOOKS: dict[str, dict[str, Any]] = {
-    "ego": {"facecolor": ROLES["ego"], "edgecolor": INK, "linewidth": 1.0},
-    "helper": {"facecolor": HATCHED[0], "edgecolor": HATCHED[1], "hatch": "//////", "linewidth": 0.8},
-    "danger": {"facecolor": ROLES["danger"], "edgecolor": INK, "hatch": "xxxxxx", "linewidth": 0.8},
-    "other": {"facecolor": "white", "edgecolor": INK, "linewidth": 0.8},
-}
-HIDDEN: dict[str, Any] = {"facecolor": "none", "linestyle": (0, (2, 1.2))}
 DIAMOND: dict[str, Any] = {
     "marker": "D", "markerfacecolor": "none", "markeredgecolor": ROLES["danger"], "markeredgewidth": 1.4,
 }  # fmt: skip
@@ -70,14 +64,15 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xticks=[], yticks=[], facecolor=LIGHT["ground"])
     axes.set_autoscale_on(False)
     # All of it lies under what is plotted, whatever its kind.
-    hidden = shade(state, state.vehicle(viewer))
-    for order, artist in enumerate([*roads(scenario), hidden, *walls(state.buildings)]):
+    hidden = artists.shade(state, state.vehicle(viewer))
+    for order, artist in enumerate([*artists.roads(scenario), hidden, *artists.walls(state.buildings)]):
         artist.set_zorder(0.1 * (1 + order))
         axes.add_artist(artist)
     labels = Labels(axes, SIDE_IN * 72 / view.width_m, TEXT_PT, view)
     for box in road.ground_within(float(np.abs(view.edges).max())).boxes:
         labels.discourage(box)
-    _sight_lines(axes, scene, viewer, seen)
+    lines = artists.sight(state, viewer, seen - {viewer}, colors=LIGHT["kerb"], linewidths=0.7, alpha=0.75)
+    axes.add_artist(lines)
     for vehicle in state.vehicles:
         _vehicle(axes, labels, view, vehicle, _look(scene, vehicle), hidden=vehicle.id not in seen)
     _conflicts(axes, labels, view, scene, viewer)
@@ -87,22 +82,8 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     save(figure, out, format)
 
 
-def style_of(look: str, hidden: bool) -> dict[str, Any]:
-    """Return how a vehicle's outline is drawn; of one that is hidden only the dashed line."""
-    if not hidden:
-        return dict(LOOKS[look])
-    return {key: value for key, value in LOOKS[look].items() if key != "hatch"} | HIDDEN
-
-
 def _look(scene: Scene, vehicle: VehicleState) -> str:
     return "danger" if vehicle.id == scene.record.danger.vehicle else vehicle.part
-
-
-def _sight_lines(axes: Axes, scene: Scene, viewer: str, seen: set[str]) -> None:
-    eye = scene.state.vehicle(viewer)
-    for v in scene.state.vehicles:
-        if v.id in seen - {viewer}:
-            axes.plot([eye.x_m, v.x_m], [-eye.y_m, -v.y_m], color=LIGHT["kerb"], linewidth=0.7, alpha=0.75)
 
 
 def _vehicle(axes: Axes, labels: Labels, view: View, vehicle: VehicleState, look: str, hidden: bool) -> None:
@@ -124,11 +105,7 @@ def _vehicle(axes: Axes, labels: Labels, view: View, vehicle: VehicleState, look
         labels.add(edge, 1.5 * unit, f"{text}\n{beyond_m:.0f} m farther", bold=look == "danger")
         return
     corners = north_up(vehicle.corners())
-    style = style_of(look, hidden)
-    if hidden:
-        style["linewidth"] = 1.1
-        style["edgecolor"] = ROLES["danger"] if look == "danger" else style["edgecolor"]
-    axes.add_patch(Polygon(corners, **style, zorder=3))
+    axes.add_artist(artists.body(vehicle, look, hidden)).set_zorder(3)
     along = north_up(np.array([np.cos(vehicle.heading_rad), np.sin(vehicle.heading_rad)]))
     nose = centre + along * vehicle.length_m / 2
     wings = corners[:2] - along * 1.2
@@ -171,7 +148,7 @@ def _signs(axes: Axes, labels: Labels, view: View, scene: Scene) -> None:
     """The scale and where north is, each in a corner that no vehicle is in, and the names of buildings."""
     (west, south), (east, north) = view.edges
     unit = view.scale
-    long_m, pad, wide, high, half = scale_m(view), 4 * unit, 24 * unit, 6 * unit, 3 * unit
+    long_m, pad, wide, high, half = artists.scale_m(view), 4 * unit, 24 * unit, 6 * unit, 3 * unit
     low, up, left, right = south + pad, north - pad - high, west + pad, east - pad - wide
     box = labels.free([np.array([[x, y], [x + wide, y + high]]) for x in (left, right) for y in (low, up)])
     start, foot = box[0]
@@ -188,7 +165,7 @@ def _signs(axes: Axes, labels: Labels, view: View, scene: Scene) -> None:
     x, (y, top) = box[:, 0].mean(), box[:, 1]
     arrow = {"arrowstyle": "-|>", "color": INK}
     axes.annotate("N", (x, top), (x, y + 2 * unit), size=8, ha="center", va="center", arrowprops=arrow)
-    for name, left, up in named(scene.state.buildings, view, TEXT_PT / labels.pt_per_m):
+    for name, left, up in artists.named(scene.state.buildings, view, TEXT_PT / labels.pt_per_m):
         axes.text(left + unit, up - unit, name, color=BUILDING_NAME, size=TEXT_PT, ha="left", va="top")
 
 

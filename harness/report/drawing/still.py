@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import PathPatch, Polygon, Rectangle
+from matplotlib.patches import PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.textpath import TextPath
 
@@ -20,12 +20,11 @@ from harness.core.arrays import Floats
 from harness.core.errors import printable
 from harness.core.image import Pixels
 from harness.evaluate.replay import Played, Still
+from harness.report.drawing.artists import body, named, roads, scale_m, shade, sight, walls
 from harness.report.drawing.colours import BAD, BUILDING_NAME, GOOD, GREY, INK, LATE, LIGHT, ROLES
 from harness.report.drawing.colours import actions as colours_of
 from harness.report.drawing.geometry import north_up, shape_of
-from harness.report.drawing.ground import named, roads, scale_m, shade, walls
 from harness.report.drawing.labels import covered, cut
-from harness.report.drawing.scene import style_of
 from harness.report.drawing.view import View
 from harness.world.perception.camera import SIZE_PX, frame
 from harness.world.state import Building, VehicleState, WorldState
@@ -120,10 +119,13 @@ class Canvas:
         for wall in self.walls:
             draw(wall)
         pt_per_m = SIDE_IN * 72 / view.width_m
-        self._over(_buildings(self.buildings, view, pt_per_m), *_sight(still.state, seen))
+        self._over(_buildings(self.buildings, view, pt_per_m))
+        for viewer, ids in seen.items():
+            colour = ROLES["ego" if viewer == ego.id else "helper"]
+            self._over(sight(still.state, viewer, ids, colors=colour, linewidths=0.6, alpha=0.5))
         for vehicle in still.state.vehicles:
             look = "danger" if vehicle.id == still.danger else vehicle.part
-            self._over(_vehicle(vehicle, look, vehicle.id in (*seen[ego.id], ego.id)))
+            self._over(body(vehicle, look, vehicle.id not in (*seen[ego.id], ego.id)))
         self._over(*_messages(self.played, still), *self._names(still, view, pt_per_m))
         for spine in self.axes.spines.values():
             draw(spine)
@@ -185,25 +187,6 @@ def _watched(state: WorldState, seen: dict[str, list[str]]) -> list[str]:
     helpers = [v.id for v in state.vehicles if v.id in seen and v.id != ego]
     more = {helper: len({*seen[helper]} - {*seen[ego], ego, helper}) for helper in helpers}
     return [ego, *sorted(helpers, key=lambda helper: -more[helper])[:1]]
-
-
-def _sight(state: WorldState, seen: dict[str, list[str]]) -> Iterator[Artist]:
-    at = {v.id: north_up(np.array([v.x_m, v.y_m])) for v in state.vehicles}
-    for viewer, ids in seen.items():
-        colour = ROLES["ego" if viewer == state.ego.id else "helper"]
-        there = [vehicle for vehicle in ids if viewer in at and vehicle in at]  # traffic may have left since
-        lines = [np.array([at[viewer], at[vehicle]]) for vehicle in there]
-        yield LineCollection(lines, colors=colour, linewidths=0.6, alpha=0.5)
-
-
-def _vehicle(vehicle: VehicleState, look: str, known: bool) -> Artist:
-    """Filled if the ego knew of it when its last decision began."""
-    style = style_of(look, not known)
-    if look == "danger" and not known:
-        style |= {"edgecolor": ROLES["danger"], "linewidth": 1.2}
-    if known and vehicle.crashed:
-        style["facecolor"] = BAD
-    return Polygon(north_up(vehicle.corners()), **style)
 
 
 def _around(vehicle: VehicleState) -> Floats:

@@ -1,16 +1,17 @@
-"""What stands still in a picture of a scene: its roads and the buildings around them."""
+"""What lies in a picture of a scene and in a video: roads, buildings, shade, vehicles, sight lines."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.collections import LineCollection
-from matplotlib.patches import PathPatch
+from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path
 
 from harness.core.arrays import Floats
 from harness.core.errors import printable
-from harness.report.drawing.colours import LIGHT
+from harness.report.drawing.colours import BAD, HATCHED, INK, LIGHT, ROLES
 from harness.report.drawing.geometry import VIEW_M, ground_of, north_up, shadows
 from harness.report.drawing.view import View
 from harness.world.scenario import Scenario
@@ -18,6 +19,13 @@ from harness.world.state import Building, VehicleState, WorldState
 
 TEXT_PT = 6.5
 FAR_M = 4 * VIEW_M  # from an eye to the end of what is in shadow
+LOOKS: dict[str, dict[str, Any]] = {
+    "ego": {"facecolor": ROLES["ego"], "edgecolor": INK, "linewidth": 1.0},
+    "helper": {"facecolor": HATCHED[0], "edgecolor": HATCHED[1], "hatch": "//////", "linewidth": 0.8},
+    "danger": {"facecolor": ROLES["danger"], "edgecolor": INK, "hatch": "xxxxxx", "linewidth": 0.8},
+    "other": {"facecolor": "white", "edgecolor": INK, "linewidth": 0.8},
+}
+HIDDEN: dict[str, Any] = {"facecolor": "none", "linestyle": (0, (2, 1.2))}
 
 
 def roads(scenario: Scenario) -> Iterator[Artist]:
@@ -44,6 +52,24 @@ def walls(buildings: Iterable[Building]) -> Iterator[Artist]:
     yield PathPatch(outlines, facecolor=LIGHT["building"], edgecolor="none")
 
 
+def body(vehicle: VehicleState, look: str, hidden: bool) -> Artist:
+    """Return a vehicle as one of `LOOKS`: red after a crash, and of a hidden one only a dashed line."""
+    style = dict(LOOKS[look])
+    if hidden:
+        edge = ROLES["danger"] if look == "danger" else style["edgecolor"]
+        style = HIDDEN | {"edgecolor": edge, "linewidth": 1.1}
+    elif vehicle.crashed:
+        style["facecolor"] = BAD
+    return Polygon(north_up(vehicle.corners()), **style)
+
+
+def sight(state: WorldState, viewer: str, seen: Collection[str], **look: Any) -> Artist:
+    """Return lines from a viewer to those of whom it sees that are still there."""
+    at = {v.id: north_up(np.array([v.x_m, v.y_m])) for v in state.vehicles}
+    there = [at[name] for name in seen if name in at and viewer in at]
+    return LineCollection([np.array([at[viewer], place]) for place in there], **look)
+
+
 def named(buildings: Iterable[Building], view: View, tall_m: float) -> Iterator[tuple[str, float, float]]:
     """The name of each building with room for one, and the north-west corner of what is in view of it."""
     for building in buildings:
@@ -54,7 +80,7 @@ def named(buildings: Iterable[Building], view: View, tall_m: float) -> Iterator[
 
 
 def scale_m(view: View) -> int:
-    """Return how long the bar is that tells a picture's scale."""
+    """Return the length of the bar that tells a picture's scale."""
     return 20 if view.width_m > 100 else 10
 
 
