@@ -6,7 +6,7 @@ from harness.backends.registry import Capabilities, Registration
 from harness.coordination.attacks import Attack, Turn
 from harness.coordination.consensus import Fused, Messages, Pool, Rule, linear_pool
 from harness.coordination.intents import Intents
-from harness.coordination.scheduling import Formula, Known
+from harness.coordination.scheduling import Formula, ScheduleInputs
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
 from harness.core.figures import PERCENT, Unit
@@ -38,7 +38,6 @@ __all__ = [
     "Ground",
     "Intents",
     "Ints",
-    "Known",
     "Lane",
     "Layout",
     "LayoutDraws",
@@ -55,6 +54,7 @@ __all__ = [
     "Road",
     "Rule",
     "Scenario",
+    "ScheduleInputs",
     "Spawn",
     "Turn",
     "Unit", "UserError",

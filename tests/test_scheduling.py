@@ -19,7 +19,7 @@ from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.coordination.schedules import SCHEDULES
-from harness.coordination.scheduling import Formula, Known, Outlook, Schedule, always, chosen
+from harness.coordination.scheduling import Formula, Outlook, Schedule, ScheduleInputs, always, chosen
 from harness.core.errors import UserError
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips
@@ -136,7 +136,7 @@ def test_what_the_deadline_expects_is_what_the_channel_does_on_average(profile, 
     """The share of 4000 decisions with draws of their own; what is expected looks at none of them."""
     rng, expected = np.random.default_rng(3), []
 
-    def spied(known: Known) -> np.ndarray:
+    def spied(known: ScheduleInputs) -> np.ndarray:
         expected.append(known.in_time)
         return always(known)
 
@@ -151,11 +151,11 @@ def test_what_the_deadline_expects_is_what_the_channel_does_on_average(profile, 
 # -- every schedule ----------------------------------------------------------------------------------------
 
 
-def known(rng: np.random.Generator, n=40, helpers=4, actions=3, regions=2) -> Known:
+def known(rng: np.random.Generator, n=40, helpers=4, actions=3, regions=2) -> ScheduleInputs:
     may_ask = rng.random((n, helpers)) < 0.7
     hole = np.where(may_ask, 1.0, np.nan)
     own = rng.dirichlet(np.ones(actions), n)
-    return Known(
+    return ScheduleInputs(
         own, rng.uniform(0, 1.1, n), may_ask, rng.uniform(1, 90, (n, helpers)) * hole,
         rng.uniform(1, 90, (n, 1 + helpers)), rng.random((n, helpers)) * hole,
         Outlook(rng.random((n, regions)), rng.random((n, helpers, regions)) * hole[..., None], rng.random(n)),
@@ -163,7 +163,7 @@ def known(rng: np.random.Generator, n=40, helpers=4, actions=3, regions=2) -> Kn
     )  # fmt: skip
 
 
-def row(of: Known, at) -> Known:
+def row(of: ScheduleInputs, at) -> ScheduleInputs:
     return replace(
         of, **{f.name: v[at] for f in fields(of) if isinstance(v := getattr(of, f.name), np.ndarray)},
         outlook=of.outlook.take(at),

@@ -30,7 +30,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.parts import FUSION
 from harness.coordination.schedules import SCHEDULES
-from harness.coordination.scheduling import Known, chosen
+from harness.coordination.scheduling import ScheduleInputs, chosen
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints, any_of, count_of
 from harness.core.errors import UserError, printable
@@ -201,23 +201,25 @@ def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
     return _worth(point, _base_knowledge(point, intents)[1], intents, draws)
 
 
-def _worth(point: OperatingPoint, known: Known, intents: Intents, draws: Draws) -> Floats:
+def _worth(point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws) -> Floats:
     return SCHEDULES[point.ask.schedule].worth(_with_schedule_needs(point, known, intents, draws))
 
 
-def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Known:
+def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> ScheduleInputs:
     """Return what the ego knows before it asks, with what the point's schedule needs."""
     return _with_schedule_needs(point, _base_knowledge(point, intents)[1], intents, draws)
 
 
-def _base_knowledge(point: OperatingPoint, intents: Intents) -> tuple[Bools, Known]:
+def _base_knowledge(point: OperatingPoint, intents: Intents) -> tuple[Bools, ScheduleInputs]:
     """Return whether the ego's answer failed, `(...)`, and what it knows under any schedule."""
     failed, own = own_intent(point, intents)
     in_radius = intents.valid & (intents.range_m <= point.ask.radius_m)
-    return failed, Known(own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m)
+    return failed, ScheduleInputs(own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m)
 
 
-def _with_schedule_needs(point: OperatingPoint, known: Known, intents: Intents, draws: Draws) -> Known:
+def _with_schedule_needs(
+    point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws
+) -> ScheduleInputs:
     if (point.needs("outlook") and intents.outlook is None) or (point.needs("lot") and draws.trips is None):
         raise UserError(NO_SCENE.format(printable(point.ask.schedule)))
     return replace(

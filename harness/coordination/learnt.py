@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from harness.coordination.scheduling import Known
+from harness.coordination.scheduling import ScheduleInputs
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 
@@ -41,7 +41,7 @@ class Learnt:
     threshold: float
     needs: ClassVar[tuple[str, ...]] = ("outlook",)
 
-    def worth(self, known: Known) -> Floats:
+    def worth(self, known: ScheduleInputs) -> Floats:
         """Return the network's output for each helper, `(..., H)`; NaN for one that may not be asked."""
         return np.where(known.may_ask, self.network(inputs(known)), np.nan)
 
@@ -81,7 +81,7 @@ class Stated:
         return Learnt(Network(**arrays), self.threshold)
 
 
-def inputs(known: Known) -> Floats:
+def inputs(known: ScheduleInputs) -> Floats:
     """Return `INPUTS` for each helper, `(..., H, F)`; arbitrary for one that may not be asked."""
     outlook, may_ask = known.outlook, known.may_ask
     assert outlook is not None

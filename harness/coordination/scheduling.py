@@ -1,6 +1,6 @@
 """Schedules: rules for whom the ego asks and when, from what it knows before it asks.
 
-A schedule is one function of `Known` and one entry in `FORMULAS`, or a learnt network (`learnt.py`);
+A schedule is one function of `ScheduleInputs` and one entry in `FORMULAS`, or a learnt network (`learnt.py`);
 `schedules.py` has all of them by name. It returns what asking each helper is worth, in its own unit. Helpers
 worth more than the operating point's threshold are asked, up to the number that the point allows: those worth
 the most first, and the nearest first of equals. `entropy` is the paper's schedule (Eq. 3).
@@ -37,7 +37,7 @@ class Outlook:
 
 
 @dataclass(frozen=True)
-class Known:
+class ScheduleInputs:
     """What the ego knows before it asks. Values for a helper that may not be asked are arbitrary."""
 
     own: Floats  # the ego's intent after the fallback, `(..., A)`
@@ -58,13 +58,13 @@ class Schedule(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Which of `in_time`, `outlook` and `lot` it uses; the others are None in `Known`."""
+        """Which of `in_time`, `outlook` and `lot` it uses; the others are None in `ScheduleInputs`."""
 
     @property
     def threshold(self) -> float | None:
         """The worth above which the ego asks, unless the operating point has its own; None without one."""
 
-    def worth(self, known: Known) -> Floats:
+    def worth(self, known: ScheduleInputs) -> Floats:
         """Return what asking each helper is worth, `(..., H)`, or `(..., 1)` if it is the same for all.
 
         If helpers differ, it is NaN for one that may not be asked.
@@ -73,56 +73,56 @@ class Schedule(Protocol):
 
 @dataclass(frozen=True)
 class Formula:
-    """A schedule that is one function of `Known`."""
+    """A schedule that is one function of `ScheduleInputs`."""
 
-    formula: Callable[[Known], Floats]
+    formula: Callable[[ScheduleInputs], Floats]
     threshold: float | None = None
     needs: tuple[str, ...] = ()
     # whether what one helper is worth depends on which others may be asked. That of a schedule that does not
     # say may
     by_presence: bool = False
 
-    def worth(self, known: Known) -> Floats:
+    def worth(self, known: ScheduleInputs) -> Floats:
         """Apply the function."""
         return self.formula(known)
 
 
-def never(known: Known) -> Floats:
+def never(known: ScheduleInputs) -> Floats:
     """No helper is worth asking."""
     return np.full((*known.entropy_nats.shape, 1), -np.inf)
 
 
-def always(known: Known) -> Floats:
+def always(known: ScheduleInputs) -> Floats:
     """Every helper is worth asking."""
     return np.full((*known.entropy_nats.shape, 1), np.inf)
 
 
-def entropy(known: Known) -> Floats:
+def entropy(known: ScheduleInputs) -> Floats:
     """Return the entropy of the ego's intent, in nats (paper Eq. 3)."""
     return known.entropy_nats[..., None]
 
 
-def margin(known: Known) -> Floats:
+def margin(known: ScheduleInputs) -> Floats:
     """Return 1 minus the lead of the likeliest action over the next: 0 sure, 1 undecided between two."""
     ranked = np.sort(known.own, axis=-1)
     lead: Floats = ranked[..., -1] - (ranked[..., -2] if ranked.shape[-1] > 1 else 0.0)
     return (1.0 - lead)[..., None]
 
 
-def risk(known: Known) -> Floats:
+def risk(known: ScheduleInputs) -> Floats:
     """Return the entropy, in nats, times the unseen share of the region that the ego sees least of."""
     assert known.outlook is not None
     unseen: Floats = np.max(known.outlook.unseen, axis=-1, initial=0.0)
     return (known.entropy_nats * unseen)[..., None]
 
 
-def deadline(known: Known) -> Floats:
+def deadline(known: ScheduleInputs) -> Floats:
     """Return the entropy, in nats, times the probability that the helper's reply arrives in time."""
     assert known.in_time is not None
     return np.where(known.may_ask, known.entropy_nats[..., None] * known.in_time, np.nan)
 
 
-def coverage(known: Known) -> Floats:
+def coverage(known: ScheduleInputs) -> Floats:
     """Return the mean share of the regions that the helper sees and the ego does not.
 
     This is need times supply at each point of a region, as in Where2comm (Hu et al. 2022, arXiv 2209.12836).
@@ -132,7 +132,7 @@ def coverage(known: Known) -> Floats:
     return np.where(known.may_ask, np.sum(known.outlook.added, axis=-1) / regions, np.nan)
 
 
-def random(known: Known) -> Floats:
+def random(known: ScheduleInputs) -> Floats:
     """Return a draw in [0, 1), so that the ego asks in a share of 1 minus the threshold of its decisions."""
     assert known.lot is not None
     return known.lot[..., None]

@@ -20,12 +20,12 @@ from harness.extend import (
     Formula,
     Fused,
     Intents,
-    Known,
     Links,
     Messages,
     Metric,
     Registration,
     Request,
+    ScheduleInputs,
     Turn,
     linear_pool,
     link_up,
@@ -82,7 +82,7 @@ class Mumble(Attack):
         return self.intend(said, turn, (said.helpers + 1 / said.helpers.shape[-1]) / 2)
 
 
-def near(known: Known) -> Floats:
+def near(known: ScheduleInputs) -> Floats:
     """How near a helper is, from 0 at 100 m to 1 beside the ego."""
     return np.where(known.may_ask, 1 - known.range_m / 100, np.nan)
 

@@ -53,7 +53,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Known:
+class Encounter:
     """A vehicle on a path, as a viewer knows it, beside the ego as that viewer knows it."""
 
     seat: Seat  # the viewer's
@@ -120,7 +120,7 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     return [Place(on, of and of[1]) for on, of in zip(near, best, strict=True)]
 
 
-def conflicts(road: Road, all_known: Sequence[Known]) -> list[list[Conflict]]:
+def conflicts(road: Road, all_known: Sequence[Encounter]) -> list[list[Conflict]]:
     """Return the conflicts of each vehicle with the ego."""
     met: list[list[Conflict]] = [[] for _ in all_known]
     if road.form == 2:
@@ -132,7 +132,7 @@ def conflicts(road: Road, all_known: Sequence[Known]) -> list[list[Conflict]]:
     return met
 
 
-def _meeting(road: Road, known: Known) -> Conflict | None:
+def _meeting(road: Road, known: Encounter) -> Conflict | None:
     """Return the conflict where another's path crosses or merges into the ego's; None if one is past it."""
     crossing = road.crossings.get(known.key)
     if crossing is None:
@@ -157,7 +157,7 @@ def _time_s(to_go_m: float, speed_mps: float) -> float | None:
     return tenths(to_go_m / speed_mps) if speed_mps > STANDING_MPS else None
 
 
-def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Conflict]]:
+def _along(road: Road, all_known: Sequence[Encounter]) -> Iterator[tuple[int, Conflict]]:
     """Yield the conflicts in a lane that both share or the ego may change to, at present speeds.
 
     Each comes after the number of its vehicle. Of two vehicles in a row only the one behind has a distance to
@@ -198,7 +198,7 @@ def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Confli
         )  # fmt: skip
 
 
-def _apart(road: Road, shared: Sequence[tuple[Known, PathKey]]) -> list[bool]:
+def _apart(road: Road, shared: Sequence[tuple[Encounter, PathKey]]) -> list[bool]:
     """Return whether each way is in another lane than the ego's where the vehicle is."""
     x, y = np.array([(known.d.x_m, known.d.y_m) for known, _ in shared]).reshape(-1, 2).T
     own = [known.own for known, _ in shared]

@@ -7,7 +7,7 @@ from msgspec import UNSET
 
 from harness.core.arrays import Bools
 from harness.world.beacons import estimated, last_heard
-from harness.world.perception.conflicts import Known, Seat, conflicts, places, tenths
+from harness.world.perception.conflicts import Encounter, Seat, conflicts, places, tenths
 from harness.world.perception.rays import Look, Surfaces, hidden, rays_on_vehicles, surfaces
 from harness.world.perception.sensors import LEAST_RAYS, Detection, detections
 from harness.world.road import Road
@@ -100,7 +100,7 @@ def _graphs(
     where = places(road, [d for _, d in things])
     of = [k for k, (n, d) in enumerate(things) if where[k].key and d.id != egos[n].id]
     known = [
-        Known(seats[n], d, where[k], egos[n], ego_arcs[n], scenario.brake_lamps)
+        Encounter(seats[n], d, where[k], egos[n], ego_arcs[n], scenario.brake_lamps)
         for k in of for n, d in [things[k]]
     ]  # fmt: skip
     met: list[list[Conflict]] = [[] for _ in looks]
