@@ -27,7 +27,8 @@ from harness.evaluate.asking import Asker
 from harness.evaluate.live_world import LiveSource, LiveWorld
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
-from harness.evaluate.walk import table, walk
+from harness.evaluate.table import table
+from harness.evaluate.walk import walk
 from harness.prompts import versions as prompts
 from harness.runs.records import Episode, Latency
 from harness.world import lockstep

@@ -23,7 +23,8 @@ from harness.evaluate.lifecycle import Evaluated
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
-from harness.evaluate.walk import Decided, table, walk
+from harness.evaluate.table import table
+from harness.evaluate.walk import Decided, walk
 from harness.prompts import versions as prompts
 from harness.runs import folder
 from harness.runs.decisions import Decisions
@@ -109,7 +110,7 @@ class Walked:
     def result(self, point: OperatingPoint, name: str, seed: int = 0) -> list[Any]:
         """A field of the coordination in each scene, in the order of their names."""
         by_scene = {
-            part.moments[at].id: getattr(part.result, name)[row]
+            part.decision_points[at].id: getattr(part.result, name)[row]
             for part in self.parts if part.point == point
             for row, (at, its_seed) in enumerate(zip(part.due.at, part.due.seed, strict=True))
             if its_seed == seed

@@ -88,7 +88,7 @@ def test_of_each_level_as_many_are_learnt_from_as_a_whole_tree_has():
         name for name, at in forest.place.items()
         if forest.tree[at] == 9 and any(ends_well(at, action) for action in range(len(CROSSING.actions)))
     }  # fmt: skip
-    points = [point.moment for point in lessons.decision_points(CROSSING, 200_009, 9)]
+    points = [point.record for point in lessons.decision_points(CROSSING, 200_009, 9)]
     by_step = Counter(int(forest.step[forest.place[name]]) for name in in_tree)
     assert {point.scene for point in points} <= in_tree
     assert Counter(point.step for point in points) == {

@@ -38,7 +38,7 @@ from harness.core.files import digest
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate import timing
-from harness.evaluate.attackers import Said
+from harness.evaluate.attackers import SentIntents
 from harness.evaluate.fusion import FusionAnswers, codes_of, heard_in
 from harness.evaluate.lifecycle import Evaluated
 from harness.evaluate.run import evaluate
@@ -70,7 +70,9 @@ def heard(due: dict[OperatingPoint, Due], intents: Intents) -> Ints:
     """The sets of messages that are heard where nobody attacks."""
     nobody = np.zeros(intents.valid.shape, dtype=bool)
     sent = {point: exchange(point, intents, of.draws) for point, of in due.items()}
-    return heard_codes(due, {point: Said(intents, of.draws, nobody) for point, of in due.items()}, sent)
+    return heard_codes(
+        due, {point: SentIntents(intents, of.draws, nobody) for point, of in due.items()}, sent
+    )
 
 
 def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None:

@@ -70,7 +70,7 @@ def script(data: Dataset) -> Scripted:
 
 
 def fused(told: Walked, point: OperatingPoint, episode: int, seed: int = 0) -> list[list[float]]:
-    scenes = sorted({scene.id for part in told.parts for scene in part.moments})
+    scenes = sorted({scene.id for part in told.parts for scene in part.decision_points})
     policies = dict(zip(scenes, told.result(point, "fused", seed), strict=True))
     return [policies[scene].tolist() for scene in scenes if scene.startswith(f"{episode:05d}-")]
 
@@ -161,7 +161,7 @@ def test_every_step_is_asked_once_and_yields_a_part_a_condition(
     world = FrozenWorld(played, spec.points, spec.seeds)
     steps = list(walk(world, spec.points, asker, spec.ties))
     assert [[part.point.name for part in parts] for parts in steps] == [["halves", "lossy"]] * 3
-    assert [len(parts[0].moments) for parts in steps] == [3, 3, 2]
+    assert [len(parts[0].decision_points) for parts in steps] == [3, 3, 2]
     assert [parts[0].due.episode.tolist() for parts in steps] == [
         [0, 1, 2, 0, 1, 2], [0, 1, 2, 0, 1, 2], [0, 2, 0, 2]
     ]  # fmt: skip

@@ -1,8 +1,8 @@
 """Hold the decision trees of a dataset as arrays: where each action leads, its worth, and how a walk ends.
 
 The rule: an episode succeeds if the ego reaches its goal no later than the delay allowance after the
-full-view driver of the same layout, which decides at the same moments and with the same lag. A pass from the
-leaves backwards gives, exactly, the earliest time at which the goal can still be reached after each action.
+full-view driver of the same layout, which decides as often and with the same lag. A pass from the leaves
+backwards gives, exactly, the earliest time at which the goal can still be reached after each action.
 An action is *safe* if that is early enough for success. A decision that is not safe, though a safe one was
 possible, has *lost* the episode: its regret is 1. A safe decision costs the *delay* in seconds by which the
 earliest time grows.

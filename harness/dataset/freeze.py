@@ -1,8 +1,8 @@
 """Freeze a layout: compute its decision tree, with every course that the ego's decisions can take.
 
-From the first decision point on, every meta-action is taken one lag after its moment, and the decision points
-that follow are frozen. Those in the same state are one, whatever led there, and actions that set the same
-target are one edge. So the tree of six decisions has some hundred decision points, and each of its leaves is
+From the first decision point on, every meta-action is taken one lag after it, and the decision points that
+follow are frozen. Those in the same state are one, whatever led there, and actions that set the same target
+are one edge. So the tree of six decisions has some hundred decision points, and each of its leaves is
 a decided episode.
 """
 
@@ -33,7 +33,7 @@ def freeze(scenario: Scenario, seed: int, episode: int) -> tuple[list[list[Branc
     while level:
         out_edges, following = edges(level, episode)
         states = [world.state() for world in level]
-        records = moments([
+        records = records_of([
             (world, state, episode, (state.ego, *state.helpers))
             for world, state in zip(level, states, strict=True)
         ])  # fmt: skip
@@ -104,26 +104,26 @@ def scene_id(episode: int, state: WorldState) -> str:
     return f"{episode:05d}-{state.step}-{digest(msgspec.to_builtins(state))[:12]}"
 
 
-def moment(world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]) -> Record:
+def record_of(world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]) -> Record:
     """Return a decision point's state, and what the viewers see of it; the ego is the first of them.
 
     Distances to the conflict zone and to the ego are as the ego knows them.
     """
-    [record] = moments([(world, state, episode, viewers)])
+    [record] = records_of([(world, state, episode, viewers)])
     return record
 
 
-def moments(points: Sequence[tuple[World, WorldState, int, Sequence[VehicleState]]]) -> list[Record]:
-    """Return the `moment` of some decision points of one scenario."""
+def records_of(points: Sequence[tuple[World, WorldState, int, Sequence[VehicleState]]]) -> list[Record]:
+    """Return the record of some decision points of one scenario."""
     looks = [(state, viewer.id) for _, state, _, viewers in points for viewer in viewers]
     graphs = iter(scene_graphs(points[0][0].scenario, looks))
     return [
-        _moment(world, state, episode, {viewer.id: next(graphs) for viewer in viewers})
+        _record(world, state, episode, {viewer.id: next(graphs) for viewer in viewers})
         for world, state, episode, viewers in points
     ]
 
 
-def _moment(world: World, state: WorldState, episode: int, graphs: dict[str, SceneGraph]) -> Record:
+def _record(world: World, state: WorldState, episode: int, graphs: dict[str, SceneGraph]) -> Record:
     """Return a decision point's record, with the scene graphs of its viewers, by their ids."""
     zone, (ego_id, *helpers) = world.scenario.road().zone_m, graphs
     ego = state.vehicle(ego_id)

@@ -70,10 +70,10 @@ def requests(
             )  # fmt: skip
 
 
-def wanted_in(moments: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Places]:
-    """Return the moments where a helper is wanted, (n, H), and the places of those helpers in each."""
+def wanted_in(scenes: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Places]:
+    """Return the scenes where a helper is wanted, (n, H), and the places of those helpers in each."""
     rows = np.flatnonzero(wanted.any(axis=1)).tolist()
-    return [moments[n] for n in rows], [(1 + np.flatnonzero(wanted[n])).tolist() for n in rows]
+    return [scenes[n] for n in rows], [(1 + np.flatnonzero(wanted[n])).tolist() for n in rows]
 
 
 def _id(scene: Scene, viewer: str, blind: bool) -> str:
@@ -301,49 +301,47 @@ class Asker:
                     answers[place] = msgspec.structs.replace(answers[place], agent=request.agent)
         return {request.id: answer for request, answer in zip(chunk, answers, strict=True)}
 
-    def __call__(self, moments: Sequence[Scene]) -> Intents:
+    def __call__(self, scenes: Sequence[Scene]) -> Intents:
         """Return what every viewer intends; NaN if it has no request or its answer failed."""
-        self._ask_at(moments, None if self.spec.asks_all else [EGO] * len(moments))
-        return self.laid_out(moments)
+        self._ask_at(scenes, None if self.spec.asks_all else [EGO] * len(scenes))
+        return self.laid_out(scenes)
 
-    def whole(self, moments: Sequence[Scene]) -> Intents:
+    def whole(self, scenes: Sequence[Scene]) -> Intents:
         """Return what every viewer intends, all of whom are asked."""
-        self._ask_at(moments)
-        return self.laid_out(moments)
+        self._ask_at(scenes)
+        return self.laid_out(scenes)
 
-    def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
-        """Return intents where helpers are shown nothing; NaN for those of moments not in `at`."""
+    def blind(self, scenes: Sequence[Scene], at: Ints) -> Intents:
+        """Return intents where helpers are shown nothing; NaN for those of scenes not in `at`."""
         if self.spec.asks_all:
-            self._ask_at([moments[n] for n in at.tolist()], blind=True)
-        return self.laid_out(moments, blind=True)
+            self._ask_at([scenes[n] for n in at.tolist()], blind=True)
+        return self.laid_out(scenes, blind=True)
 
-    def helpers(self, moments: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
-        """Ask the helpers wanted, (n, H), and return the intents of the moments where any is wanted."""
-        scenes, places = wanted_in(moments, wanted)
+    def helpers(self, scenes: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
+        """Ask the helpers wanted, (n, H), and return the intents of the scenes where any is wanted."""
+        scenes, places = wanted_in(scenes, wanted)
         self._ask_at(scenes, places, blind)
         return self.laid_out(scenes, blind, 1 + wanted.shape[1])
 
-    def lacks(
-        self, moments: Sequence[Scene], blind: bool = False, places: Places | None = None
-    ) -> list[bool]:
-        """For each moment, whether an answer of these viewers is missing; with `blind`, a blind helper's."""
-        return list(self._lacking(moments, self.answers, blind, places))
+    def lacks(self, scenes: Sequence[Scene], blind: bool = False, places: Places | None = None) -> list[bool]:
+        """For each scene, whether an answer of these viewers is missing; with `blind`, a blind helper's."""
+        return list(self._lacking(scenes, self.answers, blind, places))
 
-    def _ask_at(self, moments: Sequence[Scene], places: Places | None = None, blind: bool = False) -> None:
-        """Ask what is missing of the viewers at these places of each moment; None for all of them."""
-        if not any(self._lacking(moments, self.answers, blind, places)):
+    def _ask_at(self, scenes: Sequence[Scene], places: Places | None = None, blind: bool = False) -> None:
+        """Ask what is missing of the viewers at these places of each scene; None for all of them."""
+        if not any(self._lacking(scenes, self.answers, blind, places)):
             return
-        # Only the prompts of moments whose answers were not all given are rendered.
-        lacks = list(self._lacking(moments, self._given, blind, places))
-        scenes = list(compress(moments, lacks))
+        # Only the prompts of scenes whose answers were not all given are rendered.
+        lacks = list(self._lacking(scenes, self._given, blind, places))
+        scenes = list(compress(scenes, lacks))
         asked = None if places is None else list(compress(places, lacks))
         self.answer(list(requests(self.spec, scenes, blind, asked)))
 
     def _lacking(
-        self, moments: Sequence[Scene], available: Container[str], blind: bool = False,
+        self, scenes: Sequence[Scene], available: Container[str], blind: bool = False,
         places: Places | None = None,
     ) -> Iterator[bool]:  # fmt: skip
-        for scene, asked in zip(moments, places or repeat(None), strict=False):
+        for scene, asked in zip(scenes, places or repeat(None), strict=False):
             viewers = enumerate(self.spec.viewers(scene))
             yield any(
                 _id(scene, viewer, blind) not in available
@@ -351,15 +349,15 @@ class Asker:
                 if place >= blind and (asked is None or place in asked)
             )
 
-    def laid_out(self, moments: Sequence[Scene], blind: bool = False, width: int = 1) -> Intents:
+    def laid_out(self, scenes: Sequence[Scene], blind: bool = False, width: int = 1) -> Intents:
         """Return the answers so far as arrays of at least `width` vehicles; NaN without an intent."""
         answers = [
-            [self.answers.get(_id(s, v, blind and n > 0)) for n, v in enumerate(s.viewers)] for s in moments
+            [self.answers.get(_id(s, v, blind and n > 0)) for n, v in enumerate(s.viewers)] for s in scenes
         ]
         width = max(width, *map(len, answers))
         unknown = (math.nan,) * len(self.spec.actions)
         p, distances_m, ranges_m, bits, unasked = [], [], [], [], []
-        for scene, row in zip(moments, answers, strict=True):
+        for scene, row in zip(scenes, answers, strict=True):
             record, (ego, *helpers) = scene.record, scene.viewers
             absent = width - len(row)
             unasked.append([*[answer is None for answer in row[1:]], *[False] * absent])
@@ -373,7 +371,7 @@ class Asker:
             bits.append([*[payload_bits(xy_m[v], a) if a else 0 for v, a in sent], *[0] * absent])
         intents = np.array(p, dtype=float)
         valid = ~np.isnan(intents[:, 1:]).any(axis=-1)
-        shape = len(moments), width - 1
+        shape = len(scenes), width - 1
         not_yet = None if self.spec.asks_all else np.array(unasked, dtype=bool).reshape(shape)
         return Intents(
             intents[:, 0], intents[:, 1:], valid if not_yet is None else valid | not_yet,
@@ -381,22 +379,22 @@ class Asker:
             np.array(bits, dtype=float).reshape(shape), inference_s(self.latency, answers), unasked=not_yet,
         )  # fmt: skip
 
-    def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
+    def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         """Return the ego's answers to these sets of messages, rewritten as `rewrites` says."""
-        ids = [_fusion_id(*each) for each in _heard_sets(moments, codes, rewrites)]
+        ids = [_fusion_id(*each) for each in _heard_sets(scenes, codes, rewrites)]
         if not self.answers.keys() >= set(ids):
-            self.answer(self.fusion_requests(moments, codes, rewrites))
+            self.answer(self.fusion_requests(scenes, codes, rewrites))
         answers = [self.answers[name] for name in ids]
         unknown = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or unknown for a in answers]).reshape(len(ids), len(unknown))
         return FusionAnswers(codes, intents, fusion_s(self.latency, answers)).at
 
     def fusion_requests(
-        self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
+        self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> list[Request]:
         """Return the requests of the fusion calls with these sets of messages."""
         calls = []
-        for scene, senders in _heard_sets(moments, codes, rewrites):
+        for scene, senders in _heard_sets(scenes, codes, rewrites):
             keys = (key.partition(REWRITTEN)[0] for key in senders)
             sent = {key: a for key in keys if (a := self.answers.get(f"{scene.id}/{key}"))}
             calls.append(fusion_request(self.spec, scene, sent, senders))
@@ -425,13 +423,13 @@ def _answer_chunks(
 
 
 def _heard_sets(
-    moments: Sequence[Scene], codes: Ints, rewrites: Rewrites
+    scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites
 ) -> Iterator[tuple[Scene, list[str]]]:
     """Yield the scene of each set of messages and the keys of its senders."""
-    helpers = max(len(scene.viewers) for scene in moments) - 1
+    helpers = max(len(scene.viewers) for scene in scenes) - 1
     for code in codes.tolist():
-        moment, heard, attacking = heard_in(code, helpers, bool(rewrites.attack))
-        scene = moments[moment]
+        at, heard, attacking = heard_in(code, helpers, bool(rewrites.attack))
+        scene = scenes[at]
         yield scene, [key_of(scene.viewers[1 + h], rewrites, h in attacking) for h in heard]
 
 

@@ -22,16 +22,16 @@ from harness.radio.fading import Trips
 
 
 @dataclass(frozen=True)
-class Said:
+class SentIntents:
     """What H voices say to the channel in decisions (n,)."""
 
     intents: Intents  # the intents and claims of each voice
     draws: Draws  # the channel's draws for each voice
     attackers: Bools  # which voices are an attacker's, (n, H)
 
-    def take(self, at: Any) -> "Said":
+    def take(self, at: Any) -> "SentIntents":
         """Return what is said in the decisions at these indices."""
-        return Said(self.intents.take(at), self.draws.take(at), self.attackers[at])
+        return SentIntents(self.intents.take(at), self.draws.take(at), self.attackers[at])
 
 
 class Attackers:
@@ -42,7 +42,7 @@ class Attackers:
         self._steps = max((attack.steps for attack in self._attacks), default=0)
         self._intended: dict[tuple[int, int], list[Floats]] = {}
 
-    def said(self, truth: Intents, draws: Draws, episodes: Sequence[tuple[int, int]]) -> Said:
+    def said(self, truth: Intents, draws: Draws, episodes: Sequence[tuple[int, int]]) -> SentIntents:
         """Return what is said in decisions (n,), given what the vehicles intend.
 
         `truth` is what every vehicle intends, of H helpers; `episodes` has the number and seed of each
@@ -50,7 +50,7 @@ class Attackers:
         """
         none_attack = np.zeros(truth.valid.shape, dtype=bool)
         if not self._attacks:
-            return Said(truth, draws, none_attack)
+            return SentIntents(truth, draws, none_attack)
         if draws.trips is None:
             raise UserError("attacks need layouts, and the paper's study has none; leave attack out")
         uniforms = _uniforms(draws.trips, truth.valid.shape[1])
@@ -65,9 +65,9 @@ class Attackers:
             intended.append(intents)
             del intended[1 : -self._steps or None]  # keep the first step and those that an attack looks at
         if said.voice_of is None:
-            return Said(said, draws, attacking)
+            return SentIntents(said, draws, attacking)
         voices = np.take_along_axis(attacking, said.voice_of, axis=-1)
-        return Said(said, draws.of_helpers(said.voice_of), voices)
+        return SentIntents(said, draws.of_helpers(said.voice_of), voices)
 
     def _remembered(self, truth: Intents, episodes: Sequence[tuple[int, int]]) -> tuple[Floats, Floats]:
         """Return the first intents (n, H, A) and those of K past steps (n, K, H, A); NaN without a step."""

@@ -17,20 +17,20 @@ from harness.world.scenario import Scenario
 NEGLIGIBLE_M = 0.01  # how far a simplified line of the map may be off
 
 
-def claims(scenario: Scenario, moments: Sequence[Scene]) -> Claims:
-    """Return the claims of each moment, (n, ...)."""
+def claims(scenario: Scenario, scenes: Sequence[Scene]) -> Claims:
+    """Return the claims of each scene, (n, ...)."""
     road, p = scenario.road(), scenario.parameters
-    n, helpers = len(moments), max((len(scene.viewers) for scene in moments), default=1) - 1
+    n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
     xy_m = np.full((n, 1 + helpers, 2), np.nan)
     speed_mps, sensed_m = np.full((2, n, helpers), np.nan)
-    for i, scene in enumerate(moments):
+    for i, scene in enumerate(scenes):
         places, speeds, sensed = _claims(road, scene)
         xy_m[i, : len(places)], speed_mps[i, : len(speeds)], sensed_m[i, : len(sensed)] = (
             places,
             speeds,
             sensed,
         )
-    time_s = np.array([scene.state.time_s for scene in moments])
+    time_s = np.array([scene.state.time_s for scene in scenes])
     error_m = np.full(n, 0.0 if p.perfect_knowledge else p.beacon_noise_m)
     return Claims(xy_m, speed_mps, time_s, error_m, sensed_m, _map(scenario))
 

@@ -110,9 +110,9 @@ def decided_helpers_j(
     of: dict[int, Floats] = {}
     parts = []
     for part in decided:
-        if id(part.moments) not in of:
-            of[id(part.moments)] = vehicles_j(latency, part.moments, answers)
-        parts.append(helpers_j(part.result.infers, of[id(part.moments)][part.due.at]))
+        if id(part.decision_points) not in of:
+            of[id(part.decision_points)] = vehicles_j(latency, part.decision_points, answers)
+        parts.append(helpers_j(part.result.infers, of[id(part.decision_points)][part.due.at]))
     return np.concatenate(parts)
 
 

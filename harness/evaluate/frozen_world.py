@@ -10,8 +10,9 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.select import ALL, Selection
+from harness.evaluate.draws import channel_draws
 from harness.evaluate.settings import FrozenSettings
-from harness.evaluate.walk import Decided, Due, Placed, channel_draws
+from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World
@@ -81,10 +82,10 @@ class _Walks:
         self.dropped = np.zeros(shape, dtype=bool)
 
 
-class FrozenWorld(Placed):
+class FrozenWorld(SceneWorld):
     """Walks every episode of a dataset under all conditions and seeds.
 
-    An action always takes effect one lag of the dataset after its moment, however long the decision took.
+    An action always takes effect one lag of the dataset after its decision point, however long it took.
     """
 
     def __init__(self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]) -> None:
@@ -92,13 +93,13 @@ class FrozenWorld(Placed):
         self.scenario = dataset.scenario
         self._walks = {point: _Walks(len(seeds), self._forest.root) for point in points}
         self._decided: list[tuple[Ints, Ints, Floats]] = []  # where, which action, after how many seconds
-        self._luck: tuple[Bools, Draws] | None = None  # of the moments just shown
+        self._luck: tuple[Bools, Draws] | None = None  # of the decision points just shown
 
     def observe(self) -> Sequence[Scene]:
         """Return every decision point to which some walk has come."""
         places = np.unique(np.concatenate([walks.at.ravel() for walks in self._walks.values()]))
-        self._moments, self._luck = places[places >= 0], None
-        self.scenes = self._dataset.scenes([self._forest.ids[n] for n in self._moments.tolist()])
+        self._shown, self._luck = places[places >= 0], None
+        self.scenes = self._dataset.scenes([self._forest.ids[n] for n in self._shown.tolist()])
         self._helpers = max((len(scene.viewers) for scene in self.scenes), default=1) - 1
         return self.scenes
 
@@ -107,7 +108,7 @@ class FrozenWorld(Placed):
         walks, forest = self._walks[point], self._forest
         undecided = walks.at >= 0
         seed_index, tree = np.nonzero(undecided)
-        at = np.searchsorted(self._moments, walks.at[undecided])
+        at = np.searchsorted(self._shown, walks.at[undecided])
         drawn, draws = self._draws()
         if len(at) < np.count_nonzero(drawn):
             draws = draws.take(undecided[drawn])
@@ -127,12 +128,12 @@ class FrozenWorld(Placed):
             self._luck = latest >= 0, draws
         return self._luck
 
-    def leave_out(self, point: OperatingPoint, moments: Bools) -> None:
-        """End the walks that are at these of the moments just shown, and leave them out of the results."""
+    def leave_out(self, point: OperatingPoint, at: Bools) -> None:
+        """End the walks that are at these of the decision points just shown; no result has them."""
         walks = self._walks[point]
         undecided = walks.at >= 0
         ended = np.zeros_like(undecided)
-        ended[undecided] = moments[np.searchsorted(self._moments, walks.at[undecided])]
+        ended[undecided] = at[np.searchsorted(self._shown, walks.at[undecided])]
         walks.dropped |= ended
         walks.at[ended] = -1
 

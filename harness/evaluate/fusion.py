@@ -23,27 +23,27 @@ from harness.runs.records import BLIND, REWRITTEN, Answer
 class FusionAnswers:
     """The ego's answers to K sets of messages; H helpers, A actions."""
 
-    codes: Ints  # the moment of each set and who was heard in it (`codes_of`), ascending, (K,)
+    codes: Ints  # the decision point of each set and who was heard in it (`codes_of`), ascending, (K,)
     intents: Floats  # the intent after each set, (K, A); NaN where the answer failed
     seconds: Floats  # time of each fusion call, (K,)
 
-    def at(self, moments: Ints, attackers: Bools | None = None) -> "FusionAnswersAt":
-        """Return the call for decisions at moments (n,), with attackers (n, H) if the text shows them."""
-        return FusionAnswersAt(self, moments, attackers)
+    def at(self, points: Ints, attackers: Bools | None = None) -> "FusionAnswersAt":
+        """Return the call for decisions at points (n,), with attackers (n, H) if the text shows them."""
+        return FusionAnswersAt(self, points, attackers)
 
 
 @dataclass(frozen=True)
 class FusionAnswersAt:
-    """The fusion call for decisions at some moments, as a `FusionCall` of `coordinate`."""
+    """The fusion call for decisions at some points, as a `FusionCall` of `coordinate`."""
 
     answers: FusionAnswers
-    moments: Ints
+    points: Ints
     attackers: Bools | None = None
 
     def __call__(self, on_time: Bools) -> tuple[Floats, Floats]:
         """Return intents (n, A) and seconds (n,) by who was heard (n, H); NaN if nobody was."""
         answers, heard_any = self.answers, on_time.any(axis=1)
-        codes = codes_of(on_time, self.moments, self.attackers)[heard_any]
+        codes = codes_of(on_time, self.points, self.attackers)[heard_any]
         intents = np.full((len(on_time), answers.intents.shape[1]), np.nan)
         seconds = np.full(len(on_time), np.nan)
         if len(codes):
@@ -54,17 +54,17 @@ class FusionAnswersAt:
         return intents, seconds
 
 
-def codes_of(on_time: Bools, moments: Ints, attackers: Bools | None = None) -> Ints:
-    """Encode moments (n,) and who was heard in each (n, H) as one number each, (n,).
+def codes_of(on_time: Bools, points: Ints, attackers: Bools | None = None) -> Ints:
+    """Encode points (n,) and who was heard in each (n, H) as one number each, (n,).
 
     With attackers (n, H), the number also says which of those heard attack.
     """
     flags = on_time if attackers is None else np.concatenate([on_time, on_time & attackers], axis=1)
-    return np.asarray(moments << flags.shape[1] | flags @ (1 << np.arange(flags.shape[1])))
+    return np.asarray(points << flags.shape[1] | flags @ (1 << np.arange(flags.shape[1])))
 
 
 def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list[int], list[int]]:
-    """Decode a number: the moment, the helpers that were heard, from 0, and those of them that attack."""
+    """Decode a number: the decision point, the helpers heard, from 0, and those of them that attack."""
     bits = helpers * (1 + attacked)
     heard = [h for h in range(helpers) if code >> h & 1]
     return code >> bits, heard, [h for h in heard if attacked and code >> (helpers + h) & 1]
@@ -79,7 +79,7 @@ def key_of(helper: str, rewrites: Rewrites, attacks: bool) -> str:
 def messages_of(
     answers: Mapping[str, Answer], senders: Sequence[str], actions: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return these helpers' messages as a prompt takes them; `answers` are those of a moment, by key."""
+    """Return these helpers' messages as a prompt takes them; `answers` are a point's, by key."""
     messages = []
     for sender in senders:
         key, _, changes = sender.partition(REWRITTEN)

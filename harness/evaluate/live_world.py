@@ -15,13 +15,14 @@ import numpy as np
 from msgspec import structs
 
 from harness.coordination.operating_point import OperatingPoint
-from harness.dataset.freeze import moments
+from harness.dataset.freeze import records_of
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
 from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
+from harness.evaluate.draws import channel_draws
 from harness.evaluate.settings import DriveSettings
-from harness.evaluate.walk import Decided, Due, Placed, channel_draws
+from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.runs import metrics
 from harness.runs.records import ClosedLoop, Episode
 from harness.world import reference, scenarios
@@ -98,7 +99,7 @@ class LiveSource:
         return scenes
 
 
-class LiveWorld(Placed):
+class LiveWorld(SceneWorld):
     """Drives episodes under all conditions and seeds; those that act alike share a world."""
 
     def __init__(
@@ -122,7 +123,7 @@ class LiveWorld(Placed):
         self._step = 0
 
     def observe(self) -> Sequence[Scene]:
-        """Return each distinct moment in which some episode has no open decision."""
+        """Return each distinct decision point in which some episode has no open decision."""
         while self._going and self._step < self._p.decisions:
             for trajectory in self._going:
                 for course in trajectory.courses:
@@ -199,7 +200,7 @@ def looks(trajectories: Sequence[Trajectory], step: int, ego_alone: bool) -> lis
         (t.world, state, t.number, [state.ego] if ego_alone else [state.ego, *state.helpers])
         for t, state in zip(trajectories, states, strict=True)
     ]
-    return list(map(Scene, moments(points)))
+    return list(map(Scene, records_of(points)))
 
 
 def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) -> Episode:

@@ -17,19 +17,19 @@ from harness.world.state import VehicleState, WorldState
 MOVING_MPS = 0.1  # a slower vehicle counts as standing
 
 
-def outlook(road: Road, moments: Sequence[Scene]) -> Outlook:
-    """Return the outlook of each moment, (n, ...)."""
-    n, helpers = len(moments), max((len(scene.viewers) for scene in moments), default=1) - 1
+def outlook(road: Road, scenes: Sequence[Scene]) -> Outlook:
+    """Return the outlook of each scene, (n, ...)."""
+    n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
     unseen, to_zone_s = np.zeros((n, len(road.sectors))), np.zeros(n)
     added = np.full((n, helpers, len(road.sectors)), np.nan)
-    for i, scene in enumerate(moments):
+    for i, scene in enumerate(scenes):
         seen = _outlook(road, scene)
         unseen[i], added[i, : len(seen.added)], to_zone_s[i] = seen.unseen, seen.added, seen.to_zone_s
     return Outlook(unseen, added, to_zone_s)
 
 
 def _outlook(road: Road, scene: Scene) -> Outlook:
-    """Return a moment's outlook; kept with the immutable scene."""
+    """Return a scene's outlook; kept with the immutable scene."""
     if (kept := scene.notes.get("outlook")) is None:
         graph, state = scene.graphs[scene.viewers[0]], scene.state
         helpers = [known(state, name, state.ego.id) for name in scene.viewers[1:]]

@@ -24,7 +24,7 @@ STILLS_HZ = 10  # while no decision is open
 
 
 @dataclass(frozen=True)
-class Played:
+class ReplayedEpisode:
     """One episode of a finished closed-loop run."""
 
     manifest: Manifest  # the run's manifest
@@ -55,7 +55,7 @@ class Still:
     danger: str | None  # id of the dangerous vehicle, or None
 
 
-def find(path: Path, episode: int, condition: str | None, seed: int | None) -> Played:
+def find(path: Path, episode: int, condition: str | None, seed: int | None) -> ReplayedEpisode:
     """Return an episode of a run folder; by default of the last condition and the first seed.
 
     Raises:
@@ -78,7 +78,7 @@ def find(path: Path, episode: int, condition: str | None, seed: int | None) -> P
     return played(run, episode, condition, seed)
 
 
-def played(run: Run, episode: int, condition: str, seed: int) -> Played:
+def played(run: Run, episode: int, condition: str, seed: int) -> ReplayedEpisode:
     """Return an episode of a run that is known to have it."""
     world, table = run.manifest.world, run.decisions
     assert isinstance(world, ClosedLoop)
@@ -86,7 +86,7 @@ def played(run: Run, episode: int, condition: str, seed: int) -> Played:
     is_episode &= table.codes("condition", run.conditions) == run.conditions.index(condition)
     rows = table.take(np.flatnonzero(is_episode))
     decisions = sorted(rows.records(0, len(rows)), key=lambda decision: decision.step)
-    return Played(run.manifest, condition, seed, episode, world.first_seed + episode, decisions)
+    return ReplayedEpisode(run.manifest, condition, seed, episode, world.first_seed + episode, decisions)
 
 
 def scene_of(run: Run, name: str) -> Scene:
@@ -112,7 +112,7 @@ def _due_frame(decision: Decision, p: Parameters) -> int:
     return round(decision.step * p.decision_period_s * p.simulation_hz)
 
 
-def _actions_by_frame(played: Played) -> dict[int, str]:
+def _actions_by_frame(played: ReplayedEpisode) -> dict[int, str]:
     """Return the actions by the frame in which they were taken."""
     p = played.scenario.parameters
     return {_acting_frame(d, p): d.action for d in played.decisions if d.acted}
@@ -122,7 +122,7 @@ def _acting_frame(decision: Decision, p: Parameters) -> int:
     return round((decision.acts_at_s or 0.0) * p.simulation_hz)
 
 
-def stills(played: Played, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
+def stills(played: ReplayedEpisode, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
     """Yield the stills of an episode: ten a second, and one each frame while a decision is open."""
     p = played.scenario.parameters
     world = World.start(played.scenario, played.layout_seed)

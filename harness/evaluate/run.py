@@ -44,7 +44,8 @@ from harness.evaluate.lifecycle import (
 from harness.evaluate.settings import FILE, of_words, text_of
 from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
-from harness.evaluate.walk import of_all_seeds, table, walk
+from harness.evaluate.table import of_all_seeds, table
+from harness.evaluate.walk import walk
 from harness.runs import folder
 from harness.runs import sources as kept_sources
 from harness.runs.decisions import Decisions
@@ -184,7 +185,7 @@ def _walk(
     for n, seeds in enumerate(_split(spec.seeds, at_once)):
         world, asker = _world_of(spec, chunk, seeds), asker_of(n, answers)
         decided = list(chain.from_iterable(walk(world, spec.points, asker, spec.ties)))
-        viewers |= {scene.id: scene.viewers for part in decided for scene in part.moments}
+        viewers |= {scene.id: scene.viewers for part in decided for scene in part.decision_points}
         served += asker.served
         answers, more = asker.answers, world.columns()
         if spec.device_profile:

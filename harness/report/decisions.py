@@ -120,7 +120,7 @@ class Decisions:
         if unknown := self._details.without_prompts():
             lacks["prompts"] = lacking(unknown[0]) or "they are not known"
         if self._not_replayed:
-            lacks["pictures"] = f"{self._not_replayed} moments come out otherwise in this simulator"
+            lacks["pictures"] = f"{self._not_replayed} decision points come out otherwise in this simulator"
         return lacks
 
     def parts(self) -> list[Part]:

@@ -166,8 +166,8 @@ def messages(stored: ReplayedRun, point: OperatingPoint, drawn: Mapping[str, int
 def _messages(
     stored: ReplayedRun, part: Decided[Scene], memory: Memory, drawn: Mapping[str, int]
 ) -> Iterator[LeftOut]:
-    point, due, moments, state = part.point, part.due, part.moments, memory.recall(part.due)
-    chosen = [drawn.get(moments[at].id) == seed for at, seed in zip(due.at.tolist(), due.seed, strict=True)]
+    point, due, points, state = part.point, part.due, part.decision_points, memory.recall(part.due)
+    chosen = [drawn.get(points[at].id) == seed for at, seed in zip(due.at.tolist(), due.seed, strict=True)]
     decisions, helpers = np.nonzero(part.result.on_time & np.array(chosen)[:, None])
     if not len(decisions):
         return
@@ -178,12 +178,12 @@ def _messages(
     if point.has_fusion_call:
         attackers = shown(point, broadcast)
         codes = np.unique(codes_of(rest, at, attackers)[rest.any(axis=1)])
-        call = stored.fusion_call(moments, codes, point.rewrites)(at, attackers)
+        call = stored.fusion_call(points, codes, point.rewrites)(at, attackers)
     fusion = Fusion(call, None if state is None else state[decisions])
     less = fuse(point, replace(whole, on_time=rest), broadcast.intents, fusion)
     for n, voice in enumerate(helpers.tolist()):
         helper = voice if broadcast.intents.voice_of is None else int(broadcast.intents.voice_of[n, voice])
-        scene = moments[at[n]]
+        scene = points[at[n]]
         sender = scene.viewers[1 + helper]
         items = scene.graphs[sender].seen
         sight = any(_kind(scene, sender, item) == HIDDEN for item in items)

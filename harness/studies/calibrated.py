@@ -120,7 +120,7 @@ def _below(parts: Sequence[_Drawn]) -> _Drawn:
 
 
 class CalibratedWorld:
-    """Episodes whose moments are drawn: each step's, for all episodes at once.
+    """Episodes whose decision points are drawn: each step's, for all episodes at once.
 
     An ego that has fused the witness's message knows from its next decision on. The last decision decides.
     """
@@ -140,7 +140,7 @@ class CalibratedWorld:
         self._now = self._steps[self._step]
         return range(len(self._knows))
 
-    def __call__(self, moments: Sequence[int]) -> Intents:
+    def __call__(self, decision_points: Sequence[int]) -> Intents:
         """Return what every vehicle intends at this step."""
         own = np.where(self._knows[:, None], self._now.knowing, self._now.intents.own)
         return replace(self._now.intents, own=own)

@@ -21,8 +21,8 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.dataset.forest import Forest
 from harness.evaluate.device import helpers_j
+from harness.evaluate.draws import channel_draws, tie_draws
 from harness.evaluate.outlook import outlook
-from harness.evaluate.walk import channel_draws, tie_draws
 from harness.radio.channel import Draws
 from harness.studies.replayed_run import ReplayedRun
 from harness.world.sight_lines import site

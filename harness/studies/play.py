@@ -10,7 +10,8 @@ import numpy as np
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats, Ints
 from harness.core.statistics import Estimate, known_mean, seed_interval
-from harness.evaluate.walk import Ask, Decided, World, columns, walk
+from harness.evaluate.table import columns
+from harness.evaluate.walk import Ask, Decided, World, walk
 from harness.runs.decisions import DECIMALS
 from harness.runs.metrics import (
     METRICS,

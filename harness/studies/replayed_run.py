@@ -194,9 +194,9 @@ class ReplayedRun:
         different = list(dict.fromkeys(points))
         world = FrozenWorld(self.dataset, different, seeds)
 
-        def leave_out(moments: Bools) -> None:
+        def leave_out(at: Bools) -> None:
             for point in different:
-                world.leave_out(point, moments)
+                world.leave_out(point, at)
 
         ask = _Nearest(self, vehicles - 1, leave_out)
         walks = walk_through(world, different, ask, seeds, world.numbers, self.spec.ties, read)
@@ -204,12 +204,12 @@ class ReplayedRun:
         for point in points:
             yield [WalkResult(world.numbers, world.ends(point), *walked[point])]
 
-    def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> Floats:
+    def joules(self, scenes: Sequence[Scene], point: OperatingPoint) -> Floats:
         """Return joules of each vehicle's answer, (n, 1+H); NaN where unknown."""
         manifest = self.run.manifest
         if manifest.device_profile is None:
-            return np.full((len(moments), self.vehicles), np.nan)
-        taken = device.vehicles_j(manifest.latency, moments, self._asker.answers)
+            return np.full((len(scenes), self.vehicles), np.nan)
+        taken = device.vehicles_j(manifest.latency, scenes, self._asker.answers)
         if point.cloud.round_trip_s is not None or point.cloud.round_trip:
             taken[:, 0] = np.nan  # the ego's model is in a cloud
         return taken
@@ -248,20 +248,20 @@ class ReplayedRun:
         """Raise Unanswered if too many of the questions that were asked here got no answer."""
         self._asker.settle()
 
-    def __call__(self, moments: Sequence[Scene]) -> Intents:
+    def __call__(self, scenes: Sequence[Scene]) -> Intents:
         """Return what every vehicle intends. Where the run has no answer of an ego its model is asked."""
         with self._writing():
-            return self._asker(moments)
+            return self._asker(scenes)
 
-    def whole(self, moments: Sequence[Scene]) -> Intents:
+    def whole(self, scenes: Sequence[Scene]) -> Intents:
         """Return what every vehicle intends. Where the run has no answer its model is asked."""
         with self._writing():
-            return self._asker.whole(moments)
+            return self._asker.whole(scenes)
 
-    def helpers(self, moments: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
+    def helpers(self, scenes: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
         """Return what vehicles intend where a helper is wanted; the model is asked what the run lacks."""
-        scenes, places = wanted_in(moments, wanted)
-        if not self._asks and any(self._asker.lacks(scenes, blind, places)):
+        asked, places = wanted_in(scenes, wanted)
+        if not self._asks and any(self._asker.lacks(asked, blind, places)):
             lacks = "that are shown nothing, which messages=blind needs" if blind else "that it did not ask"
             remedy = "" if blind else ", or make the run again with --ask all"
             raise UserError(
@@ -269,24 +269,24 @@ class ReplayedRun:
                 f"leave it out{remedy}"
             )
         with self._writing():
-            there = self._asker.helpers(moments, wanted, blind)
+            there = self._asker.helpers(scenes, wanted, blind)
         if not blind:
-            self._lay_out(scenes)
+            self._lay_out(asked)
         return there
 
-    def intents(self, moments: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
+    def intents(self, scenes: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
         """Return what vehicles intend; unless the model is asked, walks without an answer are left out."""
-        new = [scene for scene in moments if scene.id not in self._row]
+        new = [scene for scene in scenes if scene.id not in self._row]
         if any(self._asker.lacks(new, places=[EGO] * len(new))):
             if self._asks:
-                return self(moments)
-            lacks = self._asker.lacks(moments, places=[EGO] * len(moments))
-            self.left_out |= {scene.id for scene, lacking in zip(moments, lacks, strict=True) if lacking}
+                return self(scenes)
+            lacks = self._asker.lacks(scenes, places=[EGO] * len(scenes))
+            self.left_out |= {scene.id for scene, lacking in zip(scenes, lacks, strict=True) if lacking}
             leave_out(np.array(lacks))
-            return self._asker.laid_out(moments)
+            return self._asker.laid_out(scenes)
         if new:
             self._lay_out(new)
-        return self._there(moments, max(len(scene.viewers) for scene in moments) - 1)
+        return self._there(scenes, max(len(scene.viewers) for scene in scenes) - 1)
 
     def _lay_out(self, scenes: Sequence[Scene]) -> None:
         """Keep the intents in these scenes as arrays."""
@@ -300,12 +300,12 @@ class ReplayedRun:
         assert self._intents is not None
         return self._intents.take([self._row[scene.id] for scene in scenes]).of_first(helpers)
 
-    def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
+    def blind(self, scenes: Sequence[Scene], at: Ints) -> Intents:
         """Return the same where helpers are shown nothing, as far as the run has answers or asks them all."""
         with self._writing():
-            return self._asker.blind(moments, at)
+            return self._asker.blind(scenes, at)
 
-    def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
+    def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         """Return the ego's answers to these sets of messages; what the run lacks is asked, and kept in it."""
         if not self._asks:
             raise UserError(
@@ -313,7 +313,7 @@ class ReplayedRun:
                 "consensus ego-prompt needs; leave it out"
             )
         with self._writing():
-            return self._asker.fusion_call(moments, codes, rewrites)
+            return self._asker.fusion_call(scenes, codes, rewrites)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -386,19 +386,19 @@ class _Nearest:
     def __init__(self, stored: ReplayedRun, helpers: int, leave_out: Callable[[Bools], None]) -> None:
         self._stored, self._helpers, self._leave_out = stored, helpers, leave_out
 
-    def __call__(self, moments: Sequence[Scene]) -> Intents:
-        return self._nearest(self._stored.intents(moments, self._leave_out))
+    def __call__(self, scenes: Sequence[Scene]) -> Intents:
+        return self._nearest(self._stored.intents(scenes, self._leave_out))
 
-    def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
-        return self._nearest(self._stored.blind(moments, at))
+    def blind(self, scenes: Sequence[Scene], at: Ints) -> Intents:
+        return self._nearest(self._stored.blind(scenes, at))
 
-    def helpers(self, moments: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
-        return self._nearest(self._stored.helpers(moments, wanted, blind))
+    def helpers(self, scenes: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
+        return self._nearest(self._stored.helpers(scenes, wanted, blind))
 
     def _nearest(self, intents: Intents) -> Intents:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)
         near = chosen(np.zeros_like(reach), -1.0, np.isfinite(reach), reach, self._helpers)
         return replace(intents, valid=intents.valid & near)
 
-    def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
-        return self._stored.fusion_call(moments, codes, rewrites)
+    def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
+        return self._stored.fusion_call(scenes, codes, rewrites)

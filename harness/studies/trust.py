@@ -147,7 +147,7 @@ def _judged(run: ReplayedRun, part: Decided[Scene]) -> dict[str, Floats]:
     `suspected` is NaN where nobody was heard or the rule judges nobody.
     """
     forest, trust = run.dataset.forest, part.result.trust
-    at = np.array([forest.place[scene.id] for scene in part.moments])[part.due.at]
+    at = np.array([forest.place[scene.id] for scene in part.decision_points])[part.due.at]
     return {
         "nats": negative_log_likelihood(part.result.fused, forest.safe[at]),
         "suspected": np.where(np.isnan(trust), np.nan, trust < TRUSTED),

@@ -26,7 +26,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.files import bytes_of, write_whole
 from harness.core.parallel import Workers, each
-from harness.dataset.freeze import edges, moment, scene_id
+from harness.dataset.freeze import edges, record_of, scene_id
 from harness.dataset.load import Scene
 from harness.dataset.schema import Record
 from harness.prompts.versions import Prompt
@@ -50,7 +50,7 @@ PRIOR = {
 class Point(msgspec.Struct, frozen=True):
     """A decision point that is learnt from."""
 
-    moment: Record
+    record: Record
     label: list[float]  # soft label, (A,)
 
 
@@ -104,8 +104,8 @@ def draw(
     each(partial(_encoded, scenario, seed), todo, workers, keep, lambda number: f"layout {number}")
     decoder = msgspec.json.Decoder(list[Point])
     points = [point for file in files for point in decoder.decode(bytes_of(file, "record"))]
-    scenes = tuple(Scene(point.moment) for point in points)
-    labels = {point.moment.scene: np.array(point.label) for point in points}
+    scenes = tuple(Scene(point.record) for point in points)
+    labels = {point.record.scene: np.array(point.label) for point in points}
     return Lessons(scenario, tuple(prompts), scenes, labels)
 
 
@@ -114,7 +114,7 @@ def _encoded(scenario: Scenario, seed: int, number: int) -> bytes:
 
 
 def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
-    """Draw a layout's decision points that are learnt from: the `moment` and the soft `label` of each."""
+    """Draw a layout's decision points that are learnt from: the `record` and the soft `label` of each."""
     rng = noise.generator("lessons", scenario.name, seed)
     reference, points = drive(scenario, PRIVILEGED, seed), []
     level = [World.start(scenario, seed)]
@@ -135,7 +135,7 @@ def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
                         ends_s.update(dict.fromkeys(edge.actions, outcome.time_s))
                 if np.isfinite(list(ends_s.values())).any():
                     taken += 1
-                    record = moment(world, state, number, (state.ego, *state.helpers))
+                    record = record_of(world, state, number, (state.ego, *state.helpers))
                     points.append(Point(record, label(ends_s).tolist()))
             following.update({scene_id(number, child.state()): child for child in children})
         level = list(following.values())

@@ -60,7 +60,7 @@ def _pick(points: list[Point], role: str, times: list[int], seed: int) -> Candid
     candidates: list[Candidate] = [
         (graph, label := np.array(point.label), int(label.argmax()))
         for point in points
-        for graph in point.moment.graphs.values()
+        for graph in point.record.graphs.values()
         if graph.role == role
     ]
     order = noise.generator("examples", role, seed).permutation(len(candidates)).tolist()

@@ -14,7 +14,8 @@ from harness.evaluate.asking import Asker
 from harness.evaluate.latency import known
 from harness.evaluate.live_world import LiveSource, LiveWorld
 from harness.evaluate.spec import Spec
-from harness.evaluate.walk import table, walk
+from harness.evaluate.table import table
+from harness.evaluate.walk import walk
 from harness.runs import folder
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
@@ -55,8 +56,8 @@ class Driven:
     answers: list[Answer]
 
     @property
-    def moments(self) -> int:
-        """How many distinct moments somebody decided in."""
+    def decision_points(self) -> int:
+        """How many distinct decision points somebody decided in."""
         return len(self.decisions.scenes)
 
 

@@ -56,7 +56,7 @@ def test_an_episode_played_by_hand():
     assert mine[2].scene != its[2].scene
     helpers = {f"{its[1].scene}/{viewer}" for viewer in ("v2", "v3", "v4")}
     egos = [asked for asked in script.asked if asked.endswith("/v1")]
-    assert len(egos) == len(set(egos)) == made.moments
+    assert len(egos) == len(set(egos)) == made.decision_points
     assert sorted(set(script.asked) - set(egos)) == sorted(helpers)  # of whom the ego was unsure, once
     assert len(script.asked) == len(egos) + len(helpers)
 

@@ -10,7 +10,8 @@ from harness.backends.base import Completion
 from harness.evaluate.asking import Asker, answer_of, requests
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
-from harness.evaluate.walk import table, walk
+from harness.evaluate.table import table
+from harness.evaluate.walk import walk
 from harness.runs import folder, formats
 from harness.runs.metrics import Grid
 from harness.runs.records import Manifest

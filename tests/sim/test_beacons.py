@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from msgspec import structs
 
 from harness.core.errors import UserError
-from harness.dataset.freeze import moment
+from harness.dataset.freeze import record_of
 from harness.world import scenarios
 from harness.world.beacons import broadcast, known, last_heard
 from harness.world.perception.graph import scene_graph
@@ -164,7 +164,7 @@ def test_weights_and_ranges_are_from_the_beacons_that_the_ego_heard():
     world = World.start(SCENARIO, 1)
     world.act("IDLE")
     state = world.state()
-    record = moment(world, state, 0, (state.ego, *state.helpers))
+    record = record_of(world, state, 0, (state.ego, *state.helpers))
     zone = SCENARIO.road().zone_m
     for helper in HELPERS:
         there, truth = known(state, helper, "v1"), state.vehicle(helper)

@@ -24,7 +24,8 @@ from harness.dataset.load import Dataset, load
 from harness.evaluate import asking
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.outlook import outlook
-from harness.evaluate.walk import columns, walk
+from harness.evaluate.table import columns
+from harness.evaluate.walk import walk
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, of_decisions
 from harness.studies import axes

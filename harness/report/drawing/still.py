@@ -19,7 +19,7 @@ from matplotlib.textpath import TextPath
 from harness.core.arrays import Floats
 from harness.core.errors import printable
 from harness.core.image import Pixels
-from harness.evaluate.replay import Played, Still
+from harness.evaluate.replay import ReplayedEpisode, Still
 from harness.report.drawing.artists import body, named, roads, scale_m, shade, sight, walls
 from harness.report.drawing.colours import BAD, BUILDING_NAME, GOOD, GREY, INK, LATE, LIGHT, ROLES
 from harness.report.drawing.colours import actions as colours_of
@@ -40,7 +40,7 @@ GAPS_PT = (3.5, 13.0, 23.0, 35.0)  # between a vehicle and its name
 class Canvas:
     """A figure whose fixed parts are drawn once; what moves is drawn over a copy of them."""
 
-    def __init__(self, played: Played, buildings: Sequence[Building]) -> None:
+    def __init__(self, played: ReplayedEpisode, buildings: Sequence[Building]) -> None:
         self.played, self.actions, self.buildings = played, played.scenario.actions, buildings
         height, width = HEIGHT_IN, SIDE_IN + CAMERA_IN
         self.figure = Figure(figsize=(width, height), dpi=DPI)
@@ -218,7 +218,7 @@ def _size(text: str) -> Floats:
     return np.array([_outline(text).get_extents().x1, 0.75 * NAME_PT])
 
 
-def _messages(played: Played, still: Still) -> Iterator[Artist]:
+def _messages(played: ReplayedEpisode, still: Still) -> Iterator[Artist]:
     """Each reply on its way from its helper to the ego; one that was lost goes half of it.
 
     Where each answer has a time of its own, a reply is drawn from the decision's start.

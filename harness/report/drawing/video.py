@@ -16,7 +16,7 @@ from harness.core import extras
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing, write_whole
 from harness.core.image import Pixels
-from harness.evaluate.replay import Played, Still, stills
+from harness.evaluate.replay import ReplayedEpisode, Still, stills
 from harness.report.drawing.geometry import shape_of
 from harness.report.drawing.pictures import styled
 from harness.report.drawing.still import Canvas
@@ -35,7 +35,7 @@ def formats() -> list[str]:
 
 
 @styled
-def write_video(played: Played, out: Path, progress: Callable[[int], None]) -> None:
+def write_video(played: ReplayedEpisode, out: Path, progress: Callable[[int], None]) -> None:
     """Draw an episode into a `.gif` or an `.mp4`; `progress` is called for each still.
 
     Raises:
@@ -86,7 +86,7 @@ def _mp4(pictures: Iterator[Pixels], out: Path) -> None:
         file.close()
 
 
-def _pictures(played: Played, progress: Callable[[int], None]) -> Iterator[Pixels]:
+def _pictures(played: ReplayedEpisode, progress: Callable[[int], None]) -> Iterator[Pixels]:
     listed = list(stills(played))
     graphs = list(_graphs(played.scenario, listed))
     canvas = Canvas(played, listed[0].state.buildings)

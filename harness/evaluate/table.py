@@ -1,0 +1,116 @@
+"""Tabulate decisions: one row for each decision point, condition and seed."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.arrays import Ints, any_of
+from harness.dataset.load import Scene
+from harness.evaluate.walk import Decided
+from harness.runs.decisions import Decisions, Labels, by_action, by_message
+
+
+@lru_cache(maxsize=1 << 10)
+def busy_ratio(point: OperatingPoint) -> float:
+    """Return the channel busy ratio under the background load; NaN if the channel has no such figure."""
+    return point.physical.busy_ratio() if point.physical else float("nan")
+
+
+def columns(decided: Decided[Any]) -> dict[str, Any]:
+    """Return the numeric columns of decisions (n,) by name; NaN where unknown."""
+    c, point = decided.result, decided.point
+    anybody = any_of(c.on_time)
+    return {
+        "messages": c.messages, "requests": c.requests, "request_bits": c.request_bits,
+        "reply_bits": c.reply_bits, "airtime_ms": c.airtime_s * 1000, "triggered": c.triggered,
+        "busy_ratio": np.full(c.messages.shape, busy_ratio(point)),
+        "own_failed": c.own_failed,
+        "entropy_nats": c.entropy_nats, "normalised_entropy": c.normalised_entropy,
+        "own_weight": c.weights[..., 0], "latency_ms": c.latency_s * 1000,
+        "deadline_missed": np.where(np.isnan(c.latency_s), np.nan, c.deadline_missed),
+        "fusion_ms": c.fusion_s * 1000,
+        "fusion_failed": np.where(anybody & point.has_fusion_call, c.fusion_failed, np.nan),
+        "effective_loss": np.where(c.triggered, c.loss, np.nan), "observed_loss": c.observed_loss,
+    }  # fmt: skip
+
+
+def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]) -> Decisions:
+    """Return the table of decisions, sorted by episode, step, decision point, condition and seed.
+
+    The decisions may be in any order; further columns (n,), `more`, are in that order.
+    """
+    points_by_id = {id(part.decision_points): part.decision_points for part in decided}
+    starts = np.cumsum([0, *map(len, points_by_id.values())]).tolist()
+    start = dict(zip(points_by_id, starts, strict=False))
+    scenes = [scene for decision_points in points_by_id.values() for scene in decision_points]
+    vehicles = max(len(scene.viewers) for scene in scenes) - 1
+    helpers = max(vehicles, *(part.said.attackers.shape[1] for part in decided))
+    at = np.concatenate([start[id(part.decision_points)] + part.due.at for part in decided])
+    n_each = [len(part.due.at) for part in decided]
+    points = list(dict.fromkeys(part.point.name for part in decided))
+    point = np.repeat([points.index(part.point.name) for part in decided], n_each)
+
+    def of_scenes(values: Iterable[Any]) -> Any:
+        return np.array(list(values))[at]
+
+    def widened(arrays: Iterable[Any]) -> Any:
+        return np.concatenate([np.pad(array, ((0, 0), (0, helpers - array.shape[1]))) for array in arrays])
+
+    def of_messages(name: str) -> Any:
+        return widened(getattr(part.result, name) for part in decided)
+
+    numbers = [columns(part) for part in decided]
+    asked, arrival_s = of_messages("asked"), of_messages("arrival_s")
+    sent = {
+        "delivered": of_messages("delivered"), "on_time": of_messages("on_time"),
+        "arrival_ms": np.where(np.isfinite(arrival_s), arrival_s * 1000, np.nan),
+        "weight": widened([part.result.weights[:, 1:] for part in decided]),
+        "trust": of_messages("trust"), "attacker": widened([part.said.attackers for part in decided]),
+    }  # fmt: skip
+    voices = [f"voice-{n + 1}" for n in range(helpers - vehicles)]  # an attacker may have several voices
+    senders = [
+        [*scene.viewers[1:], *[None] * (vehicles + 1 - len(scene.viewers)), *voices] for scene in scenes
+    ]
+    episode, step = (of_scenes(getattr(s.record, name) for s in scenes) for name in ("episode", "step"))
+    ids = [scene.id for scene in scenes]
+    rank = np.unique(ids, return_inverse=True)[1]
+    order = np.lexsort((point, rank[at], step, episode))
+    values = {
+        **{name: np.concatenate([part[name] for part in numbers]) for name in numbers[0]},
+        **by_action("fused", np.concatenate([part.result.fused for part in decided]), actions),
+        **more,
+        **{
+            column: array
+            for name, messages in sent.items()
+            for column, array in by_message(name, np.where(asked, messages, np.nan)).items()
+        },
+        "seed": np.concatenate([part.due.seed for part in decided]), "episode": episode, "step": step,
+    }  # fmt: skip
+    labels = {
+        "scene": _labels(ids, at),
+        "danger": _labels([s.record.danger.sector for s in scenes], at),
+        "condition": Labels(point, points),
+        "action": Labels(np.concatenate([part.result.action for part in decided]), actions),
+        **{f"helper_{h + 1}": _labels([row[h] for row in senders], at, asked[:, h]) for h in range(helpers)},
+    }
+    return Decisions.of({**values, **labels}, actions, helpers).take(order)
+
+
+def of_all_seeds(tables: Sequence[Decisions], points: Sequence[OperatingPoint]) -> Decisions:
+    """Return tables of the same episodes and of different seeds, in their order, as `table` makes one."""
+    if len(tables) == 1:
+        return tables[0]
+    whole = Decisions.concat(tables)
+    ids = sorted(set().union(*(part.scenes for part in tables)))
+    condition = whole.codes("condition", [point.name for point in points])
+    order = np.lexsort((condition, whole.codes("scene", ids), whole.whole("step"), whole.whole("episode")))
+    return whole.take(order)
+
+
+def _labels(of_scenes: Sequence[str | None], at: Ints, mask: Any = True) -> Labels:
+    names = list(dict.fromkeys(label for label in of_scenes if label is not None))
+    code: dict[str | None, int] = {None: -1, **{name: place for place, name in enumerate(names)}}
+    return Labels(np.where(mask, np.array([code[label] for label in of_scenes])[at], -1), names)
