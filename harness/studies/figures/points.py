@@ -37,15 +37,16 @@ def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]]) -> Figure:
     ):
         for line in lines:
             axes.plot(line.x, line.y, drawstyle="steps-post", linewidth=1, label=line.label, **line.look)
-            if line.name:
-                axes.annotate(
-                    line.name, (line.x[-1], line.y[-1]), xytext=(0, 5), textcoords="offset points",
-                    ha="center", fontsize=6.5, color=INK,
-                )  # fmt: skip
         axes.set(xlabel=cost, ylabel="success, %" if axes is figure.axes[0] else "")
         axes.set_title(title, fontsize=8)
         axes.margins(x=0.1, y=0.1)
         plain(axes, "both")
+        for line in lines:  # a name extends to the middle, away from the ends of the axis
+            right = line.x[-1] > sum(axes.get_xlim()) / 2
+            axes.annotate(
+                line.name, (line.x[-1], line.y[-1]), xytext=(5 if right else -5, 5),
+                textcoords="offset points", ha="right" if right else "left", fontsize=6.5, color=INK,
+            )  # fmt: skip
     handles, labels = figure.axes[0].get_legend_handles_labels()
     key = dict(zip(labels, handles, strict=True))
     figure.legend(
