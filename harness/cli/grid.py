@@ -43,8 +43,7 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.evaluate import resolve
-    from harness.studies.grid import run_cells
-    from harness.studies.grid_study import grid_study
+    from harness.studies.grid import grid_study, run_cells
     from harness.studies.study import refuse_taken
 
     extras.need("harness study grid", "matplotlib")

@@ -1,12 +1,13 @@
 """A finished study in a terminal."""
 
+import json
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.cli.estimates import WIDTH, echo_json, table
+from harness.cli.estimates import WIDTH, table
 from harness.core.errors import printable
 
 if TYPE_CHECKING:
@@ -30,10 +31,14 @@ def finish(study: "Study", out: Path, as_json: bool = False, quiet: bool = False
 
 def echo_answer(study: "Study") -> None:
     """Print what a study found as JSON: a data frame as records."""
+
+    def records(frame: Any) -> Any:
+        return json.loads(frame.to_json(orient="records"))
+
     if hasattr(study.answer, "to_json"):
         typer.echo(study.answer.to_json(orient="records"))
     else:
-        echo_json(study.answer)
+        typer.echo(json.dumps(study.answer, indent=1, default=records))
 
 
 def show(study: "Study") -> None:

@@ -21,8 +21,7 @@ from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
 from harness.prompts import versions
 from harness.runs.metrics import LATENCY, SUCCESS
-from harness.studies.grid import Cell, Grid, run_cells
-from harness.studies.grid_study import front, grid_study, headline
+from harness.studies.grid import Cell, Grid, front, grid_study, headline, run_cells
 from harness.studies.study import write_study
 
 
@@ -175,6 +174,16 @@ def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset
         assert (out / f"{name}.svg").stat().st_size > 1000
     assert "proxy-faulty · v2 · json" in page
     assert page.count("<a href=") == page.count('<a href="cells/1-2/report.html">cells/1-2</a>') == 3
+
+
+@pytest.mark.slow
+def test_a_grid_is_printed_as_json(harness: Callable[..., Any], small_path: Path) -> None:
+    few = ("--dataset", str(small_path), "--limit", "1", "--seeds", "0:1", "--condition", "6g")
+    code, out, err = harness("study", "grid", "--prompt", "v1,v2", *few, "--out", "grid", "--json")
+    assert code == 0, err
+    answer = json.loads(out)
+    assert {row["metric"] for row in answer["cells"]} == {SUCCESS, LATENCY, "tokens"}
+    assert next(row["effect"] for row in answer["effects"]) == "ego prompt: v1 → v2"
 
 
 @pytest.mark.slow
