@@ -36,8 +36,7 @@ def evaluate(
     spec: "Spec", repeats: int, out: Path | None, cache: Path | None, quiet: bool, as_json: bool
 ) -> None:
     """Evaluate every repeat; write and print what they have in common and what not."""
-    from harness.studies.repeats import each, run_repeats
-    from harness.studies.repeats_study import FIGURES, MARKER, PAGE, repeats_study
+    from harness.studies.repeats import FIGURES, MARKER, PAGE, each, repeats_study, run_repeats
 
     together = Together(each(spec, repeats), "finished repeats", MARKER, (FIGURES, PAGE))
     folder = out or free_folder([spec], f"{spec.source.name}-repeats", together.goes_on)

@@ -92,8 +92,7 @@ def compare(
     """
     from harness.coordination.schedules import SCHEDULES
     from harness.studies.replayed_run import ReplayedRun
-    from harness.studies.schedule_study import schedule_study
-    from harness.studies.schedules import run_schedules
+    from harness.studies.schedules import run_schedules, schedule_study
 
     extras.need("harness study schedule compare", "matplotlib")
     names = list(dict.fromkeys(schedule or SCHEDULES.usable()))

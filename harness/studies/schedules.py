@@ -5,11 +5,12 @@ A schedule's settings are its threshold and how many helpers it asks at most. Wh
 on tune layouts, where a run on such is given, and reported on others.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,13 +20,21 @@ from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
+from harness.core.figures import shown
 from harness.core.statistics import Estimate, resampled, resampled_estimate
+from harness.core.versions import versions
+from harness.report.document import Table
+from harness.report.drawing.colours import COLOURS, INK, MARKERS
 from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
 from harness.studies.choices import COSTS, Choices, choices
+from harness.studies.figures.points import Steps, fronts
 from harness.studies.learning import layouts
 from harness.studies.replayed_run import ReplayedRun
-from harness.studies.study import corrected, refuse_other
+from harness.studies.study import Study, corrected, p_cell, refuse_other
 from harness.studies.sweep import point_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 RESAMPLES = 2000
 SHARES = np.arange(0.0, 1.0, 0.1)  # of decision points that ask nobody, at the thresholds that are tried
@@ -33,7 +42,7 @@ NEVER, ALWAYS, RANDOM = "never", "always", "random"
 
 
 @dataclass(frozen=True)
-class Setting:
+class Candidate:
     """A schedule with a threshold, None without one, that asks `most` helpers at most."""
 
     schedule: str
@@ -41,7 +50,7 @@ class Setting:
     most: int
 
     def at(self, point: OperatingPoint) -> OperatingPoint:
-        """Return the operating point with this setting."""
+        """Return the operating point with this schedule."""
         if self.schedule == PAPER and self.threshold is not None:
             changed = point.changed(schedule=PAPER, threshold=None, tau_nats=self.threshold)
         else:
@@ -54,9 +63,9 @@ class Setting:
 
 @dataclass(frozen=True)
 class Play:
-    """The outcome of a setting: success, (S, E), and `COSTS`, (S, E, C), of every episode."""
+    """The outcome of a candidate: success, (S, E), and `COSTS`, (S, E, C), of every episode."""
 
-    setting: Setting
+    candidate: Candidate
     success: Floats
     costs: Floats
 
@@ -77,30 +86,30 @@ class Play:
         return {**means, "latency_ms": means["latency_ms"] / decisions}
 
 
-def plays(choices: Choices, point: OperatingPoint, settings: Sequence[Setting]) -> list[Play]:
-    """Play settings of one schedule; what asking is worth by it is worked out once."""
-    worths = choices.worths(settings[0].at(point))
-    rules = [choices.scheduled(setting.at(point), worths) for setting in settings]
-    return [Play(s, *choices.played(rule)) for s, rule in zip(settings, rules, strict=True)]
+def plays(choices: Choices, point: OperatingPoint, candidates: Sequence[Candidate]) -> list[Play]:
+    """Play candidates of one schedule; what asking is worth by it is worked out once."""
+    worths = choices.worths(candidates[0].at(point))
+    rules = [choices.scheduled(candidate.at(point), worths) for candidate in candidates]
+    return [Play(c, *choices.played(rule)) for c, rule in zip(candidates, rules, strict=True)]
 
 
-def settings(choices: Choices, point: OperatingPoint, schedule: str) -> list[Setting]:
-    """Return the settings to try: tenths of what asking is worth, the own threshold, and 0."""
+def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[Candidate]:
+    """Return what to try of a schedule: tenths of what asking is worth, its own threshold, and 0."""
     most = range(1, point.ask.max_helpers + 1)
     own = point.changed(schedule=schedule, threshold=None)
     if schedule != PAPER and SCHEDULES[schedule].threshold is None:
-        return [Setting(schedule, None, m) for m in most]
+        return [Candidate(schedule, None, m) for m in most]
     best = [np.fmax.reduce(worth, axis=-1) for worth in choices.worths(own)]
     tenths = np.nanquantile(np.concatenate(best), SHARES).tolist()
     tried = {0.0, own.ask.above, *(float(f"{value:.3g}") for value in tenths if value > 0)}
-    return [Setting(schedule, threshold, m) for threshold in sorted(tried) for m in most]
+    return [Candidate(schedule, threshold, m) for threshold in sorted(tried) for m in most]
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """A schedule at the setting chosen for it, and what it is worth."""
+    """A schedule's chosen candidate, and what it is worth."""
 
-    play: Play  # its setting, and success and costs of every episode
+    play: Play  # it, and success and costs of every episode
     success: Estimate  # of episodes
     over_paper: Estimate  # success less that of the paper's schedule
     # of no such difference, by Holm's method for all schedules of the run; None without an interval, and for
@@ -121,7 +130,7 @@ class Compared:
     name: str  # the run's model, prompt and answer mode
     point: OperatingPoint  # the operating point
     names: tuple[str, ...]  # of the schedules that are compared
-    plays: Mapping[str, Sequence[Play]]  # of every setting, by schedule
+    plays: Mapping[str, Sequence[Play]]  # of every candidate, by schedule
     tune: Mapping[str, Sequence[Play]]  # the same on tune layouts; empty without
     oracle: Play  # the bound
     budget: float  # share of the paper's messages within which settings are chosen
@@ -132,13 +141,13 @@ class Compared:
         return _at(self.plays[PAPER], self._paper)
 
     @property
-    def _paper(self) -> Setting:
-        return Setting(PAPER, self.point.ask.tau_nats, self.point.ask.max_helpers)
+    def _paper(self) -> Candidate:
+        return Candidate(PAPER, self.point.ask.tau_nats, self.point.ask.max_helpers)
 
     @property
     def everybody(self) -> Play:
         """Always asking all the helpers that the point allows."""
-        return _at(self.plays[ALWAYS], Setting(ALWAYS, None, self.point.ask.max_helpers))
+        return _at(self.plays[ALWAYS], Candidate(ALWAYS, None, self.point.ask.max_helpers))
 
     @cached_property
     def weights(self) -> Floats:
@@ -154,12 +163,12 @@ class Compared:
         """
         if not self.tune:
             threshold = self.point.ask.tau_nats if schedule == PAPER else SCHEDULES[schedule].threshold
-            return _at(self.plays[schedule], Setting(schedule, threshold, self.point.ask.max_helpers))
+            return _at(self.plays[schedule], Candidate(schedule, threshold, self.point.ask.max_helpers))
         budget = self.budget * _at(self.tune[PAPER], self._paper).messages.mean()
         cheapest = min(self.tune[schedule], key=lambda play: play.messages.mean())
         within = [play for play in self.tune[schedule] if play.messages.mean() <= budget] or [cheapest]
         best = max(within, key=lambda play: (round(float(play.success.mean()), 9), -play.messages.mean()))
-        return _at(self.plays[schedule], best.setting)
+        return _at(self.plays[schedule], best.candidate)
 
     @property
     def energy(self) -> bool:
@@ -183,8 +192,8 @@ class Compared:
     def _ranked(self, schedule: str) -> list[tuple[Play, float]]:
         """A schedule's plays, and never asking, each with its success on tune layouts, else its own."""
         every = [self.plays[NEVER][0], *(self.plays[schedule] if schedule != NEVER else ())]
-        tuned = {play.setting: play for of in self.tune.values() for play in of}
-        return [(play, float(tuned.get(play.setting, play).success.mean())) for play in every]
+        tuned = {play.candidate: play for of in self.tune.values() for play in of}
+        return [(play, float(tuned.get(play.candidate, play).success.mean())) for play in every]
 
     def of_oracle(self) -> list[Play]:
         """Return the oracle where a success may cost so many messages at most, from none on."""
@@ -192,7 +201,7 @@ class Compared:
         cheap = [bound.messages <= cap for cap in range(int(bound.messages.max()) + 1)]
         costs = [np.where(of[..., None], bound.costs, alone) for of in cheap]
         return [
-            Play(bound.setting, bound.success * of, spent) for of, spent in zip(cheap, costs, strict=True)
+            Play(bound.candidate, bound.success * of, spent) for of, spent in zip(cheap, costs, strict=True)
         ]
 
     def area(self, schedule: str, cost: str = "messages") -> Estimate:
@@ -220,7 +229,7 @@ class Compared:
 
     @cached_property
     def rows(self) -> list[Chosen]:
-        """The paper's schedule, every one at the setting chosen for it, and last the oracle."""
+        """The paper's schedule, the chosen candidate of every one, and last the oracle."""
         plays = [self.paper, *map(self.chosen, self.names), self.oracle]
         raw = [p_value(SUCCESS, play.success.T, self.paper.success.T) for play in plays[1:-1]]
         return [self._row(play, p) for play, p in zip(plays, [None, *corrected(raw), None], strict=True)]
@@ -233,14 +242,14 @@ class Compared:
             difference(SUCCESS, play.success.T, self.paper.success.T), p,
             difference(SUCCESS, play.success.T, self.random_like(play).T),
             self._interval(_ratio(success[:, 0] - success[:, 1], success[:, 2] - success[:, 1])),
-            self._interval(_ratio(messages[:, 0], messages[:, 1])), self.area(play.setting.schedule),
-            self.area(play.setting.schedule, "energy_j"),
+            self._interval(_ratio(messages[:, 0], messages[:, 1])), self.area(play.candidate.schedule),
+            self.area(play.candidate.schedule, "energy_j"),
         )  # fmt: skip
 
     def random_like(self, play: Play) -> Floats:
         """Return success of `random` with as many messages, (S, E): a mean of its two shares next to it."""
         most = self.point.ask.max_helpers
-        every = [play for play in self.plays[RANDOM] if play.setting.most == most]
+        every = [play for play in self.plays[RANDOM] if play.candidate.most == most]
         ladder = sorted(
             [self.plays[NEVER][0], *every, self.everybody], key=lambda p: float(p.messages.mean())
         )
@@ -259,7 +268,7 @@ def compare(
 
     Args:
         stored: a run.
-        tune: a run on tune layouts; the settings that are tried are its own then.
+        tune: a run on tune layouts; what is tried of a schedule follows from it then.
         point: the operating point, whose schedule is replaced.
         names: of schedules.
         seeds: of the channel.
@@ -276,12 +285,12 @@ def compare(
     of_run: dict[str, list[Play]] = {}
     of_tune: dict[str, list[Play]] = {}
     for name in dict.fromkeys((PAPER, NEVER, ALWAYS, RANDOM, *names)):
-        tried = settings(tune_run or run, point, name)
+        tried = candidates(tune_run or run, point, name)
         of_run[name] = plays(run, point, tried)
         if tune_run:
             of_tune[name] = plays(tune_run, point, tried)
         progress(1)
-    bound = Play(Setting(ORACLE, None, point.ask.max_helpers), *run.oracle())
+    bound = Play(Candidate(ORACLE, None, point.ask.max_helpers), *run.oracle())
     return Compared(stored.name, point, tuple(names), of_run, of_tune, bound, budget)
 
 
@@ -313,8 +322,8 @@ def run_schedules(
     return compared
 
 
-def _at(plays: Sequence[Play], setting: Setting) -> Play:
-    return next(play for play in plays if play.setting == setting)
+def _at(plays: Sequence[Play], candidate: Candidate) -> Play:
+    return next(play for play in plays if play.candidate == candidate)
 
 
 def _area(success: Floats, messages: Floats, ranks: Floats, most: Floats) -> Floats:
@@ -337,3 +346,153 @@ def _area(success: Floats, messages: Floats, ranks: Floats, most: Floats) -> Flo
 def _ratio(part: Floats, whole: Floats) -> Floats:
     """Return a share, NaN of nothing."""
     return np.where(whole > 0, part / np.where(whole > 0, whole, 1.0), np.nan)
+
+
+SLACK = 1.1  # by which messages may exceed on these layouts what they were on tune layouts
+BUDGETS = {"messages": "messages per episode", "energy_j": "joules per episode"}
+HEADS = (
+    "schedule", "success %", "msgs", "J", "over paper's", "gap closed %", "p", "over random, points",
+    "messages, % of the paper's", "on air, ms", "latency, ms", "area, %", "area over joules, %",
+)  # fmt: skip
+JOULES = ("J", "area over joules, %")
+
+
+def schedule_study(compared: Sequence[Compared], runs: Sequence[ReplayedRun], seeds: Sequence[int]) -> Study:
+    """Declare the study of schedules on one or several runs; `runs` are these and those on tune layouts."""
+    first, data = compared[0], tables(compared)
+    tuned = bool(first.tune)
+    panels = [
+        (f"{run.name}, {run.point.name}", BUDGETS[cost], list(_steps(run, cost)))
+        for run in compared for cost in BUDGETS if cost == "messages" or run.energy
+    ]  # fmt: skip
+    chosen = (
+        "Both were chosen for the most success on tune layouts, within "
+        f"{100 * first.budget:.0f} % of the paper's messages there."
+        if tuned
+        else "Both are the defaults of the condition and of the schedule; give a run on tune layouts to have "
+        "them chosen."
+    )
+    best = "that is best on tune layouts" if tuned else "that is best on these layouts, which flatters it"
+    return Study(
+        "schedule", "Whom the ego asks, and when",
+        [sentence for run in compared for sentence in headline(run)],
+        [
+            "Decisions are made again from stored answers with the same random draws, channel seeds "
+            f"{', '.join(map(str, seeds))}; n is {first.regret.n} episodes, differences are paired by "
+            "episode, and 95 % intervals are over episodes; those of shares and areas come from a "
+            "bootstrap. The oracle knows how every course ends: it is a bound and no schedule.",
+            "After a schedule's name stand the most helpers that it asks, and the threshold above which "
+            "it asks. "
+            + chosen + f" A line of the figure shows, of the settings within a budget, the one {best}.",
+        ],
+        [_table(run) for run in compared], data,
+        {
+            "sources": [run.manifest() for run in runs], "condition": first.point.name,
+            "schedules": first.names, "budget": first.budget, "seeds": list(seeds), "versions": versions(),
+        },
+        data["schedules"], {"fronts": fronts(panels)},
+        [caveat for run in runs for caveat in run.caveats],
+    )  # fmt: skip
+
+
+def name_of(row: Chosen) -> str:
+    """Return a schedule with the setting chosen for it: at most so many helpers, above a threshold."""
+    return f"{row.play.candidate.schedule} {row.play.candidate}"
+
+
+def headline(compared: Compared) -> list[str]:
+    """Say the paper's regret, and what the best schedule within half of its messages closes."""
+    regret, bound = compared.regret, compared.oracle.means["messages"]
+    sentences = [
+        f"{compared.name}, {compared.point.name}: the oracle succeeds {shown(regret)} points more often than "
+        f"entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} episodes), with {bound:.1f} instead "
+        f"of {compared.paper.means['messages']:.1f} messages per episode."
+    ]
+    within = [row for row in compared.rows[1:-1] if row.messages.value <= SLACK * compared.budget]
+    if compared.tune and within:
+        best = max(within, key=lambda row: row.success.value)
+        sentences.append(
+            f"Chosen on tune layouts within {100 * compared.budget:g} % of the paper's messages, "
+            f"{name_of(best)} succeeds most often, in {shown(best.success)} %, a difference of "
+            f"{shown(best.over_paper)} points from the paper's schedule: it closes {shown(best.closed)} % "
+            f"of that gap with {shown(best.messages)} % of the messages."
+        )
+    return sentences
+
+
+def _steps(run: Compared, cost: str) -> Iterator[Steps]:
+    """Yield the settings that are taken as the budget grows."""
+
+    def steps(label: str, plays: Sequence[Play], **look: Any) -> Steps:
+        success = [100 * float(play.success.mean()) for play in plays]
+        return Steps(label, [play.means[cost] for play in plays], success, look)
+
+    for n, name in enumerate(name for name in run.names if name != NEVER):
+        yield steps(
+            name, run.front(name, cost), linestyle="-" if n < len(COLOURS) else ":", markersize=3,
+            color=COLOURS[n % len(COLOURS)], marker=MARKERS[n % len(MARKERS)],
+        )  # fmt: skip
+    yield steps("oracle, a bound", run.of_oracle(), linestyle="--", color=INK)
+    tau = f"entropy above {run.point.ask.tau_nats:g}"
+    yield steps(tau, [run.paper], linestyle="", marker="*", color=INK, markersize=9)
+
+
+def _table(run: Compared) -> Table:
+    heads = [head for head in HEADS if run.energy or head not in JOULES]
+    rows = []
+    for n, row in enumerate(run.rows):
+        means = row.play.means
+        cells = (
+            name_of(row) + " (the paper's)" * (n == 0), shown(row.success), f"{means['messages']:.1f}",
+            f"{means['energy_j']:.1f}", shown(row.over_paper), shown(row.closed), p_cell(row.p),
+            shown(row.over_random), shown(row.messages), f"{means['airtime_ms']:.3f}",
+            f"{means['latency_ms']:.1f}", shown(row.area), shown(row.area_j),
+        )  # fmt: skip
+        rows.append([cell for head, cell in zip(HEADS, cells, strict=True) if head in heads])
+    return Table(
+        f"{run.name}, {run.point.name}", heads, rows,
+        "Messages, milliseconds on air and joules are per episode, latency is per decision. Over paper's: "
+        "success less that of the paper's schedule, in points; over random: less that of the schedule "
+        "random with as many messages. Gap: from the paper's schedule to the oracle. Area: success "
+        "averaged over budgets from no message to always asking all; over joules, from the joules of "
+        "asking nobody. p comes from the interval and is corrected by Holm's method for all schedules of "
+        "the table; bold: 0.05 or less. All settings are in "
+        "settings.csv.", terminal=range(heads.index("p")),
+    )  # fmt: skip
+
+
+def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
+    """Return `schedules`, each at the setting chosen for it, and `settings`, all that were played."""
+    import pandas as pd
+
+    def ends(name: str, e: Estimate) -> dict[str, Any]:
+        return {name: e.value, f"{name}_low": e.low, f"{name}_high": e.high}
+
+    def place(run: Compared, play: Play) -> dict[str, Any]:
+        of = play.candidate
+        where = {"run": run.name, "condition": run.point.name}
+        return {**where, "schedule": of.schedule, "threshold": of.threshold, "max_helpers": of.most}
+
+    schedules = [
+        {
+            **place(run, row.play), **ends("success", row.success), "n": row.success.n, **row.play.means,
+            **ends("over_paper", row.over_paper), "p_holm": row.p, **ends("over_random", row.over_random),
+            **ends("gap_closed", row.closed), **ends("messages_share", row.messages),
+            **ends("area", row.area), **ends("area_j", row.area_j),
+        }
+        for run in compared for row in run.rows
+    ]  # fmt: skip
+    settings = [
+        {
+            **place(run, play), "success": float(play.success.mean()), **play.means,
+            "success_on_tune": _on_tune(run, play),
+            "on_front": any(play is taken for taken in run.front(play.candidate.schedule)),
+        }
+        for run in compared for plays in run.plays.values() for play in plays
+    ]  # fmt: skip
+    return {"schedules": pd.DataFrame(schedules), "settings": pd.DataFrame(settings)}
+
+
+def _on_tune(run: Compared, play: Play) -> float | None:
+    tuned = {of.candidate: of for of in run.tune.get(play.candidate.schedule, ())}
+    return float(tuned[play.candidate].success.mean()) if tuned else None

@@ -31,10 +31,11 @@ from harness.studies.repeats import (
     any_of,
     between_share,
     flips,
+    headline,
+    repeats_study,
     run_repeats,
     stable,
 )
-from harness.studies.repeats_study import headline, repeats_study
 from harness.studies.study import write_study
 
 Said = tuple[int, str, str]

@@ -32,7 +32,7 @@ from harness.studies import axes
 from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.learning import fit, layouts
 from harness.studies.replayed_run import ReplayedRun
-from harness.studies.schedules import Compared, Play, Setting, _area, compare
+from harness.studies.schedules import Candidate, Compared, Play, _area, compare
 from harness.world import scenarios
 
 SEED = 100  # of the first layout of `small`
@@ -134,7 +134,7 @@ def play(schedule: str, most: int, threshold: float | None, success: Any, messag
     """One seed. An episode takes 10 J, and 5 J a message."""
     n, joules = len(success), 10.0 + 5.0 * np.array(messages)
     costs = np.array([messages, [0.1] * n, [150.0] * n, [1.0] * n, joules]).T
-    return Play(Setting(schedule, threshold, most), np.array([success], dtype=float), costs[None])
+    return Play(Candidate(schedule, threshold, most), np.array([success], dtype=float), costs[None])
 
 
 def by_hand(tune: bool = True) -> Compared:
@@ -160,17 +160,17 @@ def by_hand(tune: bool = True) -> Compared:
 def test_a_setting_is_chosen_on_tune_layouts_within_the_budget():
     """The paper's takes 3 messages an episode, half of it is 1.5: one helper alone is within."""
     compared = by_hand()
-    assert compared.paper.setting == Setting("entropy", 0.7, 2)
-    assert compared.chosen("entropy").setting.most == 1
-    assert compared.chosen("always").setting.most == 1, "none is within the budget: the cheapest"
-    assert by_hand(tune=False).chosen("entropy").setting.most == 2, "the point's own"
+    assert compared.paper.candidate == Candidate("entropy", 0.7, 2)
+    assert compared.chosen("entropy").candidate.most == 1
+    assert compared.chosen("always").candidate.most == 1, "none is within the budget: the cheapest"
+    assert by_hand(tune=False).chosen("entropy").candidate.most == 2, "the point's own"
 
 
 def test_the_front_takes_what_was_best_on_tune_layouts():
     taken = by_hand().front("entropy")
-    assert [(p.setting.schedule, p.setting.most) for p in taken] == [("never", 1), ("entropy", 2)]
+    assert [(p.candidate.schedule, p.candidate.most) for p in taken] == [("never", 1), ("entropy", 2)]
     flattered = by_hand(tune=False).front("entropy")
-    assert [(p.setting.schedule, p.setting.most) for p in flattered] == [("never", 1), ("entropy", 1)]
+    assert [(p.candidate.schedule, p.candidate.most) for p in flattered] == [("never", 1), ("entropy", 1)]
 
 
 def test_areas_are_means_over_budgets_up_to_always_asking_all():
