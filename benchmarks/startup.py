@@ -49,7 +49,7 @@ main()
 # Answers of the first scene's ego and its three helpers.
 FIRST_DECISION = """
 import os, sys
-from harness.backends.llama_cpp.child import Child
+from harness.backends.llama_cpp.backend import Child
 from harness.cli import main
 
 complete = Child.complete

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from harness.backends.base import Request
-from harness.backends.llama_cpp.child import LOADS, Child
+from harness.backends.llama_cpp.backend import LOADS, Child
 from harness.core.errors import UserError
 
 TESTS = Path(__file__).parent
@@ -100,7 +100,7 @@ def test_an_engine_killed_while_idle_is_started_again(tmp_path: Path) -> None:
 def test_an_engine_that_somebody_stops_is_ended_and_its_question_asked_of_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("harness.backends.llama_cpp.child.LOOK_S", 0.05)
+    monkeypatch.setattr("harness.backends.llama_cpp.backend.LOOK_S", 0.05)
     child = mortal(tmp_path)
     pid = child.call("pid")
     os.kill(pid, signal.SIGSTOP)
@@ -115,7 +115,7 @@ def test_an_engine_that_somebody_stops_is_ended_and_its_question_asked_of_anothe
 def test_an_engine_that_is_stopped_for_a_moment_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("harness.backends.llama_cpp.child.LOOK_S", 0.5)
+    monkeypatch.setattr("harness.backends.llama_cpp.backend.LOOK_S", 0.5)
     child = mortal(tmp_path)
     pid = child.call("pid")
     os.kill(pid, signal.SIGSTOP)

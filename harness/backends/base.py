@@ -208,6 +208,4 @@ def doubt(backend: Backend) -> str | None:
 class Timed(Backend, Protocol):
     """A backend whose answers were timed earlier, so that they are not timed again."""
 
-    def latency(self) -> "Latency":
-        """Return the latency with which the decisions of the replayed run were made."""
-        ...
+    def latency(self) -> "Latency": ...

@@ -178,9 +178,15 @@ def _directory_card(text: str, where: Path, engine: str | None) -> Card:
     files = sorted(file for file in where.glob("*.gguf") if not file.name.startswith(PROJECTOR))
     if (where / "config.json").is_file() and engine != "llama-cpp":
         return _new_card(
-            where.name, "transformers", str(where), "Local directory", thinking=_thinking(where),
-            vision=_vision(text, where), system=_system(_template(where)), letters=_letters(where),
-        )  # fmt: skip
+            where.name,
+            "transformers",
+            str(where),
+            "Local directory",
+            thinking=_thinking(where),
+            vision=_vision(text, where),
+            system=_system(_template(where)),
+            letters=_letters(where),
+        )
     if len(files) == 1:
         return _gguf_card(text, files[0], engine)
     if files:

@@ -64,10 +64,8 @@ class HubTokenizer:
         return [self._text([i], skip_special_tokens=False) for i in ids]
 
     def candidates(self, letters: str) -> Sequence[int]:
-        return [
-            token for text, token in self.hub.get_vocab().items()
-            if len(text) <= _LONGEST and (text.startswith("<0x") or any(x in text for x in letters))
-        ]  # fmt: skip
+        short = [(text, i) for text, i in self.hub.get_vocab().items() if len(text) <= _LONGEST]
+        return [i for text, i in short if text.startswith("<0x") or any(x in text for x in letters)]
 
     def _text(self, ids: Sequence[int], skip_special_tokens: bool) -> str:
         options = {"skip_special_tokens": skip_special_tokens, "clean_up_tokenization_spaces": False}
@@ -89,6 +87,10 @@ class Chat:
         self.template, self.bos, self.vocabulary = tokenizer.template, tokenizer.bos, tokenizer.vocabulary
         self.encode, self.decode, self.pieces = tokenizer.encode, tokenizer.decode, tokenizer.pieces
         self._compiled = ChatTemplate(name, self.template)
+
+    @property
+    def shown(self) -> str:
+        return f"model {printable(self.name)!r}"
 
     @property
     def _switch(self) -> bool:
@@ -131,7 +133,7 @@ class Chat:
         if (lacking := lost_message(shown, prompt)) is not None:
             turn = next(n for n, message in enumerate(shown, 1) if message is lacking)
             raise UserError(
-                f"model {printable(self.name)!r}: its chat template leaves out or changes the text of "
+                f"{self.shown}: its chat template leaves out or changes the text of "
                 f"message {turn} of {len(shown)}, the {printable(lacking['role'])}'s, or moves it; the model "
                 f"would not read what it is asked; {self._way_out(messages, thinking)}"
             )

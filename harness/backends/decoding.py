@@ -17,7 +17,7 @@ from harness.backends.engine import Engine, Session, common_length
 from harness.backends.orders import average_orders
 from harness.backends.sampling import Choice
 from harness.backends.skeleton import Filled, Skeleton, filled, tokens_after
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError
 from harness.prompts.answer_schema import Shape
 from harness.prompts.readout import letters, stated
 
@@ -136,7 +136,7 @@ class Decoding:
         skeleton = self._skeletons[shape]
         if skeleton.most_tokens > request.max_tokens:
             raise UserError(
-                f"model {printable(self._chat.name)!r}: a constrained {request.role} answer takes "
+                f"{self._chat.shown}: a constrained {request.role} answer takes "
                 f"{skeleton.most_tokens} tokens, and {request.max_tokens} are allowed; raise max_new_tokens"
             )
         return skeleton
@@ -170,7 +170,7 @@ class Decoding:
             encodings = [tokens_after(self._chat, "\n", letter) for letter in letters(actions)]
             if any(len(tokens) != 1 for tokens in encodings) or len(set(encodings)) < len(encodings):
                 raise UserError(
-                    f"model {printable(self._chat.name)!r}: its tokenizer has no single token for each of "
+                    f"{self._chat.shown}: its tokenizer has no single token for each of "
                     f"the letters {letters(actions)}; use --answer json"
                 )
             known = self._chat.spellings(letters(actions))

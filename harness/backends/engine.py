@@ -40,8 +40,8 @@ class Session(Protocol):
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
         """Return the log-probabilities of some tokens after each of some chunks of each sequence.
 
-        Each sequence has equally many chunks, none empty, and can only be closed then. Shape (n, ways,
-        len(tokens)).
+        Each sequence has equally many chunks, none empty, and can only be closed then. Shape (n, chunks,
+        tokens).
         """
         ...
 

@@ -10,7 +10,7 @@ from harness.backends.base import Completion, Request, failed
 from harness.backends.decoding import Decoding
 from harness.backends.engine import Engine, common_length
 from harness.core.arrays import Floats
-from harness.core.errors import UserError, one_line, printable
+from harness.core.errors import UserError, one_line
 
 
 class _Prompt(NamedTuple):
@@ -65,7 +65,7 @@ class LanguageModel:
         before, *after = text.split(self.chat.image_token) if self.chat.image_token else [text]
         if len(after) != 1:
             raise UserError(
-                f"model {printable(self.chat.name)!r}: its chat template writes {len(after)} places for one "
+                f"{self.chat.shown}: its chat template writes {len(after)} places for one "
                 "picture; give a model that takes pictures, with the template that it was trained with"
             )
         return [*self.chat.encode(before), *self.engine.look(request.image), *self.chat.encode(after[0])]
@@ -90,7 +90,6 @@ class LanguageModel:
         def kind(p: _Prompt) -> tuple[str, int, str, int, int]:
             return p.request.answer, len(p.orders), p.request.role, p.request.max_tokens, len(p.orders[0])
 
-        # A batch has one answer mode, and one number of orders.
         for _, group in groupby(sorted(prompts, key=kind, reverse=True), lambda p: kind(p)[:2]):
             same_mode = list(group)
             for start in range(0, len(same_mode), self.batch_size):

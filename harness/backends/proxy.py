@@ -66,12 +66,9 @@ def answers(requests: Sequence[Request]) -> list[str]:
 
 
 def _answers(requests: Sequence[Request]) -> list[str]:
-    scenario, views = requests[0].scenario, []
-    for request in requests:
-        if request.view is None or scenario is None:
-            raise ValueError(f"request {request.id} has no view of a scenario; the proxy reads nothing else")
-        views.append(request.view)
-    assert scenario is not None
+    scenario, views = requests[0].scenario, [request.view for request in requests if request.view]
+    if scenario is None or len(views) < len(requests):
+        raise ValueError("a request has no view of a scenario; the proxy reads nothing else")
     return [
         _text(request, view, _hedged(scenario.actions, planned, view))
         for request, view, planned in zip(requests, views, plans(scenario, views), strict=True)

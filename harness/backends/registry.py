@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from harness.backends.base import AnswerMode, Backend
@@ -163,11 +164,17 @@ def missing(card: "Card") -> str | None:
     if package := missing_package(card.engine):
         return package
     try:
-        if finds := registration(card.engine).finds:
-            resolve(finds)(card)
+        if registration(card.engine).finds:
+            locate(card)
     except UserError:
         return "weights"
     return None
+
+
+def locate(card: "Card") -> Path:
+    """Return where the weights of a card lie for its engine. Raises UserError if they are not found."""
+    where: Path = resolve(registration(card.engine).finds)(card)
+    return where
 
 
 def processor_tokens(card: "Card") -> int | None:

@@ -1,7 +1,7 @@
 """The replay backend: answers from an earlier run, to score a changed parser, rule or mix without a model."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ from harness.core.files import digest, sha256_file
 from harness.runs.folder import Run, read
 from harness.runs.records import BLIND, Answer, FirstTurn, Latency
 from harness.runs.unanswered import why
+
+_KEPT = [field.name for field in fields(Completion)][2:]  # an answer has the same fields
 
 
 def open(card: Card, **_: Any) -> "Replay":
@@ -135,13 +137,7 @@ class Replay:
                 f"{printable(self._run.path)} was asked {request.id} with another prompt or dataset; "
                 "replay it with that run's --prompt, --image and --dataset"
             )
-        whole = Completion(
-            request.id, answer.raw, answer.prompt_tokens, answer.completion_tokens,
-            answer.finish_reason, answer.seconds, answer.batch_size, answer.error,  # type: ignore[arg-type]
-            answer.label_mass, answer.retries, answer.cached, answer.slow_s, answer.first_token_s,
-            answer.token_s, answer.cell("letter_share"), answer.cell("follows_letter"),
-            answer.cell("flipped"),
-        )  # fmt: skip
+        whole = Completion(request.id, answer.raw, **{name: answer.cell(name) for name in _KEPT})
         return _turn(whole, answer.first, again) if answer.first else whole
 
     def latency(self) -> Latency:

@@ -15,7 +15,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 from harness.backends.chat import Chat
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError
 from harness.core.files import canonical_json
 from harness.prompts.answer_schema import Shape, constrained_schema, number_texts
 
@@ -158,7 +158,7 @@ class Skeleton:
             by_tokens = sorted(leg.tokens for leg in legs)
             if any(longer[: len(tokens)] == tokens for tokens, longer in pairwise(by_tokens)):
                 raise UserError(
-                    f"model {printable(self._chat.name)!r}: its tokenizer cannot tell the choices of a "
+                    f"{self._chat.shown}: its tokenizer cannot tell the choices of a "
                     "constrained answer apart; use --answer json"
                 )
         return self._legs[point, before]

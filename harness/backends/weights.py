@@ -12,7 +12,7 @@ from pathlib import Path
 from harness.backends import packages
 from harness.backends.card import Card
 from harness.backends.gguf import ModelFacts, read_facts
-from harness.backends.registry import capabilities, missing_package, registration, resolve
+from harness.backends.registry import capabilities, locate, missing_package, registration, resolve
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, sha256_file, text_of
 from harness.core.resources import find
@@ -100,12 +100,6 @@ def check_digest(card: Card, file: Path) -> Path:
             f"and the card has {card.sha256}; fetch it again, or fix the card"
         )
     return file
-
-
-def locate(card: Card) -> Path:
-    """Return where the weights of a card lie for its engine. Raises UserError if they are not found."""
-    where: Path = resolve(registration(card.engine).finds)(card)
-    return where
 
 
 def contradictions(card: Card) -> Iterator[str]:

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 from harness.backends.card import Card
 from harness.backends.cards import each_engine, names
-from harness.backends.registry import missing, open_backend
-from harness.backends.weights import locate
+from harness.backends.registry import locate, missing, open_backend
 from harness.core.errors import Unanswered
 from harness.evaluate import questions
 from harness.evaluate.agent import Agent

@@ -3,9 +3,11 @@
 import os
 from collections.abc import Sequence
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import llama_cpp as c
 import numpy as np
 
 from harness.backends.card import Card
@@ -13,7 +15,7 @@ from harness.backends.chat import Chat
 from harness.backends.engine import Session, check_logits, common_beginning, common_length, group_by_beginning
 from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp.context import LlamaContext, Logits
-from harness.backends.llama_cpp.model import LlamaModel, build, most_sequences
+from harness.backends.llama_cpp.model import LlamaModel
 from harness.backends.llama_cpp.projector import Projector
 from harness.backends.registry import BUILT_IN
 from harness.backends.weights import hub_commit
@@ -30,7 +32,7 @@ _PICTURES = ("<|image_pad|>", "<image>")  # tokens that chat templates write for
 def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
     """Load a GGUF file in this process, which llama.cpp may abort."""
     os.environ.setdefault("GGML_NO_BACKTRACE", "1")  # a backtrace would start a debugger if there is one
-    most = most_sequences() - BEGINNINGS
+    most = c.llama_max_parallel_sequences() - BEGINNINGS
     if batch_size > most:
         raise UserError(f"batch size {batch_size}; llama.cpp takes {most} at most")
     model = LlamaModel(card.name, file, device)
@@ -158,7 +160,9 @@ class LlamaEngine:
         return {
             "engine": "llama-cpp",
             "answers": BUILT_IN["llama-cpp"].answers,
-            **build(),
+            # Its version and the features of the CPU move an answer's last digits.
+            "llama_cpp_python": version("llama-cpp-python"),
+            "system": c.llama_print_system_info().decode().strip(" |"),
             "weights": self._card.weights,
             "file": self._card.file,
             "revision": commit,
@@ -205,8 +209,8 @@ class LlamaSession(Session):
         return _log_probs(self._logits, tokens)
 
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
-        ways = [dict(zip(self._places, way, strict=True)) for way in zip(*chunks, strict=True)]
-        return np.stack([_log_probs(self._engine.peek(way), tokens) for way in ways], axis=1)
+        turns = [dict(zip(self._places, each, strict=True)) for each in zip(*chunks, strict=True)]
+        return np.stack([_log_probs(self._engine.peek(turn), tokens) for turn in turns], axis=1)
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
         rows = [row for row, chunk in enumerate(chunks) if chunk]

@@ -2,7 +2,6 @@
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -106,15 +105,3 @@ class LlamaModel:
         buffer = ctypes.create_string_buffer(128)
         c.llama_model_desc(self.pointer, buffer, len(buffer))
         return buffer.value.decode(errors="replace")
-
-
-def most_sequences() -> int:
-    """Return the most sequences that llama.cpp can hold."""
-    most: int = c.llama_max_parallel_sequences()
-    return most
-
-
-def build() -> dict[str, str]:
-    """Return the version and CPU features of llama.cpp, which move an answer's last digits."""
-    features: bytes = c.llama_print_system_info()
-    return {"llama_cpp_python": version("llama-cpp-python"), "system": features.decode().strip(" |")}

@@ -122,10 +122,8 @@ class ServerPool:
     def _enqueue(self, *requests: _Pending) -> None:
         """Queue requests at their key's server, or at the next that is up and has failed them less often."""
         for pending in requests:
-            server = min(self._ranked(pending.key), key=lambda server: (server.aside, pending.failed[server]))
-            (server.queue.appendleft if pending.failed else server.queue.append)(
-                pending
-            )  # a retry goes first
+            queue = min(self._ranked(pending.key), key=lambda s: (s.aside, pending.failed[s])).queue
+            queue.insert(0 if pending.failed else len(queue), pending)  # a retry goes first
         if not self._woken:  # once, after all ready coroutines have queued their requests
             self._woken = True
             asyncio.get_running_loop().call_soon(self._hand_out)

@@ -113,11 +113,11 @@ def _entry(payload: Any, key: str, weights: str) -> dict[str, Any] | None:
     """Return the entry of a model in a list of models, or the only one; None if there is none."""
     listed = payload.get(key) if isinstance(payload, dict) else None
     entries = [entry for entry in listed if isinstance(entry, dict)] if isinstance(listed, list) else []
-    names = (weights, f"{weights}:latest")  # Ollama adds the tag
-    named = [e for e in entries if any(e.get(k) in names[:1] for k in ("id", "name", "model"))] or [
-        e for e in entries if any(e.get(k) in names for k in ("id", "name", "model"))
-    ]
-    return next(iter(named or (entries if len(entries) == 1 else [])), None)
+    for name in (weights, f"{weights}:latest"):  # Ollama adds the tag
+        for entry in entries:
+            if name in (entry.get("id"), entry.get("name"), entry.get("model")):
+                return entry
+    return entries[0] if len(entries) == 1 else None
 
 
 def _flat(facts: Mapping[str, Any]) -> dict[str, Fact]:

@@ -65,10 +65,9 @@ class Eyes:
         ids = torch.tensor([list(prompt)])
         images = [self._pictures.image(number) for number in pictures_in(prompt)]
         grids = [self._processor.measured(image.pixels)[1] for image in images]
-        place, _ = self._model.model.get_rope_index(
-            torch.where(ids < 0, self._filled, ids), mm_token_type_ids=(ids < 0).int(),
-            image_grid_thw=torch.cat(grids) if grids else None,
-        )  # fmt: skip
+        filled, grid = torch.where(ids < 0, self._filled, ids), torch.cat(grids) if grids else None
+        types = (ids < 0).int()
+        place, _ = self._model.model.get_rope_index(filled, mm_token_type_ids=types, image_grid_thw=grid)
         positions: torch.Tensor = place[:, 0]
         return positions
 

@@ -16,21 +16,20 @@ LEAST_TOKENS = 16  # a shorter beginning is cheaper to read again than to keep
 MOST_TOKENS = 2048  # most tokens kept in total: 0.3 GB for a 4B model with grouped-query attention
 
 
-def join_caches(parts: Sequence[tuple[Sequence[int], Cache]]) -> Cache:
-    """Return one cache of the rows of several, which are emptied.
+def join_caches(caches: Sequence[Cache], order: Any) -> Cache:
+    """Return one cache of the rows of several, in some order. The others are emptied.
 
-    Each cache comes with the places of its rows among all. Rows with fewer columns end in zeros.
+    Rows with fewer columns end in zeros.
     """
-    order = torch.tensor([place for places, _ in parts for place in places]).argsort()
-    columns = max(cache.get_seq_length() for _, cache in parts)
-    for layers in zip(*(cache.layers for _, cache in parts), strict=True):
+    columns = max(cache.get_seq_length() for cache in caches)
+    for layers in zip(*(cache.layers for cache in caches), strict=True):
         for name in ("keys", "values"):
             held = [getattr(layer, name) for layer in layers]
             wide = torch.cat([pad(each, (0, 0, 0, columns - each.shape[-2])) for each in held])
             for layer in layers:
                 setattr(layer, name, None)  # so that no more than one layer is in memory twice
             setattr(layers[0], name, wide[order.to(wide.device)])
-    return parts[0][1]
+    return caches[0]
 
 
 class Prefix(NamedTuple):

@@ -23,7 +23,7 @@ from transformers.cache_utils import Cache, DynamicCache, DynamicLayer
 
 from harness.backends.engine import Session, check_logits, common_beginning, group_by_beginning
 from harness.backends.transformers.eyes import Eyes
-from harness.backends.transformers.memory import LEAST_TOKENS, Prefix, Prefixes, join_caches
+from harness.backends.transformers.memory import LEAST_TOKENS, NOTHING, Prefix, Prefixes, join_caches
 from harness.core.arrays import Floats
 
 CPU_TOKENS = 1024  # most tokens that a CPU reads together: what more of them need does not stay in its cache
@@ -68,7 +68,7 @@ class Reader:
 
     def _read(self, prompts: list[list[int]]) -> Session:
         if not self.together:
-            return Apart([Rows.read(self, Prefix([], []), [p], self.positions([p])) for p in prompts])
+            return Apart([Rows.read(self, NOTHING, [p], self.positions([p])) for p in prompts])
         # Each prompt's last token is always read, for the distribution after it.
         beginnings = [prompt[:-1] for prompt in prompts]
         if len(prompts) == 1:
@@ -159,15 +159,13 @@ class Reader:
 class Rows:
     """A `Session` of sequences in one batch."""
 
-    def __init__(
-        self, reader: Reader, parts: list[tuple[Sequence[int], Cache]], mask: Any, logits: Any, places: Any
-    ) -> None:
-        """Hold what was read: caches with the places of their sequences, and the logits after each sequence.
+    def __init__(self, reader: Reader, cache: Cache, mask: Any, logits: Any, places: Any) -> None:
+        """Hold what was read, and the logits after each sequence.
 
         The mask is 1 for a token and 0 for a pad, (n, columns), on the CPU. `places` has the positions of
         each prompt's tokens; None if they are consecutive.
         """
-        self._reader, self._parts, self._mask, self._logits = reader, parts, mask, logits
+        self._reader, self._cache, self._mask, self._logits = reader, cache, mask, logits
         self._places = places
 
     @classmethod
@@ -176,7 +174,7 @@ class Rows:
         n, known, cache = len(prompts), len(prefix.ids), reader.cache()
         for i, (keys, values) in enumerate(prefix.layers):
             cache.update(keys.expand(n, -1, -1, -1), values.expand(n, -1, -1, -1), i)
-        rows = cls(reader, [(range(n), cache)], torch.ones(n, known, dtype=torch.long), None, places)
+        rows = cls(reader, cache, torch.ones(n, known, dtype=torch.long), None, places)
         rows.advance([prompt[known:] for prompt in prompts])
         return rows
 
@@ -189,20 +187,11 @@ class Rows:
         columns = max(rows._mask.shape[1] for _, rows in parts)
         mask = torch.cat([pad(rows._mask, (0, columns - rows._mask.shape[1])) for _, rows in parts])
         logits = torch.cat([rows._logits for _, rows in parts])
-        caches = [(piece, rows._cache) for piece, rows in parts]
-        return cls(parts[0][1]._reader, caches, mask[order], logits[order.to(logits.device)], positions)
-
-    @property
-    def _cache(self) -> Cache:
-        """The cache of all sequences: of several parts one is made here, so never for a read-out."""
-        if len(self._parts) > 1:
-            self._parts = [(range(len(self._mask)), join_caches(self._parts))]
-        return self._parts[0][1]
+        cache = join_caches([rows._cache for _, rows in parts], order)
+        return cls(parts[0][1]._reader, cache, mask[order], logits[order.to(logits.device)], positions)
 
     def copy(self) -> "Rows":
-        """Return sequences that go on by themselves."""
-        caches: list[tuple[Sequence[int], Cache]] = [(range(len(self._mask)), deepcopy(self._cache))]
-        return Rows(self._reader, caches, self._mask, self._logits, self._places)
+        return Rows(self._reader, deepcopy(self._cache), self._mask, self._logits, self._places)
 
     def layers(self) -> list[tuple[Any, Any]]:
         """Return each layer's keys and values, (n, heads, tokens, dim); advancing never alters them."""
@@ -221,30 +210,29 @@ class Rows:
         return _log_probs(self._logits, tokens)
 
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
-        # All ways of a sequence stand side by side in its row, and a token sees those of its own way alone:
-        # the sequence's keys and values are neither copied nor read again.
-        n, ways, width = len(chunks), len(chunks[0]), max(len(way) for each in chunks for way in each)
-        ids = torch.zeros(n, ways, width, dtype=torch.long)
-        own = torch.zeros(n, ways, width, dtype=torch.bool)
+        # All chunks of a sequence stand side by side in its row, and a token sees those of its own chunk
+        # alone: the sequence's keys and values are neither copied nor read again.
+        n, count, width = len(chunks), len(chunks[0]), max(len(chunk) for each in chunks for chunk in each)
+        ids = torch.zeros(n, count, width, dtype=torch.long)
+        own = torch.zeros(n, count, width, dtype=torch.bool)
         for row, each in enumerate(chunks):
-            for turn, way in enumerate(each):
-                ids[row, turn, width - len(way) :] = torch.tensor(way)
-                own[row, turn, width - len(way) :] = True
-        same = torch.eye(ways, dtype=torch.bool)[:, None, :, None]
+            for i, chunk in enumerate(each):
+                ids[row, i, width - len(chunk) :] = torch.tensor(chunk)
+                own[row, i, width - len(chunk) :] = True
+        same = torch.eye(count, dtype=torch.bool)[:, None, :, None]
         earlier = torch.ones(width, width, dtype=torch.bool).tril()[:, None]
-        among = (same & earlier & own[:, None, None]).reshape(n, ways * width, ways * width)
-        before = self._mask.bool()[:, None].expand(-1, ways * width, -1)
+        among = (same & earlier & own[:, None, None]).reshape(n, count * width, count * width)
+        before = self._mask.bool()[:, None].expand(-1, count * width, -1)
         if self._places is None:
             starts = self._mask.sum(-1)
         else:  # after the prompt, positions are consecutive
             starts = torch.stack([place.max() + 1 for place in self._places])
         places = (starts[:, None, None] + (own.cumsum(-1) - 1).clamp(min=0)).reshape(n, -1)
-        logits = self._reader.forward(
-            self._cache, ids.reshape(n, -1), torch.cat([before, among], dim=-1)[:, None],
-            torch.arange(1, ways + 1) * width - 1,
-            places if self._places is None else places.expand(3, -1, -1),
-        )  # fmt: skip
-        return _log_probs(logits.flatten(0, 1), tokens).reshape(n, ways, -1)
+        if self._places is not None:
+            places = places.expand(3, -1, -1)
+        mask, last = torch.cat([before, among], dim=-1)[:, None], torch.arange(1, count + 1) * width - 1
+        logits = self._reader.forward(self._cache, ids.reshape(n, -1), mask, last, places)
+        return _log_probs(logits.flatten(0, 1), tokens).reshape(n, count, -1)
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
         if not any(chunks):
@@ -303,7 +291,7 @@ class Rows:
         self._cache.batch_select_indices(rows.to(self._logits.device))
 
     def close(self) -> None:
-        self._parts, self._logits = [], None
+        self._cache = self._logits = None
 
 
 def _log_probs(logits: Any, tokens: Sequence[int] | None) -> Floats:
@@ -332,9 +320,9 @@ class Apart(Session):
 
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
         rows = []
-        for session, ways in zip(self._sessions, chunks, strict=True):
-            forks = [session.copy() for _ in ways]
-            for fork, chunk in zip(forks, ways, strict=True):
+        for session, each in zip(self._sessions, chunks, strict=True):
+            forks = [session.copy() for _ in each]
+            for fork, chunk in zip(forks, each, strict=True):
                 fork.advance([chunk])
             rows.append(np.concatenate([fork.log_probs(tokens) for fork in forks]))
         return np.stack(rows)

@@ -62,17 +62,17 @@ def _unpack(file: Path, to: Path, shown: str) -> None:
         raise UserError(f"{shown} does not load: {error}; copy or download the file again") from None
     if not isinstance(values.get("tokenizer.chat_template"), str):
         raise UserError(f"{shown} has no chat template; give the GGUF file of its instruct version")
-    words = tokenizer(file)
+    loaded = tokenizer(file)
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     try:
         # What is wrong is reported below; a bar of its own would stand in the middle of ours.
         with catch_warnings(), redirect_stderr(io.StringIO()):
             simplefilter("ignore")
+            options = {"dtype": torch.float32, "local_files_only": True, "trust_remote_code": False}
             model, report = transformers.AutoModelForCausalLM.from_pretrained(
-                file.parent, gguf_file=file.name, dtype=torch.float32, output_loading_info=True,
-                local_files_only=True, trust_remote_code=False,
-            )  # fmt: skip
+                file.parent, gguf_file=file.name, output_loading_info=True, **options
+            )
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
         if isinstance(error, OSError) and error.errno is not None:  # the disk, and not transformers' words
             raise
@@ -88,9 +88,13 @@ def _unpack(file: Path, to: Path, shown: str) -> None:
     if hasattr(model.config, "quantization_config"):
         del model.config.quantization_config
     model.save_pretrained(to)
-    words.save(str(to / "tokenizer.json"))
-    settings = {"tokenizer_class": "PreTrainedTokenizerFast", "clean_up_tokenization_spaces": False,
-                "chat_template": values["tokenizer.chat_template"], **_specials(values)}  # fmt: skip
+    loaded.save(str(to / "tokenizer.json"))
+    settings = {
+        "tokenizer_class": "PreTrainedTokenizerFast",
+        "clean_up_tokenization_spaces": False,
+        "chat_template": values["tokenizer.chat_template"],
+        **_specials(values),
+    }
     write_whole(to / "tokenizer_config.json", json.dumps(settings, indent=1))
 
 
