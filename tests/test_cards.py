@@ -222,7 +222,7 @@ def test_what_was_said_of_one_engines_weights_says_nothing_of_anothers(shelf: Pa
             ["[engines.llama-cpp] has no latency; add it"],
         ),
         (('revision = "v1"', 'sha256 = "abc"'), ["sha256 = 'abc'", "64 digits"]),
-        (('revision = "v1"', "gated = 1"), ["gated", "bool"]),
+        (('revision = "v1"', "gated = 1"), ["gated", "true or false"]),
     ],
 )
 def test_a_mistake_about_engines_is_one_line_that_names_it(
@@ -271,9 +271,12 @@ def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
         (('basis = "declared: none"', 'basis = "b"\nspeed = 3'), ["[latency]", "speed", "inference_s"]),
         (('"driver"', '"drivr"'), ["engine", "drivr", "did you mean 'driver'"]),
         (('source = "card"', 'source = "guess"'), ["source", "guess", "paper"]),
-        (('description = "d"', "description = 3"), ["description", "3", "str"]),
+        (('description = "d"', "description = 3"), ["description", "3", "a text"]),
         (('description = "d"', ""), ["description", "add it"]),
-        (('description = "d"', 'description = "d"\ncontext_tokens = true'), ["context_tokens", "int"]),
+        (
+            ('description = "d"', 'description = "d"\ncontext_tokens = true'),
+            ["context_tokens", "whole number"],
+        ),
         (('description = "d"', 'description = "d"\nmax_new_tokens = 0'), ["max_new_tokens = 0", "1 or more"]),
         (('description = "d"', 'description = "d"\nweights = "a/b"'), ["weights", "transformers"]),
         (('"driver"', '"transformers"'), ["weights", "transformers"]),
@@ -283,7 +286,7 @@ def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
         (("inference_s = 0", "inference_s = -1.0"), ["inference_s = -1.0", "0 or more"]),
         (("inference_s = 0", "inference_s = 1e308"), ["inference_s = 1e+308", "at most 3600"]),
         (("inference_s = 0", "inference_s = nan"), ["inference_s = nan", "0 or more"]),
-        (("inference_s = 0", "inference_s = true"), ["inference_s", "float"]),
+        (("inference_s = 0", "inference_s = true"), ["inference_s", "a number"]),
         (("[latency]", "[latency"), ["mine.toml", "no TOML"]),
     ],
 )
@@ -334,7 +337,7 @@ def test_a_served_model_has_a_server_with_defaults_that_are_stated(shelf: Path) 
         (("[server]", "[server]\ntimeout_s = 0"), ["timeout_s = 0", "more than 0"]),
         (("[server]", "[server]\ntimeout_s = inf"), ["timeout_s = inf", "more than 0"]),
         (("[server]", "[server]\nretries = -1"), ["retries = -1", "0 to 10"]),
-        (("[server]", "[server]\nretries = true"), ["retries", "int"]),
+        (("[server]", "[server]\nretries = true"), ["retries", "whole number"]),
         (
             ("[latency]", 'thinking = "switch"\n[latency]'),
             ["thinking", "vllm or llama-server", "at the server"],
