@@ -49,10 +49,10 @@ COMMANDS = {
     "dataset scenario show": "scenario:show",
     "dataset scenario drive": "scenario:drive",
     "dataset scenario audit": "scenario:audit",
-    "radio list": "channel:list_channels",
-    "radio show": "channel:show",
-    "radio check": "channel:check",
-    "radio crowd": "channel:crowd",
+    "radio list": "radio:list_channels",
+    "radio show": "radio:show",
+    "radio check": "radio:check",
+    "radio crowd": "radio:crowd",
 }
 
 GROUPS = {

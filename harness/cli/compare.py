@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import echo_json
+from harness.cli.terminal import echo_json
 from harness.core.errors import UserError, in_range, printable
 
 

@@ -3,16 +3,16 @@
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import console, echo_json, table
 from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
+from harness.cli.terminal import console, echo_json, table
 from harness.core.errors import UserError, printable
-from harness.core.figures import as_mapping, shown
+from harness.core.figures import shown
 
 if TYPE_CHECKING:
     from harness.core.statistics import Estimate
@@ -152,21 +152,18 @@ def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: opti
     with bar(f"driving {printable(data.name, 30)}", episodes) as progress:
         standings = rank(data, who, progress)
     if as_json:
-        echo_json(_as_mapping(data.name, episodes, standings))
+        drivers = {driver: _as_mapping(standing) for driver, standing in standings.items()}
+        echo_json({"dataset": data.name, "episodes": episodes, "drivers": drivers})
     else:
         _table(episodes, standings)
 
 
-def _as_mapping(name: str, episodes: int, standings: dict[str, dict[str, "Estimate"]]) -> dict[str, Any]:
-    drivers = {}
-    for driver, s in standings.items():
-        points = {end: 100 * getattr(s["difference"], end) for end in ("value", "low", "high")}
-        estimates = {
-            "frozen": s["frozen"], "live": s["closed"],
-            "difference_points": replace(s["difference"], **points), "agreement": s["agreement"],
-        }  # fmt: skip
-        drivers[driver] = {name: as_mapping(each) for name, each in estimates.items()}
-    return {"dataset": name, "episodes": episodes, "drivers": drivers}
+def _as_mapping(standing: dict[str, "Estimate"]) -> dict[str, "Estimate"]:
+    points = {end: 100 * getattr(standing["difference"], end) for end in ("value", "low", "high")}
+    return {
+        "frozen": standing["frozen"], "live": standing["closed"],
+        "difference_points": replace(standing["difference"], **points), "agreement": standing["agreement"],
+    }  # fmt: skip
 
 
 def _table(episodes: int, standings: dict[str, dict[str, "Estimate"]]) -> None:

@@ -8,10 +8,10 @@ import msgspec
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import echo_json, echo_wrong, table
+from harness.cli.terminal import echo_each, echo_json, table
 from harness.core import resources
 from harness.core.errors import UserError, in_range, printable
-from harness.core.figures import Unit, as_mapping, known, shown
+from harness.core.figures import Unit, known, shown
 
 if TYPE_CHECKING:
     from harness.core.statistics import Estimate
@@ -32,20 +32,11 @@ def list_devices(as_json: options.Json = False) -> None:
     """List the device profiles, which --device-profile takes."""
     from harness.backends import devices
 
-    every = resources.each(devices.names(), devices.load)
-    if as_json:
-        echo_json([
-            {"name": name, "error": str(device)} if isinstance(device, UserError)
-            else msgspec.to_builtins(device)
-            for name, device in every.items()
-        ])  # fmt: skip
-        return
-    for name, device in every.items():
-        if isinstance(device, UserError):
-            echo_wrong(name, device)
-            continue
-        typer.echo(f"{printable(device.name)} · {', '.join(printable(row.model) for row in device.rows)}")
+    def show(name: str, device: "Device") -> None:
+        typer.echo(f"{printable(name)} · {', '.join(printable(row.model) for row in device.rows)}")
         typer.echo(f"  {printable(device.description, 78)}")
+
+    echo_each(resources.each(devices.names(), devices.load), as_json, msgspec.to_builtins, show)
 
 
 def show(
@@ -84,7 +75,7 @@ def show(
             "fits": [
                 {"model": fit.row.model, "answer": fit.answer, "prompt_tokens": fit.prompt_tokens,
                  "output_tokens": fit.output_tokens, "ms": known(1000 * fit.seconds),
-                 "in_time": as_mapping(fit.in_time), "joules": as_mapping(fit.joules)}
+                 "in_time": fit.in_time, "joules": fit.joules}
                 for fit in results
             ],
         })  # fmt: skip
@@ -137,11 +128,7 @@ def check(
     row = devices.find_row(device, model or str(done.manifest.model["name"]).partition(":")[0])
     results = held(device, row, done)
     if as_json:
-        echo_json([
-            {"role": each.role, "what": each.what, "measured": as_mapping(each.measured),
-             "stated": known(each.stated)}
-            for each in results
-        ])  # fmt: skip
+        echo_json(results)
         return
     scales = {"seconds": ("answer, ms", 1000.0), "prefill_tokens_per_s": ("prefill, tokens/s", 1.0),
               "decode_tokens_per_s": ("decoding, tokens/s", 1.0)}  # fmt: skip
@@ -176,21 +163,12 @@ def measure(
     The meters are NVML, RAPL and a Jetson's rails; `harness model doctor` lists those that can be read. Each
     measurement first idles, then asks one question after the other for as long.
     """
-    from dataclasses import asdict
-
     from harness.backends import cards
     from harness.backends.counters import counters
-    from harness.backends.registry import open_backend
     from harness.cli.progress import bar
-    from harness.core.resources import DATASET
-    from harness.dataset import load
     from harness.evaluate.agent import Agent
-    from harness.evaluate.asking import requests
-    from harness.evaluate.frozen_world import FrozenSource
-    from harness.evaluate.spec import Spec
     from harness.prompts import versions
-    from harness.studies.device_power import WINDOWS
-    from harness.studies.device_power import measure as measured
+    from harness.studies.device_power import WINDOWS, measure_agent
 
     if not 0.1 <= window_s <= MOST_MS / 1000:
         raise UserError(f"--window-s {window_s:g} is out of range; give 0.1 to {MOST_MS // 1000}")
@@ -200,22 +178,12 @@ def measure(
             "harness model device measure: no meter can be read here: NVML needs an NVIDIA GPU and the "
             "nvidia-ml-py, RAPL needs root; state joules in devices/NAME.toml with their source"
         )
-    data = load.load(load.find(DATASET), 10)
-    card = cards.load(f"{model}:{engine}" if engine else model)
-    agent = Agent(card, versions.load(prompt), answer)
-    spec = Spec(agent, FrozenSource(data), (), (0,), batch_size=1, device=device)
-    asked = list(requests(spec, data.scenes(data.forest.ids[:10])))
+    agent = Agent(cards.load(f"{model}:{engine}" if engine else model), versions.load(prompt), answer)
     with bar("windows", WINDOWS, quiet=as_json) as progress:
-        backend = open_backend(agent.card, device=device, dtype=None, batch_size=1)
-        drawn, n = measured(backend, asked, meters, window_s, progress)
+        powers, n = measure_agent(agent, meters, window_s, device, progress)
     if as_json:
-        figures = ("watts", "answer_j", "more_j")
         echo_json({
-            "model": agent.name, "answers": n, "windows": WINDOWS, "window_s": window_s,
-            "meters": [
-                {**asdict(each), **{name: as_mapping(getattr(each, name)) for name in figures}}
-                for each in drawn
-            ],
+            "model": agent.name, "answers": n, "windows": WINDOWS, "window_s": window_s, "meters": powers
         })  # fmt: skip
         return
     typer.echo(f"{printable(agent.name)} · {n} answers, one by one")
@@ -224,7 +192,7 @@ def measure(
         [
             (printable(each.meter), f"{each.idle_watts:.2f}", shown(each.watts, Unit("W", 2)),
              shown(each.answer_j, Unit("J", 3)), shown(each.more_j, Unit("J", 3)))
-            for each in drawn
+            for each in powers
         ],
     )  # fmt: skip
     _say(

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, cast
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show
+from harness.cli.terminal import echo_json
 from harness.core import extras
 from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import stated

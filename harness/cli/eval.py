@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from harness.cli import options, repeats, suite
-from harness.cli.estimates import echo_json
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show
+from harness.cli.terminal import echo_json
 from harness.core.errors import UserError, printable
 from harness.core.seeds import stated
 from harness.evaluate.settings import ANSWERS, OUTPUT, FrozenSettings, Settings

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import WIDTH, echo_json, echo_wrong
+from harness.cli.terminal import WIDTH, echo_json, echo_wrong
 from harness.core.errors import UserError, printable
 from harness.core.figures import DASH
 from harness.runs.listing import SUCCESS

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import WIDTH, echo_json
+from harness.cli.terminal import WIDTH, echo_json
 from harness.core.errors import printable
 from harness.core.figures import PERCENT
 

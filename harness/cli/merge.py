@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from harness.cli import drive, options
-from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
+from harness.cli.terminal import echo_json
 from harness.core import work
 from harness.core.errors import printable
 

@@ -8,8 +8,8 @@ import typer
 from msgspec import to_builtins
 
 from harness.cli import options
-from harness.cli.estimates import echo_json, echo_wrong
 from harness.cli.progress import bar
+from harness.cli.terminal import echo_json, echo_wrong
 from harness.core import resources
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.resources import DATASET

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
+from harness.cli.terminal import echo_json
 from harness.core import resources
 from harness.core.errors import UserError, printable
 

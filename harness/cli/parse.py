@@ -6,7 +6,7 @@ import sys
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import echo_json
+from harness.cli.terminal import echo_json
 from harness.core import errors
 from harness.core.files import LARGEST, bytes_of, canonical_json
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.cli.estimates import console
+from harness.cli.terminal import console
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 

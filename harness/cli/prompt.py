@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from harness.cli import options, pictures, trial
-from harness.cli.estimates import console, echo_json
 from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
+from harness.cli.terminal import console, echo_json
 from harness.core import extras, resources
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import write_whole

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import typer
 
-from harness.cli.estimates import console, table
 from harness.cli.progress import bar
+from harness.cli.terminal import console, table
 from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.formats import WORK

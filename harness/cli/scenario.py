@@ -1,15 +1,16 @@
 """`harness dataset scenario`: the scenarios, and how hard each is for the reference drivers."""
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import console, echo_json, echo_wrong, table
 from harness.cli.progress import bar
+from harness.cli.terminal import attributes, console, echo_each, echo_fields, echo_json, table
 from harness.core import resources
 from harness.core.errors import UserError, in_range, printable
-from harness.core.figures import Unit, as_mapping, shown
+from harness.core.figures import Unit, shown
 from harness.core.seeds import FIRST, purpose, stated
 
 if TYPE_CHECKING:
@@ -21,24 +22,15 @@ def list_scenarios(as_json: options.Json = False) -> None:
     """List the scenarios, each with a summary."""
     from harness.world import scenarios
 
-    entries = resources.each(scenarios.names(), scenarios.get)
-    if as_json:
-        echo_json([
-            {"name": name, "error": str(each)} if isinstance(each, UserError)
-            else {"name": name, "summary": each.summary}
-            for name, each in entries.items()
-        ])  # fmt: skip
-        return
-    for name, each in entries.items():
-        if isinstance(each, UserError):
-            echo_wrong(name, each)
-        else:
-            typer.echo(f"{name}: {each.summary}")
+    echo_each(
+        resources.each(scenarios.names(), scenarios.get), as_json,
+        lambda scenario: {"summary": scenario.summary},
+        lambda name, scenario: typer.echo(f"{name}: {scenario.summary}"),
+    )  # fmt: skip
 
 
 def show(name: options.Scenario, as_json: options.Json = False) -> None:
     """Print a scenario's actions and its parameters, with meanings."""
-    from harness.cli.docstrings import echo_fields
     from harness.world import scenarios
 
     scenario = scenarios.get(options.typed_scenario(name))
@@ -46,9 +38,15 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
     if as_json:
         from harness.prompts.answer_schema import ROLES, answer_schema
 
-        described = {"name": name, "description": description, "actions": actions}
-        schemas = {role: answer_schema(role, actions, name) for role in ROLES}
-        echo_json({**described, "parameters": _parameters(scenario), "answer_schema": schemas})
+        meanings = attributes(type(scenario.parameters))
+        echo_json({
+            "name": name, "description": description, "actions": actions,
+            "parameters": {
+                key: {"value": value, "meaning": meanings[key]}
+                for key, value in asdict(scenario.parameters).items()
+            },
+            "answer_schema": {role: answer_schema(role, actions, name) for role in ROLES},
+        })  # fmt: skip
         return
     typer.echo(f"{description}\nactions: {', '.join(actions)}\n")
     echo_fields(scenario.parameters)
@@ -71,7 +69,7 @@ def drive(
     with bar(f"driving {printable(name, 30)}", episodes) as progress:
         outcomes = live.check(scenario, episodes, seed, who, progress)
     if as_json:
-        echo_json(_as_mapping(name, episodes, seed, outcomes))
+        echo_json({"scenario": name, "episodes": episodes, "seed": seed, "drivers": outcomes})
     else:
         _table(episodes, seed, outcomes)
 
@@ -100,8 +98,7 @@ def audit(
     if as_json:
         echo_json({
             "scenario": name, "layouts": layouts, "seed": seed, "steps": result.steps, "tells": result.tells,
-            "worst": result.worst, "auc": {question: as_mapping(auc) for question, auc in result.auc.items()},
-            "told_by": result.told_by,
+            "worst": result.worst, "auc": result.auc, "told_by": result.told_by,
         })  # fmt: skip
     else:
         _print(result)
@@ -110,7 +107,7 @@ def audit(
 
 
 def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episodes") -> "Scenario":
-    """The scenario. Raises UserError if there is none, or where those layouts cannot be driven together."""
+    """Return the scenario. Raises UserError for none, or for layouts that cannot be driven together."""
     from harness.core.seeds import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios
 
@@ -121,37 +118,14 @@ def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episod
     return scenario
 
 
-def _parameters(scenario: "Scenario") -> dict[str, dict[str, Any]]:
-    """Return the value of each parameter, and its meaning."""
-    from dataclasses import asdict
-
-    from harness.cli.docstrings import attributes
-
-    meanings = attributes(type(scenario.parameters))
-    return {
-        name: {"value": value, "meaning": meanings[name]}
-        for name, value in asdict(scenario.parameters).items()
-    }
-
-
-def _as_mapping(name: str, episodes: int, seed: int, outcomes: dict[str, Any]) -> dict[str, Any]:
-    from harness.core.statistics import Estimate
-
-    drivers = {
-        driver: {k: as_mapping(v) if isinstance(v, Estimate) else v for k, v in results.items()}
-        for driver, results in outcomes.items()
-    }
-    return {"scenario": name, "episodes": episodes, "seed": seed, "drivers": drivers}
-
-
 def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     heads = ("driver", "success % [95 % CI]", "collision %", "late %", "time-out %", "other crashes")
     rows = []
-    for driver, of in outcomes.items():
-        rates = (f"{100 * of[k].value:.1f}" for k in ("collision", "late", "time_out"))
-        rows.append((driver, shown(of["success"]), *rates, str(of["other_crashes"])))
+    for driver, rates in outcomes.items():
+        percent = (f"{100 * rates[k].value:.1f}" for k in ("collision", "late", "time_out"))
+        rows.append((driver, shown(rates["success"]), *percent, str(rates["other_crashes"])))
     table(heads, rows)
-    off_road = sum(round(of["off_road"].value * episodes) for of in outcomes.values())
+    off_road = sum(round(rates["off_road"].value * episodes) for rates in outcomes.values())
     console().print(
         f"n = {episodes} episodes, {stated(seed, episodes)};\nWilson intervals; off the road: {off_road}"
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.cli.estimates import WIDTH, table
+from harness.cli.terminal import WIDTH, table
 from harness.core.errors import printable
 
 if TYPE_CHECKING:

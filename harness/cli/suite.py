@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import typer
 
-from harness.cli.estimates import console, echo_json, table
 from harness.cli.run import Together, as_mapping, free_folder, origins
+from harness.cli.terminal import console, echo_json, table
 from harness.core.errors import UserError, printable
 from harness.core.figures import shown
 from harness.core.formats import SUITE, WORK

@@ -13,7 +13,7 @@ from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
-from harness.core.config import changed, settable, value_of
+from harness.core.config import changed, pairs, settable, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.radio import constant
 from harness.radio.channel import Channel, Physical, Unit
@@ -329,11 +329,6 @@ def named_point(text: str) -> OperatingPoint:
         settings["round_trip_s"] = None  # `cloud` has the paper's; only one of the two may be set
     point = point.of_radio(radio) if radio else point
     return point.changed(name=text, **settings) if settings or radio else point
-
-
-def pairs(text: str) -> dict[str, str]:
-    """Return the names and values in `density_per_km=200,power_dbm=23`; a missing value is empty."""
-    return {key: value for key, _, value in (pair.partition("=") for pair in text.split(",") if pair)}
 
 
 # Short names of settings, as in `harness study sweep --over`, each with the factor to the setting's unit.

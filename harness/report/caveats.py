@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from harness.backends import findings
 from harness.backends.registry import ENGINES
-from harness.coordination.operating_point import pairs
+from harness.core.config import pairs
 from harness.core.errors import printable
 from harness.parsing.status import Status
 from harness.radio.profiles import outside

@@ -8,8 +8,15 @@ import numpy as np
 
 from harness.backends.base import Backend, Request
 from harness.backends.counters import Counter, metered
+from harness.backends.registry import open_backend
 from harness.core.errors import Unanswered, printable
+from harness.core.resources import DATASET
 from harness.core.statistics import Estimate, seed_interval
+from harness.dataset import load
+from harness.evaluate.agent import Agent
+from harness.evaluate.asking import requests
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.spec import Spec
 
 WINDOWS = 5  # of asking; the intervals are over them
 
@@ -69,6 +76,18 @@ def measure(
         estimates = (seed_interval(each) for each in (spent_j / seconds, spent_j / answers, more / answers))
         powers.append(Power(name, idle_watts, *estimates))
     return powers, int(answers.sum())
+
+
+def measure_agent(
+    agent: Agent, meters: Sequence[Counter], window_s: float, device: str | None,
+    progress: Callable[[int], None],
+) -> tuple[list[Power], int]:  # fmt: skip
+    """Load an agent's model on a device, and `measure` it with questions of the default dataset."""
+    data = load.load(load.find(DATASET), 10)
+    spec = Spec(agent, FrozenSource(data), (), (0,), batch_size=1, device=device)
+    asked = list(requests(spec, data.scenes(data.forest.ids[:10])))
+    backend = open_backend(agent.card, device=device, dtype=None, batch_size=1)
+    return measure(backend, asked, meters, window_s, progress)
 
 
 def _ask(backend: Backend, request: Request) -> None:

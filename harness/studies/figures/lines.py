@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.core.arrays import Floats
+from harness.radio.reception import by_sight
 from harness.report.drawing.colours import COLOURS, FAINT, GREY, INK, MARKERS
 from harness.report.drawing.pictures import styled
 from harness.studies.axes import axis_of
@@ -16,7 +17,8 @@ from harness.studies.figures.axes import cross, interval_of, lettered, paper_val
 if TYPE_CHECKING:
     import pandas as pd
 
-    from harness.studies.reception import Compared, Drawn
+    from harness.radio.channel import Physical
+    from harness.radio.reception import Compared, Drawn
 
 PAPER_LOSS = ((2, 0.6), (4, 6.6), (8, 18.6))  # vehicles, % lost: the paper's panel of swarm sizes
 BEST_BAND = (0.65, 0.70)  # of tau, the paper's
@@ -91,18 +93,18 @@ def _along(axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None") -> No
 
 @styled
 def reception(
-    name: str, curves: Mapping[str, Floats], distances_m: Floats, messages: "Sequence[Drawn]",
-    against: "Sequence[Compared]",
-) -> Figure:  # fmt: skip
+    name: str, channel: "Physical", messages: "Sequence[Drawn]", against: "Sequence[Compared]"
+) -> Figure:
     """Draw a radio's reception against distance, and beside it, if there are any, against others' curves.
 
     Args:
         name: of the condition.
-        curves: label of what stands between, and reception at `distances_m`.
-        distances_m: `(n,)`.
+        channel: the radio.
         messages: what was drawn in sight.
         against: others' curves.
     """
+    distances_m = np.linspace(1, messages[-1].distance_m, 250)
+    curves = by_sight(channel, distances_m)
     figure = Figure(figsize=(7.2 if against else 3.8, 3.0), layout=ConstrainedLayoutEngine(w_pad=0.1))
     axes = figure.add_subplot(1, 2 if against else 1, 1)
     for (label, curve), colour, dashes in zip(curves.items(), COLOURS, ("-", "--", ":"), strict=False):
@@ -131,20 +133,20 @@ def reception(
 
 
 @styled
-def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], line: Floats, title: str) -> Figure:
+def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], title: str) -> Figure:
     """Draw the loss of one transmission against vehicles in the radius: radios beside the paper's line.
 
     Args:
         vehicles: `(n,)`, sender and receiver included.
-        losses: name of a radio to its losses, `(n,)`.
-        line: the paper's, `(n,)`.
+        losses: losses by the name of a radio, `(n,)`, and the paper's line as `paper`.
         title: what the losses are of.
     """
     figure = Figure(figsize=(4.6, 3.2), layout=ConstrainedLayoutEngine(w_pad=0.1))
     axes = figure.add_subplot()
-    axes.plot(vehicles, 100 * line, color=INK, linewidth=1.2, label="the paper's line")
+    radios = dict(losses)
+    axes.plot(vehicles, 100 * radios.pop("paper"), color=INK, linewidth=1.2, label="the paper's line")
     axes.plot(*zip(*PAPER_LOSS, strict=True), "x", color=INK, label="the paper's three points")
-    for (name, loss), colour, marker in zip(losses.items(), COLOURS, MARKERS, strict=False):
+    for (name, loss), colour, marker in zip(radios.items(), COLOURS, MARKERS, strict=False):
         axes.plot(vehicles, 100 * loss, marker=marker, markersize=3, linewidth=1.0, color=colour, label=name)
     axes.set(
         xscale="log",

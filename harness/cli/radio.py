@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import echo_json, echo_wrong, table
+from harness.cli.terminal import echo_each, echo_fields, echo_json, table
 from harness.core import resources
-from harness.core.errors import UserError, printable, unknown
-from harness.core.figures import Unit, as_mapping, known, shown
+from harness.core.errors import UserError, in_range, printable, unknown
+from harness.core.figures import Unit, known, shown
 
 if TYPE_CHECKING:
     from harness.radio.channel import Channel
-
+    from harness.radio.profiles import Profile
 
 MOST_TRIPS = 100_000  # at each distance
 Name = typer.Argument(
@@ -26,20 +26,11 @@ def list_channels(as_json: options.Json = False) -> None:
     """List the channel profiles. Each name is also a condition that --condition takes."""
     from harness.radio.profiles import CHANNELS
 
-    profiles = resources.each(CHANNELS, CHANNELS.profile)
-    if as_json:
-        echo_json([
-            {"name": name, "error": str(profile)} if isinstance(profile, UserError)
-            else {"name": name, **asdict(profile)}
-            for name, profile in profiles.items()
-        ])  # fmt: skip
-        return
-    for name, profile in profiles.items():
-        if isinstance(profile, UserError):
-            echo_wrong(name, profile)
-            continue
+    def show(name: str, profile: "Profile") -> None:
         typer.echo(f"{printable(name)} · {printable(profile.model)} · {profile.status}")
         typer.echo(f"  {printable(profile.description, 78)}")
+
+    echo_each(resources.each(CHANNELS, CHANNELS.profile), as_json, asdict, show)
 
 
 def show(name: str = Name, as_json: options.Json = False) -> None:
@@ -51,10 +42,9 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     """
     import textwrap
 
-    from harness.cli.docstrings import echo_fields
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS, outside
-    from harness.studies.reception import DISTANCES_M, by_sight
+    from harness.radio.reception import DISTANCES_M, by_sight
 
     profile_name, channel = _channel_of(name)
     profile, settings = CHANNELS.profile(profile_name), asdict(channel)
@@ -109,106 +99,70 @@ def check(
     own shadowing. The waits are those from one received background packet of a vehicle to the next; they take
     a tenth as many samples. Each published curve is compared at its own settings.
     """
-    import numpy as np
-
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS, outside
-    from harness.radio.transceiver import Transceiver
-    from harness.studies.reception import DISTANCES_M, PACKETS, by_sight, compared, curves_of, drawn, gaps
+    from harness.radio.reception import PACKETS
+    from harness.radio.reception import check as checked
 
-    if not 100 <= n <= MOST_TRIPS:
-        raise UserError(f"-n {n}: give 100 to {MOST_TRIPS} trips")
+    in_range("-n", n, 100, MOST_TRIPS)
     profile, channel = _channel_of(name)
     if not isinstance(channel, Physical):
         raise UserError(
             f"{printable(name)} loses the same at every distance, so there is no curve to check; give a "
             "physical radio, such as mode4"
         )
-    _picture(out)
-    where = f"channel profile {profile}"
-    messages = drawn(channel, DISTANCES_M, n)
-    of_others = [compared(channel, curve, where) for path in against or () for curve in curves_of(path)]
-    model = by_sight(channel, DISTANCES_M)["clear"].tolist()
-    waits = (
-        gaps(channel, DISTANCES_M, n // 10) if isinstance(channel, Transceiver) and channel.rate_hz else []
-    )
-    busy = channel.busy_ratio()
+    _refuse_format(out)
+    found = checked(channel, n, against or (), f"channel profile {profile}")
     beyond = outside(asdict(channel), CHANNELS.profile(profile).limits)
     if out:
         from harness.report.drawing.pictures import save
         from harness.studies.figures.lines import reception
 
-        every = np.linspace(1, DISTANCES_M[-1], 250)
-        save(reception(name, by_sight(channel, every), every, messages, of_others), out, out.suffix[1:])  # type: ignore[arg-type]
+        save(reception(name, channel, found.messages, found.curves), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
-        echo_json({
-            "name": name, "n": n, "outside": beyond, "busy_ratio": known(busy),
-            "waits": [
-                {"distance_m": w.distance_m, "mean_s": as_mapping(w.mean_s), "p95_s": as_mapping(w.p95_s),
-                 "independent_s": w.independent_s if np.isfinite(w.independent_s) else None}
-                for w in waits
-            ],
-            "messages": [
-                {"distance_m": m.distance_m, "model": share, "crossing": as_mapping(m.crossing),
-                 "round_trip": as_mapping(m.round_trip), "delay_s": m.delay_s}
-                for m, share in zip(messages, model, strict=True)
-            ],
-            "curves": [
-                {"configuration": c.curve.configuration, "source": c.curve.source, "n": len(c.reception),
-                 "mean_difference": c.mean_difference, "largest_difference": c.largest_difference}
-                for c in of_others
-            ],
-        })  # fmt: skip
+        curves = [
+            {"configuration": c.curve.configuration, "source": c.curve.source, "n": len(c.reception),
+             "mean_difference": c.mean_difference, "largest_difference": c.largest_difference}
+            for c in found.curves
+        ]  # fmt: skip
+        echo_json({"name": name, "outside": beyond, **vars(found), "curves": curves})
         return
-    heads = ["in sight", "model %", "one message %", "round trip %", "delay ms"]
     table(
-        heads,
+        ["in sight", "model %", "one message %", "round trip %", "delay ms"],
         [
-            (
-                f"{m.distance_m:g} m",
-                f"{100 * share:.1f}",
-                shown(m.crossing),
-                shown(m.round_trip),
-                f"{1000 * m.delay_s:.1f}",
-            )
-            for m, share in zip(messages, model, strict=True)
+            (f"{m.distance_m:g} m", f"{100 * m.model:.1f}", shown(m.crossing), shown(m.round_trip),
+             f"{1000 * m.delay_s:.1f}")
+            for m in found.messages
         ],
-    )
+    )  # fmt: skip
     typer.echo(f"n = {n} messages per distance, each with its own shadowing; 95 % intervals")
-    if waits:
+    if found.waits:
         typer.echo()
         table(
             ["next packet after, s", "mean", "95th percentile", "if independent"],
             [
-                (
-                    f"{w.distance_m:g} m",
-                    shown(w.mean_s, Unit("s", 3)),
-                    shown(w.p95_s, Unit("s", 2)),
-                    f"{w.independent_s:.3f}",
-                )
-                for w in waits
+                (f"{w.distance_m:g} m", shown(w.mean_s, Unit("s", 3)), shown(w.p95_s, Unit("s", 2)),
+                 f"{w.independent_s:.3f}")
+                for w in found.waits
             ],
-        )
-        typer.echo(f"n = {n // 10} trips a distance, {PACKETS} packets each; busy ratio {busy:.3f}")
+        )  # fmt: skip
+        busy = f"busy ratio {found.busy_ratio:.3f}"
+        typer.echo(f"n = {n // 10} trips a distance, {PACKETS} packets each; {busy}")
     for line in beyond:
         typer.echo(line)
-    if of_others:
+    if found.curves:
         typer.echo()
         table(
             ["curve", "points", "mean apart", "largest"],
             [
-                (
-                    c.curve.configuration or c.curve.source,
-                    str(len(c.reception)),
-                    f"{100 * c.mean_difference:.1f}",
-                    f"{100 * c.largest_difference:+z.1f}",
-                )
-                for c in of_others
+                (c.curve.configuration or c.curve.source, str(len(c.reception)),
+                 f"{100 * c.mean_difference:.1f}", f"{100 * c.largest_difference:+z.1f}")
+                for c in found.curves
             ],
-        )
-        mean = 100 * float(np.mean([c.mean_difference for c in of_others]))
-        typer.echo(f"{len(of_others)} curves, {mean:.1f} points apart on average; model less theirs")
-        sources = dict.fromkeys(c.curve.source for c in of_others)
+        )  # fmt: skip
+        mean = f"{100 * found.mean_difference:.1f} points apart on average"
+        typer.echo(f"{len(found.curves)} curves, {mean}; model less theirs")
+        sources = dict.fromkeys(c.curve.source for c in found.curves)
         typer.echo(printable("; ".join(sources), 1000))
     if out:
         typer.echo(f"wrote {printable(out)}")
@@ -234,17 +188,14 @@ def crowd(
 
     The road has the same density of vehicles everywhere as within the radius, and all of them send.
     """
-    import numpy as np
-
     from harness.core.config import settable
     from harness.radio.channel import Physical
-    from harness.radio.constant import density_coupled_loss
     from harness.radio.profiles import CHANNELS
-    from harness.studies.reception import SIGHTS, crowded
+    from harness.radio.reception import SIGHTS, VEHICLES, crowds
 
     if sight not in SIGHTS:
         raise unknown("--sight", sight, SIGHTS)
-    _picture(out)
+    _refuse_format(out)
     every = {name: _channel_of(name)[1] for name in names} if names else CHANNELS.usable()
     loaded = {
         name: channel for name, channel in every.items()
@@ -254,35 +205,31 @@ def crowd(
         raise UserError(
             f"{printable(lacks[0])} has no density_per_km that a swarm could change; leave it out"
         )
-    vehicles = (2, 4, 8, 16, 32, 64, 128)
-    losses = {n: crowded(channel, vehicles, radius_m, distance_m, sight) for n, channel in loaded.items()}
-    line = density_coupled_loss(np.array(vehicles))
+    losses = crowds(loaded, radius_m, distance_m, sight)
     if out:
         from harness.report.drawing.pictures import save
-        from harness.studies.figures.lines import crowds
+        from harness.studies.figures.lines import crowds as draw
 
         between = {"clear": "in sight", "vehicle": "behind a car", "building": "behind a building"}[sight]
         title = f"one transmission over {distance_m:g} m {between}, vehicles within {radius_m:g} m"
-        save(crowds(vehicles, losses, line, title), out, out.suffix[1:])  # type: ignore[arg-type]
+        save(draw(VEHICLES, losses, title), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
+        paper = losses.pop("paper")
         echo_json({
-            "vehicles": vehicles, "distance_m": distance_m, "radius_m": radius_m, "sight": sight,
-            "paper": line.tolist(), "loss": {name: loss.tolist() for name, loss in losses.items()},
+            "vehicles": VEHICLES, "distance_m": distance_m, "radius_m": radius_m, "sight": sight,
+            "paper": paper, "loss": losses,
         })  # fmt: skip
         return
-    columns = {"paper": line, **losses}
+    shares = zip(VEHICLES, *losses.values(), strict=True)
     table(
-        ["lost, %", *map(printable, columns)],
-        [
-            (f"{n} vehicles", *(f"{100 * column[place]:.1f}" for column in columns.values()))
-            for place, n in enumerate(vehicles)
-        ],
+        ["lost, %", *map(printable, losses)],
+        [(f"{n} vehicles", *(f"{100 * share:.1f}" for share in row)) for n, *row in shares],
     )
     if out:
         typer.echo(f"wrote {printable(out)}")
 
 
-def _picture(out: Path | None) -> None:
+def _refuse_format(out: Path | None) -> None:
     if not out:
         return
     from harness.report.drawing.pictures import FORMATS

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from harness.cli.estimates import table
+from harness.cli.terminal import table
 from harness.core.figures import PERCENT
 from harness.runs.metrics import over_episodes
 

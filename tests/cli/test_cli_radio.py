@@ -10,7 +10,7 @@ import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
 
-from harness.cli.docstrings import attributes
+from harness.cli.terminal import attributes
 from harness.coordination.operating_point import named_point
 from harness.dataset.load import Dataset
 from harness.radio.channel import Physical

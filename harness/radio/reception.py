@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,19 +11,21 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from harness.coordination.operating_point import pairs
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
-from harness.core.config import changed
+from harness.core.config import changed, pairs
 from harness.core.errors import UserError, printable
+from harness.core.figures import known
 from harness.core.files import text_of
 from harness.core.statistics import Estimate, episode_interval, rate_interval, resampled
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Physical, Site
+from harness.radio.constant import density_coupled_loss
 from harness.radio.fading import Trips
 from harness.radio.transceiver import Transceiver
 
 DISTANCES_M = (10, 20, 50, 100, 150, 200, 300, 400, 500)
 SIGHTS = {"clear": CLEAR, "vehicle": VEHICLE, "building": BUILDING}
+VEHICLES = (2, 4, 8, 16, 32, 64, 128)
 PAYLOAD_BITS = 800.0
 PACKETS, MPS = 200, 14.0  # of a trip, and its speed
 RESAMPLES = 200
@@ -34,6 +36,7 @@ class Drawn:
     """What a channel did to messages at one distance."""
 
     distance_m: float  # between ego and helper
+    model: float  # share of single transmissions that succeed, by the channel's own curve
     crossing: Estimate  # share of single transmissions that succeed, over shadowing
     round_trip: Estimate  # share of requests that come back answered
     # mean seconds from the request to the end of the reply, for helpers that have their answer
@@ -49,7 +52,8 @@ def by_sight(channel: Physical, distances_m: Sequence[float] | Floats) -> dict[s
 def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Drawn]:
     """Draw `n` trips with one helper at each distance, in sight along one road."""
     result = []
-    for distance_m in distances_m:
+    curve = by_sight(channel, distances_m)["clear"].tolist()
+    for distance_m, model in zip(distances_m, curve, strict=True):
         trips = Trips(np.arange(n), np.full(n, seed), np.zeros(n, dtype=int), 1)
         draws = Draws(trips.uniforms(1)[:, None, 1:], trips.uniforms(1)[:, :1], trips)
         shape = (n, 1)
@@ -66,7 +70,7 @@ def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0
         up, delay_s, loss, _ = channel.deliver(links, draws)
         crossed = draws.packet[..., 1] >= np.broadcast_to(loss, shape)
         crossing, round_trip = (rate_interval(each[:, 0].astype(float)) for each in (crossed, up))
-        result.append(Drawn(distance_m, crossing, round_trip, float(delay_s.mean())))
+        result.append(Drawn(distance_m, model, crossing, round_trip, float(delay_s.mean())))
     return result
 
 
@@ -192,24 +196,59 @@ def compared(channel: Channel, curve: Curve, where: str) -> Compared:
     return Compared(curve, there.reception(curve.distance_m))
 
 
-def crowded(
-    channel: Channel, vehicles: Sequence[int], radius_m: float, distance_m: float, sight: str
-) -> Floats:
-    """Return the loss of one transmission with only so many vehicles, within a radius, `(n,)`.
+@dataclass(frozen=True)
+class Check:
+    """A radio held against simulation and against others' curves."""
 
-    Those other than sender and receiver are the background's load, evenly along one road through the radius.
+    n: int  # messages at each distance
+    busy_ratio: float | None  # of its channel, under the background load
+    waits: list[Gap]  # between packets of a vehicle; of a radio that sends none, empty
+    messages: list[Drawn]  # what was simulated
+    curves: list[Compared]  # others' curves
+
+    @property
+    def mean_difference(self) -> float:
+        """Mean absolute difference from others' curves, each with the same weight, a share."""
+        return float(np.mean([curve.mean_difference for curve in self.curves]))
+
+
+def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check:
+    """Simulate `n` messages at each of `DISTANCES_M`, and compare the radio with the curves of CSV files.
+
+    Raises:
+        UserError: a file has no curves, or one states a setting that the radio, named `where`, does not have.
+    """
+    sends = isinstance(channel, Transceiver) and channel.rate_hz
+    return Check(
+        n,
+        known(channel.busy_ratio()),
+        gaps(channel, DISTANCES_M, n // 10) if isinstance(channel, Transceiver) and sends else [],
+        drawn(channel, DISTANCES_M, n),
+        [compared(channel, curve, where) for file in files for curve in curves_of(file)],
+    )
+
+
+def crowds(
+    channels: Mapping[str, Channel], radius_m: float, distance_m: float, sight: str
+) -> dict[str, Floats]:
+    """Return the loss of one transmission among each of `VEHICLES`, by the name of a channel, `(n,)`.
+
+    Vehicles are within a radius; sender and receiver are two of them, the others the background's load,
+    evenly along one road through the radius. `paper` is the paper's line.
 
     Args:
-        channel: whose `density_per_km` they are.
-        vehicles: how many, sender and receiver included.
+        channels: channels, whose `density_per_km` the others are.
         radius_m: the radius.
         distance_m: between sender and receiver.
-        sight: what stands between.
+        sight: what stands between, a key of `SIGHTS`.
     """
-    losses = []
-    for n in vehicles:
-        per_km = max(n - 2, 0) / (2 * radius_m) * 1000
-        there = changed(channel, {"density_per_km": str(per_km)}, "channel")
-        assert isinstance(there, Physical)
-        losses.append(1 - there.reception(np.array([distance_m]), SIGHTS[sight])[0])
-    return np.array(losses)
+    losses = {"paper": density_coupled_loss(np.array(VEHICLES))}
+    for name, channel in channels.items():
+        received = []
+        for n in VEHICLES:
+            per_km = max(n - 2, 0) / (2 * radius_m) * 1000
+            there = changed(channel, {"density_per_km": str(per_km)}, "channel")
+            assert isinstance(there, Physical)
+            received.append(there.reception(np.array([distance_m]), SIGHTS[sight])[0])
+        losses[name] = 1 - np.array(received)
+    return losses
