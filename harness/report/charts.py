@@ -7,7 +7,6 @@ in `currentColor` is light on dark and dark on light.
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from harness.report import statistics
 from harness.report.drawing import colours
 from harness.report.drawing.colours import BAD, FAILURES, GOOD, GREY, LATE, PALE, ROLES
 
@@ -31,7 +30,7 @@ BASE: Spec = {"$schema": "https://vega.github.io/schema/vega-lite/v5.json", "wid
 REACTION_MS = (150, 250)  # the paper's reaction window in an urban intersection
 VERDICTS = {"strict": [GOOD], "recovered": [LATE], "failed": FAILURES}
 REPLIES = {"on time": GOOD, "late": LATE, "lost": BAD}
-ENERGIES = dict(zip(statistics.ENERGIES, (ROLES["ego"], ROLES["helper"], BAD), strict=True))
+ENERGIES = {"ego's inference": ROLES["ego"], "helpers' inference": ROLES["helper"], "radios": BAD}
 TIMES = {
     "inference": PALE, "reply on time": GOOD, "reply late": LATE, "reply lost": BAD, "fusion": ROLES["merge"],
     "decision": GREY,

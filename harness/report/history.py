@@ -9,8 +9,7 @@ from pathlib import Path
 from harness.core.errors import UserError, printable, unknown
 from harness.report.compare.page import Place, beside
 from harness.report.compare.pair import scenes_of, where
-from harness.report.document import Section, Table, document, linked
-from harness.report.forest import forest, reach
+from harness.report.document import Section, Table, document, forest, linked, reach
 from harness.report.page import save
 from harness.report.words import cell
 from harness.runs.folder import Run, read

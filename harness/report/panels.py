@@ -1,15 +1,28 @@
-"""Which charts a report has, in what part of it, and what is to be read from each."""
+"""Which charts a report has: what is counted for each, and how it is read.
 
-from collections.abc import Callable, Iterator
+The rows of a chart are plain. Shares are 0 to 1; `low` and `high` are a 95 % interval over episodes.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from harness.report import charts, statistics
+import numpy as np
+
+from harness.core.arrays import Floats, Ints
+from harness.core.statistics import rate_interval
+from harness.parsing.status import Status
+from harness.report import charts
 from harness.report.references import driven, in_trees, label, sentences
 from harness.report.runs import Runs
 from harness.runs.folder import Run
+from harness.runs.metrics import LATENCY, SUCCESS
 from harness.runs.records import Score
 
+Table = list[dict[str, Any]]
+ENTROPY_NATS, TOKENS, ARRIVAL_MS = 0.1, 25, 10.0  # widths of bins
+CERTAINTY = 0.1
 Part = Literal["overview", "answers", "communication"]
 ENTROPY = "entropy of the ego's own intent, nats"
 BUDGET = (200, 400)  # tokens of a prompt: the paper's
@@ -29,7 +42,7 @@ class Panel:
 def panels(runs: Runs) -> Iterator[Panel]:
     """Yield the charts of which there is anything to draw."""
 
-    def joined(of: Callable[[Run], statistics.Table]) -> statistics.Table:
+    def joined(of: Callable[[Run], Table]) -> Table:
         return [
             charts.named({"run": name, **row})
             for name, run in zip(runs.names, runs.runs, strict=True)
@@ -40,7 +53,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
     tau_nats = sorted({c["tau_nats"] for c in points})
     windows_ms = sorted({c["window_s"] * 1000 for c in points})
 
-    if rows := joined(statistics.success):
+    if rows := joined(_success):
         references, scenario = _references(runs), runs.scenario.name
         success = {label(name, scenario): s.value for name, s in references.items() if s.value is not None}
         yield Panel(
@@ -50,14 +63,14 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "decision window is not fused." + sentences(references, scenario),
             charts.success_latency(rows, success, windows_ms),
         )  # fmt: skip
-    if rows := joined(statistics.statuses):
+    if rows := joined(_statuses):
         yield Panel(
             "statuses", "answers", "How answers were read",
             "Share of each role's answers by status. Strict: the text fits the schema as it is. Recovered: "
             "it was read after repairs. All others failed and gave no distribution.",
             charts.statuses(rows),
         )  # fmt: skip
-    if rows := joined(statistics.reliability):
+    if rows := joined(_reliability):
         yield Panel(
             "reliability", "answers", "Is the policy as safe as it is sure?",
             "Decisions are grouped by the probability of the chosen action in the fused policy, in steps of "
@@ -69,16 +82,16 @@ def panels(runs: Runs) -> Iterator[Panel]:
                 rows, "certainty", "fused probability of the action taken", "share safe", diagonal=True
             ),
         )  # fmt: skip
-    if rows := joined(statistics.entropies):
+    if rows := joined(_entropies):
         yield Panel(
             "entropy",
             "answers",
             "Entropy of the ego's own answers",
             "Number of the ego's own answers by entropy, for those that could be read. Dashed: τ, above "
             "which the ego asks helpers.",
-            charts.bars(rows, "entropy_nats", ENTROPY, "answers", statistics.ENTROPY_NATS, rules=tau_nats),
+            charts.bars(rows, "entropy_nats", ENTROPY, "answers", ENTROPY_NATS, rules=tau_nats),
         )
-    if rows := joined(statistics.errors):
+    if rows := joined(_errors):
         yield Panel(
             "entropy-error", "answers", "Entropy against error",
             "Share of decisions whose action was unsafe, by the entropy of the ego's own intent before "
@@ -87,24 +100,24 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "intervals over episodes.",
             charts.shares(rows, "entropy_nats", ENTROPY, "share unsafe", rules=tau_nats),
         )  # fmt: skip
-    if rows := joined(statistics.tokens):
+    if rows := joined(_tokens):
         yield Panel(
             "tokens", "answers", "Length of prompts",
             "Number of prompts by length, in tokens as the engine counted them. Shaded: the paper's budget "
             "of 200 to 400 tokens.",
             charts.bars(
-                rows, "tokens", "tokens in the prompt", "prompts", statistics.TOKENS, series="role",
+                rows, "tokens", "tokens in the prompt", "prompts", TOKENS, series="role",
                 within=BUDGET,
             ),
         )  # fmt: skip
-    if rows := joined(statistics.replies):
+    if rows := joined(_replies):
         yield Panel(
             "replies", "communication", "Replies on time, late and lost",
             "Scheduled replies, all seeds. On time: the reply arrived within the decision window and was "
             "fused. Late: it arrived after the window. Lost: the request or the reply was lost.",
             charts.stacked(rows, "condition", "reply", charts.REPLIES, "replies"),
         )  # fmt: skip
-    if rows := joined(statistics.energies):
+    if rows := joined(_energies):
         yield Panel(
             "energy",
             "communication",
@@ -115,14 +128,14 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "to see, cooperation costs energy because helpers infer, not because they transmit.",
             charts.stacked(rows, "condition", "part", charts.ENERGIES, "J per decision", amount="joules"),
         )
-    if rows := joined(statistics.arrivals):
+    if rows := joined(_arrivals):
         yield Panel(
             "arrivals", "communication", "When replies arrive",
             "Number of replies by arrival time, for those that were not lost; all seeds. Dashed: the end of "
             "the decision window.",
             charts.bars(
                 rows, "arrival_ms", "arrival, ms from the start of the decision", "replies",
-                statistics.ARRIVAL_MS, series="condition", rules=windows_ms,
+                ARRIVAL_MS, series="condition", rules=windows_ms,
             ),
         )  # fmt: skip
 
@@ -132,3 +145,139 @@ def _references(runs: Runs) -> dict[str, Score]:
     if runs.dataset is None:
         return driven(runs.runs)
     return in_trees(runs.dataset.of_episodes({number for run in runs.runs for number in run.grid.episodes}))
+
+
+def _success(run: Run) -> Table:
+    """Return success and latency of each condition, of which both are known."""
+    rows = []
+    for condition in run.conditions:
+        latency, rate = run.score(condition, LATENCY), run.score(condition, SUCCESS)
+        if latency and rate:
+            rows.append({
+                "condition": condition, "latency_ms": latency.value, "latency_low": latency.low,
+                "latency_high": latency.high, "success": rate.value, "low": rate.low, "high": rate.high,
+                "n": rate.n, "interval": rate.interval,
+            })  # fmt: skip
+    return rows
+
+
+def _statuses(run: Run) -> Table:
+    """Return how many answers of each role have which status."""
+    order = {status: n for n, status in enumerate(map(str, Status))}
+    count = Counter((a.role, order.get(a.status, -1), a.status, a.verdict) for a in run.answers)
+    of = Counter(a.role for a in run.answers)
+    return [
+        {"role": role, "status": status, "verdict": verdict, "count": n, "share": n / of[role], "n": of[role]}
+        for (role, _, status, verdict), n in sorted(count.items())
+    ]
+
+
+def _reliability(run: Run) -> Table:
+    """Return how often the action taken was safe, by how probable fusion held it."""
+    certainty = run.decisions.of_actions("fused").max(axis=1)
+    bins = np.minimum((certainty / CERTAINTY).astype(int), round(1 / CERTAINTY) - 1)
+    return list(_shares(run, bins, certainty, 1.0 - run.decisions["regret"], "certainty"))
+
+
+def _errors(run: Run) -> Table:
+    """Return how often a decision was unsafe, by the entropy of the ego's own intent."""
+    nats = run.decisions["entropy_nats"]
+    bins = np.where(np.isnan(nats), -1, nats / ENTROPY_NATS).astype(int)
+    return list(_shares(run, bins, nats, run.decisions["regret"], "entropy_nats"))
+
+
+def _shares(run: Run, bins: Ints, value: Floats, hits: Floats, name: str) -> Iterator[dict[str, Any]]:
+    conditions, episodes = run.decisions.codes("condition", run.conditions), run.decisions.whole("episode")
+    for n, condition in enumerate(run.conditions):
+        for place in np.unique(bins[(conditions == n) & (bins >= 0)]):
+            here = (conditions == n) & (bins == place) & ~np.isnan(hits)
+            if here.any():
+                share = rate_interval(hits[here], episodes[here])
+                yield {
+                    "condition": condition, name: round(float(value[here].mean()), 4), "share": share.value,
+                    "low": share.low, "high": share.high, "n": share.n,
+                }  # fmt: skip
+
+
+def _entropies(run: Run) -> Table:
+    """Return how uncertain the ego's own answers are."""
+    p = [a.intent for a in run.answers if a.role == "ego" and a.intent]
+    if not p:
+        return []
+    probabilities = np.array(p, dtype=float)
+    nats = -np.sum(probabilities * np.log(np.where(probabilities > 0, probabilities, 1.0)), axis=1)
+    return _histogram(nats, ENTROPY_NATS, "entropy_nats")
+
+
+def _tokens(run: Run) -> Table:
+    """Count the tokens of prompts by role, where the engine counts them."""
+    by_role: dict[str, list[float]] = {}
+    for answer in run.answers:
+        if answer.prompt_tokens is not None:
+            by_role.setdefault(answer.role, []).append(answer.prompt_tokens)
+    return [{"role": role, **bar} for role, of in by_role.items() for bar in _histogram(of, TOKENS, "tokens")]
+
+
+def _replies(run: Run) -> Table:
+    """Count the replies that were scheduled, by how they ended."""
+    d = run.decisions
+    delivered, on_time = d.of_messages("delivered"), d.of_messages("on_time")
+    by_reply = {
+        "on time": on_time == 1.0,
+        "late": (delivered == 1.0) & (on_time == 0.0),
+        "lost": delivered == 0.0,
+    }
+    conditions = d.codes("condition", run.conditions)
+    rows = []
+    for place, condition in enumerate(run.conditions):
+        count = {reply: int(which[conditions == place].sum()) for reply, which in by_reply.items()}
+        total = sum(count.values())
+        rows += [
+            {"condition": condition, "reply": reply, "count": n, "share": n / total, "n": total}
+            for reply, n in count.items() if n
+        ]  # fmt: skip
+    return rows
+
+
+def _energies(run: Run) -> Table:
+    """What a decision takes in joules, by who takes it, with the total's interval; where all is known."""
+    rows = []
+    for condition in run.conditions:
+        total, helpers, radio = (run.score(condition, n) for n in ("energy_j", "helpers_j", "radio_mj"))
+        if total and helpers and radio:
+            sent, thought = (radio.value or 0.0) / 1000, helpers.value or 0.0
+            joules = ((total.value or 0.0) - thought - sent, thought, sent)
+            of_total = {
+                "total_j": total.value, "low": total.low, "high": total.high, "n": total.n,
+                "interval": total.interval,
+            }  # fmt: skip
+            rows += [
+                {"condition": condition, "part": part, "joules": of_part, **of_total}
+                for part, of_part in zip(charts.ENERGIES, joules, strict=True)
+            ]
+    return rows
+
+
+def _arrivals(run: Run) -> Table:
+    """Return when replies that are not lost arrive, in ms from the start of the decision."""
+    d = run.decisions
+    arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)
+    by_condition = {name: arrival_ms[conditions == place] for place, name in enumerate(run.conditions)}
+    return [
+        {"condition": condition, **bar}
+        for condition, of in by_condition.items()
+        if len(known := of[~np.isnan(of)])
+        for bar in _histogram(known, ARRIVAL_MS, "arrival_ms")
+    ]
+
+
+def _histogram(values: Sequence[float] | Floats, width: float, name: str) -> Table:
+    """Return bars of one width with their lower end, from the first that is not empty to the last."""
+    # A value on a bin's edge belongs to the bin above it, whatever rounding makes of the quotient.
+    bins = np.floor(np.asarray(values, dtype=float) / width + 1e-9).astype(int)
+    first = int(bins.min())
+    count = np.bincount(bins - first)
+    return [
+        {name: round((first + n) * width, 6), "count": int(c), "share": float(c / len(bins))}
+        for n, c in enumerate(count)
+    ]

@@ -10,8 +10,7 @@ import pytest
 from run_on_disk import Row, change, configure, rows_of
 
 from harness.prompts import versions as prompts
-from harness.report.compare.difference import compare
-from harness.report.compare.flips import DecisionFlip
+from harness.report.compare.difference import DecisionFlip, compare
 from harness.report.compare.pair import pair
 
 Said = tuple[int, str, str]

@@ -16,8 +16,8 @@ from harness.core.errors import UserError
 from harness.evaluate.replay import find, scene_of
 from harness.prompts import versions as prompts
 from harness.report import scenes
-from harness.report.choose import failures, pick
 from harness.report.compare.pair import pair
+from harness.report.decisions import failures, pick
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import read

@@ -15,10 +15,10 @@ from matplotlib.image import imread
 
 from harness.core.errors import UserError
 from harness.report.drawing.colours import ROLES
+from harness.report.drawing.geometry import View
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import styled
 from harness.report.drawing.scene import draw
-from harness.report.drawing.view import View
 
 
 def picture(scene, format="svg", viewer=None):

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from harness.report.drawing.geometry import shadows
+from harness.report.drawing.geometry import EASE, LEAST_M, MARGIN_M, View, shadows, spots, view_of, views
 from harness.report.drawing.labels import covered, crossed, cut
-from harness.report.drawing.view import EASE, LEAST_M, MARGIN_M, View, spots, view_of, views
 from harness.world.scene_graph import Arrival, Conflict, Ego, EgoArrival, Point, SceneGraph, Viewer
 from harness.world.state import Building, VehicleState, WorldState
 

@@ -12,11 +12,10 @@ from harness.core.errors import printable
 from harness.core.statistics import Estimate
 from harness.prompts.difference import marked
 from harness.report.compare import words
-from harness.report.compare.difference import Comparison, Difference, Flip
-from harness.report.compare.flips import DecisionFlip
+from harness.report.compare.difference import Comparison, DecisionFlip, Difference, Flip
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Side
-from harness.report.forest import forest, reach
+from harness.report.document import forest, reach
 from harness.report.page import environment
 from harness.runs.folder import Run
 from harness.runs.metrics import entry

@@ -9,8 +9,7 @@ from harness.core.multiplicity import LEVEL
 from harness.prompts.difference import marked
 from harness.prompts.versions import as_it_was
 from harness.report.caveats import no_prompt, void
-from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
-from harness.report.compare.flips import LOST_BY, DecisionFlip
+from harness.report.compare.difference import LOST_BY, Comparison, DecisionFlip, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.words import p_value, pace

@@ -12,8 +12,7 @@ from matplotlib.path import Path
 from harness.core.arrays import Floats
 from harness.core.errors import printable
 from harness.report.drawing.colours import BAD, HATCHED, INK, LIGHT, ROLES
-from harness.report.drawing.geometry import VIEW_M, ground_of, north_up, shadows
-from harness.report.drawing.view import View
+from harness.report.drawing.geometry import VIEW_M, View, ground_of, north_up, shadows
 from harness.world.scenario import Scenario
 from harness.world.state import Building, VehicleState, WorldState
 

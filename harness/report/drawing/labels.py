@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from harness.core.arrays import Floats
 from harness.report.drawing.colours import INK
-from harness.report.drawing.view import View
+from harness.report.drawing.geometry import View
 
 DIRECTIONS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
 DISTANCES_M = (1.0, 4.0, 8.0, 13.0, 19.0, 26.0, 34.0, 44.0)  # in a picture of the whole world

@@ -17,10 +17,9 @@ from harness.dataset.load import Scene
 from harness.report.drawing import artists
 from harness.report.drawing.artists import HIDDEN, LOOKS, TEXT_PT
 from harness.report.drawing.colours import BUILDING_NAME, GREY, INK, LIGHT, ROLES
-from harness.report.drawing.geometry import conflict_points, north_up, shape_of
+from harness.report.drawing.geometry import View, conflict_points, north_up, shape_of, spots, view_of
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import Format, save, styled
-from harness.report.drawing.view import View, spots, view_of
 from harness.world import scenarios
 from harness.world.scene_graph import EgoArrival
 from harness.world.state import VehicleState

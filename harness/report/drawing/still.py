@@ -23,9 +23,8 @@ from harness.evaluate.replay import ReplayedEpisode, Still
 from harness.report.drawing.artists import body, named, roads, scale_m, shade, sight, walls
 from harness.report.drawing.colours import BAD, BUILDING_NAME, GOOD, GREY, INK, LATE, LIGHT, ROLES
 from harness.report.drawing.colours import actions as colours_of
-from harness.report.drawing.geometry import north_up, shape_of
+from harness.report.drawing.geometry import View, north_up, shape_of
 from harness.report.drawing.labels import covered, cut
-from harness.report.drawing.view import View
 from harness.world.perception.camera import SIZE_PX, frame
 from harness.world.state import Building, VehicleState, WorldState
 

@@ -17,10 +17,9 @@ from harness.core.errors import UserError, printable
 from harness.core.files import replacing, write_whole
 from harness.core.image import Pixels
 from harness.evaluate.replay import ReplayedEpisode, Still, stills
-from harness.report.drawing.geometry import shape_of
+from harness.report.drawing.geometry import View, shape_of, spots, views
 from harness.report.drawing.pictures import styled
 from harness.report.drawing.still import Canvas
-from harness.report.drawing.view import View, spots, views
 from harness.world.perception.graph import scene_graph
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
