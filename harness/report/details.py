@@ -132,7 +132,7 @@ class Details:
         asked = {tuple(m["from"] for m in d["messages"]) for run in runs if run for d in run["decisions"]}
         return {
             "world": scene and _world(self.runs.scenario, scene, asked),
-            "cameras": scene and name in self.framed and _cameras(self.runs.scenario, scene),
+            "cameras": scene and name in self.framed and cameras(self.runs.scenario, scene),
             "outcomes": forest and _outcomes(forest, name),
             "runs": runs,
             "prompts": list(sent.values()),
@@ -292,7 +292,7 @@ def _world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) -
     }  # fmt: skip
 
 
-def _cameras(scenario: Scenario, scene: Scene) -> dict[str, Any]:
+def cameras(scenario: Scenario, scene: Scene) -> dict[str, Any]:
     """Of each viewer, what its cameras see and boxes around what its sensors list (`Frame.boxes`)."""
     shown = {}
     for viewer, graph in scene.graphs.items():

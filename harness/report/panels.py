@@ -53,24 +53,24 @@ def panels(runs: Runs) -> Iterator[Panel]:
     tau_nats = sorted({c["tau_nats"] for c in points})
     windows_ms = sorted({c["window_s"] * 1000 for c in points})
 
-    if rows := joined(_success):
+    if rows := joined(success):
         references, scenario = _references(runs), runs.scenario.name
-        success = {label(name, scenario): s.value for name, s in references.items() if s.value is not None}
+        rates = {label(name, scenario): s.value for name, s in references.items() if s.value is not None}
         yield Panel(
             "success-latency", "overview", "Success and latency",
             "Each point is a condition; the lines through it are 95 % intervals over episodes. Rings: what "
             "the paper reports, with other scenes and another model. A reply that arrives after the "
             "decision window is not fused." + sentences(references, scenario),
-            charts.success_latency(rows, success, windows_ms),
+            charts.success_latency(rows, rates, windows_ms),
         )  # fmt: skip
-    if rows := joined(_statuses):
+    if rows := joined(statuses):
         yield Panel(
             "statuses", "answers", "How answers were read",
             "Share of each role's answers by status. Strict: the text fits the schema as it is. Recovered: "
             "it was read after repairs. All others failed and gave no distribution.",
             charts.statuses(rows),
         )  # fmt: skip
-    if rows := joined(_reliability):
+    if rows := joined(reliability):
         yield Panel(
             "reliability", "answers", "Is the policy as safe as it is sure?",
             "Decisions are grouped by the probability of the chosen action in the fused policy, in steps of "
@@ -82,7 +82,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
                 rows, "certainty", "fused probability of the action taken", "share safe", diagonal=True
             ),
         )  # fmt: skip
-    if rows := joined(_entropies):
+    if rows := joined(entropies):
         yield Panel(
             "entropy",
             "answers",
@@ -91,7 +91,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "which the ego asks helpers.",
             charts.bars(rows, "entropy_nats", ENTROPY, "answers", ENTROPY_NATS, rules=tau_nats),
         )
-    if rows := joined(_errors):
+    if rows := joined(errors):
         yield Panel(
             "entropy-error", "answers", "Entropy against error",
             "Share of decisions whose action was unsafe, by the entropy of the ego's own intent before "
@@ -100,7 +100,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "intervals over episodes.",
             charts.shares(rows, "entropy_nats", ENTROPY, "share unsafe", rules=tau_nats),
         )  # fmt: skip
-    if rows := joined(_tokens):
+    if rows := joined(tokens):
         yield Panel(
             "tokens", "answers", "Length of prompts",
             "Number of prompts by length, in tokens as the engine counted them. Shaded: the paper's budget "
@@ -110,14 +110,14 @@ def panels(runs: Runs) -> Iterator[Panel]:
                 within=BUDGET,
             ),
         )  # fmt: skip
-    if rows := joined(_replies):
+    if rows := joined(replies):
         yield Panel(
             "replies", "communication", "Replies on time, late and lost",
             "Scheduled replies, all seeds. On time: the reply arrived within the decision window and was "
             "fused. Late: it arrived after the window. Lost: the request or the reply was lost.",
             charts.stacked(rows, "condition", "reply", charts.REPLIES, "replies"),
         )  # fmt: skip
-    if rows := joined(_energies):
+    if rows := joined(energies):
         yield Panel(
             "energy",
             "communication",
@@ -128,7 +128,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "to see, cooperation costs energy because helpers infer, not because they transmit.",
             charts.stacked(rows, "condition", "part", charts.ENERGIES, "J per decision", amount="joules"),
         )
-    if rows := joined(_arrivals):
+    if rows := joined(arrivals):
         yield Panel(
             "arrivals", "communication", "When replies arrive",
             "Number of replies by arrival time, for those that were not lost; all seeds. Dashed: the end of "
@@ -147,7 +147,7 @@ def _references(runs: Runs) -> dict[str, Score]:
     return in_trees(runs.dataset.of_episodes({number for run in runs.runs for number in run.grid.episodes}))
 
 
-def _success(run: Run) -> Table:
+def success(run: Run) -> Table:
     """Return success and latency of each condition, of which both are known."""
     rows = []
     for condition in run.conditions:
@@ -161,7 +161,7 @@ def _success(run: Run) -> Table:
     return rows
 
 
-def _statuses(run: Run) -> Table:
+def statuses(run: Run) -> Table:
     """Return how many answers of each role have which status."""
     order = {status: n for n, status in enumerate(map(str, Status))}
     count = Counter((a.role, order.get(a.status, -1), a.status, a.verdict) for a in run.answers)
@@ -172,14 +172,14 @@ def _statuses(run: Run) -> Table:
     ]
 
 
-def _reliability(run: Run) -> Table:
+def reliability(run: Run) -> Table:
     """Return how often the action taken was safe, by how probable fusion held it."""
     certainty = run.decisions.of_actions("fused").max(axis=1)
     bins = np.minimum((certainty / CERTAINTY).astype(int), round(1 / CERTAINTY) - 1)
     return list(_shares(run, bins, certainty, 1.0 - run.decisions["regret"], "certainty"))
 
 
-def _errors(run: Run) -> Table:
+def errors(run: Run) -> Table:
     """Return how often a decision was unsafe, by the entropy of the ego's own intent."""
     nats = run.decisions["entropy_nats"]
     bins = np.where(np.isnan(nats), -1, nats / ENTROPY_NATS).astype(int)
@@ -199,7 +199,7 @@ def _shares(run: Run, bins: Ints, value: Floats, hits: Floats, name: str) -> Ite
                 }  # fmt: skip
 
 
-def _entropies(run: Run) -> Table:
+def entropies(run: Run) -> Table:
     """Return how uncertain the ego's own answers are."""
     p = [a.intent for a in run.answers if a.role == "ego" and a.intent]
     if not p:
@@ -209,7 +209,7 @@ def _entropies(run: Run) -> Table:
     return _histogram(nats, ENTROPY_NATS, "entropy_nats")
 
 
-def _tokens(run: Run) -> Table:
+def tokens(run: Run) -> Table:
     """Count the tokens of prompts by role, where the engine counts them."""
     by_role: dict[str, list[float]] = {}
     for answer in run.answers:
@@ -218,7 +218,7 @@ def _tokens(run: Run) -> Table:
     return [{"role": role, **bar} for role, of in by_role.items() for bar in _histogram(of, TOKENS, "tokens")]
 
 
-def _replies(run: Run) -> Table:
+def replies(run: Run) -> Table:
     """Count the replies that were scheduled, by how they ended."""
     d = run.decisions
     delivered, on_time = d.of_messages("delivered"), d.of_messages("on_time")
@@ -239,7 +239,7 @@ def _replies(run: Run) -> Table:
     return rows
 
 
-def _energies(run: Run) -> Table:
+def energies(run: Run) -> Table:
     """What a decision takes in joules, by who takes it, with the total's interval; where all is known."""
     rows = []
     for condition in run.conditions:
@@ -258,7 +258,7 @@ def _energies(run: Run) -> Table:
     return rows
 
 
-def _arrivals(run: Run) -> Table:
+def arrivals(run: Run) -> Table:
     """Return when replies that are not lost arrive, in ms from the start of the decision."""
     d = run.decisions
     arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)

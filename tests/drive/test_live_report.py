@@ -15,9 +15,9 @@ from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.evaluate.replay import find, scene_of
 from harness.prompts import versions as prompts
-from harness.report import scenes
 from harness.report.compare.pair import pair
 from harness.report.decisions import failures, pick
+from harness.report.details import cameras
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import read
@@ -106,8 +106,8 @@ def test_the_cameras_of_a_run_see_by_the_light_that_it_was_driven_in(tmp_path):
     assert list(every) == list(found.decisions.scenes)
     for scene, detail in every.items():
         replayed = scene_of(found, scene)
-        assert detail["cameras"] == plain(scenes.cameras(scenarios.get(name), replayed))
-        assert detail["cameras"] != plain(scenes.cameras(scenarios.get("occluded-intersection"), replayed))
+        assert detail["cameras"] == plain(cameras(scenarios.get(name), replayed))
+        assert detail["cameras"] != plain(cameras(scenarios.get("occluded-intersection"), replayed))
 
 
 def plain(value):

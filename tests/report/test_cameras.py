@@ -11,7 +11,8 @@ from reading import details, packed
 
 from harness.core.resources import folder
 from harness.dataset.load import load
-from harness.report import choose, decisions, library, scenes
+from harness.report import decisions, library
+from harness.report.details import cameras
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import read
@@ -50,7 +51,7 @@ def test_each_viewer_has_its_picture_and_boxes_around_what_its_sensors_list(run,
 
 @pytest.mark.slow
 def test_where_an_episode_was_lost_comes_first_if_a_page_cannot_have_all(run, monkeypatch):
-    lost, every = choose.lost(read(run)), list(read(run).decisions.scenes)
+    lost, every = decisions.lost(read(run)), list(read(run).decisions.scenes)
     assert 1 < len(lost) < len(every) - 1
     for room in (len(lost) - 1, len(lost) + 1):
         monkeypatch.setattr(decisions, "FRAMES", 4 * room + 3)  # four viewers each
@@ -79,6 +80,6 @@ def test_an_answer_says_which_picture_its_prompt_had(run, tmp_path, mode):
 @pytest.mark.slow
 def test_pictures_of_a_report_of_the_default_dataset_take_less_than_one_and_a_half_megabytes():
     dataset = load(folder("datasets") / "occluded-intersection-v2", limit=30)
-    drawn = [scenes.cameras(dataset.scenario, scene) for scene in dataset.scenes(dataset.courses()[::20])]
+    drawn = [cameras(dataset.scenario, scene) for scene in dataset.scenes(dataset.courses()[::20])]
     bytes_each = len(library.packed(drawn)) / sum(map(len, drawn))
     assert 1_000_000 < decisions.FRAMES * bytes_each < 1_500_000

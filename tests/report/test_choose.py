@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from run_on_disk import made_up
 
 from harness.coordination.operating_point import POINTS
-from harness.report import choose
+from harness.report import decisions
 from harness.runs.folder import read
 
 
@@ -42,7 +42,7 @@ def run_of(out, episodes):
 
 def pick(run, n):
     """Episode and step of what is chosen."""
-    return [tuple(map(int, scene.split("-"))) for scene in choose.pick(run, choose.failures(run), n)]
+    return [tuple(map(int, scene.split("-"))) for scene in decisions.pick(run, decisions.failures(run), n)]
 
 
 def test_telling_decisions_are_chosen_and_an_even_sample_fills_up(tmp_path):
@@ -61,16 +61,16 @@ def test_a_layout_begins_to_fail_where_its_failed_episodes_leave_those_that_did_
     parted = [point(), point(safe=(False, True)), point()]
     all_fail = [point(safe=(False, False)), point(), point()]
     run = run_of(tmp_path / "run", [parted, all_fail, [point()] * 3])
-    assert choose.failures(run) == {"00000-2": 0, "00001-2": 0}
+    assert decisions.failures(run) == {"00000-2": 0, "00001-2": 0}
 
 
 def test_a_run_full_of_failures_still_shows_ordinary_decisions(tmp_path):
     run = run_of(tmp_path / "run", [[point(safe=(n > 50, True))] for n in range(100)])
-    failures = choose.failures(run)
+    failures = decisions.failures(run)
     assert len(failures) == 51
-    chosen = choose.pick(run, failures, 40)
+    chosen = decisions.pick(run, failures, 40)
     # A quarter are chosen as failures, and 30 are spread over the other 90, of which 49 are ordinary.
-    assert set(choose.spread(list(failures), 10)) <= set(chosen)
+    assert set(decisions.spread(list(failures), 10)) <= set(chosen)
     assert len([scene for scene in chosen if scene not in failures]) == 16
 
 
@@ -83,7 +83,7 @@ def test_a_decision_lost_an_episode_where_any_condition_with_any_seed_gave_succe
     run = read(
         made_up(tmp_path / "run", decision, points=points, seeds=(0, 1), episodes=3, steps=2, helpers=0)
     )
-    assert choose.lost(run) == ["00001-1"]
+    assert decisions.lost(run) == ["00001-1"]
 
 
 POINTS_AS_DRAWN = st.builds(

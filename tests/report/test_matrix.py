@@ -13,7 +13,7 @@ from sample_run import write_run
 
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import load
-from harness.report import matrix, statistics
+from harness.report import matrix, panels
 from harness.report.charts import statuses
 from harness.report.page import render
 from harness.report.runs import gather
@@ -165,21 +165,21 @@ def test_every_decision_and_reply_is_counted_once(run, dataset):
     assert len(rows) == sum(episode.decisions for episode in found.episodes)
     judged = sum(bool(forest.value[forest.place[row["scene"]]]) for row in rows)
     assert judged > 0
-    assert sum(row["n"] for row in statistics.reliability(found)) == judged
-    assert sum(row["n"] for row in statistics.errors(found)) == judged
-    replies = statistics.replies(found)
+    assert sum(row["n"] for row in panels.reliability(found)) == judged
+    assert sum(row["n"] for row in panels.errors(found)) == judged
+    replies = panels.replies(found)
     assert sum(row["count"] for row in replies) == sum(row["messages"] for row in rows)
     arrived = sum(row[f"delivered_{place}"] is True for row in rows for place in (1, 2, 3))
-    assert sum(row["count"] for row in statistics.arrivals(found)) == arrived > 0
+    assert sum(row["count"] for row in panels.arrivals(found)) == arrived > 0
     answers = answers_of(run)
     assert len(answers) == sum(len(scene.viewers) for scene in dataset.scenes(list(found.decisions.scenes)))
-    assert sum(row["count"] for row in statistics.statuses(found)) == len(answers)
+    assert sum(row["count"] for row in panels.statuses(found)) == len(answers)
     read_out = [a for a in answers if a.role == "ego" and a.intent]
-    assert sum(row["count"] for row in statistics.entropies(found)) == len(read_out)
+    assert sum(row["count"] for row in panels.entropies(found)) == len(read_out)
 
 
 def test_a_value_on_an_edge_belongs_to_the_bar_above_it():
-    bars = statistics._histogram([0.3, 0.3, 0.1, 0.6], 0.1, "x")
+    bars = panels._histogram([0.3, 0.3, 0.1, 0.6], 0.1, "x")
     assert [(bar["x"], bar["count"]) for bar in bars] == [
         (0.1, 1), (0.2, 0), (0.3, 2), (0.4, 0), (0.5, 0), (0.6, 1),
     ]  # fmt: skip
