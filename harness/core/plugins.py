@@ -1,8 +1,10 @@
 """Registries of plug-ins: built-in ones, and those that installed packages add by entry points."""
 
 import os
+import sys
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -10,6 +12,18 @@ from harness.core import resources
 from harness.core.errors import UserError, printable
 
 T = TypeVar("T")
+
+
+def entries(group: str) -> Mapping[str, Any]:
+    """Return the entry points of a group by name, of the packages on `sys.path`."""
+    return _entries(group, tuple(sys.path))
+
+
+@cache  # a look at all packages takes milliseconds
+def _entries(group: str, path: tuple[str, ...]) -> Mapping[str, Any]:
+    from importlib.metadata import entry_points  # imported here because it is slow
+
+    return {entry.name: entry for entry in sorted(entry_points(group=group))}
 
 
 class Plugins(Mapping[str, T], Generic[T]):
@@ -43,10 +57,8 @@ class Plugins(Mapping[str, T], Generic[T]):
     def __len__(self) -> int:
         return len(list(iter(self)))
 
-    def _entries(self) -> dict[str, Any]:
-        from importlib.metadata import entry_points  # imported here because it is slow
-
-        return {entry.name: entry for entry in sorted(entry_points(group=self.group))}
+    def _entries(self) -> Mapping[str, Any]:
+        return entries(self.group)
 
     def _load(self, name: str) -> T:
         entry = self._entries()[name]

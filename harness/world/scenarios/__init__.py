@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from pkgutil import iter_modules
 from typing import Any
 
 from harness.core.config import convert, value_of
 from harness.core.errors import UserError, printable, unknown
+from harness.core.plugins import entries
 from harness.world.environments import environment
 from harness.world.parameters import Parameters
 from harness.world.scenario import Scenario
@@ -24,7 +24,7 @@ DEFAULT = "occluded-intersection"  # taken if none is named
 
 def names() -> tuple[str, ...]:
     """Return the names of all scenarios in alphabetical order."""
-    return tuple(sorted({*_files(), *entry_points(group=GROUP).names}))
+    return tuple(sorted({*_files(), *entries(GROUP)}))
 
 
 def get(text: str) -> Scenario:
@@ -65,7 +65,7 @@ def _named(name: str) -> Scenario:
     if is_here(name):
         scenario: Scenario = import_module(f"{__name__}.{name.replace('-', '_')}").SCENARIO
         return scenario
-    for plugin in entry_points(group=GROUP, name=name):
+    if plugin := entries(GROUP).get(name):
         scenario = plugin.load()
         return scenario
     raise unknown("scenario", name, names())
