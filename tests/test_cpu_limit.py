@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 TESTS = """
+import functools
 import time
 import pytest
 
@@ -38,9 +39,12 @@ def test_with_a_long_fixture_that_is_shared(shared):
 def test_that_says_so():
     busy()
 
-def test_that_loads_packages():
+@functools.cache
+def cached():
     busy()
-    import asyncio, email.mime.text, http.server, sqlite3, unittest.mock, xmlrpc.client, wsgiref.simple_server
+
+def test_that_fills_a_cache():
+    cached()
 
 def test_short():
     pass

@@ -277,6 +277,7 @@ def test_an_orthogonal_factor_has_singular_values_near_one() -> None:
 # -- a run ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_it_writes_a_model_that_every_engine_can_take(student: Path) -> None:
     names = {p.name for p in student.iterdir()}
     assert names >= {"config.json", "model.safetensors", "tokenizer.json", "student-f16.gguf", "README.md"}
@@ -287,11 +288,13 @@ def test_it_writes_a_model_that_every_engine_can_take(student: Path) -> None:
     assert "imitate one planner in the scenarios below" in (student / "README.md").read_text()
 
 
+@pytest.mark.slow
 def test_its_loss_falls(student: Path) -> None:
     for stage, curve in json.loads((student / "training.json").read_text())["curves"].items():
         assert curve[-1][1] < curve[0][1], stage
 
 
+@pytest.mark.slow
 def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, asked: list[Question]) -> None:
     from transformers import AutoTokenizer
 

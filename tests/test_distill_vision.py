@@ -210,6 +210,7 @@ def test_a_picture_is_answered_as_the_base_answers_the_same_scene_graph_in_words
     assert all(s.target is q.label for q, s in zip(texts, student.reading(texts), strict=True))
 
 
+@pytest.mark.slow
 def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
     model = new_model(read_tokenizer(folder, sees=True), 0, sees=True)
     with pytest.raises(
@@ -241,6 +242,7 @@ def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Q
         assert p == pytest.approx(q, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_picture_is_what_two_prompts_that_say_the_same_differ_in(folder: Path, asked: list[Question]):
     model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
     one, other = asked[0], next(q for q in asked if q.image and q.image.sha256 != asked[0].image.sha256)

@@ -4,7 +4,7 @@ import json
 import re
 import shlex
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -18,7 +18,7 @@ from harness.core.shards import Shard, shard_of
 from harness.runs.sources import read as read_sources
 
 Typed = Callable[..., tuple[int, str, str]]
-DRIVE = ("drive", "--model", "cruise", "--episodes", "36", "--seeds", "0", "--workers", "1", "--quiet")
+DRIVE = ("drive", "--model", "cruise", "--episodes", "6", "--seeds", "0", "--workers", "1", "--quiet")
 BUILD = ("dataset", "build", "parking-exit", "--episodes", "2", "--seed", "100", "--workers", "1")
 TIMES = ("name", "created", "command")
 
@@ -77,6 +77,14 @@ def test_what_is_no_shard_is_one_line(text: str, environment: Mapping[str, str],
     assert str(raised.value).isprintable()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _two_at_once() -> Iterator[None]:
+    """Six episodes are three parts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 2)
+        yield
+
+
 @pytest.fixture(scope="module")
 def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a whole run, and the same in three shards."""
@@ -125,7 +133,7 @@ def test_a_shard_says_what_to_do_with_it_and_goes_on(split: Path, harness: Typed
     code, out, _ = harness(*DRIVE[:-1], "--shard", "2/3", "--out", shard)
     assert code == 0
     assert out == (
-        f"wrote {shard}: 16 of 36 episodes, shard 2/3; merge all 3 shards with "
+        f"wrote {shard}: 2 of 6 episodes, shard 2/3; merge all 3 shards with "
         "`harness run merge FOLDER... --out FOLDER`\n"
     )
     for other in (["--shard", "1/3"], []):
@@ -146,7 +154,7 @@ def test_gaps_are_refused(split: Path, harness: Typed, tmp_path: Path) -> None:
     assert "shards 2/3 are missing; give the folders of all 3" in refused(harness, [shards[0], shards[2]])
     shutil.rmtree(next((shards[1] / ".work").glob("episodes-*")))
     said = refused(harness, shards)
-    assert re.search(r"/2, shard 2/3, lacks episodes 16 to 31 and 0 parts more; type its command again", said)
+    assert re.search(r"/2, shard 2/3, lacks episodes 2 to 3 and 0 parts more; type its command again", said)
 
 
 @pytest.mark.slow
@@ -155,11 +163,11 @@ def test_the_same_shard_twice_is_taken_where_its_bytes_agree(
 ) -> None:
     shards = copied(split, tmp_path, "1", "2", "3")
     shutil.copytree(shards[1], tmp_path / "again")
-    file = tmp_path / "again/.work/episodes-000016-000031/episodes.csv"
+    file = tmp_path / "again/.work/episodes-000002-000003/episodes.csv"
     text = file.read_text()
-    file.write_text(text.replace("True", "False"))
+    file.write_text(text.replace("collision", "time_out"))
     assert re.search(
-        r"episodes 16 to 31 came out differently in \S*/again than in \S*/2; find out which is right",
+        r"episodes 2 to 3 came out differently in \S*/again than in \S*/2; find out which is right",
         refused(harness, [*shards, tmp_path / "again"]),
     )
     file.write_text(text)

@@ -24,7 +24,7 @@ def alone(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the model that ships, each answer asked alone."""
     out = tmp_path_factory.mktemp("runs") / "alone"
     points = (POINTS["single-local"],)
-    run(spec_of(small, "swarm-tiny", points=points, seeds=(0,), batch_size=1, ask="all"), out)
+    run(spec_of(small, "swarm-tiny", points=points, seeds=(0,), batch_size=1, ask="all", limit=1), out)
     return out
 
 

@@ -46,6 +46,7 @@ def success(run: Path, condition: str) -> pd.Series:
     return table[table.condition == condition].groupby("episode").success.mean()
 
 
+@pytest.mark.slow
 def test_episodes_are_paired_by_layout_condition_and_seed(runs: list[Path]) -> None:
     found = fidelity(runs)
     assert len(found.table) == 4 * 3
@@ -63,6 +64,7 @@ def test_episodes_are_paired_by_layout_condition_and_seed(runs: list[Path]) -> N
     assert disagreements(found.episodes)["count"].sum() == other.sum()
 
 
+@pytest.mark.slow
 def test_a_driver_drives_as_its_frozen_scenes_say(runs: list[Path]) -> None:
     found = fidelity([Path("eval-cruise"), Path("drive-cruise")])
     assert (found.table.difference == 0).all()
@@ -95,6 +97,7 @@ def test_the_command_writes_a_page_and_says_the_largest_difference(
     assert len(json.loads(harness("study", "fidelity", *runs, "--json")[1])) == 12
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compared_is_one_line(runs: list[Path], harness: Callable[..., Said]) -> None:
     for folders, said in (
         (runs[:1], "no run on live episodes"),

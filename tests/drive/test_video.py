@@ -62,6 +62,7 @@ def drawn(out, tmp_path_factory):
     return picture, (done.exit_code, done.stdout, done.stderr)
 
 
+@pytest.mark.slow
 def test_an_episode_is_drawn_as_a_gif_in_which_things_move(out, drawn):
     picture, said = drawn
     assert said[:2] == (0, f"wrote {picture}\n")

@@ -1,15 +1,13 @@
 import pytest
 from sample_run import write_run
 
-from harness.dataset.build import build
 from harness.dataset.load import load
-from harness.world.scenarios.occluded_intersection import SCENARIO
 
 
 @pytest.fixture(scope="session")
-def dataset(once):
+def dataset(two_path):
     """Two episodes."""
-    return load(once("two", lambda out: build(SCENARIO, out, 2, 5, 1, lambda done: None)))
+    return load(two_path)
 
 
 @pytest.fixture(scope="session")

@@ -213,8 +213,8 @@ def test_another_lag_is_another_dataset_and_everybody_has_it(small, tmp_path):
 
 
 @pytest.fixture
-def copy(small_folder, tmp_path):
-    return shutil.copytree(small_folder, tmp_path / "copy")
+def copy(two_path, tmp_path):
+    return shutil.copytree(two_path, tmp_path / "copy")
 
 
 def rewrite(folder, name, change):

@@ -13,22 +13,27 @@ from harness.studies.figures.lines import along
 from harness.studies.ledger import ledger, marks, paper_numbers, tally, verdict
 from harness.studies.paper import panels, run_paper
 from harness.studies.play import joined, over_own_episodes, play
-from harness.studies.study import write_study
+from harness.studies.study import Study, write_study
 
 EPISODES = 1500  # a seed
 SEEDS = range(5)
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def paper() -> Study:
+    return run_paper(panels(core=EPISODES, sweep=EPISODES), SEEDS, lambda done: None)
+
+
+@pytest.fixture(scope="module")
+def study(paper: Study, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "paper"
-    write_study(run_paper(panels(core=EPISODES, sweep=EPISODES), SEEDS, lambda done: None), out)
+    write_study(paper, out)
     return out
 
 
 @pytest.fixture(scope="module")
-def found(study: Path) -> pd.DataFrame:
-    return pd.read_csv(study / "ledger.csv")
+def found(paper: Study) -> pd.DataFrame:
+    return paper.data["ledger"]
 
 
 def test_every_number_of_the_paper_is_in_the_ledger(found: pd.DataFrame) -> None:
@@ -91,6 +96,7 @@ def test_seeds_are_the_studys_own() -> None:
     assert other.manifest["seeds"] == [3]
 
 
+@pytest.mark.slow
 def test_what_equation_2_does_is_measured(study: Path) -> None:
     """The witness has 1/6 of 1/6 + 1/25 + 2/20, more than half; of equal weights it has a quarter."""
     rows = pd.read_csv(study / "conditions.csv", dtype={"value": float})
@@ -125,6 +131,7 @@ def test_grid_points_that_are_the_same_point_give_the_same_number(found: pd.Data
     assert size == pytest.approx(low)
 
 
+@pytest.mark.slow
 def test_the_folder_holds_figures_tables_and_what_was_fitted(study: Path) -> None:
     names = {f"figure-{f}.{kind}" for f in "ab" for kind in ("svg", "pdf", "png")}
     assert {p.name for p in study.iterdir()} == names | {
@@ -137,6 +144,7 @@ def test_the_folder_holds_figures_tables_and_what_was_fitted(study: Path) -> Non
     assert len(manifest["source"]["parameters"]) <= 10
 
 
+@pytest.mark.slow
 def test_episodes_add_up_to_the_conditions(study: Path) -> None:
     episodes, conditions = (
         pd.read_csv(study / f"{name}.csv", dtype={"value": float}) for name in ("episodes", "conditions")
