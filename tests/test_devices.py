@@ -14,7 +14,6 @@ from evaluating import Scripted, course, run, same_decisions, says, spec_of, sur
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.backends import devices
 from harness.backends.base import Completion, Request
 from harness.coordination.coordinate import coordinate
 from harness.coordination.intents import Intents
@@ -25,7 +24,7 @@ from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate.device import answer_j, answer_s, transmit_watts
 from harness.radio.channel import Draws
-from harness.runs import folder
+from harness.runs import devices, folder
 from harness.runs.devices import Constant, Device, DeviceRow, Speed
 
 

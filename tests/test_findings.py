@@ -8,13 +8,12 @@ import pytest
 from evaluating import run as made
 from evaluating import spec_of
 
-from harness.backends import cards, findings
+from harness.backends import cards
 from harness.backends.base import Completion, Request
-from harness.backends.findings import Findings, Moved
 from harness.core import kept
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
-from harness.evaluate.examine import COUNT, examine
+from harness.evaluate.examine import COUNT, Findings, Moved, examine, keep_findings, recall_findings
 from harness.prompts import versions
 from harness.report.caveats import by_letter, caveats
 from harness.runs.records import Score
@@ -78,12 +77,12 @@ def test_findings_are_kept_by_identity_and_a_damaged_file_is_none() -> None:
     found = Findings("v2", "cyclic", 12, 0.9, 12, 0.2, (Moved("gap", 4, 0, 0.001),))
     folder = kept.folder() / "findings"
     before = set(folder.iterdir()) if folder.is_dir() else set()
-    findings.keep({"engine": "e", "weights": "w"}, found)
-    assert findings.recall({"engine": "e", "weights": "w", "helpers": [{}]}) == found
-    assert findings.recall({"engine": "e", "weights": "other"}) is None
+    keep_findings({"engine": "e", "weights": "w"}, found)
+    assert recall_findings({"engine": "e", "weights": "w", "helpers": [{}]}) == found
+    assert recall_findings({"engine": "e", "weights": "other"}) is None
     [file] = set(folder.iterdir()) - before
     file.write_text("{")
-    assert findings.recall({"engine": "e", "weights": "w"}) is None
+    assert recall_findings({"engine": "e", "weights": "w"}) is None
     file.unlink()
 
 
@@ -92,7 +91,7 @@ def test_a_run_of_a_checked_model_says_so_and_a_raw_one_no_share_of_letters(
 ) -> None:
     done = made(spec_of(small), tmp_path / "run")
     assert not any("read the scene" in sentence for sentence in caveats(done.manifest, done.scores))
-    findings.keep(done.manifest.identity, Findings("v2", "raw", 12, 1.0, 12, 1.0, (Moved("gap", 4, 0, 0.0),)))
+    keep_findings(done.manifest.identity, Findings("v2", "raw", 12, 1.0, 12, 1.0, (Moved("gap", 4, 0, 0.0),)))
     said = [s for s in caveats(done.manifest, done.scores) if "read the scene" in s]
     assert len(said) == 1
     assert said[0].startswith("proxy: it does not read the scene")

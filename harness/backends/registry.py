@@ -82,7 +82,7 @@ BUILT_IN: Mapping[str, Registration] = {
         install=extras.install("transformers"),
         finds="harness.backends.weights:find_weights",
         prepares="harness.backends.transformers.engine:checkpoint",
-        sees="harness.backends.transformers.processor:tokens",
+        sees="harness.backends.transformers.eyes:count_tokens",
     ),
     "llama-cpp": Registration(
         "harness.backends.llama_cpp.backend:open",

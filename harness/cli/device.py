@@ -30,7 +30,7 @@ Model = typer.Option(
 
 def list_devices(as_json: options.Json = False) -> None:
     """List the device profiles, which --device-profile takes."""
-    from harness.backends import devices
+    from harness.runs import devices
 
     def show(name: str, device: "Device") -> None:
         typer.echo(f"{printable(name)} · {', '.join(printable(row.model) for row in device.rows)}")
@@ -57,7 +57,7 @@ def show(
     It shows their time and energy, too. The time is that of the ego's own answer, without any message.
     Nothing else runs on the computer.
     """
-    from harness.backends import devices
+    from harness.runs import devices
     from harness.runs.folder import read
     from harness.studies.device_fit import declared, fits, of_run
 
@@ -120,7 +120,7 @@ def check(
 
     Run it on the device itself. On another machine, the figures show how far the two are apart.
     """
-    from harness.backends import devices
+    from harness.runs import devices
     from harness.runs.folder import read
     from harness.studies.device_fit import held
 
@@ -202,14 +202,14 @@ def measure(
 
 
 def _rows(device: "Device", model: str | None) -> "list[DeviceRow]":
-    from harness.backends.devices import find_row
+    from harness.runs.devices import find_row
 
     return [find_row(device, model)] if model else list(device.rows)
 
 
 def _origins(device: "Device", rows: "list[DeviceRow]") -> None:
     """What the numbers rest on, each source once."""
-    from harness.backends.devices import JOULES, RATES, constants
+    from harness.runs.devices import JOULES, RATES, constants
 
     for names, head in ((RATES, "rates"), (tuple(JOULES), "J")):
         sources = {

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from harness.backends.base import AnswerMode, Completion, Request
     from harness.backends.card import Card
     from harness.backends.checkup import Checkup
-    from harness.backends.findings import Findings
+    from harness.evaluate.examine import Findings
     from harness.evaluate.pace import Pace
     from harness.evaluate.spec import Spec
 
@@ -166,14 +166,13 @@ def _examine(
     card: "Card", thinking: bool, device: str | None, dtype: str | None
 ) -> "tuple[Spec, Checkup, Findings | None]":
     """Check a model, examine it if it answers by letters, and keep what was found."""
-    from harness.backends import findings
     from harness.backends.base import AnswerMode, Rendering
     from harness.backends.checkup import check as look
     from harness.backends.registry import open_backend
     from harness.dataset import load
     from harness.evaluate.agent import Agent
     from harness.evaluate.asking import requests
-    from harness.evaluate.examine import COUNT, examine
+    from harness.evaluate.examine import COUNT, examine, keep_findings
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.prompts import versions as prompts
@@ -205,7 +204,7 @@ def _examine(
     if isinstance(result, str):
         typer.echo(f"harness: the fixed questions got no answer: {printable(result, 300)}", err=True)
         return spec, seen, None
-    findings.keep(seen.identity, result)
+    keep_findings(seen.identity, result)
     return spec, seen, result
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harness.backends.card import Card
-    from harness.backends.findings import Findings, Moved
+    from harness.evaluate.examine import Findings, Moved
     from harness.evaluate.trial import Trial
     from harness.prompts.versions import Prompt
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from harness.backends import devices
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError, printable
 from harness.evaluate.fusion import key_of
 from harness.radio.wrapped import innermost
+from harness.runs import devices
 from harness.runs.decisions import Decisions
 from harness.runs.devices import Constant, Device, DeviceRow, Speed
 from harness.runs.records import Answer, Latency

@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.backends import cards, devices
+from harness.backends import cards
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.errors import UserError, in_range, unknown
@@ -20,6 +20,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
+from harness.runs import devices
 from harness.runs.folder import read
 from harness.world.scenario import Scenario
 from harness.world.scenarios import DEFAULT

@@ -4,13 +4,14 @@ from pathlib import Path
 
 import msgspec
 
-from harness.backends import cards, devices
+from harness.backends import cards
 from harness.coordination.schedules import SCHEDULES
 from harness.core import resources
 from harness.core.files import bytes_of
 from harness.evaluate.spec import Spec
 from harness.prompts.answer_schema import ROLES, answer_schema
 from harness.radio.profiles import CHANNELS
+from harness.runs import devices
 
 
 def sources(spec: Spec) -> dict[str, bytes]:

@@ -8,12 +8,11 @@ from typing import Any, get_args
 from msgspec import Struct
 
 from harness.backends.base import Backend, Completion, Role
-from harness.backends.findings import Moved
 from harness.core.errors import Unanswered, printable
 from harness.evaluate import questions
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import answer_of
-from harness.evaluate.examine import moved
+from harness.evaluate.examine import Moved, moved
 from harness.parsing.status import Repair, Status
 from harness.prompts.versions import Prompt
 from harness.runs.records import Answer

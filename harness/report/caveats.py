@@ -4,10 +4,10 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-from harness.backends import findings
 from harness.backends.registry import ENGINES
 from harness.core.config import pairs
 from harness.core.errors import printable
+from harness.evaluate.examine import MOST_SHARE, recall_findings
 from harness.parsing.status import Status
 from harness.radio.profiles import outside
 from harness.runs.folder import Run
@@ -136,8 +136,8 @@ def findings_of(manifest: Manifest) -> Iterator[str]:
     identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
     agents = [manifest.agent(0), *manifest.helpers]
     for agent, identity in zip(agents, identities, strict=False):
-        if isinstance(identity, Mapping) and (model_findings := findings.recall(identity)):
-            for sentence in model_findings.sentences(agent["answer"] == "readout"):
+        if isinstance(identity, Mapping) and (findings := recall_findings(identity)):
+            for sentence in findings.sentences(agent["answer"] == "readout"):
                 yield f"{printable(str(agent['model']['name']), 30)}: {sentence}"
 
 
@@ -146,7 +146,7 @@ def by_letter(scores: Sequence[Score]) -> Iterator[str]:
     of = {s.metric: s for s in scores if s.condition == ALL}
     for role, (whose, _) in _FAILED.items():
         share, follows = of.get(f"letter_share_{role}"), of.get(f"follows_letter_{role}")
-        if share and follows and (share.value or 0.0) > findings.MOST:
+        if share and follows and (share.value or 0.0) > MOST_SHARE:
             hits = round((follows.value or 0.0) * follows.n)
             yield (
                 f"{100 * (share.value or 0.0):.0f} % of what {whose} read-outs say follows the letter and "

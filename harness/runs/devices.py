@@ -1,13 +1,25 @@
-"""Define a device profile: an on-board computer as a file of `devices/` and a run's `run.json` state it."""
+"""Device profiles (`devices/*.toml`, shipped and a project's), and the time and energy of an answer on one.
 
-from typing import Annotated, Literal
+A file has one row for each model. A number without a source is left out, and results from it are not known.
+"""
 
+import re
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+import msgspec
 from msgspec import Meta, Struct
 
-from harness.core.config import Count
+from harness.core import resources
+from harness.core.config import Count, convert, toml
+from harness.core.errors import UserError, printable, unknown
 
 Rate = Annotated[float, Meta(gt=0, description="a number above 0")]
 Status = Literal["measured", "cited", "modelled", "assumed"]
+RATES = ("prefill_tokens_per_s", "decode_tokens_per_s")
+# Joules that a row lacks are derived from the power that the device draws, and the rate.
+JOULES = {"joules_per_prompt_token": RATES[0], "joules_per_output_token": RATES[1]}
+_SIZE = re.compile(r"(\d+(?:\.\d+)?)b")
 
 
 class Speed(Struct, frozen=True):
@@ -66,3 +78,99 @@ class Device(Struct, frozen=True, kw_only=True):
         names = [row.model for row in self.rows]
         if not names or len(set(names)) < len(names):
             raise ValueError("rows: give one or more, of different models")
+
+
+def names() -> list[str]:
+    """Return the sorted names of all device profiles."""
+    return resources.names("devices")
+
+
+def load(name: str) -> Device:
+    """Load a profile by name. Raises UserError if there is none, or its file has a mistake."""
+    if name not in names():
+        raise unknown("device profile", name, names())
+    path = resources.find("devices", f"{name}.toml")
+    where = f"device profile {printable(path)}"
+    table = toml(path, where)
+    sources = table.pop("sources", {})
+    if not isinstance(sources, dict) or not all(isinstance(text, str) for text in sources.values()):
+        raise UserError(f"{where} [sources]: give each source a name and a text")
+    return convert(_with_sources(table, sources), Device, where, name=name)
+
+
+def _with_sources(value: Any, sources: dict[str, str]) -> Any:
+    if isinstance(value, list):
+        return [_with_sources(item, sources) for item in value]
+    if not isinstance(value, dict):
+        return value
+    source = value.get("source")
+    named = {"source": sources.get(source, source)} if isinstance(source, str) else {}
+    return {key: _with_sources(inner, sources) for key, inner in value.items()} | named
+
+
+def find_row(device: Device, model: str) -> DeviceRow:
+    """Return the row of a model: its own, or the nearest one scaled if the profile allows scaling.
+
+    A model is the name of a row, of a card, or a size such as `3b`, in billions of weights. Raises UserError
+    if the profile has no row for it.
+    """
+    by_name = {row.model: row for row in device.rows}
+    if model in by_name:
+        return by_name[model]
+    size = _SIZE.fullmatch(model)
+    if size and float(size[1]) and device.scaling:
+        return _scaled(device, float(size[1]))
+    hint = "; give one of them as --device-model"
+    if device.scaling:
+        hint += ", or a size such as 3b, which the nearest one is scaled to"
+    raise unknown(f"model of device profile {device.name}", model, by_name, hint)
+
+
+def _scaled(device: Device, billions: float) -> DeviceRow:
+    """Scale the row with the nearest number of weights, by ratio; rates go down as the weights go up."""
+    near = min(device.rows, key=lambda row: max(row.billions, billions) / min(row.billions, billions))
+    ratio = billions / near.billions
+
+    def scaled(constant: Constant | None, factor: float) -> Constant | None:
+        source = f"{near.model} times {factor:.3g}, by the number of weights"
+        return constant and Constant(constant.value * factor, "modelled", source)
+
+    factors = {**dict.fromkeys(RATES, 1 / ratio), **dict.fromkeys(JOULES, ratio)}
+    values = {name: scaled(getattr(near, name), factor) for name, factor in factors.items()}
+    return msgspec.structs.replace(
+        near, model=f"{billions:g}b from {near.model}", billions=billions, **values
+    )
+
+
+def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | None]]:
+    """Yield the rates and joules of a row by name; joules that it lacks are derived from `load_watts`."""
+    for name in RATES:
+        yield name, getattr(row, name)
+    for name, rate in JOULES.items():
+        joules, per_s = getattr(row, name), getattr(row, rate)
+        if joules is None and per_s is not None and device.load_watts is not None:
+            watts = device.load_watts
+            source = f"{watts.value:g} W over {per_s.value:g} tokens/s; {watts.source}"
+            joules = Constant(watts.value / per_s.value, "modelled", source)
+        yield name, joules
+
+
+def speed(device: Device, row: DeviceRow) -> Speed:
+    """Return the rates and joules of a row as plain numbers."""
+    return Speed(row.model, **{name: c.value if c else None for name, c in constants(device, row)})
+
+
+def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
+    """Return the seconds of one answer: prompt and output tokens, each over its rate; NaN if unknown."""
+    rates = _or_nan(speed.prefill_tokens_per_s), _or_nan(speed.decode_tokens_per_s)
+    return prompt_tokens / rates[0] + output_tokens / rates[1]
+
+
+def joules(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
+    """Return the joules of one answer, with those of the idle device in that time; NaN if unknown."""
+    per_token = _or_nan(speed.joules_per_prompt_token), _or_nan(speed.joules_per_output_token)
+    return prompt_tokens * per_token[0] + output_tokens * per_token[1]
+
+
+def _or_nan(value: float | None) -> float:
+    return float("nan") if value is None else value

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.backends import devices
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.statistics import Estimate, episode_interval, rate_interval
 from harness.evaluate.device import tokens
-from harness.runs import percentiles
+from harness.runs import devices, percentiles
 from harness.runs.devices import Device, DeviceRow
 from harness.runs.folder import Run
 from harness.runs.records import Answer

@@ -9,11 +9,10 @@ import pytest
 from evaluating import run, spec_of
 from msgspec.structs import replace
 
-from harness.backends import devices
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
-from harness.runs import folder
+from harness.runs import devices, folder
 from harness.studies.device_fit import declared, fits, held, of_run
 
 Said = tuple[int, str, str]

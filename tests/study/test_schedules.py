@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from evaluating import live_spec_of, run, spec_of
 
-from harness.backends import devices
 from harness.backends.registry import open_backend
 from harness.coordination.learnt import Learnt
 from harness.coordination.operating_point import POINTS, named_point
@@ -26,6 +25,7 @@ from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.outlook import outlook
 from harness.evaluate.table import columns
 from harness.evaluate.walk import walk
+from harness.runs import devices
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, of_decisions
 from harness.studies import axes
