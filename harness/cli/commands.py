@@ -27,7 +27,7 @@ COMMANDS = {
     "model list": "model:list_models",
     "model pull": "model:pull",
     "model check": "model:check",
-    "model parity": "parity",
+    "model parity": "model:parity",
     "model distill": "distill",
     "model doctor": "doctor",
     "model device list": "device:list_devices",

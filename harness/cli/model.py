@@ -1,15 +1,15 @@
 """`harness model`: the model cards, fetching weights, and a look at a model before a run."""
 
-import json
-from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any, cast, get_args
+from dataclasses import asdict
+from math import isfinite
+from typing import TYPE_CHECKING, Any
 
 import typer
 from msgspec import to_builtins
 
 from harness.cli import options
 from harness.cli.progress import bar
-from harness.cli.terminal import echo_json, echo_wrong
+from harness.cli.terminal import echo_each, echo_json
 from harness.core import resources
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.resources import DATASET
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from harness.evaluate.spec import Spec
 
 
-PROMPT, IMAGE_PROMPT = "v2", "v7"  # what a check asks
 _WIDTH = 100  # of lines of tokens
 
 
@@ -37,26 +36,13 @@ def list_models(as_json: options.Json = False) -> None:
     from harness.backends import cards
     from harness.backends.registry import missing
 
-    rows: list[tuple[str, Card | UserError, str | None]] = []
+    each_engine: dict[str, Card | UserError] = {}
     for name, entry in resources.each(cards.names(), cards.each_engine).items():
-        if isinstance(entry, UserError):
-            rows.append((name, entry, None))
-        else:
-            rows += [(card.name, card, missing(card)) for card in entry]
-    if as_json:
-        echo_json([
-            {"name": name, "error": str(card)} if isinstance(card, UserError)
-            else {**asdict(card), "missing": lack}
-            for name, card, lack in rows
-        ], indent=2)  # fmt: skip
-        return
+        each_engine |= {name: entry} if isinstance(entry, UserError) else {card.name: card for card in entry}
     line = "{:<22}{:<14}{:<10}{:<13}{}"
-    typer.echo(line.format("name", "engine", "thinking", "latency", "runs here"))
-    for name, card, lack in rows:
-        if isinstance(card, UserError):
-            echo_wrong(name, card)
-            continue
-        seconds = card.latency.inference_s
+
+    def show(name: str, card: "Card") -> None:
+        seconds, lack = card.latency.inference_s, missing(card)
         latency = "paper" if seconds is None else f"card {seconds * 1000:g} ms"
         here = f"no: {lack}" if lack else "yes"
         stem, _, engine = name.partition(":")
@@ -64,6 +50,10 @@ def list_models(as_json: options.Json = False) -> None:
         typer.echo(line.format("" if engine else printable(stem), card.engine, card.thinking, latency, here))
         if not engine:
             typer.echo(f"  {printable(card.description, 78)}")
+
+    if not as_json:
+        typer.echo(line.format("name", "engine", "thinking", "latency", "runs here"))
+    echo_each(each_engine, as_json, lambda card: {**asdict(card), "missing": missing(card)}, show)
 
 
 def pull(
@@ -103,55 +93,106 @@ def check(
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities
+    from harness.evaluate import checkup
     from harness.evaluate.pace import advice
 
     card = resolve(name, engine)
     head: dict[str, Any] = {"name": card.name, "engine": card.engine}
     if not capabilities(card.engine).renders:
         if as_json:
-            typer.echo(json.dumps({**head, "model_free": True}, indent=2))
+            echo_json({**head, "model_free": True})
         else:
             typer.echo(
                 f"{card.name}: engine {card.engine} is model-free: no weights, no tokens, nothing to load"
             )
         return
-    spec, seen, result = _examine(card, thinking, device, dtype)
+    with bar(f"asking {printable(card.name, 30)}", grows=True) as progress:
+        done = checkup.check(card, thinking, device, dtype, progress, progress.more)
+    spec, seen, who = done.spec, done.seen, printable(card.name)
+    if done.unanswered:
+        typer.echo(f"harness: the fixed questions got no answer: {printable(done.unanswered, 300)}", err=True)
     paces = _paces(card)
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    **head, "model_free": False, "thinking_asked": spec.ego.thinking, **asdict(seen),
-                    "findings": result and {**to_builtins(result), "reads_scene": result.reads_scene},
-                    "paces": [asdict(pace) for pace in paces],
-                },
-                indent=2,
-            )
-        )  # fmt: skip
+        result = done.findings
+        echo_json({
+            **head, "model_free": False, "thinking_asked": spec.ego.thinking, **asdict(seen),
+            "findings": result and {**to_builtins(result), "reads_scene": result.reads_scene},
+            "paces": paces,
+        })  # fmt: skip
     else:
         _show(spec, seen)
-        _show_findings(result)
+        _show_findings(done.findings)
         if paces:
             typer.echo(f"engines      {advice(paces)}")
-    every = [*seen.answers.values(), *(seen.looks.answers.values() if seen.looks else ())]
-    errors = [answer.error for answer in every if answer.error is not None]
-    if len(errors) == len(every):
-        who = printable(card.name)
+    errors = [answer.error for answer in done.completions if answer.error is not None]
+    if len(errors) == len(done.completions):
         raise Unanswered(f"{printable(errors[0], 300)}: no answer of {who} in any answer mode")
     if seen.looks and seen.looks.fault:
         typer.echo(f"harness: {_blind(card, seen.looks.fault)}", err=True)
         raise typer.Exit(1)
-    if not _usable(spec, seen):
-        typer.echo(f"harness: no answer of {printable(card.name)} can be read as a decision", err=True)
+    if not done.usable:
+        typer.echo(f"harness: no answer of {who} can be read as a decision", err=True)
         raise typer.Exit(1)
 
 
-def _usable(spec: "Spec", seen: "Checkup") -> bool:
-    """Return whether an answer in any mode says what to do."""
-    from harness.evaluate.asking import answer_of
+def parity(
+    model: str = typer.Argument(
+        help="A .gguf file, a card that names both engines, or a folder with a checkpoint and a GGUF file."
+    ),
+    prompt: options.Prompt = "v2",
+    dataset: options.Dataset = resources.DATASET,
+    prompts: int = typer.Option(64, help="Number of prompts to compare, spread over scenes and viewers."),
+    read_outs: bool = typer.Option(
+        False, "--read-outs", help="Compare tokens and read-outs alone, which takes a fraction of the time."
+    ),
+    as_json: options.Json = False,
+) -> None:
+    """Compare a model's answers on transformers and on llama.cpp. Exit code 1 if they differ too much."""
+    from harness.backends import cards
+    from harness.backends.registry import missing
+    from harness.dataset import load
+    from harness.evaluate.agent import Agent
+    from harness.evaluate.asking import requests
+    from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.spec import Spec
+    from harness.prompts import versions
+    from harness.training.parity import PASSES, compare
 
-    asked = spec.ego.blank("ego", spec.actions)
-    return any(answer_of(asked.alike(answer=mode), reply).intent for mode, reply in seen.answers.items())
+    if prompts < 1:
+        raise UserError(f"--prompts {prompts}: give 1 or more")
+    reference, gguf = cards.resolve(model, "transformers"), cards.resolve(model, "llama-cpp")
+    for card in (reference, gguf):
+        if lack := missing(card):
+            raise UserError(
+                f"model {printable(card.name)!r} lacks {lack} on {card.engine}; see `harness model check`"
+            )
+    data = load.load(load.find(dataset))
+    scenes = data.scenes(data.courses())
+
+    def some(answer: "AnswerMode") -> "list[Request]":
+        agent = Agent(reference, versions.load(prompt), answer, letters="raw")
+        asked = list(requests(Spec(agent, FrozenSource(data), (), (0,)), scenes))
+        return asked[:: max(1, len(asked) // prompts)][:prompts]
+
+    asked, letters = [] if read_outs else some("json"), some("readout")
+    with bar(f"comparing {printable(reference.name, 30)}", PASSES, as_json) as progress:
+        compared = compare(reference, gguf, asked, letters, progress)
+    findings, left_out = compared.findings, compared.left_out
+    holds = all(finding.holds for finding in findings)
+    if as_json:
+        rows = [asdict(f) | {"measured": f.measured if isfinite(f.measured) else None} for f in findings]
+        echo_json({"holds": holds, "findings": rows, "left_out": left_out})
+        raise typer.Exit(0 if holds else 1)
+    for f in findings:
+        limit = "" if f.allowed is None else f"{f.allowed:g}"
+        typer.echo(f"{'ok  ' if f.holds else 'FAIL'} {f.what:<52}{f.measured:>10.5g} {limit:>8}")
+        for difference in f.differences:
+            typer.echo(f"       {printable(difference, 200)}")
+    if left_out:
+        typer.echo(f"left out: the same weights in F32 on llama.cpp: {printable(left_out, 300)}")
+    verdict = "the engines agree" if holds else "the engines differ"
+    typer.echo(f"{verdict}: {len(letters)} prompts; measured, and what is allowed")
+    raise typer.Exit(0 if holds else 1)
 
 
 def _blind(card: "Card", fault: str) -> str:
@@ -160,52 +201,6 @@ def _blind(card: "Card", fault: str) -> str:
     if card.server:
         who, remedy = f"the server of {who}", f"start it with its projector, or {remedy}"
     return f"{who} {printable(fault, 300)}; {remedy}"
-
-
-def _examine(
-    card: "Card", thinking: bool, device: str | None, dtype: str | None
-) -> "tuple[Spec, Checkup, Findings | None]":
-    """Check a model, examine it if it answers by letters, and keep what was found."""
-    from harness.backends.base import AnswerMode, Rendering
-    from harness.backends.checkup import check as look
-    from harness.backends.registry import open_backend
-    from harness.dataset import load
-    from harness.evaluate.agent import Agent
-    from harness.evaluate.asking import requests
-    from harness.evaluate.examine import COUNT, examine, keep_findings
-    from harness.evaluate.frozen_world import FrozenSource
-    from harness.evaluate.spec import Spec
-    from harness.prompts import versions as prompts
-
-    data = load.load(load.find(DATASET), 1)
-    ego = Agent(card, prompts.load(PROMPT), thinking=thinking)
-    sees = Agent(card, prompts.load(IMAGE_PROMPT), thinking=thinking) if card.vision else None
-    spec = Spec(ego, FrozenSource(data), (), (0,), batch_size=1, device=device, dtype=dtype)
-    ways = ("json",) if ego.thinking else get_args(AnswerMode)
-    scenes = data.scenes(data.forest.ids[:1])
-
-    def question(who: Agent) -> "Request":
-        return next(requests(replace(spec, ego=who), scenes))  # the first of a scene's is the ego's
-
-    asked = [question(replace(ego, answer=way)) for way in ways]
-    shown = [
-        (question(replace(sees, answer=way)), question(replace(sees, answer=way, image="blank")),
-         question(replace(sees, answer=way, image="none")))
-        for way in ways if sees
-    ]  # fmt: skip
-    backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
-    with bar(f"asking {printable(card.name, 30)}", len(asked) + 2 * len(shown)) as progress:
-        seen = look(cast("Rendering", backend), asked, shown, progress)
-    read_out = seen.answers.get("readout")
-    if read_out is None or read_out.error is not None or (seen.looks and seen.looks.fault):
-        return spec, seen, None
-    with bar(f"examining {printable(card.name, 30)}", COUNT) as progress:
-        result = examine(backend, ego, progress)
-    if isinstance(result, str):
-        typer.echo(f"harness: the fixed questions got no answer: {printable(result, 300)}", err=True)
-        return spec, seen, None
-    keep_findings(seen.identity, result)
-    return spec, seen, result
 
 
 def _paces(card: "Card") -> "list[Pace]":
@@ -223,6 +218,7 @@ def _paces(card: "Card") -> "list[Pace]":
 def _show(spec: "Spec", seen: "Checkup") -> None:
     from harness.backends.registry import capabilities
     from harness.backends.weights import contradictions
+    from harness.evaluate.checkup import IMAGE_PROMPT, PROMPT
 
     card, what = spec.ego.card, seen.identity
     where = " on ".join(printable(what[key]) for key in ("dtype", "device") if what.get(key))

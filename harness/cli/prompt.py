@@ -1,13 +1,14 @@
 """`harness prompt`: the versions, the text a model is sent, and its token budget."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from msgspec import to_builtins
 
-from harness.cli import options, pictures, trial
+from harness.cli import options, pictures
 from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.cli.terminal import console, echo_json
@@ -17,11 +18,10 @@ from harness.core.files import write_whole
 from harness.core.seeds import FIRST
 
 if TYPE_CHECKING:
-    from harness.dataset.load import Scene
+    from harness.evaluate.examine import Findings, Moved
+    from harness.evaluate.trial import Trial
     from harness.prompts.difference import TextChange
 
-FUSION = "fusion"  # the ego's call with messages
-REPAIR = "repair"  # any of them with the turn that follows an answer that cannot be read
 NOT_COUNTED = "tokens not counted: give --tokenizer (tokenizer.json, its folder, or a GGUF)"
 COLOURS = {"same": "", "removed": "red", "added": "green"}
 
@@ -48,14 +48,11 @@ def list_prompts(as_json: options.Json = False) -> None:
     from harness.prompts import versions as prompts
 
     fields = ("version", "released", "sha256", "description", "changed", "known_failures")
-    rows: list[dict[str, Any]] = []
-    for name in prompts.names():
-        try:
-            version = prompts.load(name)
-        except UserError as error:
-            rows.append({"version": name, "error": str(error)})
-        else:
-            rows.append({field: getattr(version, field) for field in fields})
+    rows: list[dict[str, Any]] = [
+        {"version": name, "error": str(each)} if isinstance(each, UserError)
+        else {field: getattr(each, field) for field in fields}
+        for name, each in resources.each(prompts.names(), prompts.load).items()
+    ]  # fmt: skip
     if as_json:
         echo_json(rows)
     else:
@@ -186,17 +183,17 @@ def check(
     """
     from harness.backends.tokens import counter, summarize_counts
     from harness.dataset import load
+    from harness.evaluate import trial
     from harness.evaluate.agent import example_actions
     from harness.prompts import versions as prompts
-    from harness.prompts.densest import densest_messages, densest_repair
+    from harness.prompts.budget import REPAIR, measure
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
     if reason := prompts.unfit(prompt, data.scenario):
         raise UserError(f"prompt {version} {reason}; give another --dataset, or fix the prompt")
-    words = data.scenario.prompt_words
     scenes = data.scenes(data.courses())
     taker = pictures.taker(prompt, model, checked=True)
-    asks = trial.asks(prompt, model, engine) if model and taker is None else None
+    asked = trial.card_of(prompt, model, engine) if model and taker is None else None
     if difference := taker and taker.difference:
         typer.echo(difference)
         raise typer.Exit(1)
@@ -204,62 +201,79 @@ def check(
     count = counter(tokenizer, card)
     for role in prompts.ROLES:
         example_actions(prompt, role, data.actions)
-    least, most = prompt.token_budget
-    sizes: dict[str, list[int]] = {role: [] for role in (*prompts.ROLES, FUSION, REPAIR)}
-    turns = {role: densest_repair(prompt, role, data.actions, words) for role in prompt.repair_turn}
-    added = {role: count(turn) for role, turn in turns.items()} if count else {}
-    outside: list[dict[str, Any]] = []
-
-    def render(scene: "Scene", viewer: str, messages: Sequence[Mapping[str, Any]] = ()) -> None:
-        graph = scene.graphs[viewer]
-        role, rendered = graph.role, prompt.render(graph, data.actions, messages, words)
-        if not count:
-            return
-        n = count(rendered) + picture
-        calls = {FUSION if messages else role: n, **({REPAIR: n + added[role]} if role in added else {})}
-        for call, tokens in calls.items():
-            sizes[call].append(tokens)
-            if not least <= tokens <= most:
-                at = {"scene": scene.id, "viewer": viewer, "messages": len(messages), "call": call}
-                outside.append({**at, "tokens": tokens})
-
     with bar("scenes", len(scenes), as_json) as progress:
-        for scene in scenes:
-            ego, *helpers = scene.viewers
-            dense = densest_messages(helpers, data.actions)
-            for viewer in scene.viewers:
-                render(scene, viewer)
-            for n in range(1, len(dense) + 1):
-                render(scene, ego, dense[:n])
-            progress(1)
-    stats = {role: summarize_counts(n) for role, n in sizes.items() if n}
-    tried = trial.tried(prompt, asks, device, dtype, as_json) if asks else None
+        sizes = measure(prompt, data, scenes, count, picture, progress)
+    tried = None
+    if asked:
+        with bar(f"asking {printable(asked.name, 30)}", quiet=as_json) as progress:
+            tried = trial.try_on(prompt, asked, device, dtype, progress, progress.more)
+    stats = {call: summarize_counts(tokens) for call, tokens in sizes.tokens.items() if tokens}
     if as_json:
-        figures = {"version": version, "budget": [least, most], "tokens": stats, "outside": outside}
+        outside = [each._asdict() for each in sizes.outside]
+        figures = {"version": version, "budget": prompt.token_budget, "tokens": stats, "outside": outside}
         seen = {"picture": {**taker.as_mapping(), "checked": taker.checked}} if taker else {}
-        echo_json({**figures, **seen, **(trial.as_mapping(*tried) if tried else {})}, indent=None)
+        of_model = to_builtins(dict(zip(("trial", "readout"), tried, strict=True))) if tried else {}
+        echo_json({**figures, **seen, **of_model}, indent=None)
     else:
+        least, most = prompt.token_budget
         typer.echo(
             f"{version}: renders for every viewer of {len(scenes)} scenes; budget {least} to {most} tokens"
         )
         if taker:
             here = "as its processor says" if taker.checked else "its processor is not here to ask"
             typer.echo(f"picture {taker.picture}, {here}")
-        for role, s in stats.items():
-            typer.echo(f"{role:<7} {s['least']} to {s['most']} tokens, mean {s['mean']}, n = {s['n']}")
+        for call, s in stats.items():
+            typer.echo(f"{call:<7} {s['least']} to {s['most']} tokens, mean {s['mean']}, n = {s['n']}")
         if not count:
             typer.echo(NOT_COUNTED)
-        if outside:
-            total = sum(map(len, sizes.values()))
-            typer.echo(f"outside the budget: {len(outside)} of {total} prompts; the first are")
-        for o in outside[:10]:
-            heard = f" with messages of {o['messages']}" if o["messages"] else ""
-            repair = " with a repair turn" if o["call"] == REPAIR else ""
-            typer.echo(f"scene {o['scene']} viewer {o['viewer']}{heard}{repair}: {o['tokens']} tokens")
+        if sizes.outside:
+            total = sum(map(len, sizes.tokens.values()))
+            typer.echo(f"outside the budget: {len(sizes.outside)} of {total} prompts; the first are")
+        for each in sizes.outside[:10]:
+            messages = f" with messages of {each.messages}" if each.messages else ""
+            repair = " with a repair turn" if each.call == REPAIR else ""
+            typer.echo(f"scene {each.scene} viewer {each.viewer}{messages}{repair}: {each.tokens} tokens")
         if tried:
-            trial.show(*tried)
-    if outside:
+            _show_trial(*tried)
+    if sizes.outside:
         raise typer.Exit(1)
+
+
+def _show_trial(trial: "Trial", findings: "Findings | str | None") -> None:
+    """Print what a model does with a prompt, in words and in read-outs."""
+    n = trial.roles[0].n
+    typer.echo(f"{printable(trial.model)} was asked {n} fixed questions in each role")
+    for role in trial.roles:
+        typer.echo(
+            f"{role.role:<7} {role.readable} of {role.n} readable, {role.strict} strict, "
+            f"{role.distinct} distinct"
+        )
+        for sentence in role.sentences():
+            typer.echo(f"        {sentence}")
+        typer.echo(f"        such as {printable(role.sample, 70)}")
+    _show_moved("pairs", trial.pairs)
+    if any(pair.n for pair in trial.pairs) and not any(pair.read for pair in trial.pairs):
+        typer.echo("        the ego's answer ignores what differs between the scenes")
+    if isinstance(findings, str):
+        typer.echo(f"letters no answer: {printable(findings, 300)}")
+    elif findings:
+        if findings.letters == "cyclic":
+            typer.echo(
+                "letters the likeliest action of a read-out follows the letter in "
+                f"{findings.follows_letter} of {findings.n} questions"
+            )
+        _show_moved("letters", findings.pairs)
+
+
+def _show_moved(what: str, pairs: "Sequence[Moved]") -> None:
+    for pair in pairs:
+        if not pair.n:
+            typer.echo(f"{what:<7} {pair.fact} changed: no pair of answers can be read")
+            continue
+        typer.echo(
+            f"{what:<7} {pair.fact} changed: {pair.moved} of {pair.n} answers moved as they should "
+            f"({pair.change})"
+        )
 
 
 def compare(

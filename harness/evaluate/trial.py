@@ -8,13 +8,17 @@ from typing import Any, get_args
 from msgspec import Struct
 
 from harness.backends.base import Backend, Completion, Role
-from harness.core.errors import Unanswered, printable
+from harness.backends.card import Card
+from harness.backends.cards import resolve
+from harness.backends.registry import capabilities, open_backend
+from harness.core.errors import Unanswered, UserError, printable
 from harness.evaluate import questions
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import answer_of
-from harness.evaluate.examine import Moved, moved
+from harness.evaluate.examine import COUNT as READ_OUTS
+from harness.evaluate.examine import Findings, Moved, examine, moved
 from harness.parsing.status import Repair, Status
-from harness.prompts.versions import Prompt
+from harness.prompts.versions import Prompt, unfit
 from harness.runs.records import Answer
 
 ROLES: tuple[Role, ...] = get_args(Role)
@@ -68,6 +72,42 @@ class Trial(Struct, frozen=True):
     prompt: str  # the prompt version
     roles: tuple[Answers, ...]  # each role's answers
     pairs: tuple[Moved, ...]  # how the ego's answers moved in pairs of scenes that differ in one fact
+
+
+def card_of(prompt: Prompt, model: str, engine: str | None) -> Card:
+    """Return the card of the model that a prompt is tried on.
+
+    Raises:
+        UserError: it is no language model, or the prompt cannot ask the fixed questions.
+    """
+    card = resolve(model, engine)
+    if not capabilities(card.engine).language_model:
+        raise UserError(
+            f"--model {printable(card.name)}: it reads no prompt; give a language model (`harness model "
+            "list`)"
+        )
+    if reason := unfit(prompt, questions.scenario()):
+        raise UserError(
+            f"--model: prompt {prompt.version} {reason}; the fixed questions are of that scenario; leave "
+            "--model out"
+        )
+    return card
+
+
+def try_on(
+    prompt: Prompt, card: Card, device: str | None, dtype: str | None, progress: Callable[[int], None],
+    more: Callable[[int], None],
+) -> tuple[Trial, Findings | str | None]:  # fmt: skip
+    """Return what a model does with a prompt, in words and in read-outs.
+
+    The second is None where its engine reads none out, and a reason where they got no answer.
+    """
+    agent = Agent(card, prompt)
+    reads_out = "readout" in agent.can.answer_modes and not agent.thinking
+    backend = open_backend(card, device=device, dtype=dtype)
+    more(COUNT + reads_out * READ_OUTS)
+    trial = try_out(backend, agent, progress)
+    return trial, examine(backend, agent, progress) if reads_out else None
 
 
 def try_out(backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None) -> Trial:

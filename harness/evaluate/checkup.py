@@ -1,0 +1,87 @@
+"""Check a model before a run: ask it in every answer mode, with and without pictures, and examine it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import cast, get_args
+
+from harness.backends.base import AnswerMode, Completion, Rendering, Request
+from harness.backends.card import Card
+from harness.backends.checkup import Checkup
+from harness.backends.checkup import check as ask
+from harness.backends.registry import open_backend
+from harness.core.resources import DATASET
+from harness.dataset import load
+from harness.evaluate.agent import Agent
+from harness.evaluate.asking import answer_of, requests
+from harness.evaluate.examine import COUNT, Findings, examine, keep_findings
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.spec import Spec
+from harness.prompts import versions
+
+PROMPT, IMAGE_PROMPT = "v2", "v7"
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a check of a model showed."""
+
+    spec: Spec  # how the model was asked
+    seen: Checkup  # its prompt and answers
+    findings: Findings | None  # what its read-outs follow; None where it was not examined
+    unanswered: str | None = None  # why the fixed questions got no answer
+
+    @property
+    def completions(self) -> list[Completion]:
+        """Every answer that has to come, those to pictures too."""
+        return [*self.seen.answers.values(), *(self.seen.looks.answers.values() if self.seen.looks else ())]
+
+    @property
+    def usable(self) -> bool:
+        """Whether an answer in any mode says what to do."""
+        asked = self.spec.ego.blank("ego", self.spec.actions)
+        answers = self.seen.answers.items()
+        return any(answer_of(asked.alike(answer=mode), reply).intent for mode, reply in answers)
+
+
+def check(
+    card: Card, thinking: bool, device: str | None, dtype: str | None, progress: Callable[[int], None],
+    more: Callable[[int], None],
+) -> Check:  # fmt: skip
+    """Check a model, examine it if it answers by letters, and keep what was found.
+
+    Args:
+        card: a language model's.
+        thinking: whether it is asked to think.
+        device: where it runs; None leaves the choice to the engine.
+        dtype: number format of the weights; None takes the card's.
+        progress: called with the number of new answers.
+        more: called with the number of answers that are asked for next.
+    """
+    data = load.load(load.find(DATASET), 1)
+    ego = Agent(card, versions.load(PROMPT), thinking=thinking)
+    sees = Agent(card, versions.load(IMAGE_PROMPT), thinking=thinking) if card.vision else None
+    spec = Spec(ego, FrozenSource(data), (), (0,), batch_size=1, device=device, dtype=dtype)
+    modes = ("json",) if ego.thinking else get_args(AnswerMode)
+    scenes = data.scenes(data.forest.ids[:1])
+
+    def question(agent: Agent) -> Request:
+        return next(requests(replace(spec, ego=agent), scenes))  # the first of a scene's is the ego's
+
+    asked = [question(replace(ego, answer=mode)) for mode in modes]
+    shown = [
+        (question(replace(sees, answer=mode)), question(replace(sees, answer=mode, image="blank")),
+         question(replace(sees, answer=mode, image="none")))
+        for mode in modes if sees
+    ]  # fmt: skip
+    backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
+    more(len(asked) + 2 * len(shown))
+    seen = ask(cast("Rendering", backend), asked, shown, progress)
+    read_out = seen.answers.get("readout")
+    if read_out is None or read_out.error is not None or (seen.looks and seen.looks.fault):
+        return Check(spec, seen, None)
+    more(COUNT)
+    result = examine(backend, ego, progress)
+    if isinstance(result, str):
+        return Check(spec, seen, None, result)
+    keep_findings(seen.identity, result)
+    return Check(spec, seen, result)

@@ -1,0 +1,73 @@
+"""Render every prompt that scenes can give, and count its tokens against the version's budget."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from harness.dataset.load import Dataset, Scene
+from harness.prompts.densest import densest_messages, densest_repair
+from harness.prompts.versions import ROLES, Prompt
+
+FUSION = "fusion"  # the ego's call with messages
+REPAIR = "repair"  # any call with the turn that follows an answer that cannot be read
+
+
+class Outside(NamedTuple):
+    """A prompt outside the budget."""
+
+    scene: str  # its id
+    viewer: str
+    messages: int  # how many helpers' messages it has
+    call: str  # a role, `FUSION` or `REPAIR`
+    tokens: int
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Token counts of all prompts."""
+
+    tokens: dict[str, list[int]] = field(default_factory=dict)  # by call: a role, `FUSION` or `REPAIR`
+    outside: list[Outside] = field(default_factory=list)
+
+
+def measure(
+    prompt: Prompt, data: Dataset, scenes: Sequence[Scene], count: Callable[[Sequence[Any]], int] | None,
+    picture: int, progress: Callable[[int], None],
+) -> Sizes:  # fmt: skip
+    """Render the prompt of every viewer, and of the ego with the longest messages of one helper, of two, ...
+
+    Args:
+        prompt: the version, which fits the dataset's scenario.
+        data: the dataset.
+        scenes: the scenes to render.
+        count: returns the tokens of a chat's turns; None renders and counts nothing.
+        picture: tokens of the picture beside a text.
+        progress: called with 1 after each scene.
+    """
+    words, (least, most) = data.scenario.prompt_words, prompt.token_budget
+    turns = {role: densest_repair(prompt, role, data.actions, words) for role in prompt.repair_turn}
+    added = {role: count(turn) for role, turn in turns.items()} if count else {}
+    sizes = Sizes({call: [] for call in (*ROLES, FUSION, REPAIR)})
+
+    def render(scene: Scene, viewer: str, messages: Sequence[Mapping[str, Any]] = ()) -> None:
+        graph = scene.graphs[viewer]
+        rendered = prompt.render(graph, data.actions, messages, words)
+        if not count:
+            return
+        tokens = {FUSION if messages else graph.role: count(rendered) + picture}
+        if graph.role in added:
+            tokens[REPAIR] = sum(tokens.values()) + added[graph.role]
+        for call, n in tokens.items():
+            sizes.tokens[call].append(n)
+            if not least <= n <= most:
+                sizes.outside.append(Outside(scene.id, viewer, len(messages), call, n))
+
+    for scene in scenes:
+        ego, *helpers = scene.viewers
+        for viewer in scene.viewers:
+            render(scene, viewer)
+        dense = densest_messages(helpers, data.actions)
+        for n in range(1, len(dense) + 1):
+            render(scene, ego, dense[:n])
+        progress(1)
+    return sizes
