@@ -43,15 +43,6 @@ class _Objects:
     unfinished: bool = False
 
 
-def whole(text: str, role: str, actions: tuple[str, ...]) -> Candidate | None:
-    """Return the candidate if the text is exactly one JSON object that is shaped like an answer."""
-    try:
-        value = relaxed.DECODER.decode(text)
-    except (ValueError, RecursionError):
-        return None
-    return Candidate(value) if _shaped(value, role, actions) else None
-
-
 def candidates(
     text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool = False
 ) -> list[Candidate]:

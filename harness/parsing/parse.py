@@ -13,9 +13,8 @@ from msgspec import Struct
 from harness.core import errors
 from harness.parsing import candidates, reasoning
 from harness.parsing.answer import Answer, read
-from harness.parsing.candidates import Candidate, whole
+from harness.parsing.candidates import Candidate
 from harness.parsing.mend import unreadable
-from harness.parsing.schema import fits
 from harness.parsing.status import Failure, Repair, Status, noted
 from harness.parsing.strict import fitting
 from harness.prompts.answer_schema import ROLES, Shape
@@ -108,11 +107,11 @@ def parse(
     shape = Shape(role, tuple(actions), form, extension)
     thought: str | None = None
     try:
-        answer = None if thinking else _strict(text, shape)
+        answer = None if thinking else fitting(text, shape)
         if answer is None:
             thought, rest = reasoning.split(text, thinking) if text.strip() else (None, "")
             thought_leads = text.rstrip().endswith(rest.strip())
-            answer = _strict(rest, shape) if thought_leads else None
+            answer = fitting(rest, shape) if thought_leads else None
             if answer is None:
                 answer = _recovered(rest, shape, finish_reason == "length", reasons_first, divides)
             if (thought and not thinking) or not thought_leads:
@@ -155,22 +154,6 @@ def spans(text: str, role: str, actions: Sequence[str], thinking: bool = False) 
     if start < 0:
         return []
     return [(start + a, start + b) for a, b in candidates.spans(rest, role, tuple(actions))]
-
-
-def _strict(text: str, shape: Shape) -> Answer | None:
-    """Return the answer if the text is nothing else, fits the schema and needs no repair."""
-    return fitting(text, shape) or _unmended(text, shape)
-
-
-def _unmended(text: str, shape: Shape) -> Answer | None:
-    candidate = whole(text, shape.role, shape.actions)
-    if candidate is None:
-        return None
-    try:
-        answer = read(candidate.members, candidate.repairs, shape)
-    except Failure:
-        return None
-    return None if answer.repairs or not fits(candidate.members, shape) else answer
 
 
 def _recovered(text: str, shape: Shape, cut: bool, reasons_first: bool, divides: bool) -> Answer:
