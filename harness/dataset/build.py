@@ -220,7 +220,6 @@ def _check(scenario: Scenario, tree: Tree) -> None:
 
 
 def _join_layouts(work: Path, episodes: int, layouts: Path) -> list[bytes]:
-    """Join all layouts in one file, and return the bytes of their trees in it."""
     trees = []
     with replacing(layouts) as part, ZipFile(part, "w") as file:
         for episode in range(episodes):

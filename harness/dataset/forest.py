@@ -74,7 +74,6 @@ class Forest:
 
     @cached_property
     def place(self) -> Mapping[str, int]:
-        """The indices of the decision points, by id."""
         return {name: n for n, name in enumerate(self.ids)}
 
     @cached_property

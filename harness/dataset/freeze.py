@@ -78,7 +78,6 @@ def _branches(world: World) -> Iterator[tuple[list[str], World]]:
 
 
 def _edge(actions: list[str], branch: World, episode: int, following: dict[str, tuple[int, World]]) -> Edge:
-    """Return the edge of some actions; a new decision point is added to `following`, by its id."""
     outcome, end, child = branch.outcome, None, None
     if outcome.ended:
         assert outcome.time_s is not None
@@ -124,7 +123,6 @@ def records_of(points: Sequence[tuple[World, WorldState, int, Sequence[VehicleSt
 
 
 def _record(world: World, state: WorldState, episode: int, graphs: dict[str, SceneGraph]) -> Record:
-    """Return a decision point's record, with the scene graphs of its viewers, by their ids."""
     zone, (ego_id, *helpers) = world.scenario.road().zone_m, graphs
     ego = state.vehicle(ego_id)
     known_states = {name: known(state, name, ego_id) for name in graphs}

@@ -54,7 +54,6 @@ class Scene:
 
     @property
     def id(self) -> str:
-        """`<episode>-<step>-<digest>`."""
         return self.record.scene
 
     @property
@@ -69,7 +68,6 @@ class Scene:
 
     @property
     def viewers(self) -> tuple[str, ...]:
-        """Ids of the ego and the helpers, the ego first."""
         return tuple(self.graphs)
 
     def viewer(self, name: str | None) -> str:
@@ -79,7 +77,6 @@ class Scene:
         return self.viewers[0] if name is None else name
 
     def changed(self, **fields: Any) -> "Scene":
-        """Return the scene with other values in some fields of its record."""
         return Scene(structs.replace(self.record, **fields))
 
 
@@ -87,7 +84,6 @@ class Trees(Sequence[Tree]):
     """The decision trees of some episodes, by index; each is read on use."""
 
     def __init__(self, numbers: Iterable[int], read: Callable[[int], Tree]) -> None:
-        """Take the trees of these episodes; `read` returns the tree of an episode."""
         self.numbers, self.read = tuple(numbers), read
 
     def __len__(self) -> int:
@@ -141,7 +137,6 @@ class Dataset:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Meta-actions, in the environment's order."""
         return tuple(self.manifest.actions)
 
     @property
@@ -154,7 +149,6 @@ class Dataset:
 
     @cached_property
     def nodes(self) -> int:
-        """The number of decision points in the trees."""
         if len(self.trees) == self.manifest.episodes:
             return self.manifest.nodes
         return sum(len(level) for tree in self.trees for level in tree.levels)

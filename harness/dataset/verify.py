@@ -101,7 +101,6 @@ def check(path: Path) -> list[str]:
 
 
 def _check_tree(file: ZipFile, manifest: Manifest, episode: int) -> tuple[list[str], int]:
-    """Return what is wrong with a layout's tree and scenes, and the number of its decision points."""
     try:
         tree = read_tree(file, manifest, episode)
         problems = []

@@ -89,12 +89,10 @@ class Agent:
 
     @property
     def can(self) -> Capabilities:
-        """The capabilities of its engine."""
         return capabilities(self.card.engine)
 
     @property
     def sees(self) -> bool:
-        """Whether its prompts show a picture."""
         return bool(self.prompt.image and self.card.vision) and self.image != "none"
 
     @property

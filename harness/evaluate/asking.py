@@ -249,7 +249,6 @@ class Asker:
         self._progress(len(answers))
 
     def _keep_servers(self, these: Sequence[Served]) -> None:
-        """Keep which server gave each answer."""
         if self._kept:
             servers.keep(self._kept.parent, these)
         else:
@@ -260,7 +259,6 @@ class Asker:
         return self.spec.batch_size * math.ceil(FIRST / self.spec.batch_size)
 
     def _refused_so_far(self) -> bool:
-        """Return whether no question that was asked here got an answer."""
         return self.tally.asked == self.tally.unanswered
 
     def _recall(self, cut: bool = False) -> None:
@@ -272,7 +270,6 @@ class Asker:
                 os.truncate(self._kept, self._read_b)
 
     def _to_disk(self) -> bool:
-        """Return whether the last answers reached the disk long enough ago."""
         due = time.monotonic() - self._on_disk_s >= SYNC_S
         if due:
             self._on_disk_s = time.monotonic()
@@ -380,7 +377,6 @@ class Asker:
         )  # fmt: skip
 
     def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
-        """Return the ego's answers to these sets of messages, rewritten as `rewrites` says."""
         ids = [_fusion_id(*each) for each in _heard_sets(scenes, codes, rewrites)]
         if not self.answers.keys() >= set(ids):
             self.answer(self.fusion_requests(scenes, codes, rewrites))

@@ -30,7 +30,6 @@ class SentIntents:
     attackers: Bools  # which voices are an attacker's, (n, H)
 
     def take(self, at: Any) -> "SentIntents":
-        """Return what is said in the decisions at these indices."""
         return SentIntents(self.intents.take(at), self.draws.take(at), self.attackers[at])
 
 

@@ -31,26 +31,21 @@ class FrozenSource:
 
     @property
     def name(self) -> str:
-        """The dataset's."""
         return self.dataset.name
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The dataset's."""
         return self.dataset.actions
 
     @property
     def scenario(self) -> Scenario:
-        """The dataset's."""
         return self.dataset.scenario
 
     @property
     def layout_seeds(self) -> Sequence[int]:
-        """The layout seeds of the selected episodes."""
         return self.dataset.seeds
 
     def record(self) -> FrozenScenes:
-        """Return the dataset's record, with the digest that pins it."""
         p = self.scenario.parameters
         return FrozenScenes(
             name=self.dataset.name, sha256=self.dataset.sha256, nodes=self.dataset.nodes,
@@ -60,7 +55,6 @@ class FrozenSource:
         )  # fmt: skip
 
     def settings(self) -> FrozenSettings:
-        """Return the dataset's folder and the selection of its episodes."""
         given: dict[str, Any] = self.selection.given
         return FrozenSettings(dataset=str(argument(self.dataset.path)), limit=self.selection.limit, **given)
 
@@ -96,7 +90,6 @@ class FrozenWorld(SceneWorld):
         self._luck: tuple[Bools, Draws] | None = None  # of the decision points just shown
 
     def observe(self) -> Sequence[Scene]:
-        """Return every decision point to which some walk has come."""
         places = np.unique(np.concatenate([walks.at.ravel() for walks in self._walks.values()]))
         self._shown, self._luck = places[places >= 0], None
         self.scenes = self._dataset.scenes([self._forest.ids[n] for n in self._shown.tolist()])
@@ -138,7 +131,6 @@ class FrozenWorld(SceneWorld):
         walks.at[ended] = -1
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
-        """Follow the edge of each action."""
         for part in decided:
             walks, action = self._walks[part.point], part.result.action
             undecided = walks.at >= 0
@@ -178,7 +170,6 @@ class FrozenWorld(SceneWorld):
         return {name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()}
 
     def episodes(self) -> list[Episode]:
-        """Return how each episode ended under each condition and seed."""
         return [
             self._episode(point.name, walks, place)
             for point, walks in self._walks.items()

@@ -28,7 +28,6 @@ class FusionAnswers:
     seconds: Floats  # time of each fusion call, (K,)
 
     def at(self, points: Ints, attackers: Bools | None = None) -> "FusionAnswersAt":
-        """Return the call for decisions at points (n,), with attackers (n, H) if the text shows them."""
         return FusionAnswersAt(self, points, attackers)
 
 

@@ -50,7 +50,6 @@ class LiveSource:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The scenario that is driven."""
         return scenarios.get(self.scenario_name)
 
     @cached_property
@@ -63,16 +62,13 @@ class LiveSource:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The scenario's actions."""
         return self.scenario.actions
 
     @property
     def layout_seeds(self) -> Sequence[int]:
-        """The layout seeds of the episodes that are driven."""
         return [self.first_seed + number for number in self.numbers]
 
     def record(self) -> ClosedLoop:
-        """Return the record of the scenario and the layouts that are driven."""
         parameters = self.scenario.parameters.stated()
         return ClosedLoop(
             scenario={"name": self.scenario_name, "parameters": parameters}, first_seed=self.first_seed,
@@ -83,7 +79,6 @@ class LiveSource:
         )  # fmt: skip
 
     def settings(self) -> DriveSettings:
-        """Return the scenario and its layouts."""
         return DriveSettings(
             scenario=self.scenario_name, episodes=self.episodes, first_seed=self.first_seed,
             sample=self.sample, sample_seed=0 if self.sample is None else self.sample_seed,
@@ -123,7 +118,6 @@ class LiveWorld(SceneWorld):
         self._step = 0
 
     def observe(self) -> Sequence[Scene]:
-        """Return each distinct decision point in which some episode has no open decision."""
         while self._going and self._step < self._p.decisions:
             for trajectory in self._going:
                 for course in trajectory.courses:
@@ -136,7 +130,6 @@ class LiveWorld(SceneWorld):
         return ()
 
     def due(self, point: OperatingPoint) -> Due:
-        """Return a decision for each episode of the condition that has no open one."""
         places = self._places(point)
         at = np.array([n for n, _ in places], dtype=int)
         seed = np.array([course.seed for _, course in places], dtype=int)
@@ -147,7 +140,6 @@ class LiveWorld(SceneWorld):
         return Due(at, episode, seed, draws)
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
-        """Open every decision, and simulate until the next ones are due."""
         actions, hz = self.scenario.actions, self._p.simulation_hz
         due_frame = self._p.due_frame(self._step)
         for part in decided:

@@ -36,7 +36,6 @@ class ReplayedEpisode:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The scenario that was driven, with the parameters that it had then."""
         assert isinstance(self.manifest.world, ClosedLoop)
         record = self.manifest.world.scenario
         return scenarios.stated(record["name"], record["parameters"])
@@ -113,7 +112,6 @@ def _due_frame(decision: Decision, p: Parameters) -> int:
 
 
 def _actions_by_frame(played: ReplayedEpisode) -> dict[int, str]:
-    """Return the actions by the frame in which they were taken."""
     p = played.scenario.parameters
     return {_acting_frame(d, p): d.action for d in played.decisions if d.acted}
 

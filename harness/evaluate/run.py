@@ -280,7 +280,6 @@ def _split(numbers: Sequence[int], size: int) -> list[Sequence[int]]:
 
 
 def _folder_name(chunk: Sequence[int]) -> str:
-    """Return the name of a chunk's folder in the working folder."""
     return f"episodes-{chunk[0]:06d}-{chunk[-1]:06d}"
 
 
@@ -305,7 +304,6 @@ def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> N
 
 
 def _label(chunk: Sequence[int]) -> str:
-    """Return a chunk's name for people."""
     whole = chunk == range(chunk[0], chunk[-1] + 1)
     return f"episodes {chunk[0]} to {chunk[-1]}" if whole else f"episodes {', '.join(map(str, chunk))}"
 
@@ -353,7 +351,6 @@ def _walk_chunk(
 
 
 def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "FrozenWorld | LiveWorld":
-    """Return the world of a chunk's episodes under some seeds."""
     if isinstance(spec.source, FrozenSource):
         episodes = spec.source.dataset.of_episodes(frozenset(chunk))
         return FrozenWorld(episodes, spec.points, seeds)

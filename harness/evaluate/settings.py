@@ -295,7 +295,6 @@ class Option(NamedTuple):
 
     @property
     def flag(self) -> str:
-        """Return what is typed."""
         return "--" + self.name.replace("_", "-")
 
     @property
@@ -304,7 +303,6 @@ class Option(NamedTuple):
         return "--no-" + self.name.replace("_", "-")
 
     def of(self, settings: Any) -> Any:
-        """Return the value of settings."""
         for name in self.path:
             settings = getattr(settings, name)
         return settings

@@ -49,14 +49,10 @@ class Source(Protocol):
         ...
 
     @property
-    def scenario(self) -> Scenario:
-        """The scenario of the episodes."""
-        ...
+    def scenario(self) -> Scenario: ...
 
     @property
-    def layout_seeds(self) -> Iterable[int]:
-        """The layout seeds of the episodes that are walked."""
-        ...
+    def layout_seeds(self) -> Iterable[int]: ...
 
     def record(self) -> FrozenScenes | ClosedLoop:
         """Return the world's record in a run's manifest."""
@@ -258,7 +254,6 @@ class Spec:
 
     @property
     def agents(self) -> tuple[Agent, ...]:
-        """The ego's agent, then those of the helpers if they have their own."""
         return self.ego, *self.helpers
 
     @property
@@ -272,12 +267,10 @@ class Spec:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Meta-actions, in the environment's order."""
         return self.source.actions
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario of the episodes."""
         return self.source.scenario
 
     @property

@@ -92,16 +92,13 @@ class SceneWorld:
     scenes: Sequence[Scene]  # the scenes just shown
 
     def site(self, units: Collection[Unit]) -> Site:
-        """Return where the vehicles of each scene and these roadside units are."""
         decision_points = [(scene.state, scene.viewers) for scene in self.scenes]
         return site(decision_points, units, self.scenario.road().zone_m)
 
     def outlook(self) -> Outlook:
-        """Return what the ego of each scene sees."""
         return outlook(self.scenario.road(), self.scenes)
 
     def claims(self) -> Claims:
-        """Return what the helpers of each scene claim about themselves."""
         return claims(self.scenario, self.scenes)
 
 

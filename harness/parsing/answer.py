@@ -32,11 +32,9 @@ class Answer(Struct, frozen=True):
     extension: dict[str, Any] | None = None
 
     def mended(self, repair: Repair) -> "Answer":
-        """Return the answer with one more repair."""
         return replace(self, repairs=self.repairs | {repair})
 
     def without(self, repairs: frozenset[Repair]) -> "Answer":
-        """Return the answer without some repairs, which are not true of it."""
         return replace(self, repairs=self.repairs - repairs)
 
 
@@ -82,7 +80,6 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
 
 
 def _is_other_form(fields: dict[str, Any], shape: Shape) -> bool:
-    """Return whether the answer has another form than the one that was asked for."""
     return bool(shape.form) and ("action_distribution" in fields) == (shape.form != "distribution")
 
 

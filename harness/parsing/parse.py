@@ -59,7 +59,6 @@ class Parsed(Struct, frozen=True):
 
     @property
     def verdict(self) -> Literal["strict", "recovered", "failed"]:
-        """The status in three classes."""
         if self.status is Status.STRICT:
             return "strict"
         return "recovered" if self.status is Status.RECOVERED else "failed"

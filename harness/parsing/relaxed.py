@@ -119,8 +119,6 @@ def read(text: str, at: int) -> Reading:
 
 
 class _Reader:
-    """A recursive-descent parser with one token of look-ahead."""
-
     def __init__(self, text: str, at: int) -> None:
         self.text = text
         self.out = Reading()

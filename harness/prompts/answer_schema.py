@@ -40,7 +40,6 @@ class Shape(NamedTuple):
 
     @property
     def further(self) -> dict[str, Any]:
-        """The schemas of further members by name."""
         return dict(json.loads(self.extension)) if self.extension else {}
 
 

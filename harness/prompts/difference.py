@@ -138,7 +138,6 @@ def sent(
 
 
 def _parts(messages: Sequence[Mapping[str, str]]) -> dict[str, str]:
-    """Split a chat into the system message, the examples' turns as one text, and the user's message."""
     system, *turns, user = (message["content"] for message in messages)
     return {"system": system, "examples": "\n".join(turns), "user": user}
 

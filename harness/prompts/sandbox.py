@@ -109,7 +109,6 @@ class Code(templates.Code):
 
 
 def _is_path(node: nodes.Node) -> bool:
-    """Return whether an expression is a name or a member of one."""
     return isinstance(node, nodes.Name) or (isinstance(node, nodes.Getattr) and _is_path(node.node))
 
 
@@ -125,7 +124,6 @@ def _is_given(node: nodes.Node, chain: int = LONGEST_CHAIN) -> bool:
 
 
 def _keeps_small(node: nodes.Filter) -> bool:
-    """Return whether a filter makes a value not much larger."""
     name = node.name.removeprefix(templates.FREE)
     if node.kwargs or node.dyn_args or node.dyn_kwargs:
         return False
@@ -210,7 +208,6 @@ class Sandbox(templates.Sandbox):
         return number or super().is_small(node) or (self._binds_nothing and _is_given(node))
 
     def whole(self, value: Any) -> Any:
-        """Return what `value | round | int` is."""
         return self.filters["int"](self.filters["round"](value))
 
     def call_binop(self, context: Context | None, operator: str, left: Any, right: Any) -> Any:
@@ -222,11 +219,9 @@ class Sandbox(templates.Sandbox):
         return super().call_binop(context, operator, left, right)
 
     def is_safe_attribute(self, obj: Any, attr: str, value: Any) -> bool:
-        """Refuse the methods of strings that pad."""
         return not (isinstance(obj, str) and attr in PADDING) and super().is_safe_attribute(obj, attr, value)
 
     def getattr(self, obj: Any, attribute: str) -> Any:
-        """Return a member of a mapping, or whatever else the sandbox allows."""
         # Nearly all that a template reads is plain data, which needs no check of the sandbox.
         if type(obj) is dict and attribute in obj:
             return obj[attribute]

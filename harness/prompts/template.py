@@ -98,7 +98,6 @@ def _paths(block: nodes.Block) -> tuple[Path, ...] | None:
 
 
 def _path(node: nodes.Node) -> Path:
-    """Return the name and the members of an expression such as `graph.ego.id`; empty for any other."""
     if isinstance(node, nodes.Name):
         return (node.name,)
     if isinstance(node, nodes.Getattr) and (before := _path(node.node)):

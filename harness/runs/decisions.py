@@ -172,7 +172,6 @@ class Decisions:
         return ranges
 
     def records(self, start: int, stop: int) -> list[Decision]:
-        """Return some rows as records."""
         return [self._record(self._row(index)) for index in range(start, stop)]
 
     def _row(self, index: int) -> Mapping[str, Any]:
@@ -198,12 +197,10 @@ class Decisions:
         return next((name for name in numbers if pc.any(pc.is_inf(self.table[name])).as_py()), None)
 
     def take(self, which: Any) -> "Decisions":
-        """Return some of the decisions, by their indices."""
         places = _of_buffer(np.asarray(which, dtype=np.int64), None, WHOLE)
         return Decisions(self.table.take(places), self.actions, self.helpers)
 
     def replace(self, **columns: Any) -> "Decisions":
-        """Return the decisions with other arrays (n,) in some columns."""
         table = self.table
         for name, values in columns.items():
             index = table.schema.get_field_index(name)
@@ -211,7 +208,6 @@ class Decisions:
         return Decisions(table, self.actions, self.helpers)
 
     def rounded(self) -> "Decisions":
-        """Return the decisions rounded to `DECIMALS`."""
         decimals = {
             column: digits
             for name, digits in DECIMALS.items()
@@ -226,7 +222,6 @@ class Decisions:
             self._write(part)
 
     def encoded(self) -> bytes:
-        """Return the bytes that `write` writes."""
         data = BytesIO()
         self._write(data)
         return data.getvalue()

@@ -81,12 +81,10 @@ class Run:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The meta-actions, in the order of every distribution."""
         return self.manifest.actions
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """The conditions' names, in the run's order."""
         return tuple(str(condition["name"]) for condition in self.manifest.conditions)
 
     @property
@@ -101,7 +99,6 @@ class Run:
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:
-        """The rows of `summary.csv`."""
         return self._read("summary.csv", self._scores)
 
     @property
@@ -111,7 +108,6 @@ class Run:
 
     @property
     def grid(self) -> Grid:
-        """The conditions, seeds and episodes of the run."""
         return self._placed[0]
 
     @cached_property
@@ -125,7 +121,6 @@ class Run:
 
     @cached_property
     def answers(self) -> Answers:
-        """The lines of `answers.jsonl`."""
         return self._read("answers.jsonl", lambda file: Answers(bytes_of(file, "rows"), len(self.actions)))
 
     @cached_property
@@ -135,11 +130,9 @@ class Run:
 
     @cached_property
     def answers_by_scene(self) -> Mapping[str, list[Answer]]:
-        """The answers of each decision point, in the order of the file."""
         return self.answers.by_scene
 
     def episodes_of(self, layout: int) -> list[Episode]:
-        """Return the episodes in a layout, by condition and seed."""
         number, layouts = self._places[layout], len(self.grid.episodes)
         return list(self.episodes[number::layouts])
 
@@ -424,7 +417,6 @@ def _sha256_of(path: Path) -> str | None:
 
 
 def _holds(path: Path) -> bool:
-    """Return whether there is a dataset in a folder."""
     try:
         return (path / "manifest.json").is_file()
     except (OSError, ValueError):  # a name that no file can have

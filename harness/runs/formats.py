@@ -131,7 +131,6 @@ def identity(stated: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _with(added: Mapping[str, Added], stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is stated, then what it lacks."""
     return {**stated, **{name: entry.absent for name, entry in added.items() if name not in stated}}
 
 

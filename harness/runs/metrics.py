@@ -316,7 +316,6 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """The numbers of conditions, seeds and episodes, (C, S, E)."""
         return len(self.conditions), len(self.seeds), len(self.episodes)
 
     def places(self, decisions: Decisions) -> Ints:

@@ -85,12 +85,10 @@ class Answer(Struct, frozen=True, kw_only=True):
 
     @property
     def first_status(self) -> str | None:
-        """How the first turn was parsed; None without a repair turn."""
         return self.first.status if self.first else None
 
     @property
     def first_raw(self) -> str | None:
-        """The text of the first turn; None without a repair turn."""
         return self.first.raw if self.first else None
 
     def cell(self, column: str) -> Any:
@@ -292,7 +290,6 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
 
     @property
     def estimate(self) -> Estimate:
-        """The line as an estimate; NaN for None."""
         value, low, high = (float("nan") if x is None else x for x in (self.value, self.low, self.high))
         return Estimate(value, low, high, self.n, self.n_excluded)
 
@@ -413,7 +410,6 @@ class Manifest(Struct, frozen=True, kw_only=True):
 
     @property
     def variant(self) -> Variant:
-        """The agents of the run, in words."""
         helpers = [(h["model"]["name"], h["prompt"]["version"], h["answer"]) for h in self.helpers]
         return Variant(
             self.model["name"], self.prompt["version"], self.answer, " + ".join(map(" · ".join, helpers))

@@ -54,12 +54,10 @@ class SuiteRun:
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """The conditions' names."""
         return next(iter(self.runs.values())).conditions
 
     @property
     def source(self) -> str:
-        """The suite's name, in words for people."""
         return f"suite {self.name}"
 
     @property

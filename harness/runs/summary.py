@@ -79,7 +79,6 @@ class Figures:
         )
 
     def scores(self) -> list[Score]:
-        """Return every score."""
         values = {
             name: v for name, v in self.values.items() if not (entry(name).optional and np.isnan(v).all())
         }

@@ -36,7 +36,6 @@ class Tally:
         self.add(answers)
 
     def add(self, answers: Iterable[Answer | AnswerFacts]) -> None:
-        """Count further questions."""
         for answer in answers:
             self.asked[answer.role] += 1
             if answer.error is not None:
