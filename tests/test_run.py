@@ -36,8 +36,8 @@ from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.core.errors import Unanswered, UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import read_kept
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.kept_answers import read_kept
 from harness.evaluate.run import evaluate
 from harness.evaluate.settings import words
 from harness.evaluate.spec import Spec

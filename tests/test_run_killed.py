@@ -20,7 +20,7 @@ from harness.core.errors import UserError
 from harness.core.files import alone
 from harness.core.formats import CONFIG
 from harness.dataset.load import Dataset
-from harness.evaluate.asking import MORE_FOLLOWS, read_kept
+from harness.evaluate.kept_answers import MORE_FOLLOWS, read_kept
 from harness.evaluate.latency import PAPER
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec

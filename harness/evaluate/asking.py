@@ -1,9 +1,7 @@
 """Ask the agents: one answer for each viewer at each decision point, kept so that a run can resume."""
 
 import math
-import os
-import time
-from collections.abc import Callable, Collection, Container, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cache, partial
 from itertools import compress, repeat
@@ -19,11 +17,12 @@ from harness.backends.base import Backend, Completion, Request, Role, Served, se
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Bools, Ints
-from harness.core.errors import Unanswered, UserError, printable
-from harness.core.files import bytes_of, canonical_bytes, digest
+from harness.core.errors import Unanswered
+from harness.core.files import canonical_bytes, digest
 from harness.dataset.load import Scene
 from harness.evaluate import flip, repair, servers
 from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of
+from harness.evaluate.kept_answers import KeptAnswers
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
 from harness.evaluate.spec import Spec
@@ -38,10 +37,8 @@ T = TypeVar("T")
 CHUNK = 64  # fewest requests that are asked, and kept, together
 FIRST = 8  # fewest questions that a server is asked before it has answered any
 IN_A_ROW = CHUNK  # questions without an answer, one after the other, after which nothing more is asked
-MORE_FOLLOWS = b" \n"  # ends every kept line but the last of its chunk, so that a torn chunk can be told
 EGO = (0,)
 Places = Sequence[Collection[int]]  # of the viewers of each scene, the ego at 0
-SYNC_S = 1.0  # kept answers reach the disk this often; if power fails, those since are asked again
 
 
 def requests(
@@ -168,20 +165,16 @@ class Asker:
             spec: the evaluation.
             backend: opens the backend, at the first request.
             latency: how long inference takes.
-            kept: JSON Lines file of the answers so far; its last chunk may be torn if a run was killed. Only
-                one process at a time may ask.
+            kept: file of the answers so far (`KeptAnswers`); None keeps none.
             answers: further answers that need not be asked for, by request id.
             progress: called with the number of new answers, those kept by a stopped run included.
             more: called with the number of requests before they are made.
         """
-        self.spec, self._backend, self._kept = spec, backend, kept
+        self.spec, self._backend, self.latency = spec, backend, latency
+        self._kept = KeptAnswers(kept) if kept else None
         self._progress, self._more = progress, more
-        self.latency, self._on_disk_s = latency, -math.inf
         self._given, self.served = frozenset(answers or {}), list[Served]()
-        self.answers: dict[str, Answer] = {}
-        self._read_b = 0  # bytes of the file whose answers are among these
-        self._recall()
-        self.answers |= answers or {}
+        self.answers = {**(self._kept.recall() if self._kept else {}), **(answers or {})}
         self.tally, self._in_a_row = Tally(), 0
 
     def ask(self, asked: Sequence[Request]) -> None:
@@ -191,7 +184,8 @@ class Asker:
             Unanswered: a question of the ego or a fusion call got no answer, and all others of these were
                 asked; or none of the first questions was answered, or none of the last `IN_A_ROW`.
         """
-        self._recall(cut=True)  # another process may have asked, too
+        if self._kept:  # another process may have asked, too
+            self.answers = self._kept.recall(cut=True) | self.answers
         missing = [request for request in asked if request.id not in self.answers]
         if len(missing) < len(asked):
             self._progress(len(asked) - len(missing))
@@ -240,7 +234,7 @@ class Asker:
         """
         answered = [answer for answer in answers if answer.error is None]
         if self._kept and answered and (single or len(answered) == len(answers)):
-            self._read_b += _keep(self._kept, answered, self._to_disk())
+            self._kept.append(answered)
         refused_so_far = self._refused_so_far()
         self.tally.add(answers)
         self._in_a_row = 0 if answered else self._in_a_row + len(answers)
@@ -250,7 +244,7 @@ class Asker:
 
     def _keep_servers(self, these: Sequence[Served]) -> None:
         if self._kept:
-            servers.keep(self._kept.parent, these)
+            servers.keep(self._kept.file.parent, these)
         else:
             self.served += these
 
@@ -260,20 +254,6 @@ class Asker:
 
     def _refused_so_far(self) -> bool:
         return self.tally.asked == self.tally.unanswered
-
-    def _recall(self, cut: bool = False) -> None:
-        """Read what the file has that is not known yet; with `cut`, a torn chunk is cut from it."""
-        if self._kept and self._kept.is_file() and (size_b := self._kept.stat().st_size) != self._read_b:
-            whole = _whole(bytes_of(self._kept, "rows"))
-            self.answers, self._read_b = _answers_in(self._kept, whole) | self.answers, len(whole)
-            if cut and self._read_b < size_b:
-                os.truncate(self._kept, self._read_b)
-
-    def _to_disk(self) -> bool:
-        due = time.monotonic() - self._on_disk_s >= SYNC_S
-        if due:
-            self._on_disk_s = time.monotonic()
-        return due
 
     def _answered(self, backend: Backend, chunk: Sequence[Request]) -> dict[str, Answer]:
         """Answer each request, and ask what its answer calls for: a repair turn, or the reversed list."""
@@ -441,44 +421,3 @@ def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
     numbers = f'{{"from":,"intent":{intent},"says":,"xy_m":[{xy_m[0]:.1f},{xy_m[1]:.1f}]}}'
     texts = canonical_bytes([answer.viewer, answer.message])
     return 8 * (len(numbers) + len(texts) - len("[,]"))
-
-
-def read_kept(kept: Path) -> dict[str, Answer]:
-    """Read the answers kept so far, by request id.
-
-    Those of a torn chunk do not count, nor does a question without an answer, wherever the file comes from.
-    """
-    return _answers_in(kept, _whole(bytes_of(kept, "rows"))) if kept.is_file() else {}
-
-
-def _answers_in(kept: Path, lines: bytes) -> dict[str, Answer]:
-    try:
-        answers = [_DECODER.decode(line) for line in lines.splitlines()]
-    except (ValueError, RecursionError) as error:
-        raise UserError(
-            f"{printable(kept)} is damaged ({printable(error)}); delete its folder and start again"
-        ) from None
-    return {answer.id: answer for answer in answers if answer.error is None}
-
-
-def _whole(data: bytes) -> bytes:
-    """Return the chunks of a file that were kept to their ends."""
-    lines = data.splitlines(keepends=True)
-    while lines and (lines[-1].endswith(MORE_FOLLOWS) or not lines[-1].endswith(b"\n")):
-        lines.pop()
-    return b"".join(lines)
-
-
-_DECODER, _ENCODER = msgspec.json.Decoder(Answer), msgspec.json.Encoder()
-
-
-def _keep(kept: Path, answers: Iterable[Answer], to_disk: bool) -> int:
-    """Append a chunk of answers to a file, and return its bytes; with `to_disk`, once it is on the disk."""
-    lines = _ENCODER.encode_lines(answers)
-    chunk = lines[:-1].replace(b"\n", MORE_FOLLOWS) + lines[-1:]
-    with kept.open("ab") as file:
-        file.write(chunk)
-        file.flush()
-        if to_disk:
-            os.fsync(file.fileno())
-    return len(chunk)

@@ -28,8 +28,9 @@ from harness.dataset.load import Scene
 from harness.dataset.select import drawn
 from harness.evaluate import device, servers, timing
 from harness.evaluate import latency as latencies
-from harness.evaluate.asking import Asker, read_kept
+from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.kept_answers import read_kept
 from harness.evaluate.lifecycle import (
     Evaluated,
     RunStart,
@@ -215,8 +216,7 @@ def _frozen(
     chunks = _split(dataset.episodes, TREES_AT_ONCE)
     with work.working(out, begun, "run.json") as place:
         backend = together(spec.cards, models, cache)
-        todo = [chunk for chunk in chunks if not (place / _folder_name(chunk)).is_dir()]
-        in_workers = len(todo) > 1 and workers != 1 and _reproducible(spec) and not given
+        in_workers = len(chunks) > 1 and workers != 1 and _reproducible(spec) and not given
 
         def walk_here(chunk: Sequence[int]) -> dict[str, bytes]:
             before = read_kept(_answered_file(place, chunk))
@@ -234,18 +234,11 @@ def _frozen(
             more(n_answers)
             progress(n_answers)
 
-        def keep(index: int, files: dict[str, bytes]) -> None:
-            folder.write_part(place / _folder_name(todo[index]), files)
-            for kept in (*place.glob("answers*.jsonl"), _answered_file(place, todo[index])):
-                kept.unlink(missing_ok=True)
-            if in_workers:
-                report_kept(todo[index])
-
-        for chunk in chunks:
-            if chunk not in todo:
-                report_kept(chunk)
-        walk_chunk = partial(_walk_chunk, spec, begun, None, None) if in_workers else walk_here
-        each(walk_chunk, todo, workers if in_workers else 1, keep, _label)
+        if in_workers:
+            walk_chunk = partial(_walk_chunk, spec, begun, None, None)
+            _walk_missing(chunks, place, walk_chunk, report_kept, report_kept, workers)
+        else:
+            _walk_missing(chunks, place, walk_here, report_kept, lambda chunk: None)
         return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
 
@@ -312,20 +305,36 @@ def _drive(
     spec: Spec, begun: RunStart, chunks: Sequence[Sequence[int]], place: Path,
     progress: Callable[[int], None], cache: Path | None, workers: Workers,
 ) -> None:  # fmt: skip
-    """Drive the chunks that are not kept yet, and keep each as soon as it is done."""
-    todo = [chunk for chunk in chunks if not (place / _folder_name(chunk)).is_dir()]
-    progress(sum(map(len, chunks)) - sum(map(len, todo)))
 
-    def keep(index: int, files: dict[str, bytes]) -> None:
-        servers.keep(place, files.pop(servers.FILE, b""))
-        folder.write_part(place / _folder_name(todo[index]), files)
-        _answered_file(place, todo[index]).unlink(missing_ok=True)
-        progress(len(todo[index]))
+    def report(chunk: Sequence[int]) -> None:
+        progress(len(chunk))
 
     # These are files of this machine, which the nodes of a cluster cannot share.
     files = (cache, None if _reproducible(spec) else place) if isinstance(workers, int) else (None, None)
     walk_chunk = partial(_walk_chunk, spec, begun, *files)
-    each(walk_chunk, todo, workers, keep, _label, _reproducible(spec))
+    _walk_missing(chunks, place, walk_chunk, report, report, workers, _reproducible(spec))
+
+
+def _walk_missing(
+    chunks: Sequence[Sequence[int]], place: Path, walk_chunk: Callable[[Sequence[int]], dict[str, bytes]],
+    report_kept: Callable[[Sequence[int]], None], report_new: Callable[[Sequence[int]], None],
+    workers: Workers = 1, exact: bool = True,
+) -> None:  # fmt: skip
+    """Walk the chunks that are not kept yet, and keep each as soon as it is done."""
+    todo = [chunk for chunk in chunks if not (place / _folder_name(chunk)).is_dir()]
+    for chunk in chunks:
+        if chunk not in todo:
+            report_kept(chunk)
+
+    def keep(index: int, files: dict[str, bytes]) -> None:
+        chunk = todo[index]
+        servers.keep(place, files.pop(servers.FILE, b""))
+        folder.write_part(place / _folder_name(chunk), files)
+        for kept in (*place.glob("answers*.jsonl"), _answered_file(place, chunk)):
+            kept.unlink(missing_ok=True)
+        report_new(chunk)
+
+    each(walk_chunk, todo, workers, keep, _label, exact)
 
 
 def _reproducible(spec: Spec) -> bool:

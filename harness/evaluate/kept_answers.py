@@ -1,0 +1,64 @@
+"""Keep the answers of unfinished work in a file of chunks, so that a killed run resumes where it was."""
+
+import math
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from harness.core.errors import UserError, printable
+from harness.core.files import bytes_of
+from harness.runs.records import Answer
+
+MORE_FOLLOWS = b" \n"  # ends every line but the last of its chunk, so that a torn chunk can be told
+SYNC_S = 1.0  # answers reach the disk this often; if power fails, those since are asked again
+_DECODER, _ENCODER = msgspec.json.Decoder(Answer), msgspec.json.Encoder()
+
+
+class KeptAnswers:
+    """A file of answers, one a line, whose last chunk may be torn; one process at a time may append."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self._read_b, self._on_disk_s = 0, -math.inf  # bytes that were read or written here
+
+    def recall(self, cut: bool = False) -> dict[str, Answer]:
+        """Read the answers by request id; none if the file has nothing new. `cut` removes a torn chunk.
+
+        A question without an answer does not count, wherever the file comes from. Raises UserError if the
+        file is damaged.
+        """
+        if not self.file.is_file() or (size_b := self.file.stat().st_size) == self._read_b:
+            return {}
+        lines = bytes_of(self.file, "rows").splitlines(keepends=True)
+        while lines and (lines[-1].endswith(MORE_FOLLOWS) or not lines[-1].endswith(b"\n")):
+            lines.pop()
+        try:
+            answers = [_DECODER.decode(line) for line in lines]
+        except (ValueError, RecursionError) as error:
+            raise UserError(
+                f"{printable(self.file)} is damaged ({printable(error)}); delete its folder and start again"
+            ) from None
+        self._read_b = sum(map(len, lines))
+        if cut and self._read_b < size_b:
+            os.truncate(self.file, self._read_b)
+        return {answer.id: answer for answer in answers if answer.error is None}
+
+    def append(self, answers: Sequence[Answer]) -> None:
+        """Append a chunk of answers."""
+        lines = _ENCODER.encode_lines(answers)
+        chunk = lines[:-1].replace(b"\n", MORE_FOLLOWS) + lines[-1:]
+        with self.file.open("ab") as file:
+            file.write(chunk)
+            file.flush()
+            if time.monotonic() - self._on_disk_s >= SYNC_S:
+                os.fsync(file.fileno())
+                self._on_disk_s = time.monotonic()
+        self._read_b += len(chunk)
+
+
+def read_kept(file: Path) -> dict[str, Answer]:
+    """Read the answers of a file by request id, as `KeptAnswers.recall` does."""
+    return KeptAnswers(file).recall()
