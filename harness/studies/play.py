@@ -28,9 +28,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NAMES = ("source", "panel", "condition", "variable")
-EPISODE_METRICS = (
-    "success_rate", "trigger_rate", "latency_proxy_ms", "messages_per_episode", "effective_loss",
-)  # fmt: skip
+EPISODE_COLUMNS = {
+    "success": "success_rate", "trigger_rate": "trigger_rate", "latency_ms": "latency_proxy_ms",
+    "messages": "messages_per_episode", "effective_loss": "effective_loss",
+}  # fmt: skip
 ENDS = ("success_rate", "unsafe_rate", "late_rate")
 PER_DECISION = (
     "latency_proxy_ms", "deadline_miss_rate", "trigger_rate", "messages_per_episode", "effective_loss",
@@ -132,8 +133,7 @@ def play(
     """
     import pandas as pd
 
-    rows: list[dict[str, Any]] = []
-    episodes: list[dict[str, Floats]] = []
+    rows, episodes = list[dict[str, Any]](), list[pd.DataFrame]()
     for setting, walks in zip(settings, source.walked(settings, seeds), strict=True):
         parts = [_part(walk, len(seeds)) for walk in walks]
         metrics = {name: np.hstack([part.metrics[name] for part in parts]) for name in parts[0].metrics}
@@ -148,11 +148,14 @@ def play(
             for metric, e, interval in _estimates(source, metrics, latency_ms)
         ]  # fmt: skip
         numbers = np.concatenate([part.episodes for part in parts])
-        episodes.append({name: metrics[name].ravel() for name in EPISODE_METRICS} | {
-            "seed": np.repeat(seeds, len(numbers)), "episode": np.tile(numbers, len(seeds)),
+        table = pd.DataFrame({
+            **first, "seed": np.repeat(seeds, len(numbers)), "episode": np.tile(numbers, len(seeds)),
+            **{name: metrics[metric].ravel() for name, metric in EPISODE_COLUMNS.items()}, **place,
         })  # fmt: skip
+        episodes.append(table[table.success.notna()].astype({"success": bool, "messages": int}))
         progress(1)
-    return PanelResult(pd.DataFrame(rows), _episode_table(source.name, panel, settings, episodes))
+    whole = pd.concat(episodes, ignore_index=True).round({"latency_ms": 3, "effective_loss": 6})
+    return PanelResult(pd.DataFrame(rows), whole)
 
 
 class _Part(NamedTuple):
@@ -202,34 +205,6 @@ def over_own_episodes(name: str, values: Floats) -> Estimate:
     least = float(stdtrit(estimate.n - 1, 0.975)) * 0.5 / values.shape[1] / math.sqrt(estimate.n)
     half = float(np.fmax(estimate.high - estimate.value, least))  # no interval where all agree
     return in_range(name, replace(estimate, low=estimate.value - half, high=estimate.value + half))
-
-
-def _episode_table(
-    source: str, panel: str, settings: Sequence[Setting], values: Sequence[Mapping[str, Floats]]
-) -> "pd.DataFrame":
-    """Return a panel's episodes, from `EPISODE_METRICS`, `seed` and `episode` of each grid point, (n,)."""
-    import pandas as pd
-
-    column = {name: np.concatenate([of[name] for of in values]) for name in values[0]}
-    point = np.repeat(np.arange(len(settings)), [len(of["seed"]) for of in values])
-    whole = ~np.isnan(column["success_rate"])  # those that were not left out
-    column, point = {name: values[whole] for name, values in column.items()}, point[whole]
-    places = [{"source": source, "panel": panel, **setting.place} for setting in settings]
-    worded = any(isinstance(place["value"], str) for place in places)
-    values_of = np.array([place.pop("value") for place in places], dtype=object if worded else float)[point]
-    named = {name: pd.Categorical([place[name] for place in places]).take(point) for name in places[0]}
-    return pd.DataFrame({
-        **{name: named.pop(name) for name in NAMES},
-        "value": values_of,
-        "seed": column["seed"],
-        "episode": column["episode"].astype(int),
-        "success": column["success_rate"].astype(bool),
-        "trigger_rate": column["trigger_rate"],
-        "latency_ms": column["latency_proxy_ms"].round(3),
-        "messages": column["messages_per_episode"].astype(int),
-        "effective_loss": column["effective_loss"].round(6),
-        **named,
-    })  # fmt: skip
 
 
 def joined(parts: Sequence[PanelResult]) -> PanelResult:
