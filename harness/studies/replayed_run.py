@@ -124,8 +124,6 @@ class ReplayedRun:
         self.left_out: set[str] = set()
         self._announced, self._left = False, 0  # questions that are asked next
         self._opened: dict[int, Backend] = {}
-        self._intents: Intents | None = None  # at every decision point that was asked for
-        self._row: dict[str, int] = {}  # of each of them, by id
         missing = tally(self.run).missing  # a lost message is a part of the run; what it lacks is asked again
         answers = {a.id: a for a in self.run.answers if a.error is None or a.role not in missing}
         self._asker = Asker(
@@ -269,36 +267,17 @@ class ReplayedRun:
                 f"leave it out{remedy}"
             )
         with self._writing():
-            there = self._asker.helpers(scenes, wanted, blind)
-        if not blind:
-            self._lay_out(asked)
-        return there
+            return self._asker.helpers(scenes, wanted, blind)
 
     def intents(self, scenes: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
         """Return what vehicles intend; unless the model is asked, walks without an answer are left out."""
-        new = [scene for scene in scenes if scene.id not in self._row]
-        if any(self._asker.lacks(new, places=[EGO] * len(new))):
+        lacks = self._asker.lacks(scenes, places=[EGO] * len(scenes))
+        if any(lacks):
             if self._asks:
                 return self(scenes)
-            lacks = self._asker.lacks(scenes, places=[EGO] * len(scenes))
             self.left_out |= {scene.id for scene, lacking in zip(scenes, lacks, strict=True) if lacking}
             leave_out(np.array(lacks))
-            return self._asker.laid_out(scenes)
-        if new:
-            self._lay_out(new)
-        return self._there(scenes, max(len(scene.viewers) for scene in scenes) - 1)
-
-    def _lay_out(self, scenes: Sequence[Scene]) -> None:
-        """Keep the intents in these scenes as arrays."""
-        more = self._asker.laid_out(scenes, width=self.vehicles)
-        before = 0 if self._intents is None else len(self._intents.own)
-        self._intents = Intents.joined([self._intents, more]) if self._intents else more
-        self._row |= {scene.id: before + n for n, scene in enumerate(scenes)}
-
-    def _there(self, scenes: Sequence[Scene], helpers: int) -> Intents:
-        """Return the intents in scenes that were laid out."""
-        assert self._intents is not None
-        return self._intents.take([self._row[scene.id] for scene in scenes]).of_first(helpers)
+        return self._asker.laid_out(scenes)
 
     def blind(self, scenes: Sequence[Scene], at: Ints) -> Intents:
         """Return the same where helpers are shown nothing, as far as the run has answers or asks them all."""
