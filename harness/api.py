@@ -283,7 +283,7 @@ def sweep(
 
     path = run.path if isinstance(run, Run) else Path(run)
     with bar("grid points", quiet=quiet, grows=True) as progress:
-        replayed = ReplayedRun(path, more=progress.more, done=progress, say=progress.say)
+        replayed = ReplayedRun(path, progress=progress)
         panels = panels_over([replayed], _several(over), _several(grid), _several(condition))
         progress.more(sum(map(len, panels.values())))
         folder = folder_of(path, panels) if out is None else Path(out)

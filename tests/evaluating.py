@@ -1,7 +1,7 @@
 """Evaluations as tests make them: the real parts, or the real parts around answers from a script."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -12,6 +12,7 @@ import msgspec
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.core.progress import Progress
 from harness.core.work import tidy
 from harness.dataset.load import Dataset, Scene, Trees
 from harness.dataset.schema import Branching, Edge, End
@@ -154,6 +155,25 @@ def walked(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path 
     return Walked(
         parts, made, episodes, answers, Figures.of("frozen", grid, made, episodes, answers).scores()
     )
+
+
+class Watched(Progress):
+    """Notes what it is told, and calls `then` for what is done."""
+
+    def __init__(self, then: Callable[[int], object] = lambda done: None) -> None:
+        self.then = then
+        self.done, self.asked, self.events = list[int](), list[int](), list[str]()
+
+    def __call__(self, done: int) -> None:
+        self.done.append(done)
+        self.then(done)
+
+    def more(self, count: int) -> None:
+        self.asked.append(count)
+        self.events.append(str(count))
+
+    def say(self, text: str) -> None:
+        self.events.append(text)
 
 
 class Scripted:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evaluating import Watched
 
 from harness.backends import cards
 from harness.backends.base import Backend, Request
@@ -130,17 +131,17 @@ def test_a_study_of_a_run_that_asked_few_is_that_of_one_that_asked_all(tmp_path:
     for ask in ("all", "used"):
         evaluate(spec(frozen(4), ask, ("single-local",)), tmp_path / ask, lambda done: None)
     shutil.copytree(tmp_path / "used", tmp_path / "alone")
-    owed: dict[str, list[int]] = {"all": [], "used": []}
+    watched = {"all": Watched(), "used": Watched()}
     by_run = [
-        [one for [one] in ReplayedRun(tmp_path / ask, more=asked.append).walked(STUDIED, (0, 1))]
-        for ask, asked in owed.items()
+        [one for [one] in ReplayedRun(tmp_path / ask, progress=each).walked(STUDIED, (0, 1))]
+        for ask, each in watched.items()
     ]
     for one, other in zip(*by_run, strict=True):
         for of in ("ends", "columns"):
             assert getattr(one, of).keys() == getattr(other, of).keys()
             for name, values in getattr(one, of).items():
                 np.testing.assert_array_equal(values, getattr(other, of)[name])
-    assert sum(owed["used"]) > sum(owed["all"]) > 0
+    assert sum(watched["used"].asked) > sum(watched["all"].asked) > 0
     with pytest.raises(UserError, match=r"--no-model: .* did not ask; leave it out, .* --ask all$") as told:
         list(ReplayedRun(tmp_path / "alone", asks=False).walked(STUDIED, (0, 1)))
     assert "\n" not in str(told.value)
@@ -155,10 +156,7 @@ def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
     evaluate(spec(frozen(8), "all", ("single-local",)), out, lambda done: None)
     monkeypatch.setattr(replayed_run, "open_backend", None)  # nothing opens a model
     source = ReplayedRun(out, asks=False)
-    bench = run_bench(
-        source, "6g", ("linear",), ("liar",), (1 / 3,), (0, 1), tmp_path / "trust",
-        lambda done: None, lambda owed: None,
-    )  # fmt: skip
+    bench = run_bench(source, "6g", ("linear",), ("liar",), (1 / 3,), (0, 1), tmp_path / "trust", Watched())
     left = np.isnan(bench.at("linear", "liar", 1 / 3).success)
     assert 0 < left.sum() < left.size
     assert np.array_equal(left, np.isnan(bench.at("linear", "liar", 1 / 3).nats))
@@ -171,13 +169,9 @@ def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
 def test_how_much_is_asked_is_said_once_and_first(ask: str, tmp_path: Path) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     evaluate(spec(frozen(2), ask, ("single-local",), "swarm-tiny"), tmp_path / "run", lambda done: None)
-    told: list[str] = []
-    list(
-        ReplayedRun(tmp_path / "run", more=lambda n: told.append(str(n)), say=told.append).walked(
-            STUDIED[:1], (0,)
-        )
-    )
-    owed, text, *others = told
+    watched = Watched()
+    list(ReplayedRun(tmp_path / "run", progress=watched).walked(STUDIED[:1], (0,)))
+    owed, text, *others = watched.events
     questions = "1 question" if owed == "1" else f"{owed} questions"
     assert f"is asked {questions} now that the run did not ask (about " in text
     assert ("it lacks" in text) == (ask == "used")

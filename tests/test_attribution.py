@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluating import decisions, run, says, spec_of
+from evaluating import Watched, decisions, run, says, spec_of
 from msgspec import structs
 from reading import unpacked
 from run_on_disk import answers_of
@@ -191,12 +191,16 @@ def test_helpers_that_were_never_asked_are_asked_first(made: Callable[..., Path]
     point = named_point("v2x:max_helpers=1")
     everybody = attribute(ReplayedRun(made(point)), point.name, 12, 0)
     path = made(point, ask="used")
-    told: list[str] = []
-    assert attribute(ReplayedRun(path, say=told.append), point.name, 12, 0) == everybody
+    watched = Watched()
+    assert attribute(ReplayedRun(path, progress=watched), point.name, 12, 0) == everybody
     missing = [name for name in judging.asked if "~without" not in name]
     assert missing
     assert {answer.id for answer in folder.read(path).answers}.isdisjoint(missing)
-    assert [f"is asked {len(judging.asked)} questions now" in text for text in told] == [True]
+    assert [
+        f"is asked {len(judging.asked)} questions now" in text
+        for text in watched.events
+        if not text.isdigit()
+    ] == [True]
 
 
 @pytest.mark.slow
@@ -259,7 +263,7 @@ def test_a_killed_one_goes_on_and_asks_nothing_twice(made: Callable[..., Path], 
 
     path = made()
     with pytest.raises(Killed):
-        attribute(ReplayedRun(path, done=die), SIXG.name, 30, 0)
+        attribute(ReplayedRun(path, progress=Watched(die)), SIXG.name, 30, 0)
     before = list(judging.asked)
     assert len(before) == 64
     found = attribute(ReplayedRun(path), SIXG.name, 30, 0)

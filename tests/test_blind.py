@@ -10,6 +10,7 @@ import pytest
 from evaluating import (
     Scripted,
     Walked,
+    Watched,
     course,
     decisions,
     live_spec_of,
@@ -178,15 +179,15 @@ def test_a_sweep_has_them_asks_for_them_or_says_that_it_lacks_them(
     blind = [Setting(point.name, point, 4)]
     with pytest.raises(UserError, match="lacks answers of helpers that are shown nothing, which messages=bl"):
         list(ReplayedRun(less, asks=False).walked(blind, (0, 1)))
-    asked: list[int] = []
-    [[more]] = ReplayedRun(less, more=asked.append).walked(blind, (0, 1))
-    assert sum(asked) > 0
+    watched = Watched()
+    [[more]] = ReplayedRun(less, progress=watched).walked(blind, (0, 1))
+    assert sum(watched.asked) > 0
     copied = Path(shutil.copytree(done.out, tmp_path / "run"))
     [[stored]] = ReplayedRun(copied, asks=False).walked(blind, (0, 1))
     assert np.array_equal(stored.ends["success_rate"], more.ends["success_rate"])
-    asked.clear()
-    list(ReplayedRun(less, more=asked.append).walked(blind, (0, 1)))
-    assert asked == []
+    again = Watched()
+    list(ReplayedRun(less, progress=again).walked(blind, (0, 1)))
+    assert again.asked == []
 
 
 class Counting(Perceiving):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from evaluating import (
     Scripted,
+    Watched,
     all_scenes,
     asker_of,
     course,
@@ -327,27 +328,26 @@ def test_a_resumed_run_has_the_times_that_it_began_with(
 
 def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(done: Evaluated, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
-    asked: list[int] = []
-    source = ReplayedRun(folder, more=asked.append)
+    watched = Watched()
+    source = ReplayedRun(folder, progress=watched)
     [[same]] = source.walked([Setting("6g", FUSION, 4)], source.seeds)
-    assert asked == [], "the run's own seeds delivered nothing else"
+    assert watched.asked == [], "the run's own seeds delivered nothing else"
     assert same.ends["success_rate"].mean() == pytest.approx(figure(done, FUSION.name, "success_rate").value)
     [[fewer]] = source.walked([Setting("6g", FUSION, 2)], source.seeds)
-    assert sum(asked) > 0
-    again: list[int] = []
-    source = ReplayedRun(folder, more=again.append)
+    assert sum(watched.asked) > 0
+    again = Watched()
+    source = ReplayedRun(folder, progress=again)
     for vehicles, before in ((4, same), (2, fewer)):
         [[now]] = source.walked([Setting("6g", FUSION, vehicles)], source.seeds)
         assert np.array_equal(now.columns["latency_ms"], before.columns["latency_ms"])
-    assert again == []
+    assert again.asked == []
 
 
 @pytest.mark.slow
 def test_what_another_process_has_asked_meanwhile_is_not_asked_again(done: Evaluated, tmp_path: Path) -> None:
     """Both looked at the run before either asked."""
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
-    asked: dict[str, list[int]] = {"one": [], "other": []}
-    one, other = (ReplayedRun(folder, done=asked[name].append) for name in asked)
+    one, other = ReplayedRun(folder), ReplayedRun(folder)
     [[first]] = one.walked([Setting("6g", FUSION, 2)], one.seeds)
     kept = (folder / MORE).read_bytes()
     with (folder / MORE).open("ab") as file:
@@ -366,10 +366,10 @@ def test_points_that_are_walked_together_make_the_calls_of_each(done: Evaluated,
     points = [named_point(f"{FUSION.name},{text}") for text in texts]
     settings = [Setting(point.name, point, 4) for point in points]
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
-    asked: list[int] = []
-    together = list(ReplayedRun(folder, more=asked.append).walked(settings, (0, 1, 2)))
+    watched = Watched()
+    together = list(ReplayedRun(folder, progress=watched).walked(settings, (0, 1, 2)))
     kept = (folder / MORE).read_text().splitlines()
-    assert 0 < len(kept) == sum(asked)
+    assert 0 < len(kept) == sum(watched.asked)
     alone = Path(shutil.copytree(done.out, tmp_path / "alone"))
     for setting, [walked] in zip(settings, together, strict=True):
         [[expected]] = ReplayedRun(alone).walked([setting], (0, 1, 2))

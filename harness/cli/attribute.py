@@ -38,9 +38,7 @@ def command(
     in_range("--sample", sample, 1, MOST)
     with bar("asking without", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
-        stored = ReplayedRun(
-            run, more=progress.more, done=progress, dataset=dataset, models=own, say=progress.say
-        )
+        stored = ReplayedRun(run, progress=progress, dataset=dataset, models=own)
         chosen = condition or (USUAL if USUAL in stored.points else stored.run.conditions[-1])
         attribution = attribute(stored, chosen, sample, sample_seed)
     file, study = write(attribution, run), attribution_study(attribution, stored)

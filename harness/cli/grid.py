@@ -75,7 +75,7 @@ def command(
         )
     with bar(f"{cells} combinations", quiet=as_json or quiet, grows=True) as progress:
         cache = None if no_cache else default_file()
-        grid = run_cells(spec, egos, helpers, folder, progress, progress.more, cache)
+        grid = run_cells(spec, egos, helpers, folder, progress, cache)
     finish(grid_study(grid, spec, folder), folder, as_json, quiet)
 
 

@@ -11,16 +11,18 @@ from itertools import count
 from threading import Event, Thread
 from typing import TYPE_CHECKING
 
+from harness.core.progress import Progress
+
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import Progress as Columns
 
 LINE_S = 30.0
 SETTLE_S = 5.0  # by when what a killed command left is counted: it is no measure of the pace
 MARKS = 5  # lines over which the pace is taken
 
 
-class Bar:
+class Bar(Progress):
     """Called with how many are newly done.
 
     Attributes:
@@ -33,7 +35,7 @@ class Bar:
     def __init__(self, label: str, total: int, grows: bool = False) -> None:
         self.label, self.total, self.grows, self.done = label, total, grows, 0
         self.changed: Callable[[], object] = lambda: None
-        self.say: Callable[[str], None] = lambda text: None  # writes a line above the bar
+        self.write: Callable[[str], None] = lambda text: None  # a line above the bar
 
     def __call__(self, done: int) -> None:
         """Add `done` to the count, and show it."""
@@ -45,6 +47,10 @@ class Bar:
         self.total += count
         self.changed()
 
+    def say(self, text: str) -> None:
+        """Write a line above the bar."""
+        self.write(text)
+
 
 @contextmanager
 def bar(label: str, total: int = 0, quiet: bool = False, grows: bool = False) -> Iterator[Bar]:
@@ -54,7 +60,7 @@ def bar(label: str, total: int = 0, quiet: bool = False, grows: bool = False) ->
         yield progress
         return
     if not sys.stderr.isatty():
-        progress.say = partial(print, file=sys.stderr, flush=True)
+        progress.write = partial(print, file=sys.stderr, flush=True)
         with _lines(progress):
             yield progress
         return
@@ -65,7 +71,7 @@ def bar(label: str, total: int = 0, quiet: bool = False, grows: bool = False) ->
         progress.changed = lambda: bars.update(
             task, completed=progress.done, total=progress.total or None, description=progress.label
         )
-        progress.say = partial(bars.console.print, markup=False, highlight=False)
+        progress.write = partial(bars.console.print, markup=False, highlight=False)
         yield progress
 
 
@@ -107,7 +113,7 @@ def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> st
     return " ".join(filter(None, (progress.label, of, at)))
 
 
-def drawn(console: "Console") -> "Progress":
+def drawn(console: "Console") -> "Columns":
     """Return the bar's columns. The bar itself gives way where the line is narrow."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
     from rich.table import Column

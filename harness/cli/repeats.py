@@ -46,5 +46,5 @@ def evaluate(
         work.going_on(folder),
         bar(f"asking {name}, {repeats} repeats", quiet=quiet or as_json, grows=True) as progress,
     ):
-        done = run_repeats(spec, repeats, folder, progress, progress.more, cache)
+        done = run_repeats(spec, repeats, folder, progress, cache)
     finish(repeats_study(done), folder, as_json, quiet)

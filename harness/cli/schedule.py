@@ -48,8 +48,7 @@ def learn(
     command = shlex.join(["harness", *sys.argv[1:]])
     with bar("learning", ROUNDS, quiet=quiet) as progress:
         train, tune_runs = (
-            [ReplayedRun(run, None, progress.more, progress, models=own, say=progress.say) for run in of]
-            for of in (runs, tune)
+            [ReplayedRun(run, progress=progress, models=own) for run in of] for of in (runs, tune)
         )
         progress.more(sum(each.dataset.scenario.parameters.decisions for each in (*train, *tune_runs)))
         schedule = run_learn(train, tune_runs, point, out, command, progress)
@@ -110,15 +109,9 @@ def compare(
     with bar("schedules", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
         replayed, tuned = (
-            [
-                ReplayedRun(run, latency, progress.more, progress, models=own, say=progress.say)
-                for run in folders
-            ]
-            for folders in (runs, tune)
+            [ReplayedRun(run, latency, progress, models=own) for run in folders] for folders in (runs, tune)
         )
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or runs[0] / "schedules"
-        compared = run_schedules(
-            replayed, tuned, condition, names, draws, budget, where, progress, progress.more
-        )
+        compared = run_schedules(replayed, tuned, condition, names, draws, budget, where, progress)
     finish(schedule_study(compared, [*replayed, *tuned], draws), where, as_json, quiet)

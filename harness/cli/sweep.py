@@ -66,10 +66,7 @@ def command(
         raise unknown("--latency", latency, ("run", "paper"))
     with bar("grid points", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
-        replayed = [
-            ReplayedRun(run, latency, progress.more, progress, not no_model, dataset, own, progress.say)
-            for run in runs
-        ]
+        replayed = [ReplayedRun(run, latency, progress, not no_model, dataset, own) for run in runs]
         panels = panels_over(replayed, over or (), grid or (), list(dict.fromkeys(condition)), apart)
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or folder_of(runs[0], panels)

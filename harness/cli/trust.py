@@ -87,15 +87,11 @@ def command(
             cache = default_file()
             run = read_or_evaluate(spec, out / "run", progress, cache, progress.more, open_backend).path
         own = options.cards([model] if model else None)
-        replayed = ReplayedRun(
-            run, more=progress.more, done=progress, asks=not no_model, models=own, say=progress.say
-        )
+        replayed = ReplayedRun(run, progress=progress, asks=not no_model, models=own)
         draws = parse_seeds(seeds) if seeds else replayed.seeds
         where = out or run / "trust"
         with work.going_on(where):
-            bench = run_bench(
-                replayed, condition, rule_names, attack_names, shares, draws, where, progress, progress.more
-            )
+            bench = run_bench(replayed, condition, rule_names, attack_names, shares, draws, where, progress)
     finish(trust_study(bench), where, as_json, quiet)
 
 

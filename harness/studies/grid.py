@@ -6,7 +6,7 @@ episodes and the same draws, so contrasts are paired by episode.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import combinations, product
@@ -21,6 +21,7 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import PLAIN, shown
 from harness.core.multiplicity import LEVEL
+from harness.core.progress import Progress
 from harness.core.statistics import Estimate, resampled, resampled_estimate
 from harness.core.versions import versions
 from harness.evaluate.agent import Agent
@@ -150,7 +151,7 @@ def tokens(run: Run) -> Floats:
 
 def run_cells(
     spec: Spec, egos: Sequence[Agent], helpers: Sequence[Agent], out: Path,
-    progress: Callable[[int], None], more: Callable[[int], None], cache_file: Path | None,
+    progress: Progress, cache_file: Path | None,
 ) -> "Grid":  # fmt: skip
     """Evaluate every combination in a folder of its own under `out`; those that are there stay.
 
@@ -159,8 +160,7 @@ def run_cells(
         egos: agents of the ego.
         helpers: agents of the helpers.
         out: the grid's folder.
-        progress: called with the number of new answers.
-        more: called with the number of answers that are asked for next.
+        progress: of answers.
         cache_file: of completions kept between runs; None for no cache.
 
     Raises:
@@ -176,7 +176,7 @@ def run_cells(
         roles = {"ego": ego.name, "helper": helper.name, "blind": helper.name}
         given = {k: v for role in roles.items() for k, v in asked.get(role, {}).items()}
         folder = out / "cells" / f"{i}-{j}"
-        run = read_or_evaluate(of_pair, folder, progress, cache_file, more, opens, given)
+        run = read_or_evaluate(of_pair, folder, progress, cache_file, progress.more, opens, given)
         for answer in run.answers:
             if answer.role in roles and answer.error is None:
                 asked.setdefault((answer.role, roles[answer.role]), {})[answer.id] = answer

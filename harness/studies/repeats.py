@@ -5,7 +5,7 @@ between repeats is the model's chance alone. All intervals are over episodes.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -21,6 +21,7 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.figures import Unit, shown
+from harness.core.progress import Progress
 from harness.core.statistics import Estimate, episode_interval, known_mean, rate_interval, resampled
 from harness.core.versions import versions
 from harness.evaluate.run import read_or_evaluate
@@ -46,7 +47,7 @@ def each(spec: Spec, repeats: int) -> dict[str, Spec]:
 
 def run_repeats(
     spec: Spec, repeats: int, out: Path,
-    progress: Callable[[int], None], more: Callable[[int], None], cache_file: Path | None,
+    progress: Progress, cache_file: Path | None,
 ) -> "Repeats":  # fmt: skip
     """Evaluate every repeat in a folder of its own under `out`; those that are there stay.
 
@@ -54,8 +55,7 @@ def run_repeats(
         spec: the evaluation; the first repeat has its sampling seed, each other one the next.
         repeats: how many.
         out: the folder.
-        progress: called with the number of new answers.
-        more: called with the number of answers that are asked for next.
+        progress: of answers.
         cache_file: of completions kept between runs; None for no cache.
 
     Raises:
@@ -63,7 +63,7 @@ def run_repeats(
     """
     opens = cache(open_backend)
     runs = [
-        read_or_evaluate(of, out / name, progress, cache_file, more, opens)
+        read_or_evaluate(of, out / name, progress, cache_file, progress.more, opens)
         for name, of in each(spec, repeats).items()
     ]
     return Repeats(out, tuple(runs))

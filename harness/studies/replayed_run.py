@@ -28,6 +28,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json
 from harness.core.formats import SOURCES
+from harness.core.progress import Progress
 from harness.dataset.load import Scene
 from harness.evaluate import device
 from harness.evaluate.agent import Agent, ImageMode
@@ -46,6 +47,7 @@ from harness.runs.unanswered import tally
 from harness.studies.axes import Setting
 from harness.studies.play import Read, WalkResult, metric_columns, walk_through
 
+SILENT = Progress()
 WALKS = 1 << 17  # most that are walked together, unless one grid point has more: some 120 MB
 _GIVE_IT = "to ask it, give --model with its folder, .gguf file or hub id, or write a card models/NAME.toml"
 OWN = ("ego", "helper")  # roles that have one answer a vehicle
@@ -70,25 +72,22 @@ class ReplayedRun:
     same_episodes = True
 
     def __init__(
-        self, folder: Path, latency: str | None = None,
-        more: Callable[[int], None] = lambda count: None, done: Callable[[int], None] = lambda count: None,
-        asks: bool = True, dataset: Path | None = None, models: Sequence[Card] = (),
-        say: Callable[[str], None] = lambda text: None,
+        self, folder: Path, latency: str | None = None, progress: Progress = SILENT, asks: bool = True,
+        dataset: Path | None = None, models: Sequence[Card] = (),
     ) -> None:  # fmt: skip
         """A run.
 
         Args:
             folder: its folder.
             latency: `paper` for the paper's inference times.
-            more: called with the number of answers that are asked for next.
-            done: told how many have come.
+            progress: of questions that the model is asked; before the first to a language model it is told
+                how much is asked.
             asks: whether its model is asked what the run has no answer to. Else a walk is left out that
                 comes to a decision point without an answer of the ego, and one that needs a helper whom the
                 run did not ask is refused.
             dataset: folder of its dataset; None where the run states.
             models: cards that the user gave; a model of another name is asked only if the user has a card
                 file of it. What a run says of a model's place is never used.
-            say: told once, before a language model is asked, how much is asked.
         """
         self.run = read(folder)
         if self.run.world != "frozen":
@@ -120,7 +119,7 @@ class ReplayedRun:
         self.episodes = len(self.dataset.episodes)
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
         self._asks, self._models = asks, models
-        self._say, self._more, self._done = say, more, done
+        self._progress = progress
         self.left_out: set[str] = set()
         self._announced, self._left = False, 0  # questions that are asked next
         self._opened: dict[int, Backend] = {}
@@ -133,11 +132,11 @@ class ReplayedRun:
 
     def _set_left(self, count: int) -> None:
         self._left = count
-        self._more(count)
+        self._progress.more(count)
 
     def _count_answered(self, count: int) -> None:
         self._left -= count
-        self._done(count)
+        self._progress(count)
 
     def _announce_once(self) -> None:
         """Tell how much is asked now, at the first questions to a language model."""
@@ -152,7 +151,7 @@ class ReplayedRun:
         unasked = (
             f"; of helpers at the {len(reached)} decision points that it reached, it lacks {lacks} at most"
         )
-        self._say(
+        self._progress.say(
             f"{printable(self.name)} is asked {questions} now that the run did not ask{size}"
             f"{unasked if lacks > 0 else ''}"
         )

@@ -21,6 +21,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import shown
+from harness.core.progress import Progress
 from harness.core.statistics import Estimate, resampled, resampled_estimate
 from harness.core.versions import versions
 from harness.report.document import Table
@@ -296,8 +297,7 @@ def compare(
 
 def run_schedules(
     runs: Sequence[ReplayedRun], tune: Sequence[ReplayedRun], condition: str, names: Sequence[str],
-    seeds: Sequence[int], budget: float, out: Path, progress: Callable[[int], None],
-    more: Callable[[int], None],
+    seeds: Sequence[int], budget: float, out: Path, progress: Progress,
 ) -> list[Compared]:  # fmt: skip
     """Compare schedules on runs, each with its run on tune layouts, or with none.
 
@@ -312,7 +312,7 @@ def run_schedules(
         "sources": [run.manifest() for run in every], "condition": condition, "schedules": list(names),
         "budget": budget, "seeds": list(seeds),
     })  # fmt: skip
-    more(sum(run.dataset.scenario.parameters.decisions for run in every) + len(runs) * len(names))
+    progress.more(sum(run.dataset.scenario.parameters.decisions for run in every) + len(runs) * len(names))
     compared = [
         compare(run, tune_run, point_of([run], condition), names, seeds, budget, progress)
         for run, tune_run in zip_longest(runs, tune)

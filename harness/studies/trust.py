@@ -4,7 +4,7 @@ A run's stored answers are played again under each rule, attack and share of att
 same episodes, channel draws and attackers, so differences are paired by episode.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property, partial
@@ -22,6 +22,7 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import as_mapping, shown
 from harness.core.files import digest
 from harness.core.multiplicity import LEVEL
+from harness.core.progress import Progress
 from harness.core.statistics import Estimate, negative_log_likelihood, resampled, resampled_estimate
 from harness.core.versions import versions
 from harness.dataset.load import Scene
@@ -237,7 +238,7 @@ class Bench:
 
 def run_bench(
     run: ReplayedRun, condition: str, rules: Sequence[str], attacks: Sequence[str], shares: Sequence[float],
-    seeds: Sequence[int], out: Path, progress: Callable[[int], None], more: Callable[[int], None],
+    seeds: Sequence[int], out: Path, progress: Progress,
 ) -> Bench:  # fmt: skip
     """Play every cell that the folder has not.
 
@@ -249,8 +250,7 @@ def run_bench(
         shares: above 0.
         seeds: of the channel.
         out: the study's folder, in which finished cells are kept.
-        progress: called with 1 whenever a cell is done.
-        more: called with the number of cells that are to be played.
+        progress: of cells.
 
     Raises:
         UserError: the point has no channel, or asks nobody, or its rule is a fusion call; or the folder has
@@ -285,7 +285,7 @@ def run_bench(
         run.settle()
         return vars(cell)
 
-    more(len(every))
+    progress.more(len(every))
     for key in every:
         cells[key] = Cell(**kept.part(key, partial(compute, key)))
         progress(1)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from evaluating import run, same_decisions, spec_of
+from evaluating import Watched, run, same_decisions, spec_of
 from run_on_disk import answers_of
 
 from harness.backends import cards
@@ -31,7 +31,7 @@ def agent(model: str = "proxy", prompt: str = "v2") -> Agent:
 
 def played(data: Dataset, out: Path, done: Callable[[int], None] = lambda n: None) -> Grid:
     both = [agent("proxy"), agent("proxy-faulty")]
-    return run_cells(spec_of(data), both, both, out, done, lambda n: None, None)
+    return run_cells(spec_of(data), both, both, out, Watched(done), None)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_a_stopped_grid_goes_on_and_asks_only_what_is_missing(small: Dataset, tm
     assert [c.estimate(SUCCESS, "6g") for c in last.cells] == [c.estimate(SUCCESS, "6g") for c in whole.cells]
     others = [agent("proxy", "v1"), agent("proxy-faulty")]
     with pytest.raises(UserError, match="prompt"):
-        run_cells(spec_of(small), others, others, tmp_path / "grid", print, print, None)
+        run_cells(spec_of(small), others, others, tmp_path / "grid", Watched(), None)
 
 
 # -- effects, played by hand --------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluating import Scripted, course, same_files, spec_of, sure
+from evaluating import Scripted, Watched, course, same_files, spec_of, sure
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -82,7 +82,7 @@ def hot(data: Dataset, **options: Any) -> Spec:
 def repeated(
     spec: Spec, out: Path, k: int = 3, done: Callable[[int], None] = lambda n: None, cache: Path | None = None
 ) -> Repeats:
-    return run_repeats(spec, k, out, done, lambda n: None, cache)
+    return run_repeats(spec, k, out, Watched(done), cache)
 
 
 # -- figures ------------------------------------------------------------------------------------------------

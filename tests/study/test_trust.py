@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluating import figure, live_spec_of, run, spec_of
+from evaluating import Watched, figure, live_spec_of, run, spec_of
 
 from harness.coordination.operating_point import named_point
 from harness.core import resources, versions
@@ -41,9 +41,9 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
     return run(spec, tmp_path_factory.mktemp("trust") / "run")
 
 
-def played(done: Evaluated, out: Path, told: Any = lambda n: None) -> Bench:
+def played(done: Evaluated, out: Path) -> Bench:
     stored = ReplayedRun(done.out)
-    return run_bench(stored, "6g", RULES, ATTACKS, (THIRD,), stored.seeds, out, told, lambda n: None)
+    return run_bench(stored, "6g", RULES, ATTACKS, (THIRD,), stored.seeds, out, Watched())
 
 
 @pytest.fixture(scope="module")
@@ -210,4 +210,4 @@ def test_fusion_calls_are_attacked_elsewhere(done: Evaluated, tmp_path: Path) ->
     stored = ReplayedRun(done.out)
     for condition, rules in (("6g", ("ego-prompt",)), ("6g:attack=liar", ("linear",))):
         with pytest.raises(UserError, match="harness eval"):
-            run_bench(stored, condition, rules, (), (THIRD,), (0,), tmp_path, lambda n: None, lambda n: None)
+            run_bench(stored, condition, rules, (), (THIRD,), (0,), tmp_path, Watched())
