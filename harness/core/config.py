@@ -20,7 +20,7 @@ import dataclasses
 import math
 import re
 import tomllib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
@@ -45,7 +45,6 @@ def between(least: float, most: float) -> msgspec.Meta:
 
 
 _MISSING = re.compile(r"Object missing required field `(.+)`")
-_STEPS = re.compile(r"\.([^.\[`]+)|\[(\d+)\]|(\[\.{3}\])")  # the steps of a path such as `$.points[1].loss`
 _OF_VALUES = ("Expected", "Invalid", "Number out of range", "Integer")
 _DOTS = 100
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+"""
@@ -103,10 +102,11 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
     """
     for path, key, known in _unknown_keys(table, kind, (), given):
         raise unknown(f"key in {_place(where, path)}", key, known)
+    whole = {**table, **given}
     try:
-        record = msgspec.convert({**table, **given}, kind)
-    except msgspec.ValidationError as error:
-        raise _mistake(str(error), {**table, **given}, kind, where) from None
+        record = msgspec.convert(whole, kind)
+    except msgspec.ValidationError:
+        raise _mistake(whole, kind, where) from None
     for path, value in _endless(table, ()):  # last, since a bound has better words
         *tables, key = path
         raise UserError(f"{_place(where, tables)}: {key} = {value}; allowed: a finite number")
@@ -140,7 +140,7 @@ def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
 
 def check(record: Any) -> None:
     """Raise UserError unless a dataclass's numbers and choices are what its annotations allow; NaN is not."""
-    for name, hint in _hints(record.__class__).items():
+    for name, hint in _fields(record.__class__).items():
         value = getattr(record, name)
         bounds = [meta for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, msgspec.Meta)]
         allowed = [str(choice) for choice in get_args(hint)] if get_origin(hint) is Literal else []
@@ -183,16 +183,12 @@ def _unknown_keys(
 ) -> Iterator[tuple[tuple[str, ...], str, list[str]]]:
     """Yield each unknown key: the path of its table, the key, and the names of the known fields."""
     members = [member for member in _members(hint, value) if member is not NoneType]
-    if len(members) != 1 or not isinstance(value, Mapping | list):
-        return
-    entries: Iterable[tuple[Any, Any]] = value.items() if isinstance(value, Mapping) else enumerate(value)
-    fields = _hints(members[0]) if isinstance(value, Mapping) else {}
-    for key, inner in entries:
+    fields = _fields(members[0]) if len(members) == 1 and isinstance(value, Mapping) else {}
+    for key, inner, hints in _entries(value, hint):
         if fields and (key in exempt or key not in fields):
             yield path, key, [name for name in fields if name not in exempt]
-            continue
-        for item in [fields[key]] if fields else _items(members[0], str(key)):
-            yield from _unknown_keys(inner, item, (*path, str(key)))
+        elif len(hints) == 1:
+            yield from _unknown_keys(inner, hints[0], (*path, str(key)))
 
 
 def _endless(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float]]:
@@ -204,25 +200,24 @@ def _endless(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...
             yield from _endless(inner, (*path, str(key)))
 
 
-def _mistake(message: str, table: Mapping[str, Any], kind: Any, where: str) -> UserError:
-    """Rewrite a message of msgspec, such as "Expected `int`, got `str` - at `$.latency.n`", for people."""
-    problem, _, location = message.partition(" - at `")
-    of_key = location.startswith("key` in `")
-    path, value, hint = _locate(table, kind, location)
-    here = _place(where, path)
+def _mistake(table: Mapping[str, Any], kind: Any, where: str) -> UserError:
+    """Describe the first value that does not fit its type; msgspec's words are rewritten for people."""
+    path, value, hint = _wrong(table, kind)
+    here, (*tables, key) = _place(where, path), path or ("",)
+    problem, of_key, _ = (_problem(value, hint) or "").partition(" - at `key`")
     if missing := _MISSING.fullmatch(problem):
         return UserError(f"{here} has no {missing[1]}; add it")
     if not problem.startswith(_OF_VALUES) or not path:  # a __post_init__'s, or about the whole
         return UserError(f"{here}: {printable(problem)}")
-    *tables, key = path
     if of_key:
-        wrong = next((name for name in value if not _fits(name, hint)), "")
-        return UserError(f"{here}: {printable(repr(wrong))} is no name for this; {printable(problem)}")
-    if problem.startswith("Invalid") and (names := _names(hint)):
-        return unknown(f"{key} in {_place(where, tables)}", str(value), names)
+        names = [get_args(member)[0] for member in _members(hint, value) if get_args(member)]
+        name = next((name for name in value if _problem(name, names[0])), "")
+        return UserError(f"{here}: {printable(repr(name))} is no name for this; {printable(problem)}")
+    if problem.startswith("Invalid") and (choices := _choices(hint)):
+        return unknown(f"{key} in {_place(where, tables)}", str(value), choices)
     expected, _, got = problem.removeprefix("Expected ").replace("`", "").partition(", got ")
     kinds = " or ".join(_in_words(name) for name in expected.split(" | ") if name != "null")
-    allowed = (" or ".join(_names(hint)) or kinds) if got else _description(hint) or kinds
+    allowed = (" or ".join(_choices(hint)) or kinds) if got else _description(hint) or kinds
     if not problem.startswith("Expected"):
         allowed = _description(hint) or "a number that a computer holds"
     return UserError(f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}")
@@ -234,50 +229,32 @@ def _in_words(kind: str) -> str:
     return _IN_WORDS.get(name, name) + space + bound
 
 
-def _locate(value: Any, hint: Any, location: str) -> tuple[list[str], Any, Any]:
-    """Follow a location such as `$.points[...][1].loss` to the wrong value: its path, itself and its type.
-
-    msgspec writes `[...]` for a value of a mapping; it is the first one that does not fit. Where the way is
-    lost, in a type that is not known here, the path ends.
-    """
-    path: list[str] = []
-    for name, index, _ in _STEPS.findall(location):
-        if name:
-            fits = [hints[name] for member in _members(hint, value) if name in (hints := _hints(member))]
-            if fits and all(get_origin(each) is Literal for each in fits):  # the tags of a union's records
-                fits = [Literal[tuple(tag for each in fits for tag in get_args(each))]]
-            key: Any = name
-        else:
-            fits = [item for member in _members(hint, value) for item in _items(member, index)]
-            key = int(index) if index else _first_wrong(value, fits)
-        if not fits or not _has(value, key):
-            break
-        path.append(str(key))
-        value, hint = value[key], fits[0]
-    if location.startswith("key` in `"):
-        hint = next((get_args(member)[0] for member in _members(hint, value) if get_args(member)), str)
+def _wrong(value: Any, hint: Any, path: tuple[str, ...] = ()) -> tuple[tuple[str, ...], Any, Any]:
+    """Find the innermost first value that does not fit its type: its path, itself and the type."""
+    for key, inner, hints in _entries(value, hint):
+        if hints and all(_problem(inner, each) for each in hints):
+            tags = [tag for each in hints if get_origin(each) is Literal for tag in get_args(each)]
+            return _wrong(inner, Literal[tuple(tags)] if tags else hints[0], (*path, str(key)))
     return path, value, hint
 
 
-def _has(value: Any, key: Any) -> bool:
-    return (
-        key in value
-        if isinstance(value, Mapping)
-        else isinstance(value, list | tuple) and key in range(len(value))
-    )
-
-
-def _first_wrong(value: Any, fits: Sequence[Any]) -> Any:
-    pairs = value.items() if isinstance(value, Mapping) else enumerate(value)
-    return next((key for key, inner in pairs if fits and not _fits(inner, fits[0])), None)
-
-
-def _fits(value: Any, hint: Any) -> bool:
+def _problem(value: Any, hint: Any) -> str | None:
+    """Return msgspec's words for why a value does not fit a type; None if it does."""
     try:
         msgspec.convert(value, hint)
-    except msgspec.ValidationError:
-        return False
-    return True
+    except msgspec.ValidationError as error:
+        return str(error)
+    return None
+
+
+def _entries(value: Any, hint: Any) -> Iterator[tuple[Any, Any, list[Any]]]:
+    """Yield key, value and possible types of each entry of a table or list; no type where none is known."""
+    if isinstance(value, Mapping | list):
+        is_table = isinstance(value, Mapping)
+        members = _members(hint, value)
+        for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
+            fields = [_fields(member)[key] for member in members if is_table and key in _fields(member)]
+            yield key, inner, fields or [each for member in members for each in _items(member, key, is_table)]
 
 
 def _members(hint: Any, value: Any = None) -> list[Any]:
@@ -297,7 +274,7 @@ def _members(hint: Any, value: Any = None) -> list[Any]:
 
 
 @cache
-def _hints(kind: Any) -> dict[str, Any]:
+def _fields(kind: Any) -> dict[str, Any]:
     """Return the types of a record's fields by their names in a file; empty for any other type."""
     if not hasattr(kind, "__struct_fields__") and not dataclasses.is_dataclass(kind):
         return {}
@@ -305,24 +282,23 @@ def _hints(kind: Any) -> dict[str, Any]:
     names = getattr(kind, "__struct_fields__", hints)
     tag = getattr(kind, "__struct_config__", None)
     tagged = {tag.tag_field: Literal[tag.tag]} if tag and tag.tag_field else {}
-    return tagged | dict(
-        zip(getattr(kind, "__struct_encode_fields__", names), map(hints.get, names), strict=True)
-    )
+    in_file = getattr(kind, "__struct_encode_fields__", names)
+    return tagged | dict(zip(in_file, map(hints.get, names), strict=True))
 
 
-def _items(hint: Any, index: str) -> list[Any]:
-    """Return the type of the item at an index of a list, or of a mapping's values; none for another type."""
+def _items(hint: Any, key: Any, is_table: bool) -> list[Any]:
+    """Return the type of an entry of a list or a mapping; none for another type."""
     origin, arguments = get_origin(hint), get_args(hint)
-    if not arguments or not isinstance(origin, type):
+    if not arguments or not isinstance(origin, type) or issubclass(origin, Mapping) != is_table:
         return []
-    if issubclass(origin, Mapping):
+    if is_table:
         return [arguments[1]]
     if issubclass(origin, tuple) and arguments[-1] is not ...:
-        return [arguments[int(index)]] if index and int(index) < len(arguments) else []
+        return list(arguments[key : key + 1])
     return [arguments[0]]
 
 
-def _names(hint: Any) -> list[str]:
+def _choices(hint: Any) -> list[str]:
     """Return the choices of a type; none if it has no list of them."""
     return [str(name) for kind in _members(hint) if get_origin(kind) is Literal for name in get_args(kind)]
 
