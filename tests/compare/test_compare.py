@@ -15,8 +15,7 @@ from run_on_disk import Row, answers_of, change, configure, made_up, rows_of
 
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
-from harness.core.multiplicity import holm
-from harness.core.paired import SuccessTest
+from harness.core.multiplicity import SuccessTest, holm
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 from harness.report.compare import words

@@ -8,8 +8,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import printable
-from harness.core.multiplicity import holm, p_of_bootstrap
-from harness.core.paired import SuccessTest, success_test
+from harness.core.multiplicity import SuccessTest, holm, p_of_bootstrap, success_test
 from harness.core.statistics import Estimate, known_mean
 from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import Pair, Side
