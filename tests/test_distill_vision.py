@@ -23,8 +23,7 @@ from harness.core.errors import UserError
 from harness.core.seeds import FIRST
 from harness.prompts import readout
 from harness.prompts import versions as prompts
-from harness.training.answers import sights
-from harness.training.cells import cells
+from harness.training.answers import cells, sights
 from harness.training.distill import Curriculum, distill
 from harness.training.lessons import Lessons, draw
 from harness.training.model import (

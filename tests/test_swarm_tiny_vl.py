@@ -20,7 +20,7 @@ from harness.backends.registry import open_backend
 from harness.core.arrays import Floats
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.asking import requests
-from harness.training.cells import cells
+from harness.training.answers import cells
 from harness.training.train import Sample, hidden_states
 from harness.world.perception.camera import Sight
 

@@ -1,20 +1,24 @@
-"""What a distilled model learns to write: a given distribution, in the form that its prompt asks for."""
+"""What a distilled model learns to answer: distributions as a prompt wants them, and what a picture shows."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded
 from harness.prompts.answer_schema import plainest
 from harness.prompts.versions import Prompt
+from harness.training.model import VISION
+from harness.world.perception.camera import Sight
 from harness.world.scene_graph import Conflict, SceneGraph
 
 PARTS = 20  # of a stated distribution: so small a model cannot make hundredths sum to 1
 MOST_SEEN = 5  # vehicles of a picture that are listed
 HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which risk has that name
+CLASSES = 10  # of how far the nearest vehicle in a square of a picture is, a digit each; 0 is nobody
+STEP_M = 7.0  # from one class to the next; the last has no end
 
 
 def evidence(view: SceneGraph, named: bool = True) -> str:
@@ -90,3 +94,24 @@ def answer(
         body = f'"{name}":{canonical_json(plainest(schema))},{body}'
     reasons_first = view.role in prompt.reasons_first and not bare
     return f"{sent['evidence']}. {{{body}}}" if reasons_first else f"{{{body}}}"
+
+
+def cells(sight: Sight) -> Ints:
+    """Return the class of every token of a picture, (tokens,), row by row.
+
+    A letter and a line of words are one answer a picture, too little for a vision encoder that begins with
+    random weights. This is an answer a token.
+    """
+    frame, viewer = sight.frame, sight.state.vehicle(sight.viewer_id)
+    classes = np.zeros(len(frame.ids) + 1, dtype=np.int64)  # the last is of pixels that nobody owns
+    places = {v.id: (v.x_m, v.y_m) for v in sight.state.vehicles}
+    for n, name in enumerate(frame.ids):
+        if name in places:
+            x_m, y_m = places[name]
+            away_m = float(np.hypot(x_m - viewer.x_m, y_m - viewer.y_m))
+            classes[n] = 1 + min(CLASSES - 2, int(away_m / STEP_M))
+    side = VISION.patch_px * VISION.merge
+    height, width = frame.owners.shape
+    squares = classes[frame.owners].reshape(height // side, side, width // side, side)
+    nearest = np.where(squares == 0, CLASSES, squares).min(axis=(1, 3)).ravel()
+    return np.where(nearest == CLASSES, 0, nearest)

@@ -13,8 +13,7 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import text_of
 from harness.prompts import readout
-from harness.training.answers import answer, evidence, sights
-from harness.training.cells import CLASSES
+from harness.training.answers import CLASSES, answer, evidence, sights
 from harness.training.lessons import Lessons
 from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
 from harness.training.questions import Question, alone, excerpts, key, kl_nats, with_messages
