@@ -10,13 +10,11 @@ import json
 import os
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
 from glob import escape
 from io import BufferedReader
 from pathlib import Path
-from types import NoneType
 from typing import Any, Literal, TypeVar
 
 _EXACT = json.JSONEncoder(
@@ -24,59 +22,16 @@ _EXACT = json.JSONEncoder(
 )
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a formula begins with, and what spreadsheets skip before it
 T = TypeVar("T")
-_PLAIN = frozenset({str, int, bool, NoneType})
 
 
 def canonical_json(value: Any) -> str:
     """Return the one JSON text of a value: sorted keys, no spaces. Raises ValueError on NaN or infinity."""
-    quick = _quickly(value)
-    return _EXACT.encode(value) if quick is None else quick.decode()
+    return _EXACT.encode(value)
 
 
 def canonical_bytes(value: Any) -> bytes:
     """Return `canonical_json` in UTF-8. Raises UnicodeEncodeError, a ValueError, on a lone surrogate."""
-    quick = _quickly(value)
-    return _EXACT.encode(value).encode() if quick is None else quick
-
-
-def _quickly(value: Any) -> bytes | None:
-    # Digests depend on this text, which the standard library defines; msgspec takes half the time for most.
-    if _written_alike(value):
-        try:
-            return _quick()(value)
-        except (TypeError, UnicodeEncodeError):  # a key that is not a string, or a lone surrogate
-            pass
-    return None
-
-
-@cache
-def _quick() -> Callable[[Any], bytes]:
-    import msgspec  # here, since lists of runs do without it
-
-    return msgspec.json.Encoder(order="sorted").encode
-
-
-def _written_alike(value: Any) -> bool:
-    """Return whether msgspec and the standard library encode a value alike.
-
-    They differ on exponents, NaN and types that JSON lacks.
-    """
-    kind = type(value)
-    if kind is dict:
-        value = value.values()
-    elif kind is not list and kind is not tuple:
-        return kind in _PLAIN or (kind is float and _without_exponent(value))
-    for item in value:
-        kind = type(item)
-        if kind in _PLAIN:
-            continue
-        if not (_without_exponent(item) if kind is float else _written_alike(item)):
-            return False
-    return True
-
-
-def _without_exponent(number: float) -> bool:
-    return 1e-4 <= number < 1e16 or number == 0.0 or -1e16 < number <= -1e-4
+    return canonical_json(value).encode()
 
 
 class Refused(OSError):

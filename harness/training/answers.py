@@ -1,4 +1,4 @@
-"""What a distilled model learns to answer: distributions as a prompt wants them, and what a picture shows."""
+"""What a distilled model learns to answer: a distribution as a prompt asks for it, and what pictures show."""
 
 from collections.abc import Sequence
 from typing import Any
