@@ -7,10 +7,10 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats
 from harness.core.config import between, check
 from harness.core.errors import UserError
-from harness.radio.channel import Broadcast, Delivery, Draws, Links, Site
+from harness.radio.channel import Broadcast, Delivery, Draws, Links, Physical, Site
 from harness.radio.propagation import Propagation
 
 # Steps of a model's tables: of distance between rows, and of received power between columns.
@@ -18,7 +18,7 @@ STEP_M, STEP_DB = 10.0, 0.5
 
 
 @dataclass(frozen=True)
-class Transceiver(Propagation):
+class Transceiver(Propagation, Physical):
     """The radio of all vehicles, and background traffic with packets of one size at one rate."""
 
     # background vehicles on one kilometre of road, all lanes and both directions together
@@ -44,14 +44,6 @@ class Transceiver(Propagation):
     @abstractmethod
     def message_s(self, bits: Floats | float) -> Floats:
         """Return how long a message of so many bits is on air."""
-
-    @abstractmethod
-    def busy_ratio(self) -> float:
-        """Return the channel busy ratio under the background load."""
-
-    @abstractmethod
-    def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the share of background packets received at distances, `(n,)`: see `channel.Physical`."""
 
     @property
     @abstractmethod

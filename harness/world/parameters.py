@@ -62,18 +62,13 @@ class Parameters:
     ambient: str = DAY  # light and weather, one of `harness.world.ambient`
 
     def __post_init__(self) -> None:
+        speeds, total_frames = len(self.target_speeds_mps), self.time_limit_s * self.simulation_hz
         bounds = {
-            "target_speeds_mps": (
-                0 < len(self.target_speeds_mps) <= MOST_SPEEDS,
-                f"1 to {MOST_SPEEDS} speeds",
-            ),
+            "target_speeds_mps": (0 < speeds <= MOST_SPEEDS, f"1 to {MOST_SPEEDS} speeds"),
             "decisions": (1 <= self.decisions <= MOST_DECISIONS, f"from 1 to {MOST_DECISIONS}"),
             "decision_period_s": (self.decision_period_s > 0, "seconds above 0"),
             "simulation_hz": (0 < self.simulation_hz <= 1000, "from 1 to 1000"),
-            "time_limit_s": (
-                0 < self.time_limit_s * self.simulation_hz <= MOST_FRAMES,
-                f"above 0, and {MOST_FRAMES} frames at most",
-            ),
+            "time_limit_s": (0 < total_frames <= MOST_FRAMES, f"above 0, and {MOST_FRAMES} frames at most"),
             "ambient": (self.ambient in AMBIENTS, " or ".join(AMBIENTS)),
             "beacon_rule": (self.beacon_rule in get_args(BeaconRule), " or ".join(get_args(BeaconRule))),
             "perfect_knowledge": (isinstance(self.perfect_knowledge, bool), "true or false"),
@@ -86,11 +81,8 @@ class Parameters:
             value = getattr(self, field.name)
             least, most = next((BOUNDS[unit] for unit in BOUNDS if field.name.endswith(unit)), (None, None))
             if least is not None and bounds.get(field.name, (True, ""))[0]:
-                each = value if isinstance(value, tuple) else (value,)
-                bounds[field.name] = (
-                    all(least <= number <= most for number in each),
-                    f"from {least:g} to {most:g}",
-                )
+                fits = all(least <= each <= most for each in (value if isinstance(value, tuple) else [value]))
+                bounds[field.name] = fits, f"from {least:g} to {most:g}"
         for name, (fits, allowed) in bounds.items():
             if not fits:
                 raise UserError(f"scenario: {name} is {printable(getattr(self, name))}; it must be {allowed}")

@@ -328,8 +328,7 @@ def cover(length_m: float, width_m: float) -> tuple[Floats, float]:
 
 def _discs(path: Path, arc_m: Floats, away_m: Floats, right_m: Floats | None = None) -> Point:
     """Return x and y (discs, ...) of a vehicle's discs at arc lengths (...) of a path, or to its right."""
-    heading = path.headings_rad[np.searchsorted(path.arc_m, arc_m).clip(0, len(path.arc_m) - 1)]
-    x, y = (np.interp(arc_m, path.arc_m, along) for along in path.columns)
+    x, y, heading = path.places(arc_m)
     cos, sin = np.cos(heading), np.sin(heading)
     if right_m is not None:
         x, y = x - sin * right_m, y + cos * right_m

@@ -124,9 +124,8 @@ class Path:
     @lru_cache(maxsize=8192)  # noqa: B019
     def at(self, arc_m: float) -> tuple[float, float, float]:
         """Return the position (m, m) and the heading (rad) at an arc length."""
-        x, y = (float(np.interp(arc_m, self.arc_m, along)) for along in self.columns)
-        nearest = int(np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1))
-        return x, y, float(self.headings_rad[nearest])
+        x, y, heading = self.places(np.array(arc_m))
+        return float(x), float(y), float(heading)
 
     def places(self, arc_m: Floats) -> tuple[Floats, Floats, Floats]:
         """Return x (m), y (m) and heading (rad) at arc lengths (...), as `at` does."""
