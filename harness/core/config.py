@@ -56,14 +56,9 @@ _IN_WORDS = {
 
 
 def toml(path: Path, where: str) -> dict[str, Any]:
-    """Read the tables of a TOML file.
+    """Read the tables of a TOML file; `where` names it in messages, such as `model card models/mine.toml`.
 
-    Args:
-        path: the file, which must exist.
-        where: its name in messages, such as `model card models/mine.toml`.
-
-    Raises:
-        UserError: the file cannot be read or is not TOML.
+    Raises UserError if it cannot be read or is no TOML.
     """
     try:
         return loads(text_of(path, "settings"), where)
@@ -89,16 +84,10 @@ def loads(text: str, where: str) -> dict[str, Any]:
 
 
 def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: Any) -> Record:
-    """Convert a TOML or JSON table to a record.
+    """Convert a TOML or JSON table to a record; `where` names it in messages.
 
-    Args:
-        table: the values by field name.
-        kind: class of the record.
-        where: name of the table in messages.
-        given: fields that the program fills in; the table may not hold them.
-
-    Raises:
-        UserError: an unknown or missing key, or a value that is not allowed.
+    The program fills in the fields `given`; the table may not hold them. Raises UserError for an unknown or
+    missing key and for a value that is not allowed.
     """
     for path, key, known in _unknown_keys(table, kind, (), given):
         raise unknown(f"key in {_place(where, path)}", key, known)
@@ -114,15 +103,9 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
 
 
 def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
-    """Return a copy of a frozen dataclass with some fields set from text.
+    """Return a copy of a frozen dataclass with some fields set from text; `where` names it in messages.
 
-    Args:
-        record: the original, which stays as it is.
-        settings: new values, as text, by field name.
-        where: name of the record in messages.
-
-    Raises:
-        UserError: an unknown field, or a value that is not allowed.
+    Raises UserError for an unknown field and for a value that is not allowed.
     """
     hints = get_type_hints(type(record), include_extras=True)
     known = {name: getattr(record, name) for name in settable(record)}

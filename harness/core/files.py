@@ -89,10 +89,7 @@ def bytes_of(path: str | Path, kind: Kind) -> bytes:
 def text_of(path: str | Path, kind: Kind = "text") -> str:
     """Read a UTF-8 text file. A byte order mark, which some editors put first, is left out.
 
-    Raises:
-        OSError: it cannot be opened.
-        Refused: it is not a regular file, or is larger than `LARGEST` of its kind.
-        UnicodeDecodeError: it is not UTF-8.
+    Raises what `opened` raises, and UnicodeDecodeError.
     """
     return bytes_of(path, kind).decode("utf-8-sig")
 

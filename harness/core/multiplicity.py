@@ -17,14 +17,8 @@ def p_value(interval: Callable[[float], Estimate]) -> float | None:
     """Return the two-sided p-value of a difference of 0: 1 less the level at which the interval touches 0.
 
     It is below 0.05 exactly if the 95 % interval excludes 0, even for an asymmetric interval. For Student's t
-    interval it is the p-value of the paired t test.
-
-    Args:
-        interval: gives the difference with its interval at a level of confidence; a higher level must give a
-            wider interval.
-
-    Returns:
-        None without an interval; `LEAST` for any smaller p-value, and 1 for any above 0.999.
+    interval it is the p-value of the paired t test. It is None without an interval, `LEAST` for any smaller
+    one, and 1 above 0.999. `interval` gives the difference at a level of confidence; a higher one is wider.
     """
     from scipy.optimize import brentq
 
@@ -92,11 +86,9 @@ class SuccessTest:
 
 
 def success_test(a: Floats, b: Floats) -> SuccessTest | None:
-    """Test the difference in success between A and B over episodes; None for an interval of one episode.
+    """Test whether B's success, 0 or 1 by episode and seed, (E, S), differs from A's over episodes.
 
-    Args:
-        a: A's success, 0 or 1, by episode and seed, (E, S).
-        b: B's, in the same order.
+    None for an interval of one episode.
     """
     from scipy.stats import binomtest
 

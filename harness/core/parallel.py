@@ -83,7 +83,7 @@ def each(
     Args:
         work: the function; it and the items can be pickled.
         items: its arguments.
-        workers: processes or a cluster; 1 means this process.
+        workers: 1 means this process.
         on_result: called with an item's place and its result as soon as the result arrives.
         label: gives an item's name in messages.
         repeatable: whether the same item must give the same result on another node; a difference is an error.

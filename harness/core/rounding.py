@@ -4,12 +4,7 @@ from collections.abc import Sequence
 
 
 def rounded(p: Sequence[float], parts: int = 100) -> list[float]:
-    """Round a distribution to multiples of 1/`parts` by the method of the largest remainder.
-
-    Args:
-        p: probabilities that sum to 1.
-        parts: 100 for the hundredths that a prompt asks for.
-    """
+    """Round a distribution to multiples of 1/`parts`, hundredths unless given, by largest remainders."""
     floor = [int(x * parts + 1e-9) for x in p]
     short = parts - sum(floor)
     for i in sorted(range(len(p)), key=lambda i: floor[i] - p[i] * parts)[:short]:

@@ -16,11 +16,7 @@ LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
 
 
 def purpose(first: int, count: int) -> Purpose:
-    """Return the one purpose of the layout seeds `first` to `first + count - 1`.
-
-    Raises:
-        UserError: they have more than one purpose.
-    """
+    """Return the one purpose of the layout seeds `first` to `first + count - 1`, or raise UserError."""
     present = purposes(first, count)
     if len(present) > 1:
         ends = [f"{start} to {end - 1} ({name})" for (name, start), (_, end) in pairwise(FIRST.items())]

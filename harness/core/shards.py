@@ -48,8 +48,7 @@ class Shard:
 def shard_of(text: str, environment: Mapping[str, str] = os.environ) -> Shard:
     """Parse the value of `--shard`: `3/16`, or `auto/16` for the number of this task in a job.
 
-    Raises:
-        UserError: there is no such shard, or `auto` is given outside a job.
+    Raises UserError if there is no such shard, or `auto` is given outside a job.
     """
     number, _, total = text.partition("/")
     if number == "auto":
@@ -75,9 +74,8 @@ Start = TypeVar("Start", bound=work.WorkStart)
 def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
     """Read what the shards in some folders began with, and check that they make up one work.
 
-    Raises:
-        UserError: a folder holds no shard, a shard is still being written, the shards are of different works,
-            or one is missing.
+    Raises UserError if a folder holds no shard, one is still being written, they are of different works, or
+    one is missing.
     """
     configs = [_read(folder, kind) for folder in folders]
     first, facts = folders[0], configs[0].facts()
@@ -122,19 +120,10 @@ def owners(
     parts: Sequence[str],
     label: Callable[[str], str],
 ) -> dict[str, Path]:
-    """Locate every part of a work in the shards' folders.
+    """Return the path of each part of a work, by its name, in the folders of its shards.
 
-    Args:
-        folders: the shards' folders.
-        configs: what each shard began with.
-        parts: names of all parts of the work, in order.
-        label: gives a part's name in messages.
-
-    Returns:
-        The path of each part by its name.
-
-    Raises:
-        UserError: a shard is not finished, or a part differs between two folders.
+    `parts` are the names of all parts, in order; `label` gives a part's name in messages. Raises UserError if
+    a shard is not finished, or a part differs between two folders.
     """
     paths: dict[str, Path] = {}
     for folder, config in zip(folders, configs, strict=True):

@@ -45,16 +45,11 @@ def brier(p: Floats, target: Floats) -> Floats:
 
 
 def negative_log_likelihood(p: Floats, safe: Bools, floor: float = 1e-4) -> Floats:
-    """Return -ln of the probability that intents give to the safe actions; 0 best. Shape `(...)`.
+    """Return -ln of the probability that intents `(..., A)` give to the safe actions; 0 best. Shape `(...)`.
 
     This is the logarithmic score (Good 1952) with the set of safe actions as the event that came true. Unlike
-    in `brier`, it does not matter how the mass is spread inside the set. NaN where no action is safe.
-
-    Args:
-        p: intents, `(..., A)`.
-        safe: which actions are safe, `(..., A)`.
-        floor: least probability counted, so that an answer that is sure and wrong costs -ln(floor)
-            = 9.2 nats and not infinity.
+    in `brier`, it does not matter how the mass is spread inside the set. NaN where no action is safe. `floor`
+    is the least probability counted: an answer that is sure and wrong costs -ln(floor) = 9.2 nats.
     """
     mass = np.sum(np.where(safe, p, 0.0), axis=-1)
     # Rounding may put the mass of a distribution slightly above 1.
@@ -81,7 +76,7 @@ def episode_interval(
             episode's known values is taken; an episode that is all NaN is excluded.
         episodes: the episode of each of the values `(n,)`, if there is not one value an episode. The mean is
             then over values, and the variance is that of a ratio of totals (Cochran 1977, section 6.3).
-        level: confidence level.
+        level: of confidence.
     """
     values = values_by_episode.reshape(len(values_by_episode), math.prod(values_by_episode.shape[1:]))
     means = known_mean(values, axis=-1)
@@ -97,14 +92,10 @@ def known_mean(values: Floats, axis: int) -> Floats:
 
 
 def rate_interval(values: Floats, episodes: Ints | None = None, level: float = 0.95) -> Estimate:
-    """Return the mean of values from 0 to 1 with Wilson's interval for their effective sample size.
+    """Return the mean of values from 0 to 1, `(n,)`, with Wilson's interval for their effective sample size.
 
-    How much an episode counts depends on how alike its seeds or decisions are (`_effective_n`).
-
-    Args:
-        values: outcomes, or shares of outcomes, `(n,)`; NaN is left out.
-        episodes: the episode of each value, `(n,)`; None if each is an episode of its own.
-        level: confidence level.
+    NaN is left out. `episodes` is the episode of each value, one of its own if None; how much an episode
+    counts depends on how alike its seeds or decisions are (`_effective_n`).
     """
     known = ~np.isnan(values)
     n, n_excluded = int(known.sum()), int((~known).sum())
@@ -132,12 +123,8 @@ def seed_rate_interval(values: Floats, level: float = 0.95) -> Estimate:
     deviate from the rest of their episode are added, one each way (as Bonett and Price 2012 do with pairs):
     even if no seed changed anything, another might.
 
-    Args:
-        values: from 0 to 1, or differences of such values, `(S, E)`; NaN is left out.
-        level: confidence level.
-
-    Returns:
-        The mean, with the number of seeds as n. One seed has a value and no interval.
+    `values` are from 0 to 1, or differences of such, `(S, E)`; NaN is left out. The number of seeds is n; one
+    seed has a value and no interval.
     """
     from scipy.special import stdtrit
 
@@ -158,12 +145,8 @@ def rate_difference(a: Floats, b: Floats, level: float = 0.95) -> Estimate:
 
     The ends of both intervals are combined by the correlation over episodes (Newcombe 1998, method 10; Zou
     and Donner 2008). The correlation includes two more pairs that differ, one each way (as in Bonett and
-    Price 2012): even if all pairs agree, a few of other episodes might not.
-
-    Args:
-        a: one condition's values from 0 to 1, `(E,)` or `(E, ...)`, episodes in the same order as in `b`.
-        b: the other condition's values. A pair in which either is NaN is excluded.
-        level: confidence level.
+    Price 2012): even if all pairs agree, a few of other episodes might not. Both are `(E,)` or `(E, ...)`,
+    with the same episodes; a pair in which either is NaN is excluded.
     """
     unknown = np.isnan(a) | np.isnan(b)
     x, y = (
@@ -211,10 +194,8 @@ def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
 def resampled_estimate(values: Floats, n: int) -> Estimate:
     """Return a figure of n units with its bootstrap's 95 % interval.
 
-    Args:
-        values: `(1 + times,)`, in the order of `resampled`: the figure itself, then that of each resample.
-            NaN resamples are left out; if the figure itself is NaN, there is no interval.
-        n: number of units.
+    `values` are the figure itself, then that of each resample, in the order of `resampled`, `(1 + times,)`.
+    NaN resamples are left out; if the figure itself is NaN, there is no interval.
     """
     known = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]):
@@ -237,13 +218,8 @@ def _effective_n(rate: float, totals: Floats, sizes: Floats, level: float) -> fl
     This is the effective sample size of Korn and Graubard (1998): rate (1 - rate) over the variance of the
     mean with episodes as clusters, reduced for Student's t in place of the normal distribution. The degrees
     of freedom are Satterthwaite's, from the fourth moment: they are few if few episodes differ from the rest.
-    An episode counts as one trial at least, since no values from 0 to 1 vary more than yes or no.
-
-    Args:
-        rate: mean of the values.
-        totals: sum of each episode's deviations from the rate, (C,).
-        sizes: number of each episode's values, (C,).
-        level: confidence level.
+    An episode counts as one trial at least, since no values from 0 to 1 vary more than yes or no. `totals`
+    are each episode's sum of deviations from the rate, and `sizes` the number of its values, (C,).
     """
     from scipy.special import stdtrit
 

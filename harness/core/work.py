@@ -117,13 +117,8 @@ def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Pa
     """Lock the working folder, an existing one or a new one that begins with `begin`, and yield it.
 
     If a UserError or OSError ends the work before anything is done, the folders created here are deleted; but
-    if the model could not be asked, the folder keeps why (`unanswered`).
-
-    Args:
-        out: the output folder.
-        begin: what the work begins with.
-        last: name of the file in `out` that finished work writes. Another process may have finished since
-            this one looked; then this raises UserError.
+    if the model could not be asked, the folder keeps why (`unanswered`). Finished work writes the file `last`
+    of `out` at the end: if another process has finished since this one looked, this raises UserError.
     """
     work, created = out / WORK, [path for path in (out, *out.parents) if not path.exists()]
     try:

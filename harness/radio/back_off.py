@@ -50,12 +50,9 @@ def _idle_s(needed_s: float, per_s: float, cost_s: float) -> float:
 
 @lru_cache(maxsize=64)
 def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Floats, Floats]:
-    """Return the distribution of the access delay, whose mean is `mean_access_s`.
+    """Return the distribution of the access delay, whose mean is `mean_access_s`, by its generating function.
 
-    It is computed from its generating function.
-
-    Returns:
-        Probabilities and seconds: with each probability the delay is no longer than the seconds.
+    These are probabilities and seconds: with each probability the delay is no longer than the seconds.
     """
     packet, aifs, slot = (round(s / TICK_S) for s in (packet_s, aifs_s, SLOT_S))
     starts = -math.expm1(-float(begin_per_s(busy, packet_s)) * TICK_S)  # in a tick of idle time
@@ -78,21 +75,13 @@ def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Fl
 
 @lru_cache(maxsize=64)
 def same_slot(per_slot: float, packet_slots: float, aifs_slots: float, window: int) -> tuple[float, float]:
-    """Return how often packets that all can hear begin in the same slot, and the busy ratio.
+    """Return the share of packets that begin with another, if all can hear all, and the busy ratio.
 
     Vehicles that want to send while the medium is busy end their back-off soon after it, so packets collide
     more often than if they began at random. The model follows the mean number of vehicles with each back-off
     count, slot by slot from one busy period to the next. Numbers are assumed to be Poisson; the vehicles that
-    a busy period leaves waiting are a fixed point.
-
-    Args:
-        per_slot: packets of all vehicles that arrive in a slot.
-        packet_slots: time on air in slots.
-        aifs_slots: AIFS in slots.
-        window: back-off is uniform from 0 to this number of slots.
-
-    Returns:
-        Share of packets that begin with another, and share of time that the medium is busy.
+    a busy period leaves waiting are a fixed point. `per_slot` counts the packets of all vehicles that arrive
+    in a slot; back-off is uniform from 0 to `window` slots.
     """
     counts = window + 1
     slot, count = np.arange(counts + 1)[:, None], np.arange(counts)

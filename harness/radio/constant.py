@@ -66,9 +66,7 @@ def density_coupled_loss(n_active: Ints) -> Floats:
 def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bools:
     """Return which helpers' request and reply are both received, `(..., H)`; the probability is (1 - loss)^2.
 
-    Args:
-        uniforms: draws in [0, 1), `(..., H, 2)`: the request's and the reply's.
-        loss: probability that one transmission is lost, `(..., H)` or `(..., 1)`.
-        roadside_edge: whether a reply has a second path, so that it is lost with probability loss^2.
+    `uniforms` are the request's and the reply's draws, `(..., H, 2)`. At a roadside edge a reply has a second
+    path, so that it is lost with probability loss^2.
     """
     return (uniforms[..., 0] >= loss) & (uniforms[..., 1] >= (loss**2 if roadside_edge else loss))

@@ -42,10 +42,8 @@ class Trips:
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
         """Return the shadowing of the link to each helper, `(..., H)`, standard normal.
 
-        Args:
-            xy_m: positions of the ego and its helpers, `(..., 1+H, 2)`.
-            decorrelation_m: distance that both ends move (root of the sum of squares) until the correlation
-                is 1/e.
+        Positions are those of the ego and its helpers, `(..., 1+H, 2)`. The correlation is 1/e when both ends
+        have moved `decorrelation_m` (root of the sum of squares).
         """
         helpers = xy_m.shape[-2] - 1
         waves, place = self._once_a_pair(_waves, helpers)

@@ -94,7 +94,7 @@ def by_unit(
         unit: the unit.
         delay_s: time between what the unit has received and what it sends for that.
         links: the helpers that the ego wants to be asked; their `ready_s` is not used.
-        draws: the channel's draws.
+        draws: the channel's.
         ready: gives when replies can leave, `(..., H)`, from when helpers have the request, `(..., 1)`.
         left_s: time until the window closes, `(...)`.
     """

@@ -92,10 +92,7 @@ class Sidelink(Transceiver):
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Return the share of background packets received, averaged over shadowing, `(n,)` (6).
 
-        Args:
-            distance_m: distances, `(n,)`.
-            sight: what stands between, `(n,)` or one value for all; None means no building, and vehicles with
-                the environment's probability.
+        Without `sight`, no building stands between, and vehicles do with the environment's probability.
         """
         distance_m = np.asarray(distance_m, dtype=np.float64)
         success = np.array([np.interp(distance_m, _DISTANCE_M, column) for column in _success(self).T]).T

@@ -64,22 +64,11 @@ class Transceiver(Propagation, Physical):
     ) -> tuple[Bools, Floats]:
         """Resolve how replies affect each other: which survive, and when each has ended, all `(..., H)`.
 
-        Args:
-            links: the links, with the helpers that were asked.
-            begins_s: when each reply would begin.
-            airtime_s: how long it is on air.
-            uniforms: the draws that chose when it begins.
-            replied: which helpers have received the request.
+        `uniforms` are the draws that chose when each begins; `replied` says which helpers have the request.
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Return the probability that a message is lost on each link, `(..., H)`, given its shadowing.
-
-        Args:
-            site: positions of the links; links to absent helpers have any loss.
-            shadow: standard normal, `(..., H)`.
-            bits: size of the message, `(..., H)` or one number.
-        """
+        """Return the probability that a message is lost on each link, `(..., H)`; any for absent helpers."""
         return self._lost(self._fate_at(site, shadow), bits)
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:

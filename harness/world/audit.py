@@ -78,8 +78,7 @@ def audit(
 ) -> Audit:
     """Audit a scenario on the layout seeds `seed` to `seed + layouts - 1`.
 
-    Raises:
-        UserError: scikit-learn is missing, or too few of the layouts have a danger, or too few have none.
+    Raises UserError without scikit-learn, or if too few layouts have a danger, or too few have none.
     """
     extras.need("an audit", "sklearn")
     seeds = range(seed, seed + layouts)

@@ -89,16 +89,9 @@ def broadcast(
 ) -> tuple[Beacon, ...]:  # fmt: skip
     """Return the beacons that matter after some more frames: the last ones received, and those under way.
 
-    Args:
-        p: the scenario's parameters.
-        seed: the layout's seed.
-        before: the beacons that mattered before these frames.
-        radios: ids of the senders, the ego first, then the helpers; the ego and a helper hear each other.
-        target_mps: target of the ego's speed controller.
-        poses: x, y, heading and speed of each in each frame, (F, V, 4).
-        first_frame: number of the first of these frames; 0 is the start.
-        loss: probability that a beacon of one of these frames, counted from 0, is lost on the link to each
-            helper, `(H,)`.
+    The ego is the first of the `radios`; it and a helper hear each other. `poses` are x, y, heading and speed
+    of each in each frame, (F, V, 4), from `first_frame` on; 0 is the start. `loss` gives for one of these
+    frames, counted from 0, the probability that a beacon is lost on the link to each helper, `(H,)`.
     """
     if p.perfect_knowledge:
         return ()
@@ -207,11 +200,8 @@ def losses(
 ) -> Callable[[int], Floats]:
     """Return a function that gives, for a frame, each helper's probability to lose a beacon, `(H,)`.
 
-    Args:
-        p: the scenario's parameters.
-        world: returns the state of the world.
-        radios: ids of the ego and of the helpers.
-        poses: x, y, heading and speed of all in each frame, (F, V, 4).
+    `world` returns the state; `radios` are the ego and the helpers; `poses` are x, y, heading and speed of
+    all vehicles in each frame, (F, V, 4).
     """
     radio = beacon_radio(p.beacon_channel)
     if radio is None:

@@ -187,14 +187,8 @@ def travelled_m(
     """Return the distance travelled (m) from each start by each sequence, (starts, sequences, steps).
 
     Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
-    present speed, and IDLE keeps the target.
-
-    Args:
-        moves: levels by which each decision changes the target speed, (sequences, decisions).
-        speeds_mps: speed of each start.
-        targets_mps: target speed of each start.
-        left: number of remaining decisions.
-        parameters: the scenario's.
+    present speed, and IDLE keeps the target. `moves` are levels of each decision, (sequences, decisions); a
+    start has a speed and a target speed, and `left` decisions remain.
     """
     levels, shape = np.array(parameters.target_speeds_mps), (len(speeds_mps), len(moves))
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)

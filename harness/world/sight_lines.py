@@ -23,13 +23,9 @@ def site(
 ) -> Site:
     """Return the links at some decision points, (n, ...), with those of roadside units.
 
-    An antenna is at the centre of its vehicle. If a building and a vehicle stand between two antennas, the
-    building counts.
-
-    Args:
-        points: states, each with the ids of the ego and its helpers, in this order.
-        units: roadside units.
-        zone_m: centroid of the conflict zone, the origin of the units' positions.
+    Each point is a state with the ids of the ego and its helpers, in this order. An antenna is at the centre
+    of its vehicle. If a building and a vehicle stand between two antennas, the building counts. Units have
+    their positions from `zone_m`, the centroid of the conflict zone.
     """
     there = [(state, [state.vehicle(name) for name in viewers]) for state, viewers in points]
     among = _site([(state, ego, helpers) for state, (ego, *helpers) in there])

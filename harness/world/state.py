@@ -102,11 +102,7 @@ def rectangle(
 def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats) -> Floats:
     """Return a lower bound of the gap between pairs of rectangles, (n,) m, by separating axes.
 
-    Args:
-        poses: x, y and heading of the first of each pair, (n, 3).
-        sizes_m: its length and width, (n, 2).
-        others: x, y and heading of the second, (n, 3).
-        their_sizes_m: its length and width, (n, 2).
+    Each has x, y and heading, (n, 3), and length and width, (n, 2).
     """
     (dx, dy), apart = (others - poses)[:, :2].T, np.full(len(poses), -np.inf)
     cos, sin, its_cos, its_sin = (turn(p[:, 2]) for p in (poses, others) for turn in (np.cos, np.sin))

@@ -178,13 +178,10 @@ class World:
             self.passed(poses, speed_mps, gap_m)
 
     def passed(self, poses: Floats, speed_mps: float, gap_m: float) -> None:
-        """Record the last frames: beacons, the least gap and hard braking.
+        """Record the last frames: beacons, the least gap so far and hard braking.
 
-        Args:
-            poses: x, y, heading and speed of each vehicle in each frame, from the origin of the scenario's
-                road, (F, V, 4).
-            speed_mps: the ego's speed before these frames.
-            gap_m: least gap between the ego and others so far.
+        `poses` are x, y, heading and speed of each vehicle in each frame, (F, V, 4), from the origin of the
+        scenario's road; `speed_mps` is the ego's before these frames.
         """
         self._broadcast(poses, self.frame + 1 - len(poses))
         self.outcome = replace(self.outcome, least_gap_m=gap_m)
@@ -241,11 +238,7 @@ class World:
         return bool(self.scenario.cleared(np.array(xy_m), np.array(approaches), self.scenario.parameters))
 
     def judge(self, standing: Set[str]) -> None:
-        """Decide the episode if the last frame has decided it.
-
-        Args:
-            standing: ids of the vehicles that had crashed before that frame.
-        """
+        """Decide the episode if the last frame has decided it; `standing` had crashed before, by id."""
         p = self.scenario.parameters
         ego, traffic = self.vehicles[0], self.vehicles[1:]
         crashed = {v.spawn.id for v in traffic if v.crashed and v.spawn.id not in standing}
@@ -266,10 +259,8 @@ class World:
 def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
     """Return the least gap between the ego's outline and another's in each world, at most `least_m`, (W,).
 
-    Args:
-        poses: x, y and heading, (W, frames, vehicles, 3 or more); the ego first; NaN without a vehicle.
-        sizes_m: length and width, (W, vehicles, 2).
-        least_m: the least gap before these frames, (W,).
+    `poses` are x, y and heading, (W, frames, vehicles, 3 or more), the ego first, NaN without a vehicle, and
+    `sizes_m` length and width, (W, vehicles, 2); `least_m` is the least gap before these frames.
     """
     centres_m = np.hypot(*np.moveaxis(poses[:, :, 1:, :2] - poses[:, :, :1, :2], -1, 0))
     # Two centres are at least both half widths apart from touching, and at most both half diagonals.

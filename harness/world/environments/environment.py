@@ -196,8 +196,7 @@ def numbered(env: Any, kind: Any, action: str) -> Any:
 def lane_of(v: Any) -> Lane:
     """Return the lane that a vehicle steers for, in plain types (highway-env may use NumPy's).
 
-    Raises:
-        UserError: it has none.
+    Raises UserError if it has none.
     """
     try:
         begin, end, number = getattr(v, "target_lane_index", v.lane_index)

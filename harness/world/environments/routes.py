@@ -65,17 +65,10 @@ def routes(
     origin_m: tuple[float, float] = (0.0, 0.0),
     reach_m: float = math.inf,
 ) -> Routes:
-    """Build every path of a network, as far as it lies within reach.
+    """Build every path of a network, as far as it lies within `reach_m` of the origin of the paths' frame.
 
-    Args:
-        name: name of the environment, for messages.
-        network: highway-env's network.
-        begin: road at which a route begins on a ring.
-        origin_m: origin of the paths' frame, in the network's.
-        reach_m: distance from the origin up to which paths are built.
-
-    Raises:
-        UserError: there are more than MOST_ROUTES routes.
+    A route on a ring begins at the road `begin`. Raises UserError, with the environment's `name`, if there
+    are more than MOST_ROUTES routes.
     """
     every = list(_routes(name, network, begin))
     labels = _labels(network, every)

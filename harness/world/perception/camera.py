@@ -309,9 +309,7 @@ def _inside(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
     """Return the blocks that an area touches, by row and column, and which of each one's cells lie in it.
 
-    Args:
-        area: in the map's coordinates, m.
-        sides: middles of the cells along each side of the map, block by block, (blocks, BLOCK) m.
+    `sides` are the middles of the cells along each side of the map, block by block, (blocks, BLOCK) m.
     """
     west, north, east, south = area.bounds
     columns = np.flatnonzero((sides[:, -1] >= west) & (sides[:, 0] <= east))

@@ -79,15 +79,10 @@ def surfaces(looks: Sequence[Look]) -> Surfaces:
 
 
 def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, Floats]:
-    """Intersect rays with the walls of surfaces; wall k of a surface goes from its corner k to the next.
+    """Intersect rays (r, 2) from a place (2,) with the walls of surfaces (n, 4, 2), all in metres.
 
-    Args:
-        origin: (2,) m.
-        targets: (r, 2) direction vectors; a ray parameter of 1 is their length.
-        corners: (n, 4, 2) m.
-
-    Returns:
-        Ray parameter, (r, 4n), inf if a wall is not met; and position along the wall from 0 to 1, (r, 4n).
+    Wall k of a surface goes from its corner k to the next. Returned are the ray parameter, (r, 4n), which is
+    1 at the target and inf if a wall is not met, and the position along the wall from 0 to 1, (r, 4n).
     """
     walls = _walls(np.broadcast_to(origin, (len(corners), 2)), corners).swapaxes(1, 2)
     return _met(walls.reshape(5, -1), targets[:, :1], targets[:, 1:])
@@ -117,14 +112,8 @@ def _met(walls: Floats, ray_x: Floats, ray_y: Floats) -> tuple[Floats, Floats]:
 def _first(surface: Ints, target: Ints, t: Floats, targets: int) -> tuple[Floats, Ints]:
     """Find which surface each target's ray meets first; of equally near ones, that with the lowest number.
 
-    Args:
-        surface: numbers of the surfaces that may be met, (m,), ascending.
-        target: number of the target that each may be met on the way to, (m,).
-        t: ray parameter at which it is met, (m,).
-        targets: number of targets.
-
-    Returns:
-        Ray parameter, (targets,), inf if nothing is met, and number of the surface, -1 if nothing is met.
+    A surface, by ascending number, may be met on the way to a target at ray parameter t, all (m,). Returned
+    are the ray parameter and the number of the surface, (targets,); inf and -1 if nothing is met.
     """
     least, met = np.full(targets, np.inf), np.full(targets, -1)
     np.minimum.at(least, target, t)

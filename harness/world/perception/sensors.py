@@ -61,9 +61,7 @@ def detections(
 ) -> list[Detection | None]:
     """Return what all sensors of a viewer together report of another vehicle in its sight; None if nothing.
 
-    Args:
-        pairs: states, each with a viewer and a vehicle on which enough rays of the viewer end.
-        ambient: light and weather.
+    Each of the `pairs` is a state, a viewer and a vehicle on which enough of its rays end.
     """
     if not pairs:
         return []
