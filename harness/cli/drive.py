@@ -54,7 +54,6 @@ def command(
     If the run is stopped, the same command continues it.
     """
     from harness.backends.cache import default_file
-    from harness.cli.video import write_failures
     from harness.evaluate import resolve
     from harness.evaluate.run import evaluate_shard
     from harness.world.scenarios import DEFAULT
@@ -116,3 +115,27 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
         "it did; both are means over episodes",
     )
     show(done, "closed loop", COLUMNS, notes)
+
+
+def write_failures(run: Path, most: int, quiet: bool) -> list[Path]:
+    """Videos of a run's first failed episodes under its last condition, each with the first seed that failed.
+
+    They are written to the run's `videos`, the best kind that can be written here; returns the files.
+    """
+    from harness.evaluate.replay import played
+    from harness.report.drawing.video import formats, write_video
+    from harness.runs.folder import read
+
+    driven = read(run)
+    last = driven.conditions[-1]
+    failed: dict[int, int] = {}
+    for ended in sorted(driven.episodes, key=lambda ended: ended.episode):
+        if ended.condition == last and not ended.success and len(failed) < most:
+            failed.setdefault(ended.episode, ended.seed)
+    files = []
+    with bar("drawing failed episodes", len(failed), quiet) as progress:
+        for episode, seed in failed.items():
+            files.append(run / "videos" / f"{episode:05d}-seed{seed}{formats()[-1]}")
+            write_video(played(driven, episode, last, seed), files[-1], lambda done: None)
+            progress(1)
+    return files

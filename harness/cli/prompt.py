@@ -127,13 +127,11 @@ def show(
 
 def examples(
     version: Version,
-    scenario: Annotated[str, typer.Option(help="Scenario to take the examples from.")],
-    count: Annotated[
-        int, typer.Option(help="Number of examples for each role, each from a layout of its own.")
-    ] = 2,
-    first_seed: Annotated[
-        int, typer.Option(help="Layout seed of the first example; train seeds are 100000 to 199999.")
-    ] = FIRST["train"],
+    scenario: str = typer.Option(..., help="Scenario to take the examples from."),
+    count: int = typer.Option(2, help="Number of examples for each role, each from a layout of its own."),
+    first_seed: int = typer.Option(
+        FIRST["train"], help="Layout seed of the first example; train seeds are 100000 to 199999."
+    ),
 ) -> None:
     """Add examples to a draft: earlier turns of the chat.
 
@@ -277,8 +275,8 @@ def _show_moved(what: str, pairs: "Sequence[Moved]") -> None:
 
 
 def compare(
-    a: Annotated[str, typer.Argument(help="Prompt version to compare with.", metavar="A")],
-    b: Annotated[str, typer.Argument(help="Prompt version to compare.", metavar="B")],
+    a: str = typer.Argument(help="Prompt version to compare with.", metavar="A"),
+    b: str = typer.Argument(help="Prompt version to compare.", metavar="B"),
     scene: str | None = typer.Option(
         None, help="Scene to render, such as 00003-0. Default: the dataset's first."
     ),

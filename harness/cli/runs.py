@@ -1,0 +1,259 @@
+"""`harness run`: list finished runs, follow a metric over them, merge shards, export and film a run."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from harness.cli import drive, options
+from harness.cli.progress import bar
+from harness.cli.terminal import WIDTH, echo_json, echo_wrong
+from harness.core import extras, work
+from harness.core.errors import UserError, printable
+from harness.core.figures import DASH, PERCENT
+from harness.runs.listing import SUCCESS
+
+if TYPE_CHECKING:
+    from harness.report.history import Line
+    from harness.runs.listing import Listed
+
+VARIANT = 32  # columns of model, prompt and answer mode
+
+
+def ls(folder: options.Reports = Path("reports"), as_json: options.Json = False) -> None:
+    """List runs and studies, newest first.
+
+    Each has the success of its best condition.
+    """
+    from harness.runs.listing import UNREAD, runs
+
+    listed = runs(folder)
+    if as_json:
+        echo_json([{**asdict(run), "date": run.date.isoformat()} for run in listed])
+        return
+    for run in listed:
+        name, date = printable(run.name, WIDTH - 17), f"{run.date.astimezone():%Y-%m-%d %H:%M}"
+        typer.echo(f"{name:<{WIDTH - 17}} {date}")
+        outcome = _outcome(run)
+        kind = f"{run.kind:<5} "
+        left = WIDTH - 3 - len(kind) - len(outcome)
+        parts = " · ".join(part for part in (run.model, run.prompt, run.answer) if part is not None)
+        typer.echo(f"  {kind}{printable(parts, left):<{left}} {outcome}".rstrip())
+        if run.unread is not None and run.unread >= UNREAD:
+            share = "none" if run.unread == 1 else f"only {100 * (1 - run.unread):.1f} %"
+            typer.echo(f"{'':8}{share} of the ego's answers could be read: it drives by the fallback")
+        if run.tags:
+            typer.echo(f"{'':8}{printable('tags: ' + ', '.join(run.tags), WIDTH - 8)}")
+    if not listed:
+        typer.echo(f"no runs in {printable(folder)}; `harness eval` makes one")
+
+
+def _outcome(run: "Listed") -> str:
+    if run.why is not None:
+        return f"{run.state}: {run.why}"
+    if run.success is None:
+        return ""
+    return f"{printable(run.condition, 24)} {PERCENT.interval(run.success, run.low, run.high)} %"
+
+
+def history(
+    folder: options.Reports = Path("reports"),
+    metric: str = typer.Option(SUCCESS, help="Metric to show, by its name in summary.csv."),
+    condition: str | None = typer.Option(
+        None, help="Condition to show. Default: the last of those that most runs have."
+    ),
+    dataset: str | None = typer.Option(
+        None, help="Show only runs on this dataset, or driven in this scenario."
+    ),
+    html: Path | None = typer.Option(None, help="Also write a page to this file."),
+    as_json: options.Json = False,
+) -> None:
+    """Show a metric over runs, by date, prompt version and model.
+
+    Runs on the same scenes are grouped, since only those compare.
+    """
+    from harness.report import history
+    from harness.runs.metrics import entry, written
+
+    wrong: dict[str, UserError] = {}
+    groups = history.history(folder, metric, condition, dataset, wrong.__setitem__)
+    if html:
+        history.write(groups, metric, html)
+    if as_json:
+        echo_json([
+            {"scenes": group.of, "condition": group.condition, "metric": metric,
+             "runs": [_mapping(line) for line in group.lines]}
+            for group in groups
+        ] + [{"run": name, "error": str(error)} for name, error in wrong.items()])  # fmt: skip
+        return
+    percent = " %" if entry(metric).unit.name == "%" else ""
+    typer.echo(f"{metric}{percent} with its 95 % interval")
+    for group in groups:
+        typer.echo(f"\n{printable(f'{group.of}, {group.condition}', WIDTH)}")
+        for line in group.lines:
+            value = n = DASH
+            if score := line.score:
+                value, n = written(score), str(score.n)
+            who = printable(line.run.manifest.variant, VARIANT)
+            typer.echo(f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}")
+    for name, error in wrong.items():
+        typer.echo()
+        echo_wrong(name, error)
+    if len(groups) > 1:
+        typer.echo("\nruns on different scenes do not compare, so each group has its own table")
+
+
+def _mapping(line: "Line") -> dict[str, object]:
+    variant, score = line.run.manifest.variant, line.score
+    numbers = {key: getattr(score, key, None) for key in ("value", "low", "high", "n", "n_excluded")}
+    return {
+        "run": line.name, "date": line.date.isoformat(), "model": variant.model, "prompt": variant.prompt,
+        "answer": variant.answer, "tags": line.run.manifest.tags, **numbers,
+    }  # fmt: skip
+
+
+def merge(
+    folders: list[Path] = typer.Argument(help="Folders of all shards, in any order.", metavar="FOLDER..."),
+    out: Path = typer.Option(..., help="Folder to write the whole to."),
+    audit: bool = typer.Option(
+        True, help="Audit a merged dataset of 100 layouts or more, as `harness dataset build` does."
+    ),
+    workers: options.Workers = "2",
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Merge the shards of a run or a dataset. The result is byte for byte what one unsplit run writes."""
+    from harness.core.shards import read
+
+    who, silent = options.workers_of(workers), as_json or quiet
+    if "world" not in read(folders, work.WorkStart)[0].settings:
+        from harness.dataset.build import merge as merge_dataset
+
+        with bar("layouts", quiet=silent) as progress:
+            manifest = merge_dataset(folders, out, who, progress, audit, progress.more)
+        if as_json:
+            echo_json(manifest)
+        elif not quiet:
+            typer.echo(
+                f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points"
+            )
+        return
+    from harness.cli.report import write
+    from harness.evaluate.run import merge
+
+    done = merge(folders, out)
+    with work.going_on(out):
+        page = write([out], quiet=silent)
+    work.tidy(out)
+    drive.tell(done, as_json, quiet)
+    if not silent:
+        typer.echo(f"wrote {page}")
+
+
+def export(
+    run: Path = typer.Argument(help="Folder of a finished run.", metavar="RUN"),
+    as_csv: bool = typer.Option(
+        False,
+        "--csv",
+        help="Write decisions.csv and answers.csv, one row per decision and answer. A text that a "
+        "spreadsheet would take for a formula gets an apostrophe before it.",
+    ),
+    as_jsonl: bool = typer.Option(False, "--jsonl", help="Write decisions.jsonl, one object per decision."),
+    out: Path | None = typer.Option(
+        None, help="Folder for the files of --csv and --jsonl. Default: the run's."
+    ),
+    junit: Path | None = typer.Option(
+        None, help="Write a JUnit XML file: one test case per episode and condition."
+    ),
+    inspect: Path | None = typer.Option(
+        None, help="Write an Inspect AI log, NAME.eval: one sample per answer."
+    ),
+    sft: Path | None = typer.Option(
+        None,
+        help="Write chats to fine-tune on as JSON Lines; their answers are those that the decision trees "
+        "show to be right.",
+    ),
+    dataset: options.RunsDataset = None,
+    report_seeds_too: bool = typer.Option(
+        False,
+        "--report-seeds-too",
+        help="With --sft: also allow layouts with report seeds (200000 and above).",
+    ),
+) -> None:
+    """Write a run's data for spreadsheets and other programs. Give exactly one format."""
+    from harness.runs import export
+    from harness.runs.folder import read
+
+    files = {"--junit": junit, "--inspect": inspect, "--sft": sft}
+    asked = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
+    [option, *surplus] = [name for name, given in asked.items() if given] or [""]
+    if surplus or not option:
+        raise UserError(f"{', '.join(asked)}: give exactly one of them")
+    if report_seeds_too and not sft:
+        raise UserError("--report-seeds-too only goes with --sft; give --sft, or leave it out")
+    if dataset and option not in ("--inspect", "--sft"):
+        raise UserError("--dataset only goes with --inspect and --sft; leave it out")
+    if out and option in files:
+        raise UserError(
+            f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
+        )
+    if junit and (reason := work.unanswered(run)):
+        from harness.report.page import save
+
+        save([export.junit_of_none(run, reason)], junit, "--junit")
+        typer.echo(printable(junit, 1000))
+        return
+    source, folder = read(run), out or run
+    target = files.get(option)
+    try:
+        if as_csv:
+            decisions, answers = source.decisions, source.answers  # both are read before anything is written
+            written = [
+                export.decisions_csv(decisions, folder / "decisions.csv"),
+                export.answers_csv(answers, source.actions, folder / "answers.csv"),
+            ]
+        elif as_jsonl:
+            written = [export.decisions_jsonl(source.decisions, folder / "decisions.jsonl")]
+        elif junit:
+            written = [export.junit(source, junit)]
+        elif sft:
+            from harness.training import pairs
+
+            with bar("writing chats"):
+                written = [pairs.write(source, sft, report_seeds_too, dataset)]
+        elif inspect:
+            extras.need("--inspect", "inspect_ai")
+            from harness.report import inspect_log
+
+            with bar("writing a log"):
+                written = [inspect_log.write(source, inspect, dataset)]
+    except OSError as error:
+        where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"
+        remedy = "name another file" if target else "choose another folder with --out"
+        raise UserError(f"{where} cannot be written ({error.strerror}); {remedy}") from None
+    for file in written:
+        typer.echo(printable(file, 1000))
+
+
+def video(
+    run: Path = typer.Argument(help="Folder of a finished run of `harness drive`."),
+    episode: int = typer.Argument(help="Number of the episode, from 0."),
+    condition: str | None = typer.Option(None, help="Condition to draw. Default: the run's last."),
+    seed: int | None = typer.Option(None, help="Channel seed to draw. Default: the run's first."),
+    out: Path = typer.Option(
+        Path("episode.gif"), help="File to write: .gif, or .mp4 if the extra `video` is installed."
+    ),
+) -> None:
+    """Draw an episode of a closed-loop run as a video.
+
+    It shows what is in sight, messages and the ego's policy.
+    """
+    from harness.evaluate.replay import find, stills
+    from harness.report.drawing.video import check, write_video
+
+    check(out)
+    played = find(run, episode, condition, seed)
+    with bar("drawing", sum(1 for _ in stills(played))) as progress:
+        write_video(played, out, progress)
+    typer.echo(f"wrote {out}")
