@@ -122,6 +122,13 @@ def test_spellings_of_0_2_work_with_a_warning(small: Dataset) -> None:
     assert old.is_environment
     assert World.start(old, 3).state() == World.start(small.scenario, 3).state()
     assert replace(old, name="other").world is old.world
+    with pytest.warns(FutureWarning, match=r"Old\.by_moment is now by_scene"):
+
+        class Old(extend.Attack):
+            by_moment = True
+
+    assert Old.by_scene
+    assert not extend.Attack.by_scene
 
 
 def test_a_run_is_evaluated_with_the_command_lines_names(small_path: Path, tmp_path: Path) -> None:

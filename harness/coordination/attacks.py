@@ -12,10 +12,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
+from warnings import warn
 
 import numpy as np
 from msgspec import Meta
 
+from harness.coordination.claims import Claims
 from harness.coordination.intents import Intents
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import changed, settable
@@ -44,26 +46,45 @@ class Attack:
 
     # the share of the helpers present that attack, to the nearest whole number of helpers
     share: Share = 1 / 3
-    by_moment: ClassVar[bool] = False  # whether it depends only on the scene and on who attacks
+    by_scene: ClassVar[bool] = False  # whether it depends only on the scene and on who attacks
     in_text: ClassVar[bool] = False  # whether it changes what a fusion prompt shows
+
+    def __init_subclass__(cls) -> None:
+        if "by_moment" in vars(cls):
+            warn(
+                f"{cls.__name__}.by_moment is now by_scene; it works until 0.4.0", FutureWarning, stacklevel=2
+            )
+            cls.by_scene = vars(cls)["by_moment"]
 
     @property
     def steps(self) -> int:
         """How many past steps it needs."""
         return 0
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        """Return what is said and claimed instead; `said` is the truth as earlier attacks have changed it."""
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        """Return what is sent and claimed instead; `sent` is the truth as earlier attacks have changed it."""
         raise NotImplementedError
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         """Return an attacker's message as a fusion prompt shows it (`in_text`), except for its intent."""
         return dict(message)
 
-    def intend(self, said: Intents, turn: Turn, intents: Floats) -> Intents:
-        """Return `said` with these intents `(n, H, A)` for the attackers; a NaN row changes nothing."""
+    def intend(self, sent: Intents, turn: Turn, intents: Floats) -> Intents:
+        """Return `sent` with these intents `(n, H, A)` for the attackers; a NaN row changes nothing."""
         lies = turn.attackers[..., None] & ~np.isnan(intents).any(axis=-1, keepdims=True)
-        return replace(said, helpers=np.where(lies, intents, said.helpers))
+        return replace(sent, helpers=np.where(lies, intents, sent.helpers))
+
+    def claim(
+        self, sent: Intents, turn: Turn, to_zone_m: Floats | float, to_ego_m: Floats, claims: Claims | None
+    ) -> Intents:
+        """Return `sent` with these distances, `(n, H)`, and claims for the attackers."""
+        ego_m, helpers_m = np.split(sent.distance_m, [1], axis=1)
+        return replace(
+            sent,
+            distance_m=np.concatenate([ego_m, np.where(turn.attackers, to_zone_m, helpers_m)], axis=1),
+            range_m=np.where(turn.attackers, to_ego_m, sent.range_m),
+            claims=claims,
+        )
 
 
 @dataclass(frozen=True)
@@ -73,17 +94,17 @@ class Liar(Attack):
     # `one-hot` is sure of the action that it finds least likely; `permuted` is its own distribution with the
     # largest probability where the smallest was, and so on
     says: Literal["one-hot", "permuted"] = "one-hot"
-    by_moment: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
+    def act(self, sent: Intents, turn: Turn) -> Intents:
         p = turn.truth.helpers
         order = np.argsort(np.nan_to_num(p), axis=-1, kind="stable")
         if self.says == "one-hot":
-            return self.intend(said, turn, _sure_of(order[..., 0], p.shape[-1]))
+            return self.intend(sent, turn, _sure_of(order[..., 0], p.shape[-1]))
         reversed_p = np.empty_like(p)
         np.put_along_axis(reversed_p, order, np.take_along_axis(p, order[..., ::-1], -1), -1)
-        return self.intend(said, turn, reversed_p)
+        return self.intend(sent, turn, reversed_p)
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         """Return the message without reasons and with a low risk."""
@@ -94,8 +115,8 @@ class Liar(Attack):
 class Stuck(Attack):
     """Says at every step what it intended at the first."""
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        return self.intend(said, turn, turn.first)
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        return self.intend(sent, turn, turn.first)
 
 
 @dataclass(frozen=True)
@@ -108,42 +129,42 @@ class Stale(Attack):
     def steps(self) -> int:
         return self.decisions
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
+    def act(self, sent: Intents, turn: Turn) -> Intents:
         past = turn.past[:, self.decisions - 1]
-        return self.intend(said, turn, np.where(np.isnan(past), turn.first, past))
+        return self.intend(sent, turn, np.where(np.isnan(past), turn.first, past))
 
 
 @dataclass(frozen=True)
 class Replay(Attack):
-    """Says under its own name what the next helper said at the last step; at the first, the truth."""
+    """Says under its own name what the next helper sent at the last step; at the first, the truth."""
 
     @property
     def steps(self) -> int:
         return 1
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        return self.intend(said, turn, np.roll(turn.past[:, 0], -1, axis=1))
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        return self.intend(sent, turn, np.roll(turn.past[:, 0], -1, axis=1))
 
 
 @dataclass(frozen=True)
 class RandomIntent(Attack):
     """Is sure of an action that is drawn anew at each step, as a broken model might be."""
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        actions = said.helpers.shape[-1]
-        return self.intend(said, turn, _sure_of((turn.uniforms * actions).astype(int), actions))
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        actions = sent.helpers.shape[-1]
+        return self.intend(sent, turn, _sure_of((turn.uniforms * actions).astype(int), actions))
 
 
 @dataclass(frozen=True)
 class FeignedBraking(Attack):
     """Is always sure of the first action, the most careful one, which is safe but obstructs."""
 
-    by_moment: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        braking = np.zeros(said.helpers.shape[:-1], dtype=int)
-        return self.intend(said, turn, _sure_of(braking, said.helpers.shape[-1]))
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        braking = np.zeros(sent.helpers.shape[:-1], dtype=int)
+        return self.intend(sent, turn, _sure_of(braking, sent.helpers.shape[-1]))
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         """Return the message without reasons and with a high risk."""
@@ -155,13 +176,13 @@ class Overconfident(Attack):
     """Says what it intends, but is surer than it should be: p to a power, scaled to sum to 1."""
 
     power: Annotated[float, Meta(ge=1, le=100)] = 5.0  # the exponent; 1 changes nothing
-    by_moment: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
+    def act(self, sent: Intents, turn: Turn) -> Intents:
         p = turn.truth.helpers
         sharp = (p / np.max(p, axis=-1, keepdims=True)) ** self.power
-        return self.intend(said, turn, sharp / np.sum(sharp, axis=-1, keepdims=True))
+        return self.intend(sent, turn, sharp / np.sum(sharp, axis=-1, keepdims=True))
 
 
 @dataclass(frozen=True)
@@ -173,19 +194,16 @@ class Spoof(Attack):
 
     # claimed distance to the centroid of the conflict zone
     distance_m: Annotated[float, Meta(ge=0, le=1000)] = 3.0
-    by_moment: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        distance_m, by = said.distance_m.copy(), turn.attackers
-        distance_m[:, 1:] = np.where(by, self.distance_m, distance_m[:, 1:])
-        range_m = np.where(by, np.abs(distance_m[:, :1] - self.distance_m), said.range_m)
-        claims = said.claims
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        claims = sent.claims
         if claims is not None:
             ego = claims.xy_m[:, :1]
-            claims = claims.moved(
-                by, self.distance_m * ego / np.maximum(np.linalg.norm(ego, axis=-1), 1e-9)[..., None]
-            )
-        return replace(said, distance_m=distance_m, range_m=range_m, claims=claims)
+            ego_m = np.maximum(np.linalg.norm(ego, axis=-1), 1e-9)[..., None]
+            claims = claims.moved(turn.attackers, self.distance_m * ego / ego_m)
+        to_ego_m = np.abs(sent.distance_m[:, :1] - self.distance_m)
+        return self.claim(sent, turn, self.distance_m, to_ego_m, claims)
 
 
 @dataclass(frozen=True)
@@ -195,38 +213,36 @@ class Jump(Attack):
     offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0  # the distance from the true place
     needs: ClassVar[tuple[str, ...]] = ("claims",)
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        assert said.claims is not None
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        assert sent.claims is not None
         angle = 2 * np.pi * turn.uniforms[..., None]
         away_m = self.offset_m * np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
-        claims = said.claims.moved(turn.attackers, said.claims.xy_m[:, 1:] + away_m)
+        claims = sent.claims.moved(turn.attackers, sent.claims.xy_m[:, 1:] + away_m)
         ego, places = np.split(claims.xy_m, [1], axis=1)
-        distance_m, to_ego_m = said.distance_m.copy(), np.linalg.norm(places - ego, axis=-1)
-        distance_m[:, 1:] = np.where(turn.attackers, np.linalg.norm(places, axis=-1), distance_m[:, 1:])
-        range_m = np.where(turn.attackers, to_ego_m, said.range_m)
-        return replace(said, distance_m=distance_m, range_m=range_m, claims=claims)
+        to_ego_m = np.linalg.norm(places - ego, axis=-1)
+        return self.claim(sent, turn, np.linalg.norm(places, axis=-1), to_ego_m, claims)
 
 
 @dataclass(frozen=True)
 class Silent(Attack):
     """Does not answer when it matters: if its intent differs from the ego's. Its slot stays empty."""
 
-    by_moment: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
+    def act(self, sent: Intents, turn: Turn) -> Intents:
         own, helpers = np.nan_to_num(turn.truth.own), np.nan_to_num(turn.truth.helpers)
         differs = np.argmax(helpers, axis=-1) != np.argmax(own, axis=-1)[:, None]
-        return replace(said, silent=turn.attackers & differs)
+        return replace(sent, silent=turn.attackers & differs)
 
 
 @dataclass(frozen=True)
 class Absent(Attack):
     """Is absent. This is no attack, but a bound: what a rule would hear that knows who attacks."""
 
-    by_moment: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        return replace(said, valid=said.valid & ~turn.attackers)
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        return replace(sent, valid=sent.valid & ~turn.attackers)
 
 
 @dataclass(frozen=True)
@@ -238,8 +254,8 @@ class Sybil(Attack):
 
     voices: Annotated[int, Meta(ge=2, le=MOST_VOICES)] = 3  # the number of voices of each attacker
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        return with_voices(said, turn.attackers, self.voices)
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        return with_voices(sent, turn.attackers, self.voices)
 
 
 @dataclass(frozen=True)
@@ -249,9 +265,9 @@ class Flood(Sybil):
     Its voices take slots, and the places of other vehicles.
     """
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        alike = np.full_like(said.helpers, 1 / said.helpers.shape[-1])
-        return with_voices(self.intend(said, turn, alike), turn.attackers, self.voices)
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        alike = np.full_like(sent.helpers, 1 / sent.helpers.shape[-1])
+        return with_voices(self.intend(sent, turn, alike), turn.attackers, self.voices)
 
 
 @dataclass(frozen=True)
@@ -259,7 +275,7 @@ class Injection(Attack):
     """Writes instructions to the reading model into a message's evidence; its intent stays true."""
 
     language: str = "english"  # language of the instructions, a key of `INSTRUCTIONS`
-    by_moment: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -267,8 +283,8 @@ class Injection(Attack):
         if self.language not in INSTRUCTIONS:
             raise unknown("language of an injection", self.language, INSTRUCTIONS)
 
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        return said
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        return sent
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         """Return the message with instructions to choose the last action, the boldest one."""
@@ -352,8 +368,8 @@ def attackers(share: float, present: Bools, draws: Floats) -> Bools:
     return np.asarray(present & (rank < count))
 
 
-def with_voices(said: Intents, talkers: Bools, voices: int) -> Intents:
-    """Return `said` with further voices of the `talkers` after all others; `voice_of` has their owners."""
+def with_voices(sent: Intents, talkers: Bools, voices: int) -> Intents:
+    """Return `sent` with further voices of the `talkers` after all others; `voice_of` has their owners."""
     n, helpers = talkers.shape
     places = np.argsort(~talkers, axis=-1, kind="stable")[
         :, : int(np.max(np.sum(talkers, axis=-1), initial=0))
@@ -363,7 +379,7 @@ def with_voices(said: Intents, talkers: Bools, voices: int) -> Intents:
     apart_m = 2.0 * np.tile(np.arange(1, voices), places.shape[-1])
     index = np.concatenate([np.broadcast_to(np.arange(helpers), (n, helpers)), owners], axis=-1)
     shift_m = np.concatenate([np.zeros(helpers), apart_m])
-    widened = said.of_helpers(index)
+    widened = sent.of_helpers(index)
     distance_m = widened.distance_m + np.insert(shift_m, 0, 0.0)
     present = np.concatenate([np.ones((n, helpers), dtype=bool), is_talker], axis=-1)
     range_m = np.where(present, widened.range_m + shift_m, np.nan)

@@ -108,21 +108,21 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
     if point.radio.profile is None:
         asked = np.zeros_like(in_radius)
     elif asked is None:
-        worth = _worth(point, known, intents, draws)
-        asked = chosen(worth, point.ask.above, in_radius, intents.range_m, point.ask.max_helpers)
+        asked = _chosen(point, known, intents, draws)
     else:
         asked = asked & in_radius
     request_s, outcome, waits_until_s = _ask_helpers(point, intents, asked, in_radius, draws)
     delivered = outcome.up if intents.silent is None else outcome.up & ~intents.silent
     loss, arrival_s = outcome.loss, np.where(delivered, request_s + outcome.end_s, np.inf)
     one_loss = loss.shape[-1] == 1
+    in_turn = point.radio.profile is None or point.ask.on_demand  # else they infer before they are asked
     return Exchange(
         own=known.own,
         own_failed=own_failed,
         entropy_nats=known.entropy_nats,
         triggered=any_of(asked),
         asked=outcome.asked,
-        infers=_infers(point, intents, outcome.asked),
+        infers=outcome.asked if in_turn else np.asarray(intents.range_m <= point.ask.radius_m),
         requests=outcome.requests,
         request_bits=outcome.request_bits,
         reply_bits=np.sum(np.where(outcome.asked, intents.payload_bits, 0.0), axis=-1) + outcome.policy_bits,
@@ -150,16 +150,15 @@ def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
     known = _base_knowledge(point, intents)[1]
     if getattr(SCHEDULES[point.ask.schedule], "by_presence", True):
         return known.may_ask
-    worth = _worth(point, known, intents, draws)
-    asked = chosen(worth, point.ask.above, known.may_ask, intents.range_m, point.ask.max_helpers)
+    asked = _chosen(point, known, intents, draws)
     coupled = getattr(point.channel, "density_coupled", point.physical is None)
     return any_of(asked)[..., None] & known.may_ask if coupled or point.radio.helper_rounds else asked
 
 
-def _infers(point: OperatingPoint, intents: Intents, asked: Bools) -> Bools:
-    if point.radio.profile is None or point.ask.on_demand:
-        return asked
-    return np.asarray(intents.range_m <= point.ask.radius_m)  # before they know who is asked
+def _chosen(point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws) -> Bools:
+    """Return who is asked by the point's schedule, `(..., H)`."""
+    worth = SCHEDULES[point.ask.schedule].worth(_with_schedule_needs(point, known, intents, draws))
+    return chosen(worth, point.ask.above, known.may_ask, intents.range_m, point.ask.max_helpers)
 
 
 def _ask_helpers(
@@ -189,20 +188,9 @@ def _ask_helpers(
     return request_s, _ask_directly(point.channel, links, draws, ready), np.array(np.inf)
 
 
-def own_intent(point: OperatingPoint, intents: Intents) -> tuple[Bools, Floats]:
-    """Return whether the ego's answer failed, `(...)`, and its intent after the fallback, `(..., A)`."""
-    failed = any_of(np.isnan(intents.own))
-    fallback = fallback_intent(point.fusion.fallback, intents.own.shape[-1])
-    return failed, np.where(failed[..., None], fallback, intents.own)
-
-
 def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
     """Return what asking each helper is worth by the point's schedule, `(..., H)` or `(..., 1)`."""
-    return _worth(point, _base_knowledge(point, intents)[1], intents, draws)
-
-
-def _worth(point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws) -> Floats:
-    return SCHEDULES[point.ask.schedule].worth(_with_schedule_needs(point, known, intents, draws))
+    return SCHEDULES[point.ask.schedule].worth(known_of(point, intents, draws))
 
 
 def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> ScheduleInputs:
@@ -212,7 +200,10 @@ def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> ScheduleI
 
 def _base_knowledge(point: OperatingPoint, intents: Intents) -> tuple[Bools, ScheduleInputs]:
     """Return whether the ego's answer failed, `(...)`, and what it knows under any schedule."""
-    failed, own = own_intent(point, intents)
+    failed, n_actions = any_of(np.isnan(intents.own)), intents.own.shape[-1]
+    braking = point.fusion.fallback == "brake"
+    fallback = np.eye(n_actions)[0] if braking else np.full(n_actions, 1.0 / n_actions)
+    own = np.where(failed[..., None], fallback, intents.own)
     in_radius = intents.valid & (intents.range_m <= point.ask.radius_m)
     return failed, ScheduleInputs(own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m)
 
@@ -240,7 +231,7 @@ IMAGINED = 8  # how many imagined exchanges the ego's expectation averages
 def _in_time(point: OperatingPoint, intents: Intents, may_ask: Bools, draws: Draws) -> Floats:
     """Return the probability that a reply arrives in the window, `(..., H)`, over imagined exchanges.
 
-    These have draws of their own. The crossings of request and reply count as independent. A second path,
+    These have draws of their own. The transmissions of request and reply count as independent. A second path,
     over a roadside unit, is left out.
     """
     total = np.zeros(may_ask.shape)
@@ -285,11 +276,3 @@ def inferred_s(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
             raise UserError("round_trip needs layouts, and the paper's study has none; give round_trip_s")
         ego_s = ego_s + point.network.round_trip_s(draws.of(".cloud").wait)
     return np.insert(intents.inference_s[..., 1:], 0, ego_s, axis=-1)
-
-
-def fallback_intent(fallback: str, n_actions: int) -> Floats:
-    """Return what replaces a failed answer of the ego, `(A,)`: `uniform`, or `brake`, the first action."""
-    if fallback == "brake":
-        first: Floats = np.eye(1, n_actions)[0]
-        return first
-    return np.full(n_actions, 1.0 / n_actions)

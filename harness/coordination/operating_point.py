@@ -85,7 +85,7 @@ class OperatingPoint:
             raise wrong("edge", FUSION, f"none or relay {where}: a unit has no model")
         if self.ask.messages == "shuffled":
             raise wrong("messages", "shuffled", f"own or blind {where}")
-        if not all(attack.by_moment for attack in attacks_of(self.guard.attack)):
+        if not all(attack.by_scene for attack in attacks_of(self.guard.attack)):
             raise wrong("attack", self.guard.attack, f"one that needs no past and adds no voices {where}")
 
     @classmethod
@@ -105,10 +105,7 @@ class OperatingPoint:
                 raise unknown("operating point setting", str(key), allowed)
         if "name" not in values:
             raise UserError('operating point without a name: add name = "..."')
-        held = dict(values)
-        if "radio" in held:
-            held["further"] = held.pop("radio")
-        return cls.of(**held)
+        return cls.of(**{"further" if key == "radio" else key: value for key, value in values.items()})
 
     @staticmethod
     def types() -> dict[str, Any]:

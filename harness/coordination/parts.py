@@ -12,7 +12,7 @@ from harness.coordination.attacks import attacks_of
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
-from harness.core.config import LONGEST_S
+from harness.core.config import LONGEST_S, Seconds
 from harness.core.errors import printable, unknown
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
@@ -24,7 +24,6 @@ RELAY, FUSION = "relay", "fusion"
 EDGES = ("none", RELAY, FUSION)
 MOST_HELPERS = 1000
 
-Seconds = Annotated[float, Meta(ge=0, le=LONGEST_S, description="seconds, 0 or more, at most 3600")]
 Metres = Annotated[float, Meta(gt=0, le=1e6, description="metres above 0, at most 1000000")]
 Place = Annotated[float, Meta(ge=-10_000, le=10_000, description="metres from -10000 to 10000")]
 Text = Annotated[str, Meta(description="a text")]
@@ -38,12 +37,12 @@ class Part(Struct, frozen=True, kw_only=True):
         for key, hint in get_type_hints(type(self), include_extras=True).items():
             value = getattr(self, key)
             try:
-                held = convert(value, hint)
-                if isinstance(held, float) and not math.isfinite(held):
+                converted = convert(value, hint)
+                if isinstance(converted, float) and not math.isfinite(converted):
                     raise ValidationError
             except (ValidationError, OverflowError):
                 raise wrong(key, value, _allowed(hint)) from None
-            structs.force_setattr(self, key, held)
+            structs.force_setattr(self, key, converted)
         self.check()
 
     def check(self) -> None:

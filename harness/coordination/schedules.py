@@ -1,18 +1,118 @@
-"""Find schedules by name: formulas, files `schedules/*.toml` and those that other packages add.
+"""Find schedules by name: formulas, learnt ones in files `schedules/*.toml`, and those that packages add.
 
-A file holds a learnt schedule and what it was learnt from; `harness study schedule learn` writes it. A
-package adds a schedule by an entry point in the group `swarmdrive.schedules`.
+A file holds a small network, which says what asking a helper is worth from what the ego knows before, and
+what it was learnt from; `harness study schedule learn` writes it. A package adds a schedule by an entry point
+in the group `swarmdrive.schedules`.
 """
 
+from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
-from harness.coordination.learnt import Learnt, Stated
-from harness.coordination.scheduling import FORMULAS, Schedule
+import numpy as np
+
+from harness.coordination.scheduling import FORMULAS, Schedule, ScheduleInputs
+from harness.core.arrays import Floats
 from harness.core.config import convert, toml
-from harness.core.errors import printable
+from harness.core.errors import UserError, printable
 from harness.core.files import sha256_file
 from harness.core.plugins import FilesAndPlugins
+
+FAR_S, FAR_M = 6.0, 100.0  # scales of times and distances; a longer time counts as FAR_S
+INPUTS = (
+    "entropy", "margin", "most careful", "least careful", "unseen, most", "unseen, mean", "added, most",
+    "added, mean", "range", "helper to zone", "ego to zone", "seconds to zone", "others nearer", "others",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network with one hidden layer, of F inputs and J units."""
+
+    centre: Floats  # what is subtracted from each input, (F,)
+    scale: Floats  # what each input is then divided by, (F,)
+    into: Floats  # weights from the inputs to the units, (F, J)
+    bias: Floats  # bias of each unit, (J,)
+    out: Floats  # weights from the units to the output, (J,)
+    base: float  # bias of the output
+
+    def __call__(self, inputs: Floats) -> Floats:
+        """Return the output `(...)` for inputs `(..., F)`."""
+        units = np.tanh(((inputs - self.centre) / self.scale) @ self.into + self.bias)
+        return np.asarray(units @ self.out + self.base)
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """A schedule whose worth is the expected gain in success probability from asking only this helper."""
+
+    network: Network
+    threshold: float
+    needs: ClassVar[tuple[str, ...]] = ("outlook",)
+
+    def worth(self, known: ScheduleInputs) -> Floats:
+        """Return the network's output for each helper, `(..., H)`; NaN for one that may not be asked."""
+        return np.where(known.may_ask, self.network(inputs(known)), np.nan)
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A `Network` as a file states it."""
+
+    centre: tuple[float, ...]
+    scale: tuple[float, ...]
+    into: tuple[tuple[float, ...], ...]
+    bias: tuple[float, ...]
+    out: tuple[float, ...]
+    base: float
+
+
+@dataclass(frozen=True)
+class Stated:
+    """The content of a file of `schedules/`."""
+
+    description: str  # one sentence
+    command: str  # the command that made the file
+    learnt_from: tuple[str, ...]  # the runs that it was learnt from, with their layout seeds
+    tuned_on: tuple[str, ...]  # the runs on which the threshold was chosen, with their layout seeds
+    condition: str  # the operating point under which it was learnt
+    threshold: float  # the schedule's threshold
+    inputs: tuple[str, ...]  # the names of the network's inputs, `INPUTS`
+    network: Weights  # the network's weights
+
+    def schedule(self, where: str) -> Learnt:
+        """Return the schedule. Raises UserError for other inputs than `INPUTS`, or weights of other sizes."""
+        arrays: dict[str, Any] = {name: np.array(value) for name, value in asdict(self.network).items()}
+        f, j = len(INPUTS), len(self.network.bias)
+        shapes = {"centre": (f,), "scale": (f,), "into": (f, j), "bias": (j,), "out": (j,), "base": ()}
+        if self.inputs != INPUTS or any(arrays[name].shape != shape for name, shape in shapes.items()):
+            raise UserError(f"{where} has other inputs or sizes than the program; learn it again")
+        return Learnt(Network(**arrays), self.threshold)
+
+
+def inputs(known: ScheduleInputs) -> Floats:
+    """Return `INPUTS` for each helper, `(..., H, F)`; arbitrary for one that may not be asked."""
+    outlook, may_ask = known.outlook, known.may_ask
+    assert outlook is not None
+    ranked = np.sort(known.own, axis=-1)
+    regions = max(outlook.unseen.shape[-1], 1)
+    range_m = np.where(may_ask, known.range_m, np.inf)
+    nearer = (range_m[..., None, :] < range_m[..., :, None]).sum(axis=-1)
+    ego_inputs = (
+        known.entropy_nats, 1.0 - ranked[..., -1] + ranked[..., -2:-1].sum(axis=-1), known.own[..., 0],
+        known.own[..., -1], outlook.unseen.max(axis=-1, initial=0.0), outlook.unseen.sum(axis=-1) / regions,
+        known.distance_m[..., 0] / FAR_M, np.minimum(outlook.to_zone_s, FAR_S) / FAR_S,
+        may_ask.sum(axis=-1) - 1.0,
+    )  # fmt: skip
+    entropy, margin, careful, bold, unseen_most, unseen, ego_m, to_zone, others = (
+        np.broadcast_to(column[..., None], may_ask.shape) for column in ego_inputs
+    )
+    columns = (
+        entropy, margin, careful, bold, unseen_most, unseen, outlook.added.max(axis=-1, initial=0.0),
+        outlook.added.sum(axis=-1) / regions, known.range_m / FAR_M, known.distance_m[..., 1:] / FAR_M, ego_m,
+        to_zone, nearer, others,
+    )  # fmt: skip
+    return np.stack(columns, axis=-1)
 
 
 class Schedules(FilesAndPlugins[Schedule]):

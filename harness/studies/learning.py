@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from harness.coordination.exchange import known_of
-from harness.coordination.learnt import INPUTS, Learnt, Network, Stated, Weights, inputs
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.schedules import INPUTS, Learnt, Network, Stated, Weights, inputs
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable

@@ -11,9 +11,8 @@ import pytest
 from evaluating import live_spec_of, run, spec_of
 
 from harness.backends.registry import open_backend
-from harness.coordination.learnt import Learnt
 from harness.coordination.operating_point import POINTS, named_point
-from harness.coordination.schedules import SCHEDULES
+from harness.coordination.schedules import SCHEDULES, Learnt
 from harness.core.config import toml
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
