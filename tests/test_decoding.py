@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from run_on_disk import UNTIMED
 
-from harness.backends import decoding, sampling
+from harness.backends import decoding
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.cards import resolve
 from harness.backends.chat import Chat, HubTokenizer
@@ -168,8 +168,7 @@ def test_the_first_token_is_there_when_the_model_has_chosen_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     engine = Ticking(engine_of(backend))
-    for module in (decoding, sampling):
-        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: engine.now_s))
+    monkeypatch.setattr(decoding, "time", SimpleNamespace(perf_counter=lambda: engine.now_s))
     timed = LanguageModel(engine, 4)
     [one] = timed.complete([ask(3, answer, max_tokens=4 if answer == "json" else 80)])
     assert one.finish_reason == ("length" if answer == "json" else "stop")
@@ -340,7 +339,7 @@ def test_the_spellings_of_a_letter_are_found_in_any_vocabulary(texts: list[str],
 
 @pytest.mark.parametrize("encode", [lambda text: [1] * len(text), lambda text: list(text.encode("utf-16"))])
 def test_letters_that_are_no_single_tokens_are_refused(encode: Any) -> None:
-    engine: Any = SimpleNamespace(chat=SimpleNamespace(name="odd", encode=encode))
+    engine: Any = SimpleNamespace(chat=SimpleNamespace(shown="model 'odd'", encode=encode))
     with pytest.raises(UserError, match=r"'odd'.* no single token for each of the letters ABC; use --answer"):
         Decoding(engine).room(ask(0, "readout"))
 

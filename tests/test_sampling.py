@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from harness.backends.base import AnswerMode, Request
 from harness.backends.card import Card, Latency
 from harness.backends.cards import resolve
+from harness.backends.decoding import drawn
 from harness.backends.registry import open_backend
-from harness.backends.sampling import drawn
 from harness.backends.servers import Server
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError

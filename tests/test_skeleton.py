@@ -27,7 +27,7 @@ class Encoder:
     """What a skeleton asks of a chat: its name, and texts in tokens."""
 
     def __init__(self, name: str, encode: Callable[[str], list[int]]) -> None:
-        self.name, self.encode = name, encode
+        self.shown, self.encode = f"model {name!r}", encode
 
 
 def characters(text: str) -> list[int]:

@@ -11,15 +11,51 @@ from contextlib import closing
 from dataclasses import asdict, replace
 from typing import Any
 
+import numpy as np
+
 from harness.backends.base import Completion, FinishReason, Request, per_token_s
 from harness.backends.drafts import Drafts
 from harness.backends.engine import Engine, Session, common_length
 from harness.backends.orders import average_orders
-from harness.backends.sampling import Choice
 from harness.backends.skeleton import Filled, Skeleton, filled, tokens_after
+from harness.core import noise
+from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.prompts.answer_schema import Shape
 from harness.prompts.readout import letters, stated
+
+
+class Choice:
+    """Chooses the next tokens of some answers: the likeliest, or one drawn at a temperature.
+
+    Draws are keyed by the prompt and the answer's number, so other requests, order and a resume change none.
+    """
+
+    def __init__(self, requests: Sequence[Request], prompts: Sequence[Sequence[int]]) -> None:
+        self.first_at_s: float | None = None  # when the first token was chosen, by `time.perf_counter`
+        self.rounds = 0  # calls of `next`: the number of chosen tokens of an answer that is asked alone
+        self._drawn = {
+            place: (request.temperature, noise.generator("answer", tuple(ids), request.sample))
+            for place, (request, ids) in enumerate(zip(requests, prompts, strict=True))
+            if request.temperature
+        }
+        self.draws = bool(self._drawn)  # whether any token is drawn and not just the likeliest
+
+    def next(
+        self, session: Session, places: Sequence[int], among: Sequence[Sequence[int] | None]
+    ) -> list[int]:
+        """Choose the next token of the request at each place, in a session, among some tokens (None: all)."""
+        chosen = session.argmax(among)
+        if self._drawn:
+            log_p = session.log_probs()
+            for row, (place, tokens) in enumerate(zip(places, among, strict=True)):
+                if place in self._drawn:
+                    temperature, generator = self._drawn[place]
+                    chosen[row] = drawn(log_p[row], tokens, temperature, generator.random())
+        if not self.rounds:
+            self.first_at_s = time.perf_counter()
+        self.rounds += 1
+        return chosen
 
 
 class Decoding:
@@ -207,3 +243,15 @@ def _narrow(session: Session, live: list[int], unfinished: list[bool]) -> list[i
     if 0 < len(places) < len(live):
         session.keep(places)
     return [live[place] for place in places]
+
+
+def drawn(log_p: Floats, among: Sequence[int] | None, temperature: float, u: float) -> int:
+    """Return the token of a draw from softmax(log_p / temperature) over the tokens of `among` (None: all).
+
+    `u` is the uniform draw, in [0, 1). The temperature is above 0.
+    """
+    tokens = np.arange(len(log_p)) if among is None else np.unique(among)
+    with np.errstate(over="ignore"):  # a token far below the likeliest gets probability 0
+        ends = np.exp((log_p[tokens] - log_p[tokens].max()) / temperature).cumsum()
+    last = np.searchsorted(ends, ends[-1])  # rounding may take a draw beyond the last possible token
+    return int(tokens[min(np.searchsorted(ends, u * ends[-1], side="right"), last)])

@@ -100,11 +100,7 @@ def common_beginning(sequences: Sequence[list[int]]) -> list[int]:
 
 
 def group_by_beginning(sequences: Sequence[list[int]]) -> Iterator[list[int]]:
-    """Split sequences into groups with longer common beginnings, where that saves tokens.
-
-    Yields:
-        The places of each group's sequences.
-    """
+    """Yield the places of sequences in groups with longer common beginnings, where that saves tokens."""
     order = sorted(range(len(sequences)), key=sequences.__getitem__)
     shared = [common_length([sequences[a], sequences[b]]) for a, b in pairwise(order)]
     yield from _split(order, shared)
