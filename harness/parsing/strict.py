@@ -40,10 +40,11 @@ def _answer(answer: Any, shape: Shape, extension: dict[str, Any] | None) -> Answ
     actions = shape.actions
     mass: float | None = None
     if hasattr(answer, "action_distribution"):
-        shares = msgspec.structs.astuple(answer.action_distribution)
-        mass = math.fsum(shares)
-        if abs(mass - 1) > EXACT:
+        share_of = answer.action_distribution
+        mass = math.fsum(share_of.values())
+        if len(share_of) < len(actions) or abs(mass - 1) > EXACT:
             return None
+        shares = [share_of[action] for action in actions]
         intent = tuple([abs(p) / mass for p in shares])
         confidence = max(intent)
         maneuver = actions[intent.index(confidence)]
@@ -67,8 +68,7 @@ def _answer(answer: Any, shape: Shape, extension: dict[str, Any] | None) -> Answ
 @lru_cache(maxsize=16)
 def _forms(shape: Shape) -> tuple[type[msgspec.Struct], ...]:
     """Return the type of each form that an answer may have, without further members."""
-    share_fields = [(f"p{n}", Share, msgspec.field(name=action)) for n, action in enumerate(shape.actions)]
-    shares = msgspec.defstruct("Shares", share_fields, forbid_unknown_fields=True)
+    shares = dict[Literal[shape.actions], Share]  # type: ignore[name-defined]
     report: list[tuple[str, Any]] = []
     if shape.role == "helper":
         evidence = Annotated[str, msgspec.Meta(max_length=EVIDENCE_CHARS)]
