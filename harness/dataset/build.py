@@ -54,23 +54,13 @@ def build(
 ) -> dict[str, Any]:  # fmt: skip
     """Build a dataset in `out`, or freeze a shard of one, which `harness run merge` combines.
 
-    Args:
-        scenario: the scenario to freeze.
-        out: the folder to make; its name is the dataset's name.
-        episodes: the number of episodes; episode e has layout seed `seed + e`.
-        seed: the first layout seed.
-        workers: processes or a cluster.
-        progress: called with the number of layouts just finished.
-        audits: whether to audit the layouts for tells, if there are `LEAST_AUDITED` or more.
-        more: called with the number of layouts to audit, before the audit.
-        shard: the part of the layouts to freeze; None for all.
+    Episode e has layout seed `seed + e`, and the folder's name is the dataset's. `audits` says whether the
+    layouts are audited for tells, if there are `LEAST_AUDITED` or more; `more` is called with their number
+    before that, `progress` with the number of layouts just finished or audited.
 
-    Returns:
-        The manifest; for a shard the settings that it begins with.
-
-    Raises:
-        UserError: the folder holds a finished dataset, or one begun with other settings, or something else;
-            the seeds are for several purposes; or the audit needs a package that is missing.
+    Returns the manifest; for a shard the settings that it begins with. Raises UserError if the folder holds
+    a finished dataset, one begun with other settings, or something else; the seeds are for several purposes;
+    or the audit needs a package that is missing.
     """
     # An environment states no danger.
     audits = audits and episodes >= LEAST_AUDITED and not scenario.is_environment
@@ -125,9 +115,8 @@ def merge(
 ) -> dict[str, Any]:  # fmt: skip
     """Combine the shards of a dataset into the one that `build` makes without shards, byte for byte.
 
-    Raises:
-        UserError: as in `build`; or the folders are not all the shards of one build, a shard is unfinished,
-            or two hold different bytes for the same layout.
+    Raises UserError as `build`, or if the folders are not all the shards of one build, a shard is unfinished,
+    or two hold different bytes for the same layout.
     """
     begun = shards.read(folders, work.WorkStart)
     config = begun[0].settings

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 from zipfile import ZipFile
 
 import msgspec
@@ -81,33 +81,17 @@ class Scene:
 
 
 class Trees(Sequence[Tree]):
-    """The decision trees of some episodes, by index; each is read on use."""
+    """The decision trees of the episodes `numbers`, by index; each is read on use by its number."""
 
     def __init__(self, numbers: Iterable[int], read: Callable[[int], Tree]) -> None:
         self.numbers, self.read = tuple(numbers), read
+        self.known = frozenset(self.numbers)
 
     def __len__(self) -> int:
         return len(self.numbers)
 
-    @overload
-    def __getitem__(self, place: int, /) -> Tree: ...
-    @overload
-    def __getitem__(self, place: slice, /) -> "Trees": ...
-
-    def __getitem__(self, place: int | slice, /) -> "Tree | Trees":
-        if isinstance(place, slice):
-            return Trees(self.numbers[place], self.read)
+    def __getitem__(self, place: Any, /) -> Any:
         return self.read(self.numbers[place])
-
-    @cached_property
-    def _numbers(self) -> frozenset[int]:
-        return frozenset(self.numbers)
-
-    def of_episode(self, number: int) -> Tree:
-        """Return an episode's tree. Raises KeyError if the episode is not among these."""
-        if number not in self._numbers:
-            raise KeyError(number)
-        return self.read(number)
 
 
 @dataclass(frozen=True)
@@ -178,7 +162,7 @@ class Dataset:
         parts: dict[str, list[Floats]] = {}
         action = constant(self.scenario.name)
         for start in range(0, len(self.trees), TREES_AT_ONCE):
-            forest = replace(self, trees=self.trees[start : start + TREES_AT_ONCE]).forest
+            forest = self.of_episodes(self.episodes[start : start + TREES_AT_ONCE]).forest
             for name in forest.drivers:
                 parts.setdefault(name, []).append(forest.driver_success(name).astype(float))
             if action in forest.actions:
@@ -214,10 +198,10 @@ class Dataset:
         """Return a point's episode, step and index in that level. Raises KeyError for an unknown id."""
         if match := re.match("([0-9]{5})-([0-9])", name):
             episode, step = map(int, match.groups())
-            for at, level in enumerate(self.trees.of_episode(episode).levels):
-                for place, point in enumerate(level if at == step else ()):
-                    if point.scene == name:
-                        return episode, step, place
+            levels = self.trees.read(episode).levels if episode in self.trees.known else []
+            for place, point in enumerate(levels[step] if step < len(levels) else ()):
+                if point.scene == name:
+                    return episode, step, place
         raise KeyError(name)
 
     def _records(self, file: ZipFile, tree: Tree, step: int, places: Sequence[int]) -> Iterator[Record]:
@@ -286,9 +270,7 @@ def load(path: Path, limit: int | None = None) -> Dataset:
 
     Every file and every tree must have the digest in the manifest, and a tree pins its scenes. For a released
     dataset, whose manifest is pinned, this is enough; the content of any other dataset is checked as well.
-
-    Raises:
-        UserError: a file is missing, changed or broken.
+    Raises UserError if a file is missing, changed or broken.
     """
     manifest, digest = read_manifest(path)
     for problem in file_problems(path, manifest):

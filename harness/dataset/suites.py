@@ -30,8 +30,7 @@ class Suite(Struct, frozen=True, forbid_unknown_fields=True):
 def named(text: str) -> Suite | None:
     """Return the suite that `suite:NAME` names, shipped or the project's; None for any other text.
 
-    Raises:
-        UserError: there is no such suite, or two, or its table is wrong.
+    Raises UserError if there is no such suite, or two, or its table is wrong.
     """
     if not text.startswith(PREFIX):
         return None

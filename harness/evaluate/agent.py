@@ -182,11 +182,7 @@ def in_mode(
 
 
 def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[str]:
-    """Return the likeliest action of each of a role's examples.
-
-    Raises:
-        UserError: an example's answer does not parse without repairs.
-    """
+    """Return the likeliest action of a role's examples. Raises UserError if one parses with repairs only."""
     likeliest = []
     for number, example in enumerate(prompt.examples.of(role) if prompt.examples else (), 1):
         first = role in prompt.reasons_first

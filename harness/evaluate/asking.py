@@ -159,16 +159,10 @@ class Asker:
         progress: Callable[[int], None] = lambda count: None,
         more: Callable[[int], None] = lambda count: None,
     ) -> None:
-        """Create an asker.
+        """Create an asker. `backend` opens the backend, at the first request.
 
-        Args:
-            spec: the evaluation.
-            backend: opens the backend, at the first request.
-            latency: how long inference takes.
-            kept: file of the answers so far (`KeptAnswers`); None keeps none.
-            answers: further answers that need not be asked for, by request id.
-            progress: called with the number of new answers, those kept by a stopped run included.
-            more: called with the number of requests before they are made.
+        `kept` is the file of the answers so far; `answers` need not be asked for. `progress` gets the number
+        of new answers, those kept by a stopped run included; `more` that of requests before they are made.
         """
         self.spec, self._backend, self.latency = spec, backend, latency
         self._kept = KeptAnswers(kept) if kept else None
@@ -180,9 +174,8 @@ class Asker:
     def ask(self, asked: Sequence[Request]) -> None:
         """Ask for the missing answers, each once, and keep each chunk as soon as it is answered.
 
-        Raises:
-            Unanswered: a question of the ego or a fusion call got no answer, and all others of these were
-                asked; or none of the first questions was answered, or none of the last `IN_A_ROW`.
+        Raises Unanswered if a question of the ego or a fusion call got no answer, once all others of these
+        were asked; or if none of the first questions was answered, or none of the last `IN_A_ROW`.
         """
         if self._kept:  # another process may have asked, too
             self.answers = self._kept.recall(cut=True) | self.answers
@@ -225,12 +218,10 @@ class Asker:
             raise Unanswered(str(self.tally))
 
     def _take(self, answers: Collection[Answer], single: bool) -> None:
-        """Count and keep the answers; stop if nothing is answered any more.
+        """Count and keep the answers of a chunk; stop if nothing is answered any more.
 
-        Args:
-            answers: those of a chunk.
-            single: whether each question stands alone. Otherwise an answer may depend on the others of its
-                chunk, which is then kept only if all of it was answered.
+        Unless each question stands `single`, an answer may depend on the others of its chunk, which is then
+        kept only if all of it was answered.
         """
         answered = [answer for answer in answers if answer.error is None]
         if self._kept and answered and (single or len(answered) == len(answers)):

@@ -70,8 +70,7 @@ class Trajectory:
 def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajectory]:
     """Simulate up to a frame or the end of each episode; decisions act when they are ready.
 
-    Returns:
-        One trajectory for each way in which an episode continues, in the order of the trajectories given.
+    There is one trajectory for each way in which an episode continues, in the order of those given.
     """
     running: list[tuple[tuple[int, ...], Trajectory]] = [((n,), t) for n, t in enumerate(trajectories)]
     arrived = []

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> list[DeviceRow]:
     """Return the row of a device profile that times each agent: `model`'s, or that of its own card.
 
-    Raises:
-        UserError: an agent counts no tokens, or the profile has no row or no rates for it.
+    Raises UserError if an agent counts no tokens, or the profile has no row or no rates for it.
     """
     rows, flag = [], f"--device-profile {printable(device.name)}"
     for agent in agents:
@@ -68,8 +67,7 @@ def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> L
 def answer_s(speed: Speed, answer: Answer) -> float:
     """Return the seconds of one answer by its tokens, its repair turn included; NaN if the engine failed.
 
-    Raises:
-        UserError: the answer has no token counts.
+    Raises UserError if the answer has no token counts.
     """
     return devices.seconds(speed, *tokens(answer)) + answer.slow_s
 
@@ -119,8 +117,7 @@ def decided_helpers_j(
 def tokens(answer: Answer) -> tuple[float, float]:
     """Return an answer's tokens in and out, of both turns if there were two; NaN if the engine failed.
 
-    Raises:
-        UserError: the answer has no token counts.
+    Raises UserError if the answer has no token counts.
     """
     if answer.prompt_tokens is not None and answer.completion_tokens is not None:
         return answer.prompt_tokens, answer.completion_tokens

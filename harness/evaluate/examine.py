@@ -80,12 +80,9 @@ class Findings(Struct, frozen=True):
 def examine(
     backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None
 ) -> Findings | str:
-    """Ask a model the fixed questions by read-outs.
+    """Ask a model the fixed questions by read-outs; return what was found, or why a question got no answer.
 
     Letters are read over cyclic orders to see what follows them, and in the pairs as the agent reads them.
-
-    Returns:
-        What was found, or why a question got no answer.
     """
     reader = replace(agent, answer="readout", letters=agent.letters if agent.answer == "readout" else None)
     pairs = [*questions.scene_pairs(reader), *questions.plain_pairs(reader)]

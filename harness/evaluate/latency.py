@@ -28,11 +28,9 @@ EXAMPLE = "ego=0.171,helper=0.164,fusion=0.2"
 
 
 def known(choice: str | None, agents: Sequence[Agent], backends: Sequence[Backend]) -> Latency | None:
-    """Return the latency that `--latency` chooses; None if it has to be measured.
+    """Return the latency that `--latency` chooses for the ego's agent, then the helpers'; None to measure it.
 
     Without a choice it is each agent's own: the replayed run's, else the card's, else the paper's.
-
-    The agents are the ego's, then those of the helpers if they have their own.
     """
     if choice not in (None, *NAMES):
         return declared(choice)
@@ -71,10 +69,7 @@ def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
 def declared(text: str) -> Latency:
     """Parse a text such as `ego=0.171,helper=0.164,fusion=0.2`, in seconds; a role left out has the ego's.
 
-    Several helper models have one time each: `helper=0.164:0.2`.
-
-    Raises:
-        UserError: the text is not a valid `--latency`.
+    Several helper models have one time each: `helper=0.164:0.2`. Raises UserError for any other text.
     """
     pairs = [part.partition("=") for part in text.split(",")]
     try:

@@ -29,9 +29,7 @@ class Pace:
 def paces(stem: str) -> list[Pace]:
     """Time the engines of a card file: those that run here, if there are several and weights are small.
 
-    Raises:
-        UserError: weights do not load, or the model cannot answer so.
-        Unanswered: a question got no answer.
+    Raises UserError if weights do not load or the model cannot answer so, and Unanswered.
     """
     able = [card for card in each_engine(stem) if missing(card) is None] if stem in names() else []
     if len(able) < 2 or not all(_small(card) for card in able):

@@ -57,8 +57,7 @@ class Still:
 def find(path: Path, episode: int, condition: str | None, seed: int | None) -> ReplayedEpisode:
     """Return an episode of a run folder; by default of the last condition and the first seed.
 
-    Raises:
-        UserError: the folder holds no closed-loop run, or has no such episode, condition or seed.
+    Raises UserError if the folder holds no closed-loop run, or has no such episode, condition or seed.
     """
     run = read(path)
     if not isinstance(run.manifest.world, ClosedLoop):

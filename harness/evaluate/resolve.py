@@ -56,9 +56,8 @@ def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
 def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
     """Return the layouts that are driven; by default as many, and the same, as the shipped dataset has.
 
-    Raises:
-        UserError: an episode or seed is out of range, or mixed with those of another purpose, or the
-            scenario is an environment that cannot be driven.
+    Raises UserError if an episode or seed is out of range or mixed with those of another purpose, or if the
+    scenario is an environment that cannot be driven.
     """
     # A base install evaluates without the simulator.
     from harness.evaluate.live_world import LiveSource
@@ -115,8 +114,7 @@ def _usual_ties(ego: Agent) -> str:
 def helper_options(typed: Mapping[str, object]) -> Iterator[None]:
     """Name a helper's option in what is wrong with a helper.
 
-    Args:
-        typed: what was given as the helper's own, by the ego's option; None where the ego's holds.
+    `typed` is what was given as the helper's own, by the ego's option; None where the ego's holds.
     """
     try:
         yield

@@ -143,9 +143,8 @@ def evaluate_shard(
 def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     """Combine the shards of a closed-loop run into the run that `evaluate` would have written, byte for byte.
 
-    Raises:
-        UserError: the folders are not all the shards of one run, a shard is unfinished, two hold different
-            bytes for the same part, or `out` holds something else.
+    Raises UserError if the folders are not all the shards of one run, a shard is unfinished, two hold
+    different bytes for the same part, or `out` holds something else.
     """
     begun = shards.read(folders, RunStart)
     chunks = _chunks_of(begun[0].settings)

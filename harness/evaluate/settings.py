@@ -431,11 +431,9 @@ def _toml(value: Any) -> str:
 def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     """Return the settings of a file, or of a run's folder, with what the user typed beside it.
 
-    A file names no model to open and no server to ask: it may come from a stranger. Cards, prompts, devices
-    and datasets are looked up by name; a replay only reads another run's answers.
-
-    Raises:
-        UserError: the file cannot be read, is of another command, or names what only a user may.
+    A file may come from a stranger: it names no model to open and no server to ask. Cards, prompts, devices
+    and datasets are looked up by name; a replay only reads another run's answers. Raises UserError if it
+    cannot be read, is of another command, or names what only a user may.
     """
     file = file / FILE if file.is_dir() else file
     where = f"settings {printable(file)}"

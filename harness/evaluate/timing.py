@@ -47,13 +47,8 @@ def spread_over(scenes: Sequence[Scene]) -> Sequence[Scene]:
 def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
     """Return the median time of the answers in each role, over these scenes; each request is sent alone.
 
-    A role in which no answer can be timed gets the ego's time.
-
-    The backend is the model itself; a cache would answer in no time.
-
-    Raises:
-        UserError: no answer of the ego can be timed.
-        Unanswered: some of its questions got none.
+    A role in which no answer can be timed gets the ego's time. The backend is the model itself; a cache
+    would answer in no time. Raises UserError if no answer of the ego can be timed, and Unanswered.
     """
     first = [replace(request, timed=True) for request in requests(spec, scenes)]
     backend.complete(first[:1])  # the first request of a process includes the warm-up

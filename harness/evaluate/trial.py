@@ -77,8 +77,7 @@ class Trial(Struct, frozen=True):
 def card_of(prompt: Prompt, model: str, engine: str | None) -> Card:
     """Return the card of the model that a prompt is tried on.
 
-    Raises:
-        UserError: it is no language model, or the prompt cannot ask the fixed questions.
+    Raises UserError if it is no language model, or the prompt cannot ask the fixed questions.
     """
     card = resolve(model, engine)
     if not capabilities(card.engine).language_model:
@@ -113,8 +112,7 @@ def try_on(
 def try_out(backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None) -> Trial:
     """Ask a model the fixed questions in both roles, and the ego the pairs of scenes; `COUNT` requests.
 
-    Raises:
-        Unanswered: a question got no answer.
+    Raises Unanswered if a question got no answer.
     """
     pairs = questions.scene_pairs(agent)
     by_role = {role: questions.requests(agent, role) for role in ROLES}

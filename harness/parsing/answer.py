@@ -41,8 +41,7 @@ class Answer(Struct, frozen=True):
 def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divides: bool = False) -> Answer:
     """Read an answer-shaped object; with `divides`, any sum above 0 is divided out.
 
-    Raises:
-        Failure: statuses for values, all that are true of it.
+    Raises Failure with all statuses for values that are true of it.
     """
     if values.is_schema(members):
         raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")

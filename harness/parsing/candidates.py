@@ -46,17 +46,11 @@ class _Objects:
 def candidates(
     text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool = False
 ) -> list[Candidate]:
-    """Return all candidates, in the order of the text.
+    """Return all candidates, in the order of the text, which has no thought and no special tokens.
 
-    Args:
-        text: the answer, without thought and special tokens.
-        role: the role whose fields to look for.
-        actions: the actions whose names to look for.
-        cut: whether the engine stopped at its token limit; then an open bracket is never closed.
-        reasons_first: whether the prompt asked for reasons before the answer; then prose there is no repair.
-
-    Raises:
-        Failure: no_json, label_only, truncated_json, syntax, or missing_action if there is no candidate.
+    If the token limit `cut` the text, an open bracket is never closed. With `reasons_first` the prompt asked
+    for reasons before the answer, and prose there is no repair. Raises Failure (no_json, label_only,
+    truncated_json, syntax or missing_action) if there is no candidate.
     """
     escapes: frozenset[Repair] = frozenset()
     objects = _objects(text, cut)

@@ -26,16 +26,9 @@ def unreadable() -> Failure:
 def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
     """Return the broken object at the start of `text`, repaired, and the text after it.
 
-    The object counts only if it holds nothing ambiguous, each name is a key at most once, and the numbers
-    read are the numbers written, in the same order.
-
-    Args:
-        text: the text from the opening brace on.
-        names: the keys that count: fields and actions.
-        cut: whether the engine stopped at its token limit; then nothing is repaired.
-
-    Raises:
-        Failure: syntax.
+    The object counts only if it holds nothing ambiguous, each of `names` is a key at most once, and the
+    numbers read are the numbers written, in the same order. Nothing is repaired of a text that the token
+    limit `cut`. Raises Failure for syntax.
     """
     import json_repair
 
@@ -56,23 +49,12 @@ def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
 
 
 def around(text: str, at: int, end: int, fields: Sequence[str], cut: bool) -> tuple[dict[str, Any], str, str]:
-    """Return the broken object at the start of `text` around a value that can be read.
+    """Return the members of the broken object at the start of `text`, around a value that can be read.
 
-    The numbers of that value are as they are written, so the text of other members may hold anything. The
-    object counts only if it has no other members than `fields`, and each text in it stands in `text`.
-
-    Args:
-        text: the text from the object's brace on.
-        at: where the value begins.
-        end: where it ends.
-        fields: names of the members that it may have.
-        cut: whether the engine stopped at its token limit; then nothing is repaired.
-
-    Returns:
-        The other members, the name of the value, and the text after the object.
-
-    Raises:
-        Failure: syntax.
+    The value stands from `at` to `end`, with its numbers as they are written, so the text of other members
+    may hold anything. The object counts only if it has no other members than `fields`, and each text in it
+    stands in `text`. Returned are the other members, the name of the value, and the text after the object.
+    Nothing is repaired of a text that the token limit `cut`. Raises Failure for syntax.
     """
     import json_repair
 

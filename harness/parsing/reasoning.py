@@ -28,20 +28,11 @@ _TAG = re.compile(
 
 
 def split(text: str, thinking: bool) -> tuple[str | None, str]:
-    """Return the thought, if any, and the rest as the answer.
+    """Return the thought (None if there was none, empty for an empty block), and the rest as the answer.
 
     A closing tag without an opening one means that the prompt's template opened the thought: all text before
-    it is thought. Text before, between and after closed thoughts belongs to the answer.
-
-    Args:
-        text: the completion.
-        thinking: whether the model was asked to think; then a text without a closed thought is all thought.
-
-    Returns:
-        The thought (None if there was none, empty for an empty block) and the answer.
-
-    Raises:
-        Failure: truncated_reasoning.
+    it is thought. Text before, between and after closed thoughts belongs to the answer. If the model was
+    asked to think, a text without a closed thought is all thought. Raises Failure for truncated_reasoning.
     """
     depth = at = 0
     thoughts: list[str] = []

@@ -73,14 +73,8 @@ def distribution(
 ) -> tuple[Intent, float]:
     """Return the intent in the order of `actions`, summing to 1, and the sum as stated.
 
-    Args:
-        value: the value in the place of the distribution.
-        actions: meta-action names.
-        repairs: receives the repairs.
-        divides: whether any sum above 0 is divided out.
-
-    Raises:
-        Failure: statuses for values, all that are true of it.
+    `repairs` receives the repairs; with `divides` any sum above 0 is divided out. Raises Failure with all
+    statuses for values that are true of it.
     """
     if not isinstance(value, dict):
         raise _no_distribution(value, actions)

@@ -50,19 +50,10 @@ def answer_schema(
     form: str | None = None,
     extension: str = "",
 ) -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of one role's answer.
+    """Return the JSON Schema (draft 2020-12) of one role's answer; the arguments are a `Shape`'s.
 
-    An answer has one of two forms: a distribution, or one action with a confidence.
-
-    Args:
-        role: `ego` or `helper`.
-        actions: meta-action names, in the environment's order.
-        scenario: named in the title only.
-        form: the form that is asked for, one of the role's `FORMS`; None allows any.
-        extension: what a prompt version adds (`Shape.extension`).
-
-    Raises:
-        UserError: unknown role.
+    An answer has one of two forms: a distribution, or one action with a confidence. `scenario` stands in the
+    title only. Raises UserError for an unknown role.
     """
     if role not in ROLES:
         raise errors.unknown("role", role, ROLES)

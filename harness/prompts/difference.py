@@ -108,12 +108,8 @@ def sent(
 ) -> list[Sent]:  # fmt: skip
     """Render what is sent to the ego, to its first helper, and to the ego with a message of every helper.
 
-    Args:
-        a: version A.
-        b: version B.
-        scene: the scene to render.
-        scenario: its scenario, which gives the actions and words of the prompts.
-        count: counts the tokens of chat messages; None leaves them uncounted.
+    `scenario` gives the actions and words of the prompts. `count` counts the tokens of chat messages; None
+    leaves them uncounted.
     """
     ego, *helpers = scene.viewers
     questions: list[tuple[str, str, Sequence[str]]] = [(ego, "ego", ())]

@@ -53,15 +53,9 @@ class Examples(Struct, frozen=True):
 
 
 def read(text: str, where: str) -> Examples:
-    """Read examples from a file's text.
+    """Read examples from a file's text in JSON; `where` names the file in messages.
 
-    Args:
-        text: JSON.
-        where: name of the file in messages.
-
-    Raises:
-        UserError: the text is not JSON or lacks something, or an example is of another role or not of a train
-            seed.
+    Raises UserError if it is no JSON or lacks something, or an example is of another role or no train seed.
     """
     try:
         table = msgspec.json.decode(text)

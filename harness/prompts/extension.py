@@ -36,8 +36,7 @@ _CHOICE = re.compile(r'[^"\\]{1,80}')
 def read(text: str, where: str) -> dict[str, str]:
     """Return the JSON text of the members' schemas by role, as `Shape` takes it; `where` names the file.
 
-    Raises:
-        UserError: the text is no JSON, or has something that cannot be constrained.
+    Raises UserError if the text is no JSON, or has something that cannot be constrained.
     """
     try:
         table = msgspec.json.decode(text)

@@ -42,12 +42,9 @@ def question(actions: Sequence[str]) -> str:
 def asked(
     messages: Sequence[Mapping[str, str]], actions: Sequence[str], answered: Sequence[str] = ()
 ) -> tuple[Mapping[str, str], ...]:
-    """Append to every question of a chat the line that asks for one letter.
+    """Append to every question of a chat the line that asks for one letter, which stand for the actions.
 
-    Args:
-        messages: the chat.
-        actions: the actions that the letters stand for.
-        answered: the likeliest action of each earlier answer, whose letter replaces the answer.
+    `answered` has the likeliest action of each earlier answer, whose letter replaces the answer.
     """
     letter, earlier = dict(zip(actions, letters(actions), strict=True)), iter(answered)
 

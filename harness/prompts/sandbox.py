@@ -70,28 +70,6 @@ class Code(templates.Code):
         self.visit(rounded.node, frame)
         self.write(") is float and -1e15 < _at < 1e15 else environment.whole(_at))")
 
-    @optimizeconst
-    def visit_Mul(self, node: nodes.BinExpr, frame: Frame) -> None:
-        if not (isinstance(node.right, nodes.Const) and type(node.right.value) in (int, float)):
-            super().visit_Mul(node, frame)
-            return
-        self.write("(_at * ")
-        self.visit(node.right, frame)
-        self.write(" if type(_at := ")
-        self.visit(node.left, frame)
-        self.write(") is float else environment.call_binop(context, '*', _at, ")
-        self.visit(node.right, frame)
-        self.write("))")
-
-    @optimizeconst
-    def visit_Test(self, node: nodes.Test, frame: Frame) -> None:
-        if node.name != "none":
-            super().visit_Test(node, frame)
-            return
-        self.write("(")
-        self.visit(node.node, frame)
-        self.write(" is None)")
-
     def visit_Output(self, node: nodes.Output, frame: Frame) -> None:
         escapes = frame.eval_ctx.volatile or frame.eval_ctx.autoescape
         if frame.buffer is not None or frame.require_output_check or escapes:

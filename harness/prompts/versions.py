@@ -132,11 +132,11 @@ class Prompt:
     ) -> tuple[dict[str, str], ...]:
         """Render the chat messages for one viewer's scene graph, exactly as a model is sent them.
 
-        Examples follow the system message as earlier turns. A message with the key `image` has a picture
-        before its text.
+        The graph's `role` chooses the template. Examples follow the system message as earlier turns. A
+        message with the key `image` has a picture before its text.
 
         Args:
-            graph: the viewer's scene graph; its `role` chooses the template.
+            graph: the viewer's scene graph.
             actions: meta-action names.
             messages: helpers' messages to the ego, with `sender`, `evidence`, `risk`, `intent`,
                 `recommended_maneuver` and `confidence`.
@@ -252,8 +252,7 @@ def unfit(prompt: Prompt, scenario: Scenario) -> str | None:
 def load(version: str, where: Path | None = None) -> Prompt:
     """Load a version by name, from a folder if one is given.
 
-    Raises:
-        UserError: there is no such version, its files are wrong, or it was released and has changed.
+    Raises UserError if there is no such version, its files are wrong, or it was released and has changed.
     """
     if version not in names(where):
         raise unknown("prompt", version, names(where))

@@ -242,8 +242,7 @@ class Run:
 def read(path: Path) -> Run:
     """Read a run's folder.
 
-    Raises:
-        UserError: the folder holds no finished run, or its manifest is broken or of another version.
+    Raises UserError if it holds no finished run, or its manifest is broken or of another version.
     """
     file = path / "run.json"
     if not file.is_file():

@@ -69,8 +69,7 @@ class Listed:
 def runs(folder: Path) -> list[Listed]:
     """Return the runs and studies in a folder, newest first. Links that lead out of it are skipped.
 
-    Raises:
-        UserError: there is no such folder.
+    Raises UserError if there is no such folder.
     """
     if not os.path.isdir(folder):
         raise UserError(

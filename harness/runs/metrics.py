@@ -290,8 +290,7 @@ METRICS = Metrics("swarmdrive.metrics", Metric, {metric.name: metric for metric 
 def metrics_of(world: World) -> tuple[Metric, ...]:
     """Return the metrics of decisions and of episodes that are known in a world.
 
-    Raises:
-        UserError: a package's metric does not work.
+    Raises UserError if a package's metric does not work.
     """
     own = (metric for metric in METRICS.values() if metric.decisions or metric.episodes)
     return tuple(metric for metric in own if metric.world in (None, world))
@@ -339,14 +338,7 @@ class Grid:
 def by_episode(
     metrics: Sequence[Metric], grid: Grid, decisions: Decisions, episodes: Sequence[Episode]
 ) -> dict[str, Floats]:
-    """Return each metric's values by episode, (C, S, E).
-
-    Args:
-        metrics: the metrics.
-        grid: the grid of the episodes.
-        decisions: the decisions of all episodes.
-        episodes: the episodes in the order of the grid (`Grid.ordered`).
-    """
+    """Return each metric's values by episode, (C, S, E); the episodes are in the order of the grid."""
     places = grid.places(decisions)
 
     def values(metric: Metric) -> Floats:

@@ -105,9 +105,8 @@ def contents_of(path: Path) -> Contents:
 def read(path: Path) -> SuiteRun:
     """Read a suite's folder.
 
-    Raises:
-        UserError: the folder holds no suite, or a run of it is not finished or has another model, other
-            conditions or seeds.
+    Raises UserError if it holds no suite, or a run of it is not finished or has another model, other
+    conditions or seeds.
     """
     contents = contents_of(path)
     runs = {family: folder.read(path / name) for family, name in contents.families.items()}

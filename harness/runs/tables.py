@@ -93,10 +93,6 @@ class Tables:
 
 
 def tables_of(run: Path, kind: type[T]) -> T:
-    """Load a run from its folder.
-
-    Raises:
-        UserError: the folder holds no finished run, or one of another version.
-    """
+    """Load a run from its folder. Raises UserError if it holds no finished run, or one of another version."""
     source = read(run)
     return kind(run, msgspec.json.decode(msgspec.json.encode(source.manifest)), source)
