@@ -176,10 +176,7 @@ class Rendering(Backend, Protocol):
 
 
 def window(backend: Backend) -> int:
-    """Return the most requests that a backend works on at once, if threads may call `complete` concurrently.
-
-    0 for a backend that takes one call at a time, which has no attribute `window`.
-    """
+    """Return the most requests that a backend works on at once; 0 if `complete` takes one call at a time."""
     return getattr(backend, "window", 0)
 
 
@@ -198,10 +195,7 @@ def served(backend: Backend) -> list[Served]:
 
 
 def doubt(backend: Backend) -> str | None:
-    """Return why a backend's cached answers may be of other weights, in one line; None if it can tell.
-
-    A backend whose identity does not show that its weights have changed has an attribute `doubt`.
-    """
+    """Return why cached answers may be of other weights, in a line; None if a backend's identity can tell."""
     return getattr(backend, "doubt", None)
 
 

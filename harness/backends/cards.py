@@ -89,7 +89,7 @@ def argument(card: Card) -> str:
     return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
 
 
-def own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card:
+def find_own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card:
     """Return the user's own card of the model that a run names. What the run says of it opens nothing.
 
     Only the name of the card that the run states is looked up; the rest is compared. Cards that the user gave

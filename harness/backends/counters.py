@@ -21,14 +21,11 @@ SAMPLED_S = 0.02  # time between two samples of a power
 
 @dataclass(frozen=True)
 class Counter:
-    """One energy or power meter, such as `nvml 0`, `rapl package-0` or `jetson VDD_IN`.
+    """One energy or power meter."""
 
-    It reads either the joules counted so far, from any start, or the present watts.
-    """
-
-    name: str
-    joules: Callable[[], float] | None = None
-    watts: Callable[[], float] | None = None
+    name: str  # such as `nvml 0`, `rapl package-0` or `jetson VDD_IN`
+    joules: Callable[[], float] | None = None  # reads the joules counted so far, from any start
+    watts: Callable[[], float] | None = None  # reads the present watts, where nothing counts joules
 
 
 def counters(sys: Path = SYS) -> list[Counter]:

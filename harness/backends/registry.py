@@ -131,7 +131,7 @@ def open_backend(
         raise UserError(f"{card.shown} needs {package}, which is not installed; run `{engine.install}`")
     if batch_size < 1:
         raise UserError(f"batch size {batch_size}; allowed: 1 or more")
-    backend: Backend = resolve(engine.opens)(card, device=device, dtype=dtype, batch_size=batch_size)
+    backend: Backend = import_object(engine.opens)(card, device=device, dtype=dtype, batch_size=batch_size)
     return backend
 
 
@@ -147,7 +147,7 @@ def _opened_in(process: int, card: "Card", device: str | None, dtype: str | None
     return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
 
 
-def resolve(place: str) -> Any:
+def import_object(place: str) -> Any:
     """Import the module of `module:name` and return the object."""
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
@@ -173,16 +173,13 @@ def missing(card: "Card") -> str | None:
 
 def locate(card: "Card") -> Path:
     """Return where the weights of a card lie for its engine. Raises UserError if they are not found."""
-    where: Path = resolve(registration(card.engine).finds)(card)
+    where: Path = import_object(registration(card.engine).finds)(card)
     return where
 
 
 def processor_tokens(card: "Card") -> int | None:
-    """Return how many tokens a card's image processor makes of a picture of the card's size.
-
-    None if the processor is not installed here.
-    """
+    """Return the tokens that a card's image processor makes of its picture; None if it is not installed."""
     if missing(card) or not (sees := registration(card.engine).sees):
         return None
-    tokens: int = resolve(sees)(card)
+    tokens: int = import_object(sees)(card)
     return tokens

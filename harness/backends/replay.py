@@ -8,7 +8,7 @@ from typing import Any
 from harness.backends.base import AGAIN, Backend, Completion, Request, failed, same_model
 from harness.backends.cache import cached, default_file
 from harness.backends.card import Card
-from harness.backends.cards import own
+from harness.backends.cards import find_own
 from harness.backends.registry import BUILT_IN, ENGINES, open_backend
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
@@ -93,7 +93,7 @@ class Replay:
         if role not in self._models:
             stated = convert(agent["model"], Card, f"{shown}: its model")
             lacking = f"{shown} holds no answer for {requests[0].id}"
-            card = own(stated, (), lacking, "write one of that name, or make the run again")
+            card = find_own(stated, (), lacking, "write one of that name, or make the run again")
             model = open_backend(card, dtype=manifest.dtype, batch_size=manifest.batch_size)
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":

@@ -129,10 +129,7 @@ class Leg(NamedTuple):
 
 
 class Skeleton:
-    """The answers of a shape in a tokenizer's tokens; each follows a line break, as in every template.
-
-    The longest has `most_tokens`.
-    """
+    """The answers of a shape in tokens, each after a line break, as in every template."""
 
     def __init__(self, chat: Chat, shape: Shape) -> None:
         self._chat = chat
@@ -141,7 +138,7 @@ class Skeleton:
         self._tokens = cache(partial(tokens_after, chat))
         self._sizes: list[tuple[int, int]] = []
         self._allowed: dict[tuple[int, frozenset[int]], list[int]] = {}
-        self.most_tokens = self._most()
+        self.most_tokens = self._most()  # of the longest answer
 
     def _legs_of(self, point: Point, before: str) -> list[Leg]:
         """Return what may be chosen at a point that follows a fixed text."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from harness.backends import packages
 from harness.backends.card import Card
 from harness.backends.gguf import ModelFacts, read_facts
-from harness.backends.registry import capabilities, locate, missing_package, registration, resolve
+from harness.backends.registry import capabilities, import_object, locate, missing_package, registration
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, sha256_file, text_of
 from harness.core.resources import find
@@ -154,7 +154,7 @@ def _prepared(card: Card) -> Path:
     engine, where = registration(card.engine), locate(card)
     check_digest(card, where if where.is_file() else where / "model.safetensors")
     if engine.prepares and missing_package(card.engine) is None:
-        resolve(engine.prepares)(card)
+        import_object(engine.prepares)(card)
     return where
 
 

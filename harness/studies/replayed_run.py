@@ -15,7 +15,7 @@ import numpy as np
 from harness.backends.base import AnswerMode, Backend, Letters, Request, Sums, same_model
 from harness.backends.cache import default_file
 from harness.backends.card import Card
-from harness.backends.cards import own
+from harness.backends.cards import find_own
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
 from harness.coordination.exchange import Exchange
@@ -345,7 +345,7 @@ class ReplayedRun:
                 raise UserError(
                     f"{shown}: prompt {printable(version)} has changed since; {self._restore(stated)}"
                 )
-        cards = [own(card, self._models, shown, _GIVE_IT) for card in spec.cards]
+        cards = [find_own(card, self._models, shown, _GIVE_IT) for card in spec.cards]
         opens = partial(open_backend, dtype=spec.dtype, batch_size=spec.batch_size)
         models = open_each(cards, opens)
         identity = together(cards, models).identity()

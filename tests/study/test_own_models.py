@@ -11,7 +11,7 @@ from misbehaving import Server, completion, serving
 
 from harness.backends import cards
 from harness.backends.card import Card, Latency
-from harness.backends.cards import own
+from harness.backends.cards import find_own
 from harness.backends.servers import Server as Place
 from harness.core.errors import UserError
 from harness.core.resources import folder
@@ -154,8 +154,8 @@ def test_a_replay_asks_no_server_that_its_run_names(
 def test_a_name_of_a_shipped_card_does_not_lend_it_a_server() -> None:
     stated = Card("proxy", "openai", "d", Latency("paper", None, "b"), "m", server=Place("http://evil/v1"))
     with pytest.raises(UserError, match=r"proxy is not what it was \(\[server\] of your card differs\)"):
-        own(stated, (), "run", "")
-    assert own(cards.load("proxy"), (), "run", "") == cards.load("proxy")
+        find_own(stated, (), "run", "")
+    assert find_own(cards.load("proxy"), (), "run", "") == cards.load("proxy")
 
 
 @pytest.mark.slow
@@ -165,15 +165,15 @@ def test_a_name_of_a_shipped_card_does_not_lend_it_a_server() -> None:
 def test_a_name_in_a_run_is_no_path(name: str, run: Server) -> None:
     stated = Card(name, "openai", "d", Latency("paper", None, "b"), "m", server=Place("http://evil/v1"))
     with pytest.raises(UserError):
-        own(stated, (), "run", "give --model")
+        find_own(stated, (), "run", "give --model")
 
 
 def test_a_model_that_the_user_gives_is_taken_for_the_runs_of_its_name(tmp_path: Path) -> None:
     given = Card("my", "llama-cpp", "d", Latency("paper", None, "b"), "/here/my.gguf")
     stated = Card("my", "llama-cpp", "d", Latency("paper", None, "b"), "/theirs/my.gguf")
-    assert own(stated, (given,), "run", "").weights == "/here/my.gguf"
+    assert find_own(stated, (given,), "run", "").weights == "/here/my.gguf"
     with pytest.raises(UserError, match="engine"):
-        own(Card("my", "transformers", "d", given.latency, "/theirs"), (given,), "run", "")
+        find_own(Card("my", "transformers", "d", given.latency, "/theirs"), (given,), "run", "")
 
 
 def state(**values: Any) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 from harness.backends.base import Completion, Request, failed
 from harness.backends.card import Card
 from harness.backends.chat import Chat
-from harness.backends.registry import resolve
+from harness.backends.registry import import_object
 from harness.backends.weights import check_digest, find_gguf
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
@@ -210,7 +210,7 @@ def _serve(pipe: Connection, opener: str, arguments: tuple[Any, ...], options: d
     """Open a backend and answer until the parent is gone. Runs in the child."""
     end_with_parent()
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        backend, error = _attempt(lambda: resolve(opener)(*arguments, **options))
+        backend, error = _attempt(lambda: import_object(opener)(*arguments, **options))
         pipe.send((None, error))
         while not error:
             pipe.send(_attempt(_get, backend, *pipe.recv()))

@@ -47,10 +47,7 @@ def text_run(ids: Sequence[int]) -> Run:
 
 
 class Projector:
-    """A loaded projector.
-
-    Pictures are encoded when their tokens are first read, so that encoding is part of an answer's time.
-    """
+    """A loaded projector. It encodes a picture when its tokens are first read, in an answer's time."""
 
     def __init__(self, name: str, file: Path, model: LlamaModel, vision: Vision) -> None:
         """Load a projector. Raises UserError if it is none, not of this model, or not what the card says."""
@@ -107,10 +104,7 @@ class Projector:
         return runs[place]
 
     def _layout(self, shape: tuple[int, ...]) -> list[Sequence[int] | int]:
-        """Return the token ids of each marker and the token count of each picture part, in order.
-
-        Markers that the chat template writes itself are left out.
-        """
+        """Return each marker's token ids, but for the template's own, and each picture part's token count."""
         if shape not in self._layouts:
             with self._chunks(shape, None) as chunks:
                 parts = [

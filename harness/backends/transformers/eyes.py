@@ -107,10 +107,7 @@ class Eyes:
         return inputs
 
     def positions(self, prompt: Sequence[int]) -> torch.Tensor | None:
-        """Return the positions of a prompt's tokens in time, height and width, (3, tokens).
-
-        None if the model numbers tokens consecutively.
-        """
+        """Return positions in time, height and width, (3, tokens); None if the model numbers tokens."""
         if not hasattr(self._model.model, "get_rope_index"):
             return None
         ids = torch.tensor([list(prompt)])

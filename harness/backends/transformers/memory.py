@@ -17,10 +17,7 @@ MOST_TOKENS = 2048  # most tokens kept in total: 0.3 GB for a 4B model with grou
 
 
 def join_caches(caches: Sequence[Cache], order: Any) -> Cache:
-    """Return one cache of the rows of several, in some order. The others are emptied.
-
-    Rows with fewer columns end in zeros.
-    """
+    """Return one cache of the rows of several, which are emptied, in an order; short rows end in zeros."""
     columns = max(cache.get_seq_length() for cache in caches)
     for layers in zip(*(cache.layers for cache in caches), strict=True):
         for name in ("keys", "values"):
