@@ -1,6 +1,6 @@
 """`harness model device`: the computers of a vehicle, what each rests on, and what fits the window."""
 
-import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,13 +8,12 @@ import msgspec
 import typer
 
 from harness.cli import options
-from harness.cli.terminal import echo_each, echo_json, table
+from harness.cli.terminal import echo_each, echo_json, echo_text, table
 from harness.core import resources
 from harness.core.errors import UserError, in_range, printable
 from harness.core.figures import Unit, known, shown
 
 if TYPE_CHECKING:
-    from harness.core.statistics import Estimate
     from harness.runs.devices import Constant, Device, DeviceRow
 
 
@@ -66,7 +65,7 @@ def show(
     if not 0 < window_ms <= MOST_MS:
         raise UserError(f"--window-ms {window_ms:g} is out of range; give more than 0, to {MOST_MS}")
     device = devices.load(name)
-    rows = _rows(device, model)
+    rows = [devices.find_row(device, model)] if model else device.rows
     answers = of_run(read(run)) if run else declared(prompt_tokens, answer_tokens)
     results = fits(device, rows, answers, window_ms / 1000)
     if as_json:
@@ -83,6 +82,7 @@ def show(
     typer.echo(f"{printable(device.name)} · {printable(device.description)}")
     typer.echo()
     fitting = "in time %" if run else f"in {window_ms:g} ms"
+    yes_or_no, joules = ("no", "yes"), Unit("J", 2)
     table(
         ["model", "answer", "in + out", "ms", fitting, "J"],
         [
@@ -90,16 +90,18 @@ def show(
                 printable(fit.row.model),
                 fit.answer,
                 f"{fit.prompt_tokens:g} + {fit.output_tokens:g}",
-                _shown(1000 * fit.seconds, 0 if fit.seconds >= 0.1 else 1),
-                _share(fit.in_time) if run else _yes(fit.in_time.value),
-                _interval(fit.joules) if run else _shown(fit.joules.value, 2),
+                _known(fit.seconds, f"{1000 * fit.seconds:.{0 if fit.seconds >= 0.1 else 1}f}"),
+                _known(fit.in_time.value, shown(fit.in_time) if run else yes_or_no[bool(fit.in_time.value)]),
+                _known(
+                    fit.joules.value, shown(fit.joules, joules) if run else joules.number(fit.joules.value)
+                ),
             )
             for fit in results
         ],
     )
     typer.echo()
     if run:
-        _say(
+        echo_text(
             f"{printable(run)}: n = {len(answers.prompt)} answers of {printable(answers.who)} for the ego; "
             "tokens and ms are medians, in time and J are means with 95 % intervals over episodes; in time: "
             f"within {window_ms:g} ms; readout: one token after the same prompts. Tokens are counted by the "
@@ -139,13 +141,15 @@ def check(
                 each.role,
                 scales[each.what][0],
                 shown(each.measured, Unit(factor=scales[each.what][1])),
-                _shown(each.stated * scales[each.what][1], 1),
+                _known(each.stated, f"{each.stated * scales[each.what][1]:.1f}"),
                 str(each.measured.n),
             )
             for each in results
         ],
     )
-    _say(f"medians of answers asked alone, with 95 % intervals over episodes; {printable(row.model)}'s row")
+    echo_text(
+        f"medians of answers asked alone, with 95 % intervals over episodes; {printable(row.model)}'s row"
+    )
     _origins(device, [row])
 
 
@@ -195,20 +199,14 @@ def measure(
             for each in powers
         ],
     )  # fmt: skip
-    _say(
+    echo_text(
         f"means of {WINDOWS} windows of {window_s:g} s or more, with 95 % intervals over them; a meter "
         "counts all that draws from it, other programs and idling included"
     )
 
 
-def _rows(device: "Device", model: str | None) -> "list[DeviceRow]":
-    from harness.runs.devices import find_row
-
-    return [find_row(device, model)] if model else list(device.rows)
-
-
-def _origins(device: "Device", rows: "list[DeviceRow]") -> None:
-    """What the numbers rest on, each source once."""
+def _origins(device: "Device", rows: "Sequence[DeviceRow]") -> None:
+    """Print what the numbers rest on, each source once."""
     from harness.runs.devices import JOULES, RATES, constants
 
     for names, head in ((RATES, "rates"), (tuple(JOULES), "J")):
@@ -216,8 +214,8 @@ def _origins(device: "Device", rows: "list[DeviceRow]") -> None:
             f"{c.status} ({_source(device, c)})": None
             for row in rows for name, c in constants(device, row) if name in names and c
         }  # fmt: skip
-        _say(f"{head}: {'; '.join(sources) or 'unknown, since nobody states them'}")
-    _say(f"power mode: {device.power_mode}")
+        echo_text(f"{head}: {'; '.join(sources) or 'unknown, since nobody states them'}")
+    echo_text(f"power mode: {device.power_mode}")
 
 
 def _source(device: "Device", constant: "Constant") -> str:
@@ -227,21 +225,5 @@ def _source(device: "Device", constant: "Constant") -> str:
     return constant.source
 
 
-def _say(text: str) -> None:
-    typer.echo(textwrap.fill(printable(text, 1000), 80, subsequent_indent="  ", break_on_hyphens=False))
-
-
-def _shown(value: float, digits: int) -> str:
-    return "unknown" if value != value else f"{value:.{digits}f}"
-
-
-def _yes(share: float) -> str:
-    return "unknown" if share != share else "yes" if share else "no"
-
-
-def _share(estimate: "Estimate") -> str:
-    return "unknown" if estimate.value != estimate.value else shown(estimate)
-
-
-def _interval(estimate: "Estimate") -> str:
-    return "unknown" if estimate.value != estimate.value else shown(estimate, Unit("J", 2))
+def _known(value: float, text: str) -> str:
+    return "unknown" if value != value else text

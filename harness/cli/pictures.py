@@ -21,7 +21,7 @@ COLUMNS = 64  # of a picture in a terminal
 
 
 @dataclass(frozen=True)
-class Taker:
+class PictureModel:
     """A model that takes an image prompt's picture, by its card."""
 
     card: "Card"  # the model's
@@ -53,7 +53,7 @@ class Taker:
         return {"model": self.card.name, "width_px": width, "height_px": height, "tokens": self.vision.tokens}
 
 
-def taker(prompt: "Prompt", model: str | None, checked: bool = False) -> Taker | None:
+def picture_model(prompt: "Prompt", model: str | None, checked: bool = False) -> PictureModel | None:
     """Return the model that an image prompt's picture is drawn for; None if the prompt shows none.
 
     Args:
@@ -75,7 +75,7 @@ def taker(prompt: "Prompt", model: str | None, checked: bool = False) -> Taker |
             f"--model {printable(card.name)}: prompt {prompt.version} shows a picture, and this model reads "
             f"texts alone (its card has no [vision]); give another, such as {MODEL}"
         )
-    return Taker(card, card.vision, processor_tokens(card) if checked else None)
+    return PictureModel(card, card.vision, processor_tokens(card) if checked else None)
 
 
 def write(image: "Image", file: Path) -> str:
@@ -124,9 +124,4 @@ def _shrunk(pixels: Any, n: int, axis: int) -> Any:
     """Return the means of n parts of an axis, each as long as another or longer by a pixel."""
     import numpy as np
 
-    size = pixels.shape[axis]
-    starts = np.arange(n) * size // n
-    shape = [1, 1, 1]
-    shape[axis] = n
-    counts = np.diff(np.append(starts, size)).reshape(shape)
-    return np.add.reduceat(pixels.astype(float), starts, axis) / counts
+    return np.stack([part.mean(axis) for part in np.array_split(pixels, n, axis)], axis)

@@ -98,15 +98,15 @@ def show(
         raise unknown("viewer", viewer, at.viewers)
     viewers = at.viewers if viewer is None else [viewer]
     words = data.scenario.prompt_words
-    taker = pictures.taker(prompt, model)
-    if taker is None and out:
+    reader = pictures.picture_model(prompt, model)
+    if reader is None and out:
         raise UserError(f"--out: prompt {version} shows no picture; leave it out")
     system = resolve(model).system if model else None
     sent = {v: with_system(prompt.render(at.graphs[v], data.actions, words=words), system) for v in viewers}
-    seen = {v: Sight(data.scenario, at.state, v, taker.vision.size_px) for v in viewers if taker}
+    seen = {v: Sight(data.scenario, at.state, v, reader.vision.size_px) for v in viewers if reader}
     wrote = {v: pictures.write(image, out / f"{at.id}-{v}.png") for v, image in seen.items() if out}
     if as_json:
-        images = {v: {**taker.as_mapping(), "sha256": image.sha256} for v, image in seen.items() if taker}
+        images = {v: {**reader.as_mapping(), "sha256": image.sha256} for v, image in seen.items() if reader}
         echo_json({
             v: [{**m, "image": images[v]} if "image" in m else m for m in messages]
             for v, messages in sent.items()
@@ -115,8 +115,8 @@ def show(
     for v, messages in sent.items():
         for message in messages:
             typer.echo(f"--- {v} {message['role']}")
-            if taker and "image" in message:
-                typer.echo(f"picture: {taker.picture}, sha256 {seen[v].sha256[:8]}")
+            if reader and "image" in message:
+                typer.echo(f"picture: {reader.picture}, sha256 {seen[v].sha256[:8]}")
                 if not pictures.draw(seen[v]) and not out:
                     typer.echo("not drawn: no terminal with colours here; --out FOLDER writes PNG files")
                 if out:
@@ -190,12 +190,12 @@ def check(
     if reason := prompts.unfit(prompt, data.scenario):
         raise UserError(f"prompt {version} {reason}; give another --dataset, or fix the prompt")
     scenes = data.scenes(data.courses())
-    taker = pictures.taker(prompt, model, checked=True)
-    asked = trial.card_of(prompt, model, engine) if model and taker is None else None
-    if difference := taker and taker.difference:
+    reader = pictures.picture_model(prompt, model, checked=True)
+    asked = trial.card_of(prompt, model, engine) if model and reader is None else None
+    if difference := reader and reader.difference:
         typer.echo(difference)
         raise typer.Exit(1)
-    card, picture = (taker.card, taker.vision.tokens) if taker else (None, 0)
+    card, picture = (reader.card, reader.vision.tokens) if reader else (None, 0)
     count = counter(tokenizer, card)
     for role in prompts.ROLES:
         example_actions(prompt, role, data.actions)
@@ -209,7 +209,7 @@ def check(
     if as_json:
         outside = [each._asdict() for each in sizes.outside]
         figures = {"version": version, "budget": prompt.token_budget, "tokens": stats, "outside": outside}
-        seen = {"picture": {**taker.as_mapping(), "checked": taker.checked}} if taker else {}
+        seen = {"picture": {**reader.as_mapping(), "checked": reader.checked}} if reader else {}
         of_model = to_builtins(dict(zip(("trial", "readout"), tried, strict=True))) if tried else {}
         echo_json({**figures, **seen, **of_model}, indent=None)
     else:
@@ -217,9 +217,9 @@ def check(
         typer.echo(
             f"{version}: renders for every viewer of {len(scenes)} scenes; budget {least} to {most} tokens"
         )
-        if taker:
-            here = "as its processor says" if taker.checked else "its processor is not here to ask"
-            typer.echo(f"picture {taker.picture}, {here}")
+        if reader:
+            here = "as its processor says" if reader.checked else "its processor is not here to ask"
+            typer.echo(f"picture {reader.picture}, {here}")
         for call, s in stats.items():
             typer.echo(f"{call:<7} {s['least']} to {s['most']} tokens, mean {s['mean']}, n = {s['n']}")
         if not count:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from harness.cli import options
-from harness.cli.terminal import echo_each, echo_fields, echo_json, table
+from harness.cli.terminal import echo_each, echo_fields, echo_json, echo_text, table
 from harness.core import resources
 from harness.core.errors import UserError, in_range, printable, unknown
 from harness.core.figures import Unit, known, shown
@@ -40,8 +40,6 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
 
     Reception is the probability that one message arrives, averaged over shadowing.
     """
-    import textwrap
-
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS, outside
     from harness.radio.reception import DISTANCES_M, by_sight
@@ -64,12 +62,12 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
         return
     typer.echo(f"{printable(profile_name)} · {printable(profile.model)} · {profile.status}")
     for text in (profile.description, f"source: {profile.source}"):
-        typer.echo(textwrap.fill(printable(text, 1000), 80, subsequent_indent="  "))
+        echo_text(text)
     typer.echo()
     echo_fields(channel)
     typer.echo()
     for line in beyond:
-        typer.echo(textwrap.fill(line, 80, subsequent_indent="  "))
+        echo_text(line)
     if not curves:
         typer.echo("packet loss is the same at every distance and behind every obstacle")
         return

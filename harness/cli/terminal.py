@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Thing = TypeVar("Thing")
 
 WIDTH = 80  # columns of a terminal
+LONGEST = 1000  # characters of a text
 HEAD = 21  # of a table's column at most: three of them leave room for a name
 _FIELD = re.compile(r"((?:^    # .*\n)*)^    (\w+): [^#\n]+?(?:  # (.*))?$", re.MULTILINE)
 
@@ -60,6 +61,12 @@ def _plain(value: Any) -> Any:
         values = {field.name: getattr(value, field.name) for field in fields(value)}
         return {k: None if isinstance(v, float) and not isfinite(v) else v for k, v in values.items()}
     return value.tolist()
+
+
+def echo_text(text: str) -> None:
+    """Print a text on lines as wide as the terminal, all but the first of them indented."""
+    whole = printable(text, LONGEST)
+    typer.echo(fill(whole, WIDTH, subsequent_indent="  ", break_on_hyphens=False))
 
 
 def console() -> "Console":

@@ -48,6 +48,7 @@ class Attack:
     share: Share = 1 / 3
     by_scene: ClassVar[bool] = False  # whether it depends only on the scene and on who attacks
     in_text: ClassVar[bool] = False  # whether it changes what a fusion prompt shows
+    risk: ClassVar[str] = ""  # the risk that it states there, without reasons; empty leaves both as they are
 
     def __init_subclass__(cls) -> None:
         if "by_moment" in vars(cls):
@@ -67,7 +68,7 @@ class Attack:
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         """Return an attacker's message as a fusion prompt shows it (`in_text`), except for its intent."""
-        return dict(message)
+        return {**message, "evidence": "", "risk": self.risk} if self.risk else dict(message)
 
     def intend(self, sent: Intents, turn: Turn, intents: Floats) -> Intents:
         """Return `sent` with these intents `(n, H, A)` for the attackers; a NaN row changes nothing."""
@@ -96,6 +97,7 @@ class Liar(Attack):
     says: Literal["one-hot", "permuted"] = "one-hot"
     by_scene: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
+    risk: ClassVar[str] = "low"
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         p = turn.truth.helpers
@@ -105,10 +107,6 @@ class Liar(Attack):
         reversed_p = np.empty_like(p)
         np.put_along_axis(reversed_p, order, np.take_along_axis(p, order[..., ::-1], -1), -1)
         return self.intend(sent, turn, reversed_p)
-
-    def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
-        """Return the message without reasons and with a low risk."""
-        return {**message, "evidence": "", "risk": "low"}
 
 
 @dataclass(frozen=True)
@@ -161,14 +159,11 @@ class FeignedBraking(Attack):
 
     by_scene: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
+    risk: ClassVar[str] = "high"
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         braking = np.zeros(sent.helpers.shape[:-1], dtype=int)
         return self.intend(sent, turn, _sure_of(braking, sent.helpers.shape[-1]))
-
-    def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
-        """Return the message without reasons and with a high risk."""
-        return {**message, "evidence": "", "risk": "high"}
 
 
 @dataclass(frozen=True)
