@@ -26,14 +26,12 @@ class Commonest:
 
     @property
     def likeliest(self) -> str:
-        """That the action is the likeliest, in words."""
         if len(self.actions) == 1:
             return f"{self.actions[0]} is the likeliest action"
         return f"{', '.join(self.actions)} are equally likely"
 
     @property
     def constant(self) -> bool:
-        """Whether nearly all answers are of this kind."""
         return self.count >= CONSTANT * self.n
 
 
@@ -55,17 +53,16 @@ def commonest(run: Run) -> Commonest | None:
 def ignores_input(run: Run) -> Iterator[str]:
     """Yield the sentence on an ego whose likeliest action is nearly always the same one (`CONSTANT`)."""
     common = commonest(run)
-    if common is None or not common.constant:
-        return
-    like = f" Without messages it drives as {_like(run, common)}." if common.all_read else ""
-    yield (
-        f"The model ignores its input: {common.likeliest} in {common.count} of the ego's {common.n} readable "
-        f"answers, and its probability moves by {common.moves:.3f} (standard deviation) between them.{like}"
-    )
+    if common and common.constant:
+        like = f" Without messages it drives as {_like(run, common)}." if common.all_read else ""
+        yield (
+            f"The model ignores its input: {common.likeliest} in {common.count} of the ego's {common.n} "
+            f"readable answers, and its probability moves by {common.moves:.3f} (standard deviation) between "
+            f"them.{like}"
+        )
 
 
 def _like(run: Run, common: Commonest) -> str:
-    """Return like whom an ego drives that always answers so."""
     taken = common.actions[:1] if run.manifest.ties == "first" else common.actions
     if len(taken) == len(run.actions):
         return "the driver `uniform`, which needs no model"

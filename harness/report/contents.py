@@ -15,12 +15,12 @@ MOVED = 5  # decision points whose answers moved most
 
 def size(runs: Runs) -> str:
     """Return how much was run, of what: said once for all numbers."""
-    first = runs.runs[0]
-    episodes, seeds = (sorted({len(of) for of in each}) for each in (
-        [run.grid.episodes for run in runs.runs], [run.grid.seeds for run in runs.runs],
-    ))  # fmt: skip
-    counts = " or ".join(map(str, episodes)), " or ".join(map(str, seeds))
-    return f"{counts[0]} episodes × {counts[1]} channel seeds of {first.source}; 95 % intervals over episodes"
+    episodes, seeds = (
+        " or ".join(map(str, sorted({len(numbers) for numbers in each})))
+        for each in ([run.grid.episodes for run in runs.runs], [run.grid.seeds for run in runs.runs])
+    )
+    source = runs.runs[0].source
+    return f"{episodes} episodes × {seeds} channel seeds of {source}; 95 % intervals over episodes"
 
 
 def summary(run: Run) -> list[dict[str, Any]]:
@@ -49,10 +49,8 @@ def examples(runs: Runs) -> list[dict[str, Any]]:
     for n, run in enumerate(runs.runs):
         for answer in run.answers:
             if answer.status != "strict":
-                of = by_status.setdefault(answer.status, [])
-                if len(of) < EXAMPLES:
-                    of.append({"run": n, "answer": answer})
-    return [{"status": status, "answers": of} for status, of in by_status.items()]
+                by_status.setdefault(answer.status, []).append({"run": n, "answer": answer})
+    return [{"status": status, "answers": every[:EXAMPLES]} for status, every in by_status.items()]
 
 
 def attributions(runs: Runs) -> list[dict[str, Any]]:

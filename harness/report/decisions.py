@@ -94,9 +94,7 @@ class Decisions:
             of_scene[rows.start : rows.stop] = place[scene]
         of_run = run.grid.places(d) // run.grid.shape[2]
         letters = {
-            "acted": np.array([str(number) for number in range(len(run.actions))])[
-                d.codes("action", run.actions)
-            ],
+            "acted": np.array(list(map(str, range(len(run.actions)))))[d.codes("action", run.actions)],
             "ended": self._details.ends[n],
             "asked": np.where(d.flags("triggered"), "1", "0"),
         }
@@ -123,7 +121,6 @@ class Decisions:
         return lacks
 
     def parts(self) -> list[Part]:
-        """Return the details of all scenes, in parts."""
         return [Part(self._details, self.ids[at : at + AT_ONCE]) for at in range(0, len(self.ids), AT_ONCE)]
 
 

@@ -44,6 +44,10 @@ KEPT = (
     "mass", "message", "prompt_tokens", "completion_tokens", "seconds", "label_mass", "retries", "cached",
     "first_raw", "first_status",
 )  # fmt: skip
+ENDING = (
+    "condition", "seed", "partner", "striker", "fault", "time_s", "delay_s", "least_gap_m", "hard_brakings",
+    "other_crashes",
+)  # fmt: skip
 # The same for all decisions of a scene, or known from its outcomes.
 LEFT_OUT = ("scene", "episode", "step", "danger", "seed", "safe", "delay_s")
 
@@ -114,7 +118,6 @@ class Details:
         return [self.prompts(run) for run in self.runs.runs]
 
     def without_prompts(self) -> list[Run]:
-        """Return the runs whose prompts are not known."""
         return [run for run, sent in zip(self.runs.runs, self._sent, strict=True) if sent is None]
 
     @cached_property
@@ -204,15 +207,12 @@ class Part:
         return Part, (self.details.of_scenes(self.ids), self.ids)
 
     def packed(self) -> list[Markup]:
-        """Return the blocks of the scenes, as the page holds them."""
         return [packed(block) for block in self.details.blocks(self.ids)]
 
 
 def _shown(d: Decision) -> dict[str, Any]:
-    plain = msgspec.to_builtins(d)
-    return {key: value for key, value in plain.items() if key not in LEFT_OUT and not (
-        value is None and key in ("acts_at_s", "acted")
-    )}  # fmt: skip
+    unknown = [key for key in ("acts_at_s", "acted") if getattr(d, key) is None]
+    return {k: v for k, v in msgspec.to_builtins(d).items() if k not in (*LEFT_OUT, *unknown)}
 
 
 def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
@@ -233,11 +233,7 @@ def _left_out(run: Run) -> dict[str, list[dict[str, Any]]]:
 
 def _end(e: Episode) -> dict[str, Any]:
     """Return how an episode ended, for the page."""
-    return {
-        "condition": e.condition, "seed": e.seed, "result": e.failure or "cleared", "partner": e.partner,
-        "striker": e.striker, "fault": e.fault, "time_s": e.time_s, "delay_s": e.delay_s,
-        "least_gap_m": e.least_gap_m, "hard_brakings": e.hard_brakings, "other_crashes": e.other_crashes,
-    }  # fmt: skip
+    return {"result": e.failure or "cleared", **{key: getattr(e, key) for key in ENDING}}
 
 
 def _ends(run: Run) -> Any:

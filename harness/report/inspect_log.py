@@ -76,7 +76,6 @@ def log_of(run: Run, scenes: Mapping[str, Scene]) -> log.EvalLog:
 
 
 def _results(run: Run) -> Iterator[log.EvalScore]:
-    """Yield the summary over episodes or answers, a score a condition."""
     for condition in dict.fromkeys(score.condition for score in run.scores):
         metrics = {
             s.metric: log.EvalMetric(

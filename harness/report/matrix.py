@@ -25,15 +25,11 @@ BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 class Behind:
     """A run against the best one, over the episodes that both have."""
 
-    # its success minus the best one's, with a 95 % interval over the episodes that both have
-    change: Estimate
-    # of no difference, by that interval, corrected by Holm's method for the pairs of runs under all
-    # conditions
-    p_value: float
+    change: Estimate  # of its success minus the best one's, with a 95 % interval over these episodes
+    p_value: float  # of no difference, by that interval, corrected by Holm's method for all pairs of runs
 
     @property
     def undecided(self) -> bool:
-        """Whether the two cannot be told apart."""
         return self.p_value > LEVEL
 
 
@@ -47,8 +43,7 @@ class Line:
     answer: str  # answer mode
     condition: str  # operating point
     scores: Mapping[str, Score | None]  # metrics by name; None where the run has none
-    # median tokens of a prompt and of an answer; None where the engine counts none
-    tokens: tuple[float | None, float | None]
+    tokens: tuple[float | None, float | None]  # medians of a prompt and an answer; None where not counted
     mark: str  # `BEST` under its condition, `CLOSE` or `WORSE`; empty where no run is the best
     behind: Behind | None  # how it stands to the best; None for the best
 
@@ -175,11 +170,11 @@ def _behind(a: Floats, b: Floats) -> Behind:
 
 def uneven(runs: Runs) -> str | None:
     """That the runs have not the same episodes and seeds, and which; None where they have."""
-    sizes = [(len(run.grid.episodes), len(run.grid.seeds)) for run in runs.runs]
     if len({(run.grid.episodes, run.grid.seeds) for run in runs.runs}) < 2:
         return None
     each = "; ".join(
-        f"{name}: {episodes} × {seeds}" for name, (episodes, seeds) in zip(runs.names, sizes, strict=True)
+        f"{name}: {len(run.grid.episodes)} × {len(run.grid.seeds)}"
+        for name, run in zip(runs.names, runs.runs, strict=True)
     )
     return (
         f"The runs have different episodes × seeds ({each}): a success rate is over the run's own, and two "
@@ -189,10 +184,10 @@ def uneven(runs: Runs) -> str | None:
 
 def figures(results: Sequence[Line]) -> list[dict[str, str]]:
     """Return the best run's success under each condition, with what it is and its interval."""
-    bests = [(line, success) for line in results if line.mark == BEST and (success := line.scores[SUCCESS])]
     return [
         {"what": f"success with {line.condition}, best: {line.name}", **shown(success)}
-        for line, success in bests
+        for line in results
+        if line.mark == BEST and (success := line.scores[SUCCESS])
     ]
 
 

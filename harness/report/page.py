@@ -152,14 +152,13 @@ def _pieces(
 
 
 def _packed(parts: Sequence[Part], progress: Callable[[int], None], workers: Workers) -> Iterator[Markup]:
-    """Yield the blocks of all parts, in order."""
     if workers == 1 or len(parts) == 1:
         for part in parts:
             for block in part.details.blocks(part.ids):
                 yield library.packed(block)
                 progress(len(block))
         return
-    done: dict[int, list[Markup]] = {}
+    done: dict[int, list[Markup]] = {}  # by the part's place
 
     def keep(place: int, blocks: list[Markup]) -> None:
         done[place] = blocks

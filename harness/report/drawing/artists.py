@@ -65,7 +65,7 @@ def body(vehicle: VehicleState, look: str, hidden: bool) -> Artist:
 def sight(state: WorldState, viewer: str, seen: Collection[str], **look: Any) -> Artist:
     """Return lines from a viewer to those of whom it sees that are still there."""
     at = {v.id: north_up(np.array([v.x_m, v.y_m])) for v in state.vehicles}
-    there = [at[name] for name in seen if name in at and viewer in at]
+    there = [place for name, place in at.items() if name in seen and viewer in at]
     return LineCollection([np.array([at[viewer], place]) for place in there], **look)
 
 

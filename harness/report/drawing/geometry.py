@@ -106,7 +106,7 @@ class View:
 def spots(
     state: WorldState, zone_m: tuple[float, float], graph: SceneGraph | None, who: Collection[str | None]
 ) -> Floats:
-    """Return what a picture of a moment holds, (n, 2) m to the east and north, the ego first.
+    """Return what a picture holds, (n, 2) m to the east and north, the ego first.
 
     Args:
         state: who is where.

@@ -107,7 +107,6 @@ class Canvas:
         self.figure.draw_artist(self.lines[2])
 
     def _above(self, still: Still, seen: dict[str, list[str]], view: View) -> None:
-        """The view from above."""
         low, high = view.edges
         self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         ego, draw = still.state.ego, self.axes.draw_artist

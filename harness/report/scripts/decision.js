@@ -50,10 +50,10 @@ const acted = (d) => d.acts_at_s != null
 const first = (answers, point) => answers.filter((a) =>
   a.role === "ego" || a.role === (point.messages === "blind" ? "blind" : "helper"));
 
-function policyRows(told, chosen, actions, run) {
+function policyRows(record, chosen, actions, run) {
   const rows = [];
   const add = (who, what, p) => actions.forEach((action, n) => rows.push({ who, what, action, p: p[n] }));
-  for (const a of first(told.answers, run.points[chosen.condition])) {
+  for (const a of first(record.answers, run.points[chosen.condition])) {
     const message = chosen.messages.find((m) => m.from === sender(a));
     const weight = a.role === "ego" ? chosen.own_weight : message?.weight;
     const before = weight == null ? "before fusion" : `before fusion; weight ${number(weight, 3)}`;
@@ -65,10 +65,10 @@ function policyRows(told, chosen, actions, run) {
 }
 
 // Inference as the run took it: each answer's own time, one a role, or one each helper model, which take turns.
-function timelineRows(told, chosen, run) {
+function timelineRows(record, chosen, run) {
   const rows = [], point = run.points[chosen.condition], { latency_ms } = chosen;
   let turn = 0;
-  for (const a of first(told.answers, point)) {
+  for (const a of first(record.answers, point)) {
     const times = run.inference_s[a.role === "ego" ? "ego" : "helper"];
     const usual = a.took_s === undefined ? times[a.role === "ego" ? 0 : turn++ % times.length] : 0;
     const ready = 1000 * (a.took_s ?? usual); // null where an answer never came
@@ -109,10 +109,10 @@ class DecisionPage {
       return false;
     }
     const detail = (await block(Math.floor(n / index.block)))[n % index.block];
-    const told = detail.runs[state.run], made = (told?.decisions ?? []).filter((d) => d.seeds.includes(state.seed));
+    const record = detail.runs[state.run], decisions = (record?.decisions ?? []).filter((d) => d.seeds.includes(state.seed));
     const viewers = Object.keys(detail.world?.viewers ?? {}), viewer = params.get("viewer");
-    Object.assign(this, { n, params, state, detail, told, made, viewers });
-    this.chosen = made.find((d) => d.condition === state.condition) ?? made.at(-1);
+    Object.assign(this, { n, params, state, detail, record, decisions, viewers });
+    this.chosen = decisions.find((d) => d.condition === state.condition) ?? decisions.at(-1);
     this.viewer = viewers.includes(viewer) ? viewer : viewers[0];
     this.run = about.runs[state.run];
     this.conditions = [...new Set(index.runs.flatMap((run) => run.conditions))];
@@ -124,20 +124,20 @@ class DecisionPage {
       const policies = h("div", { class: "chart" }), timeline = h("div", { class: "chart" });
       this.show(
         this.steps(), this.title(), this.controls(),
-        this.told ? null : h("p", { class: "bad" }, "This run did not reach this scene."),
+        this.record ? null : h("p", { class: "bad" }, "This run did not reach this scene."),
         h("div", { class: "pair" },
           this.picture(),
           h("div", {}, this.came(), h("h3", {}, "Distributions before and after fusion"), policies)),
         this.cameras(),
         h("h2", {}, "What was decided"),
-        this.told ? this.decided() : null,
+        this.record ? this.decided() : null,
         this.messages(),
         this.about.names.length > 1 ? this.inEveryRun() : null,
         h("h3", {}, "Latency, from seeing to acting"), timeline,
         h("h2", {}, "Prompts and answers"),
-        (this.told?.answers ?? []).map((answer) =>
+        (this.record?.answers ?? []).map((answer) =>
           answerSection(answer, this.detail, this.index.actions, this.about.meanings,
-            this.told.left_out?.filter((each) => each.role === answer.role && each.viewer === answer.viewer))),
+            this.record.left_out?.filter((each) => each.role === answer.role && each.viewer === answer.viewer))),
       );
       if (this.chosen) await this.charts(policies, timeline);
     }
@@ -159,9 +159,9 @@ class DecisionPage {
   title() {
     const [id, episode, step, danger] = this.index.scenes[this.n], words = endWords(this.index.live);
     return [
-      h("h1", { tabindex: "-1" }, `${this.index.live ? "Moment" : "Decision"} ${id}`),
+      h("h1", { tabindex: "-1" }, `${this.index.live ? "Decision point" : "Decision"} ${id}`),
       h("p", {}, `Episode ${episode}, step ${step}; ${danger ? `danger from ${danger}` : "no danger"}. `,
-        this.made.map((d) => {
+        this.decisions.map((d) => {
           const [look, sign] = ENDS[d.end];
           return [h("span", { class: `verdict ${look}` }, `${d.condition}: ${d.action} ${sign} ${words[d.end]}`), " "];
         })),
@@ -175,7 +175,7 @@ class DecisionPage {
     const same = (names) => names.map((name) => [String(name), name]), { names } = this.about;
     return h("form", { class: "filters" },
       names.length > 1 ? pick("run", "run", names.map((name, k) => [String(k), name]), String(this.state.run)) : null,
-      pick("condition", "condition", same(this.made.map((d) => d.condition)), this.chosen?.condition),
+      pick("condition", "condition", same(this.decisions.map((d) => d.condition)), this.chosen?.condition),
       pick("seed", "seed", same(this.list.run.seeds), String(this.state.seed)),
       this.viewer ? pick("seen by", "viewer", same(this.viewers), this.viewer) : null,
       this.viewer ? pick("view", "zoom", [["", "the conflict"], ["all", "all, 160 m"]], this.params.get("zoom") ?? "") : null,
@@ -185,7 +185,7 @@ class DecisionPage {
   picture() {
     const { world } = this.detail, { ground } = this.about, [id] = this.index.scenes[this.n];
     if (!world) {
-      return h("p", { class: "picture" }, "No picture: the page has pictures of the most telling moments only, and only "
+      return h("p", { class: "picture" }, "No picture: the page has pictures of the most telling decision points only, and only "
         + "of those that could be played again here. `harness run video` draws the whole episode.");
     }
     const [drawing, said] = birdsEye(world, ground, this.viewer, this.chosen?.messages ?? [], this.params.get("zoom"));
@@ -200,24 +200,24 @@ class DecisionPage {
     if (!cameras) {
       const drawn = live ? "`harness run video` draws them" : "`harness dataset show --camera` draws any other";
       return h("p", { class: "quiet" }, `This page has camera pictures of ${framed} of ${scenes.length} `
-        + `${live ? "moments" : "decisions, those that lost an episode first"}; ${drawn}.`);
+        + `${live ? "decision points" : "decisions, those that lost an episode first"}; ${drawn}.`);
     }
     const boxes = h("input", { type: "checkbox", checked: this.boxes !== false, onchange: () => { this.boxes = boxes.checked; } });
     return h("section", { class: "cameras" },
       h("h3", {}, "What the cameras saw"),
-      h("p", { class: "quiet" }, shownTo(this.told?.answers ?? [], this.viewers), " Front above rear, each 120° wide. ",
+      h("p", { class: "quiet" }, shownTo(this.record?.answers ?? [], this.viewers), " Front above rear, each 120° wide. ",
         h("label", {}, boxes, " boxes around what the sensors list")),
       h("div", { class: "frames" }, this.viewers.map((viewer) => cameraFrame(world, viewer, cameras[viewer]))));
   }
 
   came() {
     if (this.detail.outcomes) return outcomes(this.detail.outcomes);
-    return endings((this.told?.ends ?? []).filter((e) => e.seed === this.state.seed));
+    return endings((this.record?.ends ?? []).filter((e) => e.seed === this.state.seed));
   }
 
   decided() {
     const heads = ["condition", "own entropy", "own weight", "replies", "fused", "action", "latency"];
-    return table("decided", heads, this.made.map((d) => [
+    return table("decided", heads, this.decisions.map((d) => [
       d.condition,
       `${number(d.entropy_nats, 3)}${d.triggered ? "; asked" : ""}${d.own_failed ? "; own answer failed" : ""}`,
       number(d.own_weight, 3),
@@ -229,7 +229,7 @@ class DecisionPage {
   }
 
   messages() {
-    const leftOut = this.told?.left_out?.filter((each) => each.role === "fusion") ?? [], [one] = leftOut;
+    const leftOut = this.record?.left_out?.filter((each) => each.role === "fusion") ?? [], [one] = leftOut;
     return one && moved(leftOut,
       `effect of leaving out one message at a time, under ${one.condition} with seed ${one.seed}`);
   }
@@ -248,8 +248,8 @@ class DecisionPage {
   }
 
   async charts(policies, timeline) {
-    const { told, chosen, run } = this, [id] = this.index.scenes[this.n];
-    const shares = policyRows(told, chosen, this.index.actions, run), times = timelineRows(told, chosen, run);
+    const { record, chosen, run } = this, [id] = this.index.scenes[this.n];
+    const shares = policyRows(record, chosen, this.index.actions, run), times = timelineRows(record, chosen, run);
     const window_s = run.points[chosen.condition].window_s, lines = new Set(times.map((row) => row.who)).size;
     await chart(policies, `policies-${id}`, { ...this.about.policies, height: 13 * shares.length }, { values: shares });
     await chart(timeline, `timeline-${id}`, { ...this.about.timeline, height: 22 * lines }, {

@@ -2,7 +2,7 @@
 
 const ENDS = { s: ["good", "✓"], d: ["slow", "◷"], u: ["bad", "✗"], n: ["", "○"], "-": ["quiet", ""] };
 const endWords = (live) => (live
-  ? { s: "success", d: "cleared too late", u: "failed", n: "", "-": "not in this moment" }
+  ? { s: "success", d: "cleared too late", u: "failed", n: "", "-": "not at this decision point" }
   : {
     s: "safe", d: "safe, slower than the best", u: "the answer that lost this episode",
     n: "success was no longer possible", "-": "not decided",

@@ -121,7 +121,7 @@ class List {
     const last = Math.max(Math.ceil(this.found.length / PAGE) - 1, 0), page = Math.min(state.page, last);
     const shown = this.found.slice(page * PAGE, (page + 1) * PAGE);
     const here = this.found.length > PAGE ? `, ${page * PAGE + 1} to ${page * PAGE + shown.length} here` : "";
-    const what = this.live ? "moments" : "decisions";
+    const what = this.live ? "decision points" : "decisions";
     this.count.textContent = `${this.found.length} of ${this.index.scenes.length} ${what}${here}; seed ${state.seed}`;
     const heads = ["scene", "danger", ...this.run.conditions, "not strict"];
     this.rows.replaceChildren(table("decisions", heads, shown.map((n) => this.row(n, state))));

@@ -15,10 +15,10 @@ function themes() {
 }
 
 async function route() {
-  const params = new URLSearchParams(location.hash.slice(1)), one = params.has("scene");
-  report.hidden = one;
-  single.hidden = !one;
-  if (one) {
+  const params = new URLSearchParams(location.hash.slice(1)), opened = params.has("scene");
+  report.hidden = opened;
+  single.hidden = !opened;
+  if (opened) {
     delete single.dataset.drawn;
     await page.draw(params);
     scrollTo(0, 0);

@@ -107,16 +107,13 @@ class View:
         self._drawing = asyncio.Lock()  # a page holds all rows of its runs
 
     def index(self, request: Request) -> Response:
-        """Return the list of runs, filtered by `q` and sorted by `sort`."""
         query = request.query_params
         return HTMLResponse(pages.listed(self.folder, query.get("q", ""), query.get("sort", "")))
 
     def style(self, request: Request) -> Response:
-        """Return the style of the list; reports have their own within."""
         return Response(pages.style(), media_type="text/css")
 
     async def run(self, request: Request) -> Response:
-        """Return the page of one run or study."""
         [run] = await run_in_threadpool(self._listed, [request.query_params.get("path", "")])
         if run.state != "finished":
             raise UserError(
@@ -132,7 +129,6 @@ class View:
         return await self._drawn(request, partial(pages.report, self._whole([run])))
 
     def picture(self, request: Request) -> Response:
-        """Return a picture of a study."""
         [run] = self._listed([request.query_params.get("path", "")])
         name = request.query_params.get("name", "")
         file = own_file(self.folder, run.name, name) if name in pictures(self.folder, run.name) else None
@@ -151,7 +147,6 @@ class View:
         return await self._drawn(request, partial(pages.compared, self.folder, older, newer))
 
     async def report(self, request: Request) -> Response:
-        """Return the report of all runs that are picked."""
         picked = await run_in_threadpool(self._picked, request)
         if not picked:
             raise UserError("no run is picked; pick one or more for a report")
