@@ -28,8 +28,7 @@ class DecisionFlip:
     seeds: tuple[int, ...]  # in which they do
     a: str  # action of A
     b: str  # action of B
-    # the run whose action alone gave success away; None where neither, both or nobody knows
-    lost_by: str | None
+    lost_by: str | None  # the run whose action alone gave success away; None where neither, both or unknown
 
 
 @dataclass(frozen=True)
@@ -39,13 +38,10 @@ class Difference:
     metric: str  # its name
     a: float  # mean of A over the episodes and seeds in which both know it; of a latency percentile, itself
     b: float  # mean of B over the same
-    # B - A, paired by episode and seed, with a 95 % interval over episodes
-    # (`harness.runs.metrics.difference`); of a latency percentile, a bootstrap's
+    # B - A, paired by episode and seed, with a 95 % interval over episodes; of a percentile a bootstrap's
     change: Estimate
-    # of no difference, of this one alone, by its interval; None where there is none
-    p_value: float | None = None
-    # by Holm's method (Holm 1979) for the primary metrics in all conditions; None of any other metric, which
-    # is exploratory
+    p_value: float | None = None  # of no difference, by that interval; None where there is none
+    # by Holm's method (Holm 1979) for the primary metrics in all conditions; None where exploratory
     p_corrected: float | None = None
 
     @property
@@ -70,8 +66,7 @@ class InCondition:
 
     condition: str  # its name
     differences: tuple[Difference, ...]  # metrics that both runs know
-    # of the difference in success; None for a single episode whose success depends on the seed
-    test: SuccessTest | None
+    test: SuccessTest | None  # of success; None for a single episode whose success depends on the seed
     gained: tuple[Flip, ...]  # episodes from failure to success
     lost: tuple[Flip, ...]  # episodes from success to failure
     decisions: int  # how many both runs have
@@ -85,8 +80,7 @@ class AnswersFlipped:
     role: str  # of who answered: `ego`, `helper` or `merge`
     a: str  # verdict in A: `strict`, `recovered` or `failed`
     b: str  # verdict in B
-    # their ids; first of decisions by which B gave success away, then of those by which A did
-    requests: tuple[str, ...]
+    requests: tuple[str, ...]  # their ids; first where B gave success away, then where A did
 
 
 @dataclass(frozen=True)
@@ -94,13 +88,11 @@ class Comparison:
     """B against A."""
 
     pair: Pair  # the two runs
-    # name, A's value and B's of every setting in which they differ; None where one has none
-    settings: tuple[tuple[str, str | None, str | None], ...]
+    settings: tuple[tuple[str, str | None, str | None], ...]  # that differ: name, A's value, B's, or None
     conditions: tuple[InCondition, ...]  # what changed in each
     answers: tuple[AnswersFlipped, ...]  # which answers changed their verdict
     answers_in_both: dict[str, int]  # answers by role that both runs have
-    # what differs between the texts; None where they are the same; a sentence that says why it is not known
-    prompts: PromptChange | str | None
+    prompts: PromptChange | str | None  # what differs; None where nothing; a sentence why it is not known
 
 
 def compare(pair: Pair) -> Comparison:
@@ -175,15 +167,11 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
         for metric in metrics_of(pair.a.run.world)
     ]
     names = {metric.percentile: metric.name for metric in METRICS.values()}
+    before, after = (pair.latencies(side, condition) for side in (pair.a, pair.b))
     differences += [
-        Difference(
-            names[percent], before, after, change,
-            p_of_bootstrap(change.value, change.low, change.high),
-        )
-        for percent, before, after, change in percentiles.differences(
-            pair.latencies(pair.a, condition), pair.latencies(pair.b, condition), len(pair.episodes)
-        )
-    ]  # fmt: skip
+        Difference(names[percent], a, b, change, p_of_bootstrap(change.value, change.low, change.high))
+        for percent, a, b, change in percentiles.differences(before, after, len(pair.episodes))
+    ]
     a, b = (pair.values(side, SUCCESS, condition) for side in (pair.a, pair.b))
     decisions, flipped = _decision_flips(pair, condition)
     return InCondition(
@@ -227,11 +215,8 @@ def _decision_flips(pair: Pair, condition: str) -> tuple[int, tuple[DecisionFlip
     )
     lost_a, lost_b = a.flags("regret")[rows_a], b.flags("regret")[rows_b]
     lost_by = np.where(lost_a == lost_b, 2, np.where(lost_b, 0, 1))
-    scene, episode, seed = (
-        a.codes("scene", names)[rows_a],
-        a.whole("episode")[rows_a],
-        a.whole("seed")[rows_a],
-    )
+    scene, episode = a.codes("scene", names)[rows_a], a.whole("episode")[rows_a]
+    seed = a.whole("seed")[rows_a]
     seeds: dict[tuple[int, int, str, str, int], list[int]] = {}
     for n in np.flatnonzero(acted_a != acted_b).tolist():
         how = int(lost_by[n]), int(scene[n]), str(acted_a[n]), str(acted_b[n]), int(episode[n])

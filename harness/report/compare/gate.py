@@ -41,9 +41,8 @@ class Verdict:
 
 
 def gate(
-    text: str, names: Sequence[str] = (), place: str = "CONDITION",
-    example: str = "6g:success_rate < -0.01",
-) -> Gate:  # fmt: skip
+    text: str, names: Sequence[str] = (), place: str = "CONDITION", example: str = "6g:success_rate < -0.01"
+) -> Gate:
     """Return a gate from `success_rate < -0.01`, `6g:success_rate < -0.01` or `success_rate.high < 0`.
 
     Args:

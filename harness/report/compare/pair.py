@@ -79,11 +79,10 @@ class Pair:
     def latencies(self, side: Side, condition: str) -> list[Decided]:
         """Of each seed, the episodes' places in `episodes` and the latencies in ms of their decisions."""
         decisions = side.run.decisions
-        of_condition = decisions.codes("condition", side.run.conditions) == side.run.conditions.index(
-            condition
-        )
-        kept = of_condition & np.isin(decisions.whole("episode"), self.episodes)
-        place = np.searchsorted(self.episodes, decisions.whole("episode")[kept]).astype(np.int64)
+        names, episode = side.run.conditions, decisions.whole("episode")
+        of_condition = decisions.codes("condition", names) == names.index(condition)
+        kept = of_condition & np.isin(episode, self.episodes)
+        place = np.searchsorted(self.episodes, episode[kept]).astype(np.int64)
         seed, latency_ms = decisions.whole("seed")[kept], decisions["latency_ms"][kept]
         return [(place[seed == s], latency_ms[seed == s]) for s in self.seeds]
 

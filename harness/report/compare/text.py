@@ -87,10 +87,8 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int, who
     """GitHub's Markdown, in which a run's text is code: no link, no picture, no mention."""
     pair = comparison.pair
     failed = sum(bool(verdict.failed) for verdict in verdicts)
-    lines = [
-        f"### {failed} of {len(verdicts)} gates failed" if verdicts else "### Comparison of two runs",
-        "",
-    ]
+    title = f"{failed} of {len(verdicts)} gates failed" if verdicts else "Comparison of two runs"
+    lines = [f"### {title}", ""]
     lines += [f"- {'❌' if v.failed else '✅'} {code(words.judged(v))}" for v in verdicts]
     lines += [f"- {name}: {code(side)}" for name, side in words.sides(pair)]
     lines += [f"- {code(caveat)}" for caveat in words.caveats(pair)]

@@ -94,17 +94,14 @@ def rest(c: InCondition) -> list[Difference]:
 
 def findings(comparison: Comparison) -> list[tuple[str, str]]:
     """Return how success changed in each condition: a sentence and its verdict."""
-    rows = [
-        (c.condition, d, line(d)) for c in comparison.conditions for d in c.differences if d.metric == SUCCESS
-    ]
-    return [
-        (
-            f"{condition}: success {row.change} points {row.interval}: {row.verdict or 'may be chance'}"
-            + ("" if d.p_corrected is None else f", Holm's p {row.p}"),
-            row.verdict,
-        )
-        for condition, d, row in rows
-    ]
+    findings = []
+    for c in comparison.conditions:
+        for d in [d for d in c.differences if d.metric == SUCCESS]:
+            row = line(d)
+            p = "" if d.p_corrected is None else f", Holm's p {row.p}"
+            change = f"success {row.change} points {row.interval}: {row.verdict or 'may be chance'}"
+            findings.append((f"{c.condition}: {change}{p}", row.verdict))
+    return findings
 
 
 def who(side: Side) -> str:
@@ -194,10 +191,7 @@ def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
 
 def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     """Return up to so many episodes, each with how it failed; seeds where it is not all of them."""
-    episodes = []
-    for t in some[:most]:
-        how = t.a if t.b == "success" else t.b
-        episodes.append(f"{t.episode} {how}{_seeds(t.seeds, pair)}")
+    episodes = [f"{t.episode} {t.a if t.b == 'success' else t.b}{_seeds(t.seeds, pair)}" for t in some[:most]]
     return _listed(episodes, len(some), most)
 
 

@@ -7,13 +7,8 @@ from pathlib import Path
 from harness.core.errors import UserError, printable
 
 PICTURES = {".svg": "image/svg+xml", ".png": "image/png"}
-READ = (
-    "run.json",
-    "summary.csv",
-    "decisions.parquet",
-    "answers.jsonl",
-    "episodes.csv",
-)  # what a page of a run is made from
+# What a page of a run is made from.
+READ = ("run.json", "summary.csv", "decisions.parquet", "answers.jsonl", "episodes.csv")
 
 
 def own_file(root: Path, run: str, name: str) -> Path | None:

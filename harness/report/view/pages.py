@@ -1,7 +1,8 @@
 """The pages as text. A run's text is hostile: the report's templates escape it all."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -21,14 +22,7 @@ RUNS = ("eval", "drive")
 TEMPLATES = Path(__file__).parent / "templates"
 LISTED_OF_EACH = 10  # episodes and requests, in a comparison
 NEWEST = "-date"
-COLUMNS: dict[str, Callable[[Listed], Any]] = {
-    "name": lambda run: run.name,
-    "kind": lambda run: run.kind,
-    "model": lambda run: run.model,
-    "prompt": lambda run: run.prompt,
-    "success": lambda run: run.success,
-    "date": lambda run: run.date,
-}
+COLUMNS = ("name", "kind", "model", "prompt", "success", "date")
 
 
 def report(folders: Sequence[Path]) -> str:
@@ -68,9 +62,10 @@ def listed(folder: Path, words: str, order: str) -> str:
 
 def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
     """Sorted by a column, those that have nothing there last."""
-    of = COLUMNS[order.removeprefix("-")]
-    known = [run for run in runs if of(run) is not None]
-    return [*sorted(known, key=of, reverse=order.startswith("-")), *(run for run in runs if of(run) is None)]
+    column = attrgetter(order.removeprefix("-"))
+    known = [run for run in runs if column(run) is not None]
+    unknown = [run for run in runs if column(run) is None]
+    return [*sorted(known, key=column, reverse=order.startswith("-")), *unknown]
 
 
 def study(run: Listed, pictures: Sequence[str]) -> str:
