@@ -1,14 +1,13 @@
 """A template reads a scene's members, and nothing that the sandbox forbids."""
 
 import math
-from itertools import product
 
 import pytest
 from jinja2 import StrictUndefined, UndefinedError
 from jinja2.exceptions import SecurityError, TemplateAssertionError
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
-from harness.prompts.sandbox import LOOP, Sandbox
+from harness.prompts.sandbox import Sandbox
 from harness.prompts.template import Template
 
 SANDBOX = Sandbox(undefined=StrictUndefined)
@@ -24,7 +23,7 @@ def test_a_member_is_read_by_its_name_even_where_a_method_has_it_too():
     )
 
 
-@pytest.mark.parametrize("name", sorted(LOOP))
+@pytest.mark.parametrize("name", ["first", "index", "index0", "last"])
 def test_a_loop_says_of_itself_what_it_says_in_the_plain_sandbox(name):
     template = "{% for a in actions %}{{ loop." + name + " }} {% endfor %}"
     plain = ImmutableSandboxedEnvironment(undefined=StrictUndefined).from_string(template)
@@ -107,27 +106,6 @@ def test_shorter_code_renders_what_the_plain_sandbox_does(template):
 def test_a_text_is_no_number_and_pads_nothing(template):
     with pytest.raises((SecurityError, TypeError, UndefinedError)):
         rendered(template, x="9")
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["{{ graph.ego.id }}", "{{ words.task }}", "{{ actions | join('|') }}", "{{ graph.ego }}",
-     "{% for a in actions %}{{ a }}{{ graph.ego.id if loop.last }}{% endfor %}",
-     "{% if graph.ego.id == 'v1' %}{{ words.task }}{% else %}{{ n }}{% endif %}",
-     "{{ graph.ego['id'] }}", "{% set x = n %}{{ x }}", "{{ self.other() }}", "{{ graph.speed }}",
-     "{% for graph in actions %}{{ graph }}{% endfor %}{{ n }}"],
-)  # fmt: skip
-def test_a_kept_text_is_the_one_that_would_be_rendered(text):
-    text = f"{{% block system %}}{text}{{% endblock %}}{{% block other %}}{{{{ n }}}}{{% endblock %}}"
-    template = Template(text)
-    for ego, task, actions, n in product(
-        ("v1", "v2"), ("drive", "turn"), (("A", "B"), ("A",), ["A"]), (1, True, 1.0)
-    ):
-        values = {
-            "graph": {"ego": {"id": ego}, "speed": n}, "words": {"task": task}, "actions": actions, "n": n
-        }  # fmt: skip
-        for _ in range(2):
-            assert template.render(values, ("system",)) == Template(text).render(values, ("system",))
 
 
 def test_what_draws_is_rendered_each_time():

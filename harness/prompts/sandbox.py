@@ -1,15 +1,12 @@
 """The environment in which prompt templates are compiled: Jinja's sandbox, narrower, with shorter code."""
 
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 from jinja2 import nodes
 from jinja2.compiler import Frame, optimizeconst
 from jinja2.exceptions import SecurityError
-from jinja2.runtime import Context, LoopContext
+from jinja2.runtime import Context
 
 from harness.core import templates
 
@@ -27,20 +24,6 @@ SHORTENING = frozenset({
 })  # fmt: skip
 NUMBERS = frozenset({"float", "int", "length"})  # filters that return one
 LONGEST_CHAIN = 3  # filters one after another that need not pay
-SHORT = 32  # most items of a loop whose places are made beforehand
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """What a loop says of itself at one item, where a template asks for these alone."""
-
-    index: int
-    index0: int
-    first: bool
-    last: bool
-
-
-LOOP = frozenset(Place.__dataclass_fields__)
 
 
 class Code(templates.Code):
@@ -51,13 +34,10 @@ class Code(templates.Code):
 
     @optimizeconst
     def visit_Getattr(self, node: nodes.Getattr, frame: Frame) -> None:
-        # The first cases of `Sandbox.getattr`, without the call.
-        of_loop = _is_loop(node.node) and node.attr in LOOP
-        self.write(f"(_at.{node.attr}" if of_loop else f"(_at[{node.attr!r}]")
-        self.write(" if type(_at := ")
+        # The first case of `Sandbox.getattr`, without the call.
+        self.write(f"(_at[{node.attr!r}] if type(_at := ")
         self.visit(node.node, frame)
-        self.write(") is Place" if of_loop else f") is dict and {node.attr!r} in _at")
-        self.write(f" else environment.getattr(_at, {node.attr!r}))")
+        self.write(f") is dict and {node.attr!r} in _at else environment.getattr(_at, {node.attr!r}))")
 
     @optimizeconst
     def visit_Filter(self, node: nodes.Filter, frame: Frame) -> None:
@@ -124,26 +104,10 @@ def _keeps_small(node: nodes.Filter) -> bool:
     return name in SHORTENING and all(not isinstance(x, int) or 0 <= x < 1000 for x in given)
 
 
-def _is_loop(node: nodes.Node) -> bool:
-    return isinstance(node, nodes.Name) and node.name == "loop"
-
-
 def _bare(node: nodes.Filter, name: str) -> bool:
     """Return whether a filter is the one of this name, without arguments, and applied to an expression."""
     given = node.args or node.kwargs or node.dyn_args or node.dyn_kwargs
     return node.name.removeprefix(templates.FREE) == name and not given and node.node is not None
-
-
-@lru_cache(maxsize=SHORT + 1)
-def _places(n: int) -> tuple[Place, ...]:
-    return tuple(Place(i + 1, i, i == 0, i == n - 1) for i in range(n))
-
-
-def placed(items: Any, undefined: Any) -> Iterable[tuple[Any, Any]]:
-    """Return items with their places, as `LoopContext` does for loops that are asked for no more."""
-    if type(items) in (list, tuple) and len(items) <= SHORT:
-        return zip(items, _places(len(items)), strict=True)
-    return LoopContext(items, undefined)
 
 
 class Sandbox(templates.Sandbox):
@@ -159,16 +123,6 @@ class Sandbox(templates.Sandbox):
         self._binds_nothing = False
         for name in ("center", "indent"):
             del self.filters[name]
-
-    def _generate(
-        self, source: nodes.Template, name: str | None, filename: str | None, defer_init: bool = False
-    ) -> str:
-        code = super()._generate(source, name, filename, defer_init)
-        read = [node for node in source.find_all(nodes.Getattr) if _is_loop(node.node) and node.attr in LOOP]
-        loops = [node for node in source.find_all(nodes.Name) if node.name == "loop"]
-        recursive = any(node.recursive for node in source.find_all(nodes.For))
-        loop = "LoopContext" if recursive or len(loops) > len(read) else "placed as LoopContext"
-        return f"{code}from {__name__} import Place, {loop}\n"
 
     def _put_steps_into(self, source: nodes.Template) -> None:
         # A template that binds no name can keep nothing, so its texts are as small as what it is given.
