@@ -174,9 +174,9 @@ def test_its_answers_keep_their_place_and_a_failed_one_says_so(small: Dataset) -
 @pytest.mark.parametrize(
     ("model", "options", "said"),
     [
-        ("proxy", {}, "proxy is no language model and cannot merge messages"),
+        ("proxy", {}, "proxy is no language model and cannot fuse messages"),
         ("cruise", {}, "cruise is no language model"),
-        (LANGUAGE_MODEL, {"answer": "readout"}, "a readout gives no messages to merge; use --answer json"),
+        (LANGUAGE_MODEL, {"answer": "readout"}, "a readout gives no messages to fuse; use --answer json"),
     ],
 )
 def test_who_can_merge_nothing_is_told_so(

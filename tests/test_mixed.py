@@ -199,7 +199,7 @@ def test_a_fusion_call_takes_messages_of_its_own_form(small: Dataset) -> None:
     from harness.coordination.operating_point import named_point
 
     asks = (named_point("6g:consensus=ego-prompt"),)
-    with pytest.raises(UserError, match="prompt v2 merges messages with a distribution, those of paper"):
+    with pytest.raises(UserError, match="prompt v2 fuses messages with a distribution, those of paper"):
         mixed(small, helper("swarm-tiny", "paper"), model="swarm-tiny", points=asks)
-    with pytest.raises(UserError, match="a readout gives no messages to merge"):
+    with pytest.raises(UserError, match="a readout gives no messages to fuse"):
         mixed(small, helper("swarm-tiny", answer="readout"), model="swarm-tiny", points=asks)

@@ -7,11 +7,13 @@ hears are known before the first call, and each set needs one call.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from harness.coordination.attacks import Turn, attacks_of
+from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import Rewrites
 from harness.core.arrays import Bools, Floats, Ints
@@ -27,29 +29,21 @@ class FusionAnswers:
     intents: Floats  # the intent after each set, (K, A); NaN where the answer failed
     seconds: Floats  # time of each fusion call, (K,)
 
-    def at(self, points: Ints, attackers: Bools | None = None) -> "FusionAnswersAt":
-        return FusionAnswersAt(self, points, attackers)
+    def at(self, points: Ints, attackers: Bools | None = None) -> FusionCall:
+        """Return the call for decisions at points (n,), with attackers (n, H) if the text shows them."""
+        return partial(self._of_heard, points, attackers)
 
-
-@dataclass(frozen=True)
-class FusionAnswersAt:
-    """The fusion call for decisions at some points, as a `FusionCall` of `coordinate`."""
-
-    answers: FusionAnswers
-    points: Ints
-    attackers: Bools | None = None
-
-    def __call__(self, on_time: Bools) -> tuple[Floats, Floats]:
+    def _of_heard(self, points: Ints, attackers: Bools | None, on_time: Bools) -> tuple[Floats, Floats]:
         """Return intents (n, A) and seconds (n,) by who was heard (n, H); NaN if nobody was."""
-        answers, heard_any = self.answers, on_time.any(axis=1)
-        codes = codes_of(on_time, self.points, self.attackers)[heard_any]
-        intents = np.full((len(on_time), answers.intents.shape[1]), np.nan)
+        heard_any = on_time.any(axis=1)
+        codes = codes_of(on_time, points, attackers)[heard_any]
+        intents = np.full((len(on_time), self.intents.shape[1]), np.nan)
         seconds = np.full(len(on_time), np.nan)
         if len(codes):
-            index = np.minimum(np.searchsorted(answers.codes, codes), len(answers.codes) - 1)
-            if not len(answers.codes) or not np.array_equal(answers.codes[index], codes):
+            index = np.minimum(np.searchsorted(self.codes, codes), len(self.codes) - 1)
+            if not len(self.codes) or not np.array_equal(self.codes[index], codes):
                 raise LookupError("the ego's model was never asked about a set of messages that was heard")
-            intents[heard_any], seconds[heard_any] = answers.intents[index], answers.seconds[index]
+            intents[heard_any], seconds[heard_any] = self.intents[index], self.seconds[index]
         return intents, seconds
 
 

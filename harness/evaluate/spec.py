@@ -232,22 +232,22 @@ class Spec:
             raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
         if not point.has_fusion_call:
             return
-        reason = self.unmergeable
+        reason = self.fusion_obstacle
         if not ego.can.language_model:
-            reason = f"{printable(ego.card.name)} is no language model and cannot merge messages"
+            reason = f"{printable(ego.card.name)} is no language model and cannot fuse messages"
         if reason:
             raise UserError(f"{shown}: {reason}")
 
     @property
-    def unmergeable(self) -> str | None:
+    def fusion_obstacle(self) -> str | None:
         """Why the ego's prompt cannot hold the helpers' messages; None if it can."""
         if "readout" in [agent.answer for agent in self.agents]:
-            return "a readout gives no messages to merge; use --answer json or constrained"
+            return "a readout gives no messages to fuse; use --answer json or constrained"
         version, form = self.ego.prompt.version, self.ego.prompt.helper_answer
         for prompt in (helper.prompt for helper in self.helpers):
             if prompt.helper_answer != form:
                 return (
-                    f"prompt {version} merges messages with a {form}, those of {prompt.version} have a "
+                    f"prompt {version} fuses messages with a {form}, those of {prompt.version} have a "
                     f"{prompt.helper_answer}; use another --helper-prompt"
                 )
         return None

@@ -54,7 +54,7 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
     backend.complete(first[:1])  # the first request of a process includes the warm-up
     answers = {r.id: answer_of(r, backend.complete([r])[0]) for r in first}
     fusion = []
-    for scene in scenes if spec.unmergeable is None else ():
+    for scene in scenes if spec.fusion_obstacle is None else ():
         by_viewer = {viewer: answers[f"{scene.id}/{viewer}"] for viewer in scene.viewers}
         if heard := [viewer for viewer in scene.viewers[1:] if by_viewer[viewer].intent]:
             fusion.append(replace(fusion_request(spec, scene, by_viewer, heard), timed=True))
@@ -67,12 +67,14 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
             f"--latency {MEASURED}: no answer of {name} could be timed in {len(scenes)} scenes; see what "
             f"`harness model check` says, or declare times such as {EXAMPLE}"
         )
-    ego, helper, merge = (sample.get(role, sample["ego"]).median_s for role in ("ego", "helper", "merge"))
+    ego_s, helper_s, fusion_s = (
+        sample.get(role, sample["ego"]).median_s for role in ("ego", "helper", "merge")
+    )
     several_helpers = len(spec.helpers) > 1
     helper_times = tuple(
         times(answers[r.id] for r in first if r.agent == agent).get("helper", sample["ego"]).median_s
         for agent in range(1, len(spec.agents)) if several_helpers
     )  # fmt: skip
     basis = f"median of single requests (batch 1) before the run, at most {IDLE:g} processes a core"
-    helper = helper_times[0] if helper_times else helper
-    return Latency("measured", basis, ego, helper, merge, sample, helper_times)
+    helper_s = helper_times[0] if helper_times else helper_s
+    return Latency("measured", basis, ego_s, helper_s, fusion_s, sample, helper_times)
