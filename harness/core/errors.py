@@ -43,9 +43,9 @@ def printable(text: object, limit: int = 120) -> str:
     return escaped if len(escaped) <= limit else escaped[: limit - 1] + "…"
 
 
-def one_line(error: Exception, limit: int = 200) -> str:
+def one_line(error: Exception) -> str:
     """Return an error's message on one line, made safe to show."""
-    return printable(" ".join(str(error).split()), limit)
+    return printable(" ".join(str(error).split()), 200)
 
 
 def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserError:

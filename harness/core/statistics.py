@@ -13,6 +13,8 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
 
+LEVEL = 0.95  # of confidence
+LEAST_MASS = 1e-4  # least probability that is counted of safe actions
 ROUNDING = 1e-18  # a smaller sum of squares is rounding only; relative to the mean where that is above 1
 
 
@@ -44,28 +46,28 @@ def brier(p: Floats, target: Floats) -> Floats:
     return score
 
 
-def negative_log_likelihood(p: Floats, safe: Bools, floor: float = 1e-4) -> Floats:
+def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
     """Return -ln of the probability that intents `(..., A)` give to the safe actions; 0 best. Shape `(...)`.
 
     This is the logarithmic score (Good 1952) with the set of safe actions as the event that came true. Unlike
-    in `brier`, it does not matter how the mass is spread inside the set. NaN where no action is safe. `floor`
-    is the least probability counted: an answer that is sure and wrong costs -ln(floor) = 9.2 nats.
+    in `brier`, it does not matter how the mass is spread inside the set. NaN where no action is safe. An
+    answer that is sure and wrong costs -ln(LEAST_MASS) = 9.2 nats.
     """
     mass = np.sum(np.where(safe, p, 0.0), axis=-1)
     # Rounding may put the mass of a distribution slightly above 1.
-    return np.where(np.any(safe, axis=-1), -np.log(np.clip(mass, floor, 1.0)), np.nan)
+    return np.where(np.any(safe, axis=-1), -np.log(np.clip(mass, LEAST_MASS, 1.0)), np.nan)
 
 
-def seed_interval(per_seed_means: Floats, level: float = 0.95) -> Estimate:
+def seed_interval(per_seed_means: Floats) -> Estimate:
     """Return the mean over seeds `(S,)` with Student's t interval; t(4) = 2.776 for 5 seeds.
 
     These are the paper's error bars. One seed, or seeds that all agree, have a value and no interval.
     """
-    return _student(per_seed_means, np.arange(len(per_seed_means)), level)
+    return _student(per_seed_means, np.arange(len(per_seed_means)))
 
 
 def episode_interval(
-    values_by_episode: Floats, episodes: Ints | None = None, level: float = 0.95
+    values_by_episode: Floats, episodes: Ints | None = None, level: float = LEVEL
 ) -> Estimate:
     """Return the mean with Student's t interval over episodes; for shares see `rate_interval`.
 
@@ -91,7 +93,7 @@ def known_mean(values: Floats, axis: int) -> Floats:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def rate_interval(values: Floats, episodes: Ints | None = None, level: float = 0.95) -> Estimate:
+def rate_interval(values: Floats, episodes: Ints | None = None) -> Estimate:
     """Return the mean of values from 0 to 1, `(n,)`, with Wilson's interval for their effective sample size.
 
     NaN is left out. `episodes` is the episode of each value, one of its own if None; how much an episode
@@ -103,10 +105,10 @@ def rate_interval(values: Floats, episodes: Ints | None = None, level: float = 0
         return Estimate(math.nan, math.nan, math.nan, 0, n_excluded)
     rate = float(np.mean(values[known]))
     totals, sizes = _clusters(values[known] - rate, None if episodes is None else episodes[known])
-    return Estimate(rate, *wilson(rate, _effective_n(rate, totals, sizes, level), level), n, n_excluded)
+    return Estimate(rate, *wilson(rate, _effective_n(rate, totals, sizes)), n, n_excluded)
 
 
-def wilson(rate: float, n: float, level: float = 0.95) -> tuple[float, float]:
+def wilson(rate: float, n: float, level: float = LEVEL) -> tuple[float, float]:
     """Return Wilson's score interval of a share among n (Wilson 1927)."""
     z = _normal(level)
     centre = (rate + z**2 / (2 * n)) / (1 + z**2 / n)
@@ -115,7 +117,7 @@ def wilson(rate: float, n: float, level: float = 0.95) -> tuple[float, float]:
     return min(max(centre - half, 0.0), rate), max(min(centre + half, 1.0), rate)
 
 
-def seed_rate_interval(values: Floats, level: float = 0.95) -> Estimate:
+def seed_rate_interval(values: Floats) -> Estimate:
     """Return the mean of shares over seeds, for these episodes, with an interval over other seeds.
 
     Draws are independent between seeds and between episodes, so the variance is that of seeds inside each
@@ -136,11 +138,11 @@ def seed_rate_interval(values: Floats, level: float = 0.95) -> Estimate:
         return Estimate(value, math.nan, math.nan, counted, len(means) - counted)
     within = float(np.nansum((values - known_mean(values, axis=0)) ** 2)) / freedom
     n = int(known.sum())
-    half = float(stdtrit(freedom, 0.5 + level / 2)) * math.sqrt(n * within + 2) / n
+    half = float(stdtrit(freedom, 0.5 + LEVEL / 2)) * math.sqrt(n * within + 2) / n
     return Estimate(value, max(value - half, -1.0), min(value + half, 1.0), counted, len(means) - counted)
 
 
-def rate_difference(a: Floats, b: Floats, level: float = 0.95) -> Estimate:
+def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
     """Return the mean over episodes of a - b, for shares, with an interval from the two of `rate_interval`.
 
     The ends of both intervals are combined by the correlation over episodes (Newcombe 1998, method 10; Zou
@@ -212,7 +214,7 @@ def _around(values: Floats, level: float) -> tuple[float, Floats, float, float, 
     return rate, deviations, *wilson(rate, effective_n, level), effective_n
 
 
-def _effective_n(rate: float, totals: Floats, sizes: Floats, level: float) -> float:
+def _effective_n(rate: float, totals: Floats, sizes: Floats, level: float = LEVEL) -> float:
     """Return the number of independent yes-or-no trials that are as informative as these episodes.
 
     This is the effective sample size of Korn and Graubard (1998): rate (1 - rate) over the variance of the
@@ -242,7 +244,7 @@ def _clusters(values: Floats, episodes: Ints | None) -> tuple[Floats, Floats]:
     return np.bincount(place, weights=values).astype(float), np.bincount(place).astype(float)
 
 
-def _student(values: Floats, episodes: Ints, level: float) -> Estimate:
+def _student(values: Floats, episodes: Ints, level: float = LEVEL) -> Estimate:
     from scipy.special import stdtrit
 
     known = ~np.isnan(values)

@@ -321,9 +321,7 @@ def _cost(body: Iterable[nodes.Node]) -> int:
     steps, unread = 1, list(body)
     while unread:
         node = unread.pop()
-        text = getattr(node, "data", None) or getattr(
-            node, "value", None
-        )  # of a template's text, of a constant
+        text = getattr(node, "data", None) or getattr(node, "value", None)  # of the template, of a constant
         steps += 1 + (len(text) >> 3 if isinstance(text, str) else 0)
         unread += node.iter_child_nodes()
     return steps
@@ -371,9 +369,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
     def _generate(
         self, source: nodes.Template, name: str | None, filename: str | None, defer_init: bool = False
     ) -> str:
-        _account.left = (
-            0  # so that no filter is applied to a constant here, where nothing pays for the result
-        )
+        _account.left = 0  # so that no filter is applied to a constant here, where nothing pays for it
         try:
             self._put_steps_into(source)
             code = super()._generate(source, name, filename, defer_init)

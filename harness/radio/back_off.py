@@ -85,11 +85,11 @@ def same_slot(per_slot: float, packet_slots: float, aifs_slots: float, window: i
     """
     counts = window + 1
     slot, count = np.arange(counts + 1)[:, None], np.arange(counts)
-    came = np.minimum(slot, counts - count) * per_slot / counts  # since the busy period
+    arrived = np.minimum(slot, counts - count) * per_slot / counts  # since the busy period
     left = np.zeros(counts)
     for _ in range(200):
         waiting = np.append(left + per_slot * packet_slots / counts, np.zeros(counts + 1))
-        mean = waiting[slot + count] + came
+        mean = waiting[slot + count] + arrived
         ends = -np.expm1(-mean[:, 0])
         reached = np.append(1.0, np.cumprod(1 - ends[:-1]))
         reached[-1] /= ends[-1]  # all later slots are like the last

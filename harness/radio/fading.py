@@ -55,8 +55,8 @@ class Trips:
         place, total = place.reshape(-1), np.empty((place.size, helpers))
         for start in range(0, len(place), BLOCK):
             block = slice(start, start + BLOCK)
-            of = waves[place[block]]
-            turns = of[..., 0] + np.matmul(of[..., 1:], ends[block])[..., 0]
+            drawn = waves[place[block]]
+            turns = drawn[..., 0] + np.matmul(drawn[..., 1:], ends[block])[..., 0]
             # The fraction of a turn is exact enough in single precision, whose cosine is much faster.
             angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
             total[block] = np.cos(angle).sum(axis=-1)

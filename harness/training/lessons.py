@@ -40,11 +40,8 @@ TEACHER = "local-view"
 SOFTNESS_S = 0.25
 PER_LEVEL = 6  # decision points of a level that are learnt from
 MOST_TRIED = 40  # decision points of a level that are tried to find them
-PRIOR = {
-    "FASTER": 0.3,
-    "LANE_LEFT": 0.3,
-    "LANE_RIGHT": 0.3,
-}  # weight of an action beside equals, 1 if not named
+# Weight of an action beside equals, 1 if not named.
+PRIOR = {"FASTER": 0.3, "LANE_LEFT": 0.3, "LANE_RIGHT": 0.3}
 
 
 class Point(msgspec.Struct, frozen=True):

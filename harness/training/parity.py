@@ -161,8 +161,6 @@ def _equal(what: str, least: float, ids: Sequence[str], a: Sequence[Any], b: Seq
 
 def _near(what: str, most: float | None, ids: Sequence[str], values: Floats) -> Finding:
     worst = [i for i in np.argsort(-values)[:SHOWN] if most is not None and not values[i] <= most]
-    holds, differences = (
-        most is None or bool(values.max() <= most),
-        (f"{ids[i]}: {values[i]:.2g}" for i in worst),
-    )
-    return Finding(what, float(values.max()), most, holds, len(ids), tuple(differences))
+    holds = most is None or bool(values.max() <= most)
+    differences = tuple(f"{ids[i]}: {values[i]:.2g}" for i in worst)
+    return Finding(what, float(values.max()), most, holds, len(ids), differences)

@@ -32,7 +32,7 @@ FOLDS = 5
 RESAMPLES = 1999
 BLIND = ("cruise", "local-view")  # drivers that cannot know of what the ego does not see
 DANGER, NONE = "danger", ""
-Hidden = tuple[str, list[tuple[int, dict[str, float]]]]  # sector of a danger; steps and the ego's numbers
+Hidden = tuple[str, list[tuple[int, dict[str, float | None]]]]  # a danger's sector; steps and numbers
 INDICATORS = {"off": 0.0, "left": 1.0, "right": 2.0}
 BY_SIZE = {"car": 0.0, "van": 0.5, "truck": 1.0}
 
@@ -114,8 +114,8 @@ def _hidden(scenario: Scenario, seed: int) -> Hidden:
     return start.layout.danger or NONE, hidden
 
 
-def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float]]:
-    """Yield a scene graph's numbers with names, the same names for every graph of a road."""
+def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float | None]]:
+    """Yield a scene graph's numbers with names, the same names for every graph of a road; None if unknown."""
     for name in ("speed_mps", "target_speed_mps", "zone_m"):
         yield f"ego {name}", getattr(graph.ego, name)
     for lane in (*sorted({role for path in road.paths.values() for role in path.roles}), "off-lane"):
@@ -123,9 +123,9 @@ def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float]]:
         node = min(nodes, key=lambda n: float(np.hypot(n.forward_m, n.left_m)), default=None)
         yield f"{lane}: vehicles", float(len(nodes))
         for name in ("forward_m", "left_m", "speed_mps", "heading_deg", "range_rate_mps"):
-            yield f"{lane}: nearest {name}", _or_nan(getattr(node, name, None))
-        yield f"{lane}: nearest kind", _or_nan(BY_SIZE.get(node.type) if node else None)
-        yield f"{lane}: nearest indicator", _or_nan(INDICATORS.get((node and node.indicator) or ""))
+            yield f"{lane}: nearest {name}", getattr(node, name, None)
+        yield f"{lane}: nearest kind", BY_SIZE.get(node.type) if node else None
+        yield f"{lane}: nearest indicator", INDICATORS.get((node and node.indicator) or "")
         yield f"{lane}: nearest sensors", float(len(node.sensors) if node else 0)
     seen = {sector.sector: sector for sector in graph.sectors}
     for name in road.sectors:
@@ -135,11 +135,7 @@ def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float]]:
         first = min(arrivals, key=lambda arrival: arrival.arc_m, default=None)
         yield f"{name}: conflicts", float(len(arrivals))
         for number in ("arc_m", "time_s", "speed_mps"):
-            yield f"{name}: first conflict {number}", _or_nan(getattr(first, number, None))
-
-
-def _or_nan(value: float | None) -> float:
-    return np.nan if value is None else float(value)
+            yield f"{name}: first conflict {number}", getattr(first, number, None)
 
 
 def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
@@ -168,7 +164,7 @@ def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
             "nothing to audit"
         )
     layout, step, danger, values = zip(*rows, strict=True)
-    table = np.array([list(row.values()) for row in values])
+    table = np.array([list(row.values()) for row in values], dtype=float)
     return HiddenPoints(np.array(layout), np.array(step), np.array(danger), tuple(values[0]), table)
 
 

@@ -56,7 +56,7 @@ class CompiledFleet(Fleet):
         self.ego_lanes = np.tile(self.ways, (len(worlds), 1))
 
     def _act(self) -> None:
-        of, speed = ControlledVehicle, self.speed
+        car, speed = ControlledVehicle, self.speed
         xy, lane, section = self.xy.reshape(-1, 2), self.lane.reshape(-1), self.section.reshape(-1)
         route, speeds = self.route.reshape(len(lane), -1), speed.reshape(-1)
         ahead, turn, on = self._turn(xy, lane, section, route, speeds)
@@ -64,15 +64,15 @@ class CompiledFleet(Fleet):
             ahead[on], turn[on], _ = self._turn(xy[on], lane[on], section[on], route[on], speeds[on])
         turn, slip = np.arcsin(turn).reshape(speed.shape), np.empty_like(speed)
         _set_slip(
-            ahead.reshape(speed.shape), turn, self.heading, speed, self.size, SLOW_MPS, of.KP_HEADING, slip
+            ahead.reshape(speed.shape), turn, self.heading, speed, self.size, SLOW_MPS, car.KP_HEADING, slip
         )
         self.steering = np.arctan(2 * np.tan(np.arcsin(slip)))
         self.acceleration = np.zeros_like(speed)
         self._keep_apart()
         _set_controls(
             self.frame, self.target, speed, self.crashed, self.brakes_at, self.brakes_mps2, self.brakes_to,
-            self.scenario.parameters.simulation_hz, BRAKES_OFF_HZ, LAMPS_MPS2, of.KP_A, self.limits[0],
-            self.limits[1], of.MAX_SPEED, of.MIN_SPEED, self.most_steering,
+            self.scenario.parameters.simulation_hz, BRAKES_OFF_HZ, LAMPS_MPS2, car.KP_A, self.limits[0],
+            self.limits[1], car.MAX_SPEED, car.MIN_SPEED, self.most_steering,
             self.steering, self.acceleration, self.braking,
         )  # fmt: skip
 
@@ -80,12 +80,12 @@ class CompiledFleet(Fleet):
         self, xy: Floats, lane: Ints, section: Ints, route: Ints, speed: Floats
     ) -> tuple[Floats, Floats, Ints]:
         """Return where vehicles' lanes (N,) head for, sines of turns, and who is on its next lane now."""
-        lanes, of = self.lanes, ControlledVehicle
+        lanes, car = self.lanes, ControlledVehicle
         dots, angle = self._dots(xy, lane)
         ahead, turn, on = np.empty_like(speed), np.empty_like(speed), np.empty_like(lane)
         count = _set_turn(
             dots, angle, speed, route, lanes.arc, lanes.radius, lanes.phase, lanes.sign, lanes.heading,
-            lanes.length, AbstractLane.VEHICLE_LENGTH / 2, of.TAU_PURSUIT, -of.KP_LATERAL, SLOW_MPS,
+            lanes.length, AbstractLane.VEHICLE_LENGTH / 2, car.TAU_PURSUIT, -car.KP_LATERAL, SLOW_MPS,
             lane, section, ahead, turn, on,
         )  # fmt: skip
         return ahead, turn, on[:count]
@@ -102,10 +102,10 @@ class CompiledFleet(Fleet):
         pairs, away, heading = np.empty((most, 3), dtype=int), np.empty((most, 2)), np.empty(most)
         count = _list_faster(self.lane_now, speed, self.xy, self.heading, pairs, away, heading)
         if count:
-            ways, of = np.empty((count, 2)), Traffic
-            ways[:, 0], ways[:, 1] = np.cos(heading[:count]), np.sin(heading[:count])
+            ways = np.stack([np.cos(heading[:count]), np.sin(heading[:count])], axis=-1)
             ahead = np.vecdot(away[:count], ways)
-            _set_brakes(ahead, pairs, speed, self.size, of.standoff_m, of.braking_mps2, self.acceleration)
+            gap_m, braking_mps2 = Traffic.standoff_m, Traffic.braking_mps2
+            _set_brakes(ahead, pairs, speed, self.size, gap_m, braking_mps2, self.acceleration)
 
     def _move(self) -> None:
         slip = np.arctan(1 / 2 * np.tan(self.steering))

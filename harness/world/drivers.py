@@ -54,8 +54,8 @@ def _constants() -> Mapping[str, str]:
     """Return the best action of each scenario; of equally good ones the most careful."""
     best: dict[str, dict[str, str]] = {}
     for row in csv.DictReader(text_of(CONSTANTS).splitlines()):
-        of = best.setdefault(row["scenario"], row)
-        if int(row["cleared"]) > int(of["cleared"]):
+        before = best.setdefault(row["scenario"], row)
+        if int(row["cleared"]) > int(before["cleared"]):
             best[row["scenario"]] = row
     return {name: row["action"] for name, row in best.items()}
 

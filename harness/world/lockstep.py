@@ -158,8 +158,8 @@ class Lanes:
 @lru_cache(maxsize=64)
 def _lanes(road: Callable[[], Road]) -> Lanes | None:
     """Return the lanes of a road; None if some are neither straight nor arcs."""
-    of = lanes_of(road().network())
-    lanes = list(of.values())
+    named = lanes_of(road().network())
+    lanes = list(named.values())
     if any(type(lane) not in (StraightLane, CircularLane) for lane in lanes):
         return None
     arc = np.array([type(lane) is CircularLane for lane in lanes])
@@ -175,7 +175,7 @@ def _lanes(road: Callable[[], Road]) -> Lanes | None:
 
     nowhere = np.zeros(2)
     return Lanes(
-        {name: n for n, name in enumerate(of)}, list(of),
+        {name: n for n, name in enumerate(named)}, list(named),
         each("start", nowhere, False) + each("center", nowhere, True),
         each("direction", nowhere, False), each("direction_lateral", nowhere, False),
         each("heading", 0.0, False), np.array([lane.length for lane in lanes], dtype=float),
@@ -291,11 +291,11 @@ class Fleet:
     def _steering(self, along: Floats, lateral: Floats) -> Floats:
         least = np.where(self.speed >= 0, SLOW_MPS, -SLOW_MPS)
         speed = np.where(np.abs(self.speed) > SLOW_MPS, self.speed, least)
-        of = ControlledVehicle
-        heading = self.lanes.heading_at(along + self.speed * of.TAU_PURSUIT, self.lane)
-        turn: Floats = np.clip(-of.KP_LATERAL * lateral / speed, -1.0, 1.0)
+        control = ControlledVehicle
+        heading = self.lanes.heading_at(along + self.speed * control.TAU_PURSUIT, self.lane)
+        turn: Floats = np.clip(-control.KP_LATERAL * lateral / speed, -1.0, 1.0)
         turn = np.clip(np.arcsin(turn), -np.pi / 4, np.pi / 4)
-        rate: Floats = of.KP_HEADING * turned(heading + turn - self.heading)
+        rate: Floats = control.KP_HEADING * turned(heading + turn - self.heading)
         slip = np.clip(self.size[..., 0] / 2 / speed * rate, -1.0, 1.0)
         steering: Floats = np.arctan(2 * np.tan(np.arcsin(slip)))
         return np.clip(steering, -self.most_steering, self.most_steering)
@@ -330,11 +330,11 @@ class Fleet:
             steering = np.where(self.crashed, 0.0, steering)
             acceleration = np.where(self.crashed, -1.0 * self.speed, acceleration)
         if (np.abs(self.speed) > FAST_MPS).any():
-            of = ControlledVehicle
-            most = np.minimum(acceleration, 1.0 * (of.MAX_SPEED - self.speed))
-            least = np.maximum(acceleration, 1.0 * (of.MIN_SPEED - self.speed))
-            acceleration = np.where(self.speed > of.MAX_SPEED, most, acceleration)
-            acceleration = np.where(self.speed < of.MIN_SPEED, least, acceleration)
+            fastest, slowest = ControlledVehicle.MAX_SPEED, ControlledVehicle.MIN_SPEED
+            most = np.minimum(acceleration, 1.0 * (fastest - self.speed))
+            least = np.maximum(acceleration, 1.0 * (slowest - self.speed))
+            acceleration = np.where(self.speed > fastest, most, acceleration)
+            acceleration = np.where(self.speed < slowest, least, acceleration)
         self.steering, self.acceleration = steering, acceleration
         slip = np.arctan(1 / 2 * np.tan(steering))
         way = self.heading + slip

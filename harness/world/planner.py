@@ -194,7 +194,7 @@ def travelled_m(
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
     speed, target = (np.broadcast_to(each[:, None], shape) for each in (speeds_mps, targets_mps))
     travelled = np.empty((steps, *shape))
-    gone = np.zeros(shape)
+    distance = np.zeros(shape)
     spacing = (levels[-1] - levels[0]) / (len(levels) - 1)
     for k in range(steps):
         n = k // every
@@ -204,9 +204,9 @@ def travelled_m(
             level = np.clip(nearest + move, 0, len(levels) - 1)
             target = np.where(move == 0, target, levels[level])
         change = ((target - speed) / RESPONSE_S).clip(-parameters.braking_mps2, parameters.acceleration_mps2)
-        gone = gone + speed * STEP_S
+        distance = distance + speed * STEP_S
         speed = np.maximum(speed + change * STEP_S, 0.0)
-        travelled[k] = gone
+        travelled[k] = distance
     return np.ascontiguousarray(np.moveaxis(travelled, 0, -1))
 
 

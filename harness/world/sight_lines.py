@@ -27,11 +27,11 @@ def site(
     of its vehicle. If a building and a vehicle stand between two antennas, the building counts. Units have
     their positions from `zone_m`, the centroid of the conflict zone.
     """
-    there = [(state, [state.vehicle(name) for name in viewers]) for state, viewers in points]
-    among = _site([(state, ego, helpers) for state, (ego, *helpers) in there])
+    looks = [(state, [state.vehicle(name) for name in viewers]) for state, viewers in points]
+    among = _site([(state, ego, helpers) for state, (ego, *helpers) in looks])
     of_units = {
         unit: replace(
-            _site([(state, (zone_m[0] + unit.x_m, zone_m[1] + unit.y_m), all_) for state, all_ in there]),
+            _site([(state, (zone_m[0] + unit.x_m, zone_m[1] + unit.y_m), all_) for state, all_ in looks]),
             first_m=unit.antenna_m,
         )
         for unit in units

@@ -109,7 +109,7 @@ def _create(name: str) -> Any:
 
     gymnasium.logger.min_level = gymnasium.logger.ERROR  # no warning of an old version: the user named it
     highway_env._register_highway_envs()
-    env_id, _, changes = name.removeprefix(PREFIX).partition(CHANGES)
+    env_id, changes = _id_and_changes(name)
     changed = _changed(name, changes or "{}")
     _only_allowed(name, env_id, changed)
     if not re.search(r"-v\d+$", env_id):

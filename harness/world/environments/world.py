@@ -148,8 +148,8 @@ class EnvironmentWorld(World):
 
     def _recast(self) -> None:
         """Remove vehicles that have left, and add new ones."""
-        there = {id(v) for v in self.road.vehicles}
-        self.everybody = [v for v in self.everybody if id(v) in there]
+        present = {id(v) for v in self.road.vehicles}
+        self.everybody = [v for v in self.everybody if id(v) in present]
         known = {id(v) for v in self.everybody}
         for v in self.everybody:
             self._place(v)

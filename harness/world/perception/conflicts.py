@@ -3,6 +3,7 @@
 The vehicles that many viewers know are laid on the road in one pass over arrays.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -169,9 +170,9 @@ def _along(road: Road, all_known: Sequence[Encounter]) -> Iterator[tuple[int, Co
     ]  # fmt: skip
     apart = _apart(road, [(all_known[n], key) for n, _, key in shared])
     its_heading = _at(road, [(known.key, known.place.arc_m) for known in all_known])[:, 2]
-    of = [n for n, _, _ in shared]
+    numbers = [n for n, _, _ in shared]
     on = np.array([all_known[n].place.near[key] for n, _, key in shared]).reshape(-1, 2)
-    cos = np.cos(its_heading[of] - on[:, 1]).tolist()
+    cos = np.cos(its_heading[numbers] - on[:, 1]).tolist()
     pairs = []
     for (n, side, key), separate, turned in zip(shared, apart, cos, strict=True):
         known = all_known[n]
@@ -210,10 +211,9 @@ def _apart(road: Road, shared: Sequence[tuple[Encounter, PathKey]]) -> list[bool
 
 def _at(road: Road, asked: Sequence[tuple[PathKey, float]]) -> Floats:
     """Return x, y and heading at an arc length of a path, for each that is asked for, (n, 3)."""
-    poses = np.empty((len(asked), 3))
-    of: dict[PathKey, list[int]] = {}
+    poses, places = np.empty((len(asked), 3)), defaultdict[PathKey, list[int]](list)
     for n, (key, _) in enumerate(asked):
-        of.setdefault(key, []).append(n)
-    for key, numbers in of.items():
+        places[key].append(n)
+    for key, numbers in places.items():
         poses[numbers] = np.stack(road.paths[key].places(np.array([asked[n][1] for n in numbers])), axis=-1)
     return poses

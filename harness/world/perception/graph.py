@@ -98,13 +98,13 @@ def _graphs(
     ]
     things = [(n, d) for n, seen in enumerate(listed) for d in seen]
     where = places(road, [d for _, d in things])
-    of = [k for k, (n, d) in enumerate(things) if where[k].key and d.id != egos[n].id]
+    kept = [k for k, (n, d) in enumerate(things) if where[k].key and d.id != egos[n].id]
     known = [
         Encounter(seats[n], d, where[k], egos[n], ego_arcs[n], scenario.brake_lamps)
-        for k in of for n, d in [things[k]]
+        for k in kept for n, d in [things[k]]
     ]  # fmt: skip
     met: list[list[Conflict]] = [[] for _ in looks]
-    for k, some in zip(of, conflicts(road, known), strict=True):
+    for k, some in zip(kept, conflicts(road, known), strict=True):
         met[things[k][0]] += some
     nodes: list[list[Node]] = [[] for _ in looks]
     headings = np.array([np.nan if d.heading_rad is None else d.heading_rad for _, d in things])

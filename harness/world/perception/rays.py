@@ -40,9 +40,9 @@ class Surfaces:
 
     def by_viewer(self, values: Any) -> Any:
         """Lay values of the surfaces (n,) out as (v, most surfaces of one); 0 or false without a surface."""
-        laid = np.zeros((len(self.ids), max(map(len, self.ids), default=0)), dtype=values.dtype)
-        laid[self.viewer, self.place] = values
-        return laid
+        table = np.zeros((len(self.ids), max(map(len, self.ids), default=0)), dtype=values.dtype)
+        table[self.viewer, self.place] = values
+        return table
 
 
 def turned(angle_rad: Any) -> Any:
