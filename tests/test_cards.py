@@ -10,8 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from harness.backends import cards
-from harness.backends.card import Latency
-from harness.backends.failures import Failures
+from harness.backends.card import Failures, Latency
 from harness.backends.registry import capabilities
 from harness.backends.servers import Server
 from harness.core import resources

@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 
 from harness.backends.base import AnswerMode
-from harness.backends.failures import Failures
+from harness.backends.card import Failures
 from harness.coordination.operating_point import POINTS, SETTINGS
 from harness.coordination.rules import EGO_PROMPT, POOLS
 from harness.coordination.schedules import SCHEDULES

@@ -12,8 +12,8 @@ from scipy.stats import binom
 
 from harness.backends import cards
 from harness.backends.base import Request
-from harness.backends.failures import Failures, draw_failure, spoil
-from harness.backends.proxy import answers
+from harness.backends.card import Failures
+from harness.backends.proxy import answers, draw_failure, spoil
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.core.statistics import rate_interval

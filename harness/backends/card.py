@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from harness.backends.base import Letters
-from harness.backends.failures import Failures
 from harness.backends.registry import ENGINES
 from harness.backends.servers import Server
 from harness.backends.vision import Vision
@@ -22,6 +21,7 @@ Thinking = Literal["none", "switch", "always"]
 System = Literal["first-user"]
 LatencySource = Literal["card", "paper"]
 Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z", description="64 digits 0-9 a-f")]
+Share = Annotated[float, Meta(ge=0, le=1, description="a share, 0 to 1")]
 
 # Keys that only some engines understand; a `Registration` says which.
 _ENGINE_KEYS = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation",
@@ -42,6 +42,34 @@ class Latency:
     def __post_init__(self) -> None:
         if (self.source == "card") != (self.inference_s is not None):
             raise ValueError('inference_s goes with source = "card", and only with it')
+
+
+@dataclass(frozen=True)
+class Failures:
+    """The shares of a proxy's answers that fail on purpose, drawn for each request; the others are good.
+
+    A text is spoilt in one way at most; any answer may be slow as well.
+    """
+
+    fence: Share = 0.0  # the answer is in a code fence. Recovered.
+    prose: Share = 0.0  # the answer is between sentences. Recovered.
+    truncation: Share = 0.0  # the answer is cut off inside its JSON. Failed, `truncated_json`.
+    nan: Share = 0.0  # one probability is NaN. Failed, `non_finite`.
+    unknown_action: Share = 0.0  # no action's name is one of the scenario's. Failed, `unknown_action`.
+    unclosed_think: Share = 0.0  # the answer is in a thought that never ends. Failed, `truncated_reasoning`.
+    slow_tail: Share = 0.0  # the answer takes `slow_s` seconds longer than the card's latency
+    slow_s: Seconds = 0.0
+
+    def __post_init__(self) -> None:
+        if (total := sum(self.texts.values())) > 1 + 1e-9:
+            raise ValueError(f"the shares of spoilt texts sum to {total:.4g}; allowed: 1 at most")
+        if (self.slow_tail > 0) != (self.slow_s > 0):
+            raise ValueError("slow_tail and slow_s go together; give both, or neither")
+
+    @property
+    def texts(self) -> dict[str, float]:
+        """The shares of the spoilt texts by name."""
+        return {name: rate for name, rate in asdict(self).items() if not name.startswith("slow_")}
 
 
 @dataclass(frozen=True)

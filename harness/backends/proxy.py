@@ -5,14 +5,15 @@ is less sure the more of the ego's sectors it cannot see. Its numbers are chosen
 something about the harness and nothing about any language model. Its card may make it fail at known rates.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from harness.backends.base import Completion, FinishReason, Request, split_by_scenario
-from harness.backends.card import Card
-from harness.backends.failures import Failures, draw_failure, spoil
+from harness.backends.card import Card, Failures
 from harness.backends.registry import BUILT_IN
+from harness.core import noise
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded
 from harness.prompts.answer_schema import plainest
@@ -121,3 +122,37 @@ def _reason(view: SceneGraph) -> str:
         first = min(view.conflicts, key=lambda conflict: abs(conflict.other.arc_m))
         return f"{first.vehicle} from {first.sector} {first.other.arc_m:.0f} m before the ego's path."
     return f"Nothing on the ego's path; hidden: {', '.join(view.occluded) or 'none'}."
+
+
+def draw_failure(failures: Failures, request_id: str) -> tuple[str | None, float]:
+    """Draw how a request's text fails (None if it does not), and by how many seconds its answer is slow.
+
+    The draw depends on the id only, so batch, order, prompt and condition do not change it.
+    """
+    text, slow = noise.uniforms((2,), "proxy failure", request_id).tolist()
+    slow_s = failures.slow_s if slow < failures.slow_tail else 0.0
+    for how, share in failures.texts.items():
+        if text < share:
+            return how, slow_s
+        text -= share
+    return None, slow_s
+
+
+def spoil(text: str, how: str, actions: Sequence[str]) -> tuple[str, FinishReason]:
+    """Spoil a good answer, which ends in compact JSON, in one of the ways of `Failures`."""
+    match how:
+        case "fence":
+            return f"```json\n{text}\n```", "stop"
+        case "prose":
+            return f"Here is what I would do.\n\n{text}\n\nThis keeps a safe distance.", "stop"
+        case "truncation":
+            return text[: text.rindex(":") + 1], "length"
+        case "nan":
+            return re.sub(r":[\d.]+", ":NaN", text, count=1), "stop"
+        case "unknown_action":
+            for action in actions:
+                text = text.replace(f'"{action}"', f'"NOT_{action}"')
+            return text, "stop"
+        case "unclosed_think":
+            return f"<think>\nPerhaps {text}", "length"
+    raise ValueError(f"no failure {how!r}")
