@@ -64,12 +64,12 @@ def command(
             f"--first-seed {first_seed}: {stated(first_seed, layouts)}; a model learns from train seeds "
             f"alone, {FIRST['train']} to {FIRST['report'] - 1}"
         )
-    learnt = {of: tuple(v for v in versions if not prompts.unfit(v, of)) for of in driven}
-    for of, some in learnt.items():
+    learnt = {each: tuple(v for v in versions if not prompts.unfit(v, each)) for each in driven}
+    for each, some in learnt.items():
         if not some:
             raise UserError(
-                f"--prompt {printable(' '.join(prompt))}: none is for {of.name}; give {of.prompt}, or one "
-                "of your own"
+                f"--prompt {printable(' '.join(prompt))}: none is for {each.name}; give {each.prompt}, or "
+                "one of your own"
             )
     # A stage has a batch at least, and that of messages takes a scene for four sequences of each prompt.
     counts = _counts(samples, max(batch, 4 * sum(map(len, learnt.values()))))

@@ -44,9 +44,11 @@ def command(
     if as_json:
         typer.echo(json.dumps(facts, indent=1))
         return
-    of = dict(facts["versions"])
-    _line("harness", f"{of.pop('harness')}, Python {of.pop('python')}, {of.pop('platform')}")
-    _line("packages", ", ".join(f"{name} {version}" for name, version in of.items()))
+    versions = dict(facts["versions"])
+    _line(
+        "harness", f"{versions.pop('harness')}, Python {versions.pop('python')}, {versions.pop('platform')}"
+    )
+    _line("packages", ", ".join(f"{name} {version}" for name, version in versions.items()))
     memory = "unknown" if facts["memory_gib"] is None else f"{facts['memory_gib']:g} GiB"
     _line("machine", f"{facts['cores']} cores, {memory} of memory")
     _line(
@@ -86,7 +88,7 @@ def _paces(quiet: bool) -> dict[str, list[dict[str, Any]]]:
             with suppress(UserError, Unanswered):  # a card with a mistake is reported above
                 by_card[stem] = [asdict(pace) for pace in paces(stem)]
             progress(1)
-    return {stem: of for stem, of in by_card.items() if of}
+    return {stem: measured for stem, measured in by_card.items() if measured}
 
 
 def _line(head: str, text: str) -> None:

@@ -106,10 +106,10 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
     if as_json or quiet:
         return
     world = cast("ClosedLoop", done.manifest.world)
-    of = world.selection.get("of")
+    drawn_from = world.selection.get("of")
     notes = (
         f"n = {world.episodes} episodes × {len(done.manifest.seeds)} channel seeds; "
-        f"{'of ' if of else ''}{stated(world.first_seed, of or world.episodes)};\n"
+        f"{'of ' if drawn_from else ''}{stated(world.first_seed, drawn_from or world.episodes)};\n"
         "95 % intervals over episodes; missed: decisions longer than the decision window;\n"
         "gap: smallest distance to a vehicle; clear: time until the ego had cleared, if\n"
         "it did; both are means over episodes",

@@ -107,7 +107,7 @@ def check(
             )
         return
     with bar(f"asking {printable(card.name, 30)}", grows=True) as progress:
-        done = checkup.check(card, thinking, device, dtype, progress, progress.more)
+        done = checkup.check(card, thinking, device, dtype, progress)
     spec, seen, who = done.spec, done.seen, printable(card.name)
     if done.unanswered:
         typer.echo(f"harness: the fixed questions got no answer: {printable(done.unanswered, 300)}", err=True)
@@ -273,16 +273,16 @@ def _show_findings(result: "Findings | None") -> None:
 
 
 def _show_answers(answers: "Mapping[AnswerMode, Completion]") -> None:
-    for way, answer in answers.items():
+    for mode, answer in answers.items():
         if answer.error:
-            typer.echo(f"{way:<13}no answer: {printable(answer.error, 300)}")
+            typer.echo(f"{mode:<13}no answer: {printable(answer.error, 300)}")
             continue
         took = "" if answer.seconds is None else f"{answer.seconds * 1000:.1f} ms, "
         if answer.first_token_s is not None and answer.token_s is not None:
             took += f"first token after {answer.first_token_s * 1000:.1f} ms, "
         count = answer.completion_tokens
         tokens = "" if count is None else f"{count} token{'' if count == 1 else 's'}, "
-        typer.echo(f"{way:<13}{took}{tokens}{answer.finish_reason}: {printable(repr(answer.text))}")
+        typer.echo(f"{mode:<13}{took}{tokens}{answer.finish_reason}: {printable(repr(answer.text))}")
 
 
 def _token_lines(tokens: list[tuple[int, str]]) -> list[str]:

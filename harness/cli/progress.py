@@ -104,13 +104,13 @@ def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> st
     """`asking proxy 812/1206 58.0/s 0:00:07 left`; `marks` are times in seconds and what was done by then."""
     (since_s, before), (now_s, done) = marks[0], marks[-1]
     speed = (done - before) / (now_s - since_s)
-    of = f"{done}/{progress.total}" if progress.total else str(done or "")
+    reached = f"{done}/{progress.total}" if progress.total else str(done or "")
     if speed:
         left_s = (progress.total - done) / speed if progress.total else None
-        at = pace(speed, left_s, None, progress.grows)
+        pace_text = pace(speed, left_s, None, progress.grows)
     else:
-        at = f"{timedelta(seconds=round(took_s))} so far"
-    return " ".join(filter(None, (progress.label, of, at)))
+        pace_text = f"{timedelta(seconds=round(took_s))} so far"
+    return " ".join(filter(None, (progress.label, reached, pace_text)))
 
 
 def drawn(console: "Console") -> "Columns":

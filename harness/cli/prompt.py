@@ -141,18 +141,18 @@ def examples(
     from harness.prompts.examples import EXAMPLES, text_of
 
     extras.need("harness prompt examples", "highway_env")
-    draft, of = prompts.load(version), ready_to_drive(scenario, count, first_seed, "--count")
+    draft, played = prompts.load(version), ready_to_drive(scenario, count, first_seed, "--count")
     file = resources.find("prompts", version) / EXAMPLES
     if draft.released:
         raise UserError(f"prompt {version} is released; copy it to a new version to give it examples")
     if draft.examples:
         raise UserError(f"{printable(file)} is there already; delete it to draw others")
-    if reason := prompts.unfit(draft, of):
+    if reason := prompts.unfit(draft, played):
         raise UserError(f"prompt {version} {reason}; give another --scenario, or another version")
     from harness.training import prompt_examples
 
     with bar("drawing layouts", count) as progress:
-        drawn = prompt_examples.examples(draft, of, count, first_seed, progress)
+        drawn = prompt_examples.examples(draft, played, count, first_seed, progress)
     write_whole(file, text_of(drawn))
     typer.echo(f"wrote {printable(file)}: {drawn}")
 
@@ -204,7 +204,7 @@ def check(
     tried = None
     if asked:
         with bar(f"asking {printable(asked.name, 30)}", quiet=as_json) as progress:
-            tried = trial.try_on(prompt, asked, device, dtype, progress, progress.more)
+            tried = trial.try_on(prompt, asked, device, dtype, progress)
     stats = {call: summarize_counts(tokens) for call, tokens in sizes.tokens.items() if tokens}
     if as_json:
         outside = [each._asdict() for each in sizes.outside]

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.cli.progress import bar
-from harness.cli.run import Together, free_folder
+from harness.cli.run import RunGroup, free_folder
 from harness.cli.show import finish
 from harness.core import work
 from harness.core.errors import UserError, in_range, printable
@@ -38,9 +38,9 @@ def evaluate(
     """Evaluate every repeat; write and print what they have in common and what not."""
     from harness.studies.repeats import FIGURES, MARKER, PAGE, each, repeats_study, run_repeats
 
-    together = Together(each(spec, repeats), "finished repeats", MARKER, (FIGURES, PAGE))
-    folder = out or free_folder([spec], f"{spec.source.name}-repeats", together.goes_on)
-    together.check(folder)
+    group = RunGroup(each(spec, repeats), "finished repeats", MARKER, (FIGURES, PAGE))
+    folder = out or free_folder([spec], f"{spec.source.name}-repeats", group.goes_on)
+    group.check(folder)
     name = printable(spec.ego.card.name, 30)
     with (
         work.going_on(folder),

@@ -105,7 +105,7 @@ def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
 
 
 @dataclass(frozen=True)
-class Together:
+class RunGroup:
     """Several runs in one folder."""
 
     specs: "Mapping[str, Spec]"  # by the name of the run's own folder in it

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import typer
 
-from harness.cli.run import Together, as_mapping, free_folder, origins
+from harness.cli.run import RunGroup, as_mapping, free_folder, origins
 from harness.cli.terminal import console, echo_json, table
 from harness.core.errors import UserError, printable
 from harness.core.figures import shown
@@ -58,9 +58,9 @@ def evaluate(
     from harness.runs.suite import SUMMARY, SuiteRun, write
 
     by_name = {spec.source.name: spec for spec in specs}
-    together = Together(by_name, "a finished suite", SUITE, (SUMMARY, "report.html"))
-    folder = out or free_folder(specs, suite.name, together.goes_on)
-    together.check(folder)
+    group = RunGroup(by_name, "a finished suite", SUITE, (SUMMARY, "report.html"))
+    folder = out or free_folder(specs, suite.name, group.goes_on)
+    group.check(folder)
     opens = cache(open_backend)
     for spec in specs:
         run = folder / spec.source.name

@@ -1,6 +1,5 @@
 """Check a model before a run: ask it in every answer mode, with and without pictures, and examine it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import cast, get_args
 
@@ -9,6 +8,7 @@ from harness.backends.card import Card
 from harness.backends.checkup import Checkup
 from harness.backends.checkup import check as ask
 from harness.backends.registry import open_backend
+from harness.core.progress import Progress
 from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.evaluate.agent import Agent
@@ -43,10 +43,7 @@ class Check:
         return any(answer_of(asked.alike(answer=mode), reply).intent for mode, reply in answers)
 
 
-def check(
-    card: Card, thinking: bool, device: str | None, dtype: str | None, progress: Callable[[int], None],
-    more: Callable[[int], None],
-) -> Check:  # fmt: skip
+def check(card: Card, thinking: bool, device: str | None, dtype: str | None, progress: Progress) -> Check:
     """Check a model, examine it if it answers by letters, and keep what was found.
 
     Args:
@@ -54,8 +51,7 @@ def check(
         thinking: whether it is asked to think.
         device: where it runs; None leaves the choice to the engine.
         dtype: number format of the weights; None takes the card's.
-        progress: called with the number of new answers.
-        more: called with the number of answers that are asked for next.
+        progress: counts answers.
     """
     data = load.load(load.find(DATASET), 1)
     ego = Agent(card, versions.load(PROMPT), thinking=thinking)
@@ -74,12 +70,12 @@ def check(
         for mode in modes if sees
     ]  # fmt: skip
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
-    more(len(asked) + 2 * len(shown))
+    progress.more(len(asked) + 2 * len(shown))
     seen = ask(cast("Rendering", backend), asked, shown, progress)
     read_out = seen.answers.get("readout")
     if read_out is None or read_out.error is not None or (seen.looks and seen.looks.fault):
         return Check(spec, seen, None)
-    more(COUNT)
+    progress.more(COUNT)
     result = examine(backend, ego, progress)
     if isinstance(result, str):
         return Check(spec, seen, None, result)

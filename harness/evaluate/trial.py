@@ -12,6 +12,7 @@ from harness.backends.card import Card
 from harness.backends.cards import resolve
 from harness.backends.registry import capabilities, open_backend
 from harness.core.errors import Unanswered, UserError, printable
+from harness.core.progress import Progress
 from harness.evaluate import questions
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import answer_of
@@ -94,9 +95,8 @@ def card_of(prompt: Prompt, model: str, engine: str | None) -> Card:
 
 
 def try_on(
-    prompt: Prompt, card: Card, device: str | None, dtype: str | None, progress: Callable[[int], None],
-    more: Callable[[int], None],
-) -> tuple[Trial, Findings | str | None]:  # fmt: skip
+    prompt: Prompt, card: Card, device: str | None, dtype: str | None, progress: Progress
+) -> tuple[Trial, Findings | str | None]:
     """Return what a model does with a prompt, in words and in read-outs.
 
     The second is None where its engine reads none out, and a reason where they got no answer.
@@ -104,7 +104,7 @@ def try_on(
     agent = Agent(card, prompt)
     reads_out = "readout" in agent.can.answer_modes and not agent.thinking
     backend = open_backend(card, device=device, dtype=dtype)
-    more(COUNT + reads_out * READ_OUTS)
+    progress.more(COUNT + reads_out * READ_OUTS)
     trial = try_out(backend, agent, progress)
     return trial, examine(backend, agent, progress) if reads_out else None
 
