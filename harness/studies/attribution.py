@@ -61,11 +61,7 @@ class Row:
 def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> Attribution:
     """Leave out every listed object and every message heard at some decision points of a run, in turn.
 
-    Args:
-        stored: the run, whose model is asked.
-        condition: name of the operating point whose decision points are drawn.
-        sample: how many, at most.
-        seed: of the draw.
+    At most `sample` of the condition's decision points are drawn.
 
     Raises:
         UserError: the run has no such condition, or its model is not available or cannot be asked otherwise.

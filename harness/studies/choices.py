@@ -28,13 +28,8 @@ from harness.studies.replayed_run import ReplayedRun
 from harness.world.sight_lines import site
 
 MOST_SETS = 64
-COSTS = (
-    "messages",
-    "airtime_ms",
-    "latency_ms",
-    "decisions",
-    "energy_j",
-)  # of a decision; an episode has their sums
+# Of a decision; an episode has their sums.
+COSTS = ("messages", "airtime_ms", "latency_ms", "decisions", "energy_j")
 PRICE = 1e-6  # of a message in successes, where the fewest messages break a tie
 
 
@@ -143,11 +138,7 @@ def choices(
 ) -> Choices:
     """Return all choices of an operating point. What the run has no answer to its model is asked.
 
-    Args:
-        stored: a run.
-        point: the operating point; whom its schedule asks does not matter.
-        seeds: of the channel.
-        progress: called with 1 for each step.
+    Whom its schedule asks does not matter. `progress` is called with 1 for each step.
 
     Raises:
         UserError: what follows depends on more than who is heard now, or there are too many sets.

@@ -155,13 +155,7 @@ def run_cells(
 ) -> "Grid":  # fmt: skip
     """Evaluate every combination in a folder of its own under `out`; those that are there stay.
 
-    Args:
-        spec: the evaluation, whose agents are replaced.
-        egos: agents of the ego.
-        helpers: agents of the helpers.
-        out: the grid's folder.
-        progress: of answers.
-        cache_file: of completions kept between runs; None for no cache.
+    Completions are kept between runs in the cache file, if there is one.
 
     Raises:
         UserError: the folder holds another grid, or a model is not available.

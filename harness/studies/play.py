@@ -122,14 +122,9 @@ def play(
     source: Source, panel: str, settings: Sequence[Setting], seeds: Sequence[int],
     progress: Callable[[int], None],
 ) -> PanelResult:  # fmt: skip
-    """Play every grid point with every seed.
+    """Play every grid point with every seed of the channel, which is paired with itself across the points.
 
-    Args:
-        source: whose intents.
-        panel: what tables call this set of grid points.
-        settings: the grid points.
-        seeds: of the channel; each is paired with itself across the points.
-        progress: called with 1 whenever a grid point is done.
+    `panel` is what tables call this set of grid points; `progress` is called with 1 for each of them.
     """
     import pandas as pd
 

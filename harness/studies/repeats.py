@@ -40,7 +40,7 @@ STATED, SAMPLED, DOUBT = "stated_entropy_nats", "sampled_entropy_nats", "stated_
 
 
 def each(spec: Spec, repeats: int) -> dict[str, Spec]:
-    """Return the runs of several repeats, by the name of their folders."""
+    """Return the runs of several repeats, each with the next sampling seed, by the name of their folders."""
     seeds = range(spec.sampling_seed, spec.sampling_seed + repeats)
     return {f"repeat-{n}": replace(spec, sampling_seed=seed) for n, seed in enumerate(seeds, 1)}
 
@@ -51,12 +51,7 @@ def run_repeats(
 ) -> "Repeats":  # fmt: skip
     """Evaluate every repeat in a folder of its own under `out`; those that are there stay.
 
-    Args:
-        spec: the evaluation; the first repeat has its sampling seed, each other one the next.
-        repeats: how many.
-        out: the folder.
-        progress: of answers.
-        cache_file: of completions kept between runs; None for no cache.
+    Completions are kept between runs in the cache file, if there is one.
 
     Raises:
         UserError: the folder holds something else, or a model is not available.

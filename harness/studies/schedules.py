@@ -267,14 +267,8 @@ def compare(
 ) -> Compared:  # fmt: skip
     """Play every schedule on a run, and on one on tune layouts.
 
-    Args:
-        stored: a run.
-        tune: a run on tune layouts; what is tried of a schedule follows from it then.
-        point: the operating point, whose schedule is replaced.
-        names: of schedules.
-        seeds: of the channel.
-        budget: share of the paper's messages within which settings are chosen.
-        progress: called with 1 for each step of the choices and each schedule.
+    What is tried of a schedule follows from the run on tune layouts, where there is one. Candidates are
+    chosen within `budget`, a share of the messages that the paper's schedule takes.
 
     Raises:
         UserError: no schedule can change anything at the point.

@@ -139,10 +139,7 @@ def refuse_taken(out: Path, kind: str) -> None:
 def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
     """Raise UserError if a folder has a run, another kind of study, or one of this kind made otherwise.
 
-    Args:
-        out: the folder.
-        kind: of the study.
-        manifest: what its `<kind>.json` has to state; of sources, only what they are and their latency.
+    `manifest` is what its `<kind>.json` has to state; of sources, only what they are and their latency.
     """
     refuse_taken(out, kind)
     try:

@@ -14,6 +14,7 @@ from harness.core.versions import versions
 from harness.report.document import Table
 from harness.runs.metrics import SUCCESS
 from harness.studies.axes import AXES, CORE, CROSS, Axis, Setting, Value, axis_of, crossed, described, grid
+from harness.studies.figures.axes import interval_of
 from harness.studies.figures.bars import operating_points
 from harness.studies.figures.heat_map import heat_map
 from harness.studies.figures.lines import along
@@ -207,7 +208,7 @@ def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
 def _map(part: "pd.DataFrame") -> Figure:
     """Draw success of crossed axes: the first down, the second across, a panel for each of the others."""
     down, across, *panel_axes = part.variable.iloc[0].split(CROSS)
-    rows = part[(part.metric == SUCCESS) & (part.interval == _interval(part))]
+    rows = part[(part.metric == SUCCESS) & (part.interval == interval_of(part))]
     groups = rows.groupby(panel_axes, sort=False) if panel_axes else [((), rows)]
     panels = {}
     for values, group in groups:
@@ -252,7 +253,3 @@ def in_a_sentence(table: Table) -> str:
 
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else f"{value:g}"
-
-
-def _interval(part: "pd.DataFrame") -> str:
-    return "episodes" if (part.interval == "episodes").any() else "seed means"

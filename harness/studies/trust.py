@@ -240,17 +240,9 @@ def run_bench(
     run: ReplayedRun, condition: str, rules: Sequence[str], attacks: Sequence[str], shares: Sequence[float],
     seeds: Sequence[int], out: Path, progress: Progress,
 ) -> Bench:  # fmt: skip
-    """Play every cell that the folder has not.
+    """Play every cell that the folder has not; it keeps them.
 
-    Args:
-        run: the run.
-        condition: an operating point with a channel.
-        rules: of consensus; the linear pool is added.
-        attacks: without shares.
-        shares: above 0.
-        seeds: of the channel.
-        out: the study's folder, in which finished cells are kept.
-        progress: of cells.
+    The linear pool is added to the rules. Attacks have no shares of their own, and `shares` are above 0.
 
     Raises:
         UserError: the point has no channel, or asks nobody, or its rule is a fusion call; or the folder has

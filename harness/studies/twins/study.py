@@ -15,7 +15,7 @@ from harness.core.versions import versions
 from harness.report.compare.gate import Verdict
 from harness.report.compare.words import judged
 from harness.report.document import Table
-from harness.report.page import visible
+from harness.report.page import environment, visible
 from harness.studies.study import Study
 from harness.studies.twins.asking import Questions, lack
 from harness.studies.twins.declared import TWINS, Twin
@@ -60,10 +60,7 @@ def twins_study(
             "holds that always gives the same answer, and so reads nothing.", terminal=range(7),
         )],
         {}, {**answer, "versions": versions()}, answer, caveats=notes(questions, rows, unanswered),
-        more=Markup("<h2>Worst examples</h2>\n{}").format(Markup("\n").join(
-            _example(spec.actions, row, n, pair)
-            for row in rows for n, pair in enumerate(row.broken[:EXAMPLES], 1)
-        ) or Markup("<p>None.</p>")),
+        more=_examples(spec.actions, rows),
     )  # fmt: skip
 
 
@@ -80,42 +77,14 @@ def _cells(questions: Questions, row: Row) -> list[str]:
     ]  # fmt: skip
 
 
-def _example(actions: Sequence[str], row: Row, n: int, pair: Pair) -> Markup:
-    name, apart = f"{row.twin.name}-{row.role}", DISTANCE.number(pair.distance)
-    same = Markup("The text is the same; what differs is the scene graph.")
-    lines = [*difference(*pair.messages)] or [("", same)]
-    colour = {"-": "bad", "+": "good", "": ""}
-    text = Markup().join(
-        Markup('<span class="{}">{}</span><span>{}</span>').format(colour[sign], sign, words)
-        for sign, words in lines
-    )
-    heads = Markup().join(Markup('<th scope="col">{}</th>').format(visible(a)) for a in actions)
-    answers = Markup().join(
-        Markup('<tr><th scope="row">{}</th>{}<td>{}</td></tr>').format(
-            which,
-            Markup().join(
-                Markup("<td>{}</td>").format(DISTANCE.number(p)) for p in intent or [None] * len(actions)
-            ),
-            status,
-        )
-        for which, intent, status in zip(
-            ("as it is", "its twin, read back"), (pair.p, pair.q), pair.status, strict=True
-        )
-    )
-    whole = Markup("\n").join(
-        Markup("<pre>{}\n--- answer\n{}</pre>").format(visible(question), visible(answer))
-        for question, answer in zip(pair.messages, pair.said, strict=True)
-    )
-    return Markup(
-        '<section class="answer" id="{}-{}"><h3>{}, {}: {} in scene {}, TV {} <a href="#{}">back</a></h3>\n'
-        '<pre class="diff">{}</pre>\n<div class="scroll" tabindex="0" role="region" aria-label="Answers">'
-        '<table class="metrics"><thead><tr><th scope="col">answer</th>{}<th scope="col">parsed</th></tr>'
-        "</thead><tbody>{}</tbody></table></div>\n"
-        "<details><summary>Both questions and answers in full</summary>{}</details></section>"
-    ).format(
-        name, n, row.twin.name, row.role, visible(pair.viewer), visible(pair.scene), apart, name, text, heads,
-        answers, whole,
-    )  # fmt: skip
+def _examples(actions: Sequence[str], rows: Sequence[Row]) -> Markup:
+    examples = [
+        (row, n, pair, list(difference(*pair.messages)))
+        for row in rows
+        for n, pair in enumerate(row.broken[:EXAMPLES], 1)
+    ]
+    template = environment(Path(__file__).parent).get_template("examples.html.j2")
+    return Markup(template.render(actions=actions, examples=examples))
 
 
 def mapping(
