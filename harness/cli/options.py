@@ -57,6 +57,19 @@ EnvConfig = Annotated[
 Engine = Annotated[str | None, Option(help=HELP["engine"])]
 Prompt = Annotated[str, Option(help="Prompt version; `harness prompt list` shows them.")]
 ScenarioPrompt = Annotated[str | None, Option(help=HELP["prompt"])]
+RunSeeds = Annotated[
+    str | None, Option("--seeds", help="Channel seeds, such as 0:5 or 3,7,9. Default: the run's.")
+]
+RunLatency = Annotated[
+    str, Option("--latency", help="Inference time of one answer: run (as in the run) or paper (145 ms).")
+]
+NoModel = Annotated[
+    bool,
+    Option(
+        "--no-model",
+        help="Never ask the model: leave out episodes that reach a decision point without a stored answer.",
+    ),
+]
 RunsDataset = Annotated[
     Path | None,
     Option(

@@ -71,10 +71,8 @@ def compare(
     schedule: list[str] | None = typer.Option(
         None, help="Schedule to compare, such as entropy, margin or learnt. Repeatable. Default: all."
     ),
-    seeds: str | None = typer.Option(None, help="Channel seeds, such as 0:5 or 3,7,9. Default: the run's."),
-    latency: str = typer.Option(
-        "run", help="Inference time of one answer: run (as in the run) or paper (145 ms)."
-    ),
+    seeds: options.RunSeeds = None,
+    latency: options.RunLatency = "run",
     model: options.RunModel = None,
     out: Path | None = typer.Option(
         None, help="Folder to write. Default: RUN/schedules, in the first run's folder."
@@ -98,8 +96,6 @@ def compare(
     for name in names:
         if name not in SCHEDULES:
             raise unknown("--schedule", name, SCHEDULES)
-    if latency not in ("run", "paper"):
-        raise unknown("--latency", latency, ("run", "paper"))
     if not 0 < budget <= 1:
         raise UserError(f"--budget {budget:g}: give a share above 0, 1 at most")
     if tune and len(tune) != len(runs):

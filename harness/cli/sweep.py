@@ -7,7 +7,6 @@ import typer
 from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.show import finish
-from harness.core.errors import unknown
 from harness.evaluate.settings import parse_seeds
 
 PROXY_EPISODES = 300  # a seed, as in the paper's sweeps
@@ -33,16 +32,10 @@ def command(
         ["6g"],
         help="Operating point to vary, or one with changed settings: 6g:on_demand=true. Repeatable.",
     ),
-    seeds: str | None = typer.Option(None, help="Channel seeds, such as 0:5 or 3,7,9. Default: the run's."),
-    latency: str = typer.Option(
-        "run", help="Inference time of one answer: run (as in the run) or paper (145 ms)."
-    ),
+    seeds: options.RunSeeds = None,
+    latency: options.RunLatency = "run",
     model: options.RunModel = None,
-    no_model: bool = typer.Option(
-        False,
-        "--no-model",
-        help="Never ask the model: leave out episodes that reach a decision point without a stored answer.",
-    ),
+    no_model: options.NoModel = False,
     proxy: bool = typer.Option(
         False, "--proxy", help="Also draw the calibrated proxy, which plays the paper's study."
     ),
@@ -62,8 +55,6 @@ def command(
     from harness.studies.replayed_run import ReplayedRun
     from harness.studies.sweep import folder_of, panels_over, run_sweep
 
-    if latency not in ("run", "paper"):
-        raise unknown("--latency", latency, ("run", "paper"))
     with bar("grid points", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
         replayed = [ReplayedRun(run, latency, progress, not no_model, dataset, own) for run in runs]

@@ -49,11 +49,7 @@ def command(
     seeds: str | None = typer.Option(
         None, help="Channel seeds, such as 0:5 or 3,7,9. Default: the run's, or 0:5 with --model."
     ),
-    no_model: bool = typer.Option(
-        False,
-        "--no-model",
-        help="Never ask the model: leave out episodes that reach a decision point without a stored answer.",
-    ),
+    no_model: options.NoModel = False,
     out: Path | None = typer.Option(
         None, help="Folder to write. Default: RUN/trust, or reports/trust-<model>-<prompt>-<dataset>."
     ),

@@ -25,7 +25,7 @@ from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import chosen
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import convert
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, unknown
 from harness.core.files import alone, canonical_json
 from harness.core.formats import SOURCES
 from harness.core.progress import Progress
@@ -72,14 +72,14 @@ class ReplayedRun:
     same_episodes = True
 
     def __init__(
-        self, folder: Path, latency: str | None = None, progress: Progress = SILENT, asks: bool = True,
+        self, folder: Path, latency: str = "run", progress: Progress = SILENT, asks: bool = True,
         dataset: Path | None = None, models: Sequence[Card] = (),
     ) -> None:  # fmt: skip
         """A run.
 
         Args:
             folder: its folder.
-            latency: `paper` for the paper's inference times.
+            latency: `run` for its own inference times, `paper` for the paper's.
             progress: of questions that the model is asked; before the first to a language model it is told
                 how much is asked.
             asks: whether its model is asked what the run has no answer to. Else a walk is left out that
@@ -89,6 +89,8 @@ class ReplayedRun:
             models: cards that the user gave; a model of another name is asked only if the user has a card
                 file of it. What a run says of a model's place is never used.
         """
+        if latency not in ("run", "paper"):
+            raise unknown("--latency", latency, ("run", "paper"))
         self.run = read(folder)
         if self.run.world != "frozen":
             raise UserError(
