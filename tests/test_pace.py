@@ -2,8 +2,6 @@
 
 import pytest
 
-from harness.backends import cards
-from harness.cli.doctor import _paces
 from harness.evaluate import pace
 from harness.evaluate.pace import Pace, advice, paces
 
@@ -33,14 +31,13 @@ def test_the_line_has_every_figure() -> None:
 
 
 @pytest.mark.slow
-def test_a_small_card_of_both_engines_is_timed_on_both(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_small_card_of_both_engines_is_timed_on_both() -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
-    monkeypatch.setattr(cards, "names", lambda: ["proxy", "swarm-tiny"])
-    found = _paces(quiet=True)
+    found = pace.by_card(["proxy", "swarm-tiny"], lambda done: None)
     assert list(found) == ["swarm-tiny"]
-    assert {of["engine"] for of in found["swarm-tiny"]} == {"transformers", "llama-cpp"}
-    assert all(0 < of[what] < 60 for of in found["swarm-tiny"] for what in ("readout_s", "text_s"))
+    assert {each.engine for each in found["swarm-tiny"]} == {"transformers", "llama-cpp"}
+    assert all(0 < s < 60 for each in found["swarm-tiny"] for s in (each.readout_s, each.text_s))
 
 
 def test_what_has_one_engine_or_large_weights_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:

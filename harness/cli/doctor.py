@@ -1,10 +1,7 @@
 """`harness model doctor`: versions, machine, models and what they lack, completion cache."""
 
-import json
 import os
 import subprocess
-from contextlib import suppress
-from dataclasses import asdict
 from shutil import which
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
@@ -12,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from harness.cli import options
+from harness.cli.progress import bar
+from harness.cli.terminal import WIDTH, echo_json
 from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from harness.backends.card import Card
 
-WIDTH, MARGIN = 80, 10
+MARGIN = 10
 PACKAGES = (
     "numpy", "scipy", "pandas", "jinja2", "highway-env", "matplotlib", "tokenizers", "torch", "transformers",
     "llama-cpp-python",
@@ -39,10 +36,16 @@ def command(
 
     For models that cannot run, it says what to install or fetch.
     """
-    facts = look(gpu)
-    facts["paces"] = _paces(as_json) if engines else {}
+    facts = look(gpu) | {"paces": {}}
+    if engines:
+        from harness.backends import cards
+        from harness.evaluate.pace import advice, by_card
+
+        stems = cards.names()
+        with bar("timing engines", len(stems), as_json) as progress:
+            facts["paces"] = by_card(stems, progress)
     if as_json:
-        typer.echo(json.dumps(facts, indent=1))
+        echo_json(facts)
         return
     versions = dict(facts["versions"])
     _line(
@@ -63,32 +66,8 @@ def command(
     _line("models", ", ".join(model["name"] for model in able))
     _lacking([(model["name"], model["remedy"]) for model in facts["models"] if model["missing"]])
     _lacking([(model["name"], model["remedy"]) for model in able if model["remedy"]])
-    if engines:
-        _show_paces(facts["paces"])
-
-
-def _show_paces(paces: "Mapping[str, Sequence[Mapping[str, Any]]]") -> None:
-    from harness.evaluate.pace import Pace, advice
-
-    for n, (name, engine_paces) in enumerate(paces.items()):
-        _line("" if n else "paces", f"{name}: {advice([Pace(**pace) for pace in engine_paces])}")
-
-
-def _paces(quiet: bool) -> dict[str, list[dict[str, Any]]]:
-    """Measure the engines of each small model that has several, by card file."""
-    from harness.backends import cards
-    from harness.cli.progress import bar
-    from harness.core.errors import Unanswered
-    from harness.evaluate.pace import paces
-
-    by_card = {}
-    stems = cards.names()
-    with bar("timing engines", len(stems), quiet) as progress:
-        for stem in stems:
-            with suppress(UserError, Unanswered):  # a card with a mistake is reported above
-                by_card[stem] = [asdict(pace) for pace in paces(stem)]
-            progress(1)
-    return {stem: measured for stem, measured in by_card.items() if measured}
+    for n, (name, paces) in enumerate(facts["paces"].items()):
+        _line("" if n else "paces", f"{name}: {advice(paces)}")
 
 
 def _line(head: str, text: str) -> None:

@@ -139,7 +139,7 @@ def median(p: Floats, weights: Floats) -> Floats:
     values, below = _sorted(p, weights)
     low = _pick(values, below >= 0.5 - 1e-12)
     high = _pick(values, below > 0.5 + 1e-12)
-    return _scaled((low + high) / 2, p, weights)
+    return scaled((low + high) / 2, p, weights)
 
 
 def trimmed_mean(p: Floats, weights: Floats) -> Floats:
@@ -151,7 +151,7 @@ def trimmed_mean(p: Floats, weights: Floats) -> Floats:
     values, below = _sorted(p, weights)
     inside = np.clip(below, 0.25, 0.75)
     kept = np.diff(inside, axis=-2, prepend=0.25)
-    return _scaled(np.sum(kept * values, axis=-2) / 0.5, p, weights)
+    return scaled(np.sum(kept * values, axis=-2) / 0.5, p, weights)
 
 
 def _sorted(p: Floats, weights: Floats) -> tuple[Floats, Floats]:
@@ -169,6 +169,7 @@ def _pick(values: Floats, reached: Bools) -> Floats:
     return np.take_along_axis(values, first, -2)[..., 0, :]
 
 
-def _scaled(pooled: Floats, p: Floats, weights: Floats) -> Floats:
+def scaled(pooled: Floats, p: Floats, weights: Floats) -> Floats:
+    """Return a pool scaled to sum to 1, `(..., A)`; where all of it is 0, the linear pool."""
     total = np.sum(pooled, axis=-1, keepdims=True)
     return np.where(total > 0, pooled / np.where(total > 0, total, 1.0), linear_pool(p, weights))

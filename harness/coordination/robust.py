@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.coordination.consensus import Fused, Messages, Pool, linear_pool
+from harness.coordination.consensus import Fused, Messages, Pool, linear_pool, scaled
 from harness.core.arrays import Bools, Floats, Ints
 
 CLIP = 0.3  # radius of centred clipping, as a distance between distributions (at most sqrt 2)
@@ -69,9 +69,7 @@ def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
     )
     trimmed = np.where(heads >= 3, 1, 0)
     kept = voices[..., None] & (rank >= trimmed) & (rank < heads - trimmed)
-    pooled = np.sum(np.where(kept, p, 0.0), axis=-2)
-    total = np.sum(pooled, axis=-1, keepdims=True)
-    return np.where(total > 0, pooled / np.where(total > 0, total, 1.0), linear_pool(p, weights))
+    return scaled(np.sum(np.where(kept, p, 0.0), axis=-2), p, weights)
 
 
 def geometric_median(p: Floats, weights: Floats) -> Floats:

@@ -1,12 +1,13 @@
 """How fast each engine of a card answers on this machine, shortly timed. It advises, and decides nothing."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from harness.backends.card import Card
 from harness.backends.cards import each_engine, names
 from harness.backends.registry import locate, missing, open_backend
-from harness.core.errors import Unanswered
+from harness.core.errors import Unanswered, UserError
 from harness.evaluate import questions
 from harness.evaluate.agent import Agent
 from harness.prompts import versions
@@ -35,6 +36,16 @@ def paces(stem: str) -> list[Pace]:
     if len(able) < 2 or not all(_small(card) for card in able):
         return []
     return [_pace(card) for card in able]
+
+
+def by_card(stems: Sequence[str], progress: Callable[[int], None]) -> dict[str, list[Pace]]:
+    """Time the engines of card files, as far as `paces` can. `progress` is called with 1 after each."""
+    measured = {}
+    for stem in stems:
+        with suppress(UserError, Unanswered):  # what is wrong with a card is said where cards are listed
+            measured[stem] = paces(stem)
+        progress(1)
+    return {stem: each for stem, each in measured.items() if each}
 
 
 def advice(measured: Sequence[Pace]) -> str:
