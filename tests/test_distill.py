@@ -2,11 +2,8 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,6 +15,7 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from teaching import drawn_once
 from typer.testing import CliRunner
 
 from harness.backends import cards
@@ -44,7 +42,7 @@ from harness.world.world import World
 PLAN = Plan({"excerpts": 128, "alone": 128, "messages": 128, "answers": 96}, batch=8)
 CROSSING, PASSING = scenarios.get("occluded-intersection"), scenarios.get("do-not-pass")
 LEARNT = {CROSSING: (prompts.load("v1"), prompts.load("v2")), PASSING: (prompts.load("v4"),)}
-CURRICULUM = Curriculum(LEARNT, layouts=3, seed=100_000)
+CURRICULUM = Curriculum(LEARNT, layouts=2, seed=100_000)
 
 
 class Killed(Exception):
@@ -56,16 +54,10 @@ def silent(*_: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def once_drawn() -> Callable[..., Any]:
-    """What a layout teaches, drawn once for all tests."""
-    return cache(lessons.decision_points)
-
-
-@pytest.fixture(scope="module")
-def few(once_drawn: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
+def few(tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
     place = tmp_path_factory.mktemp("lessons")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lessons, "decision_points", once_drawn)
+        patch.setattr(lessons, "decision_points", drawn_once)
         return [
             draw(scenario, versions, CURRICULUM.layouts, CURRICULUM.seed, place / scenario.name, 1, silent)
             for scenario, versions in LEARNT.items()
@@ -120,15 +112,15 @@ def asked(few: list[Lessons]) -> list[Question]:
 
 
 @pytest.fixture
-def drawn_before(once_drawn: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lessons, "decision_points", once_drawn)
+def drawn_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lessons, "decision_points", drawn_once)
 
 
 @pytest.fixture(scope="module")
-def student(once_drawn: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def student(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("distilled") / "student"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lessons, "decision_points", once_drawn)
+        patch.setattr(lessons, "decision_points", drawn_once)
         patch.setattr("harness.training.train.LOG_STEPS", 4)
         distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
     return out

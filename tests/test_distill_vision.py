@@ -1,6 +1,7 @@
 """A small model that learns to see: what it is shown in training is what it is shown in a run."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,12 @@ import pytest
 from graphs import CAR, graph
 from msgspec import structs
 
-from harness.training.lessons import Point
 from harness.world.scene_graph import Node
 
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("highway_env", reason="needs the sim extra")
+
+from teaching import drawn_once
 
 from harness.backends import cards
 from harness.backends.base import Request
@@ -54,6 +56,13 @@ def silent(*_: object) -> None:
 CAMERA = {"sensors": ("camera", "lidar"), "indicator": "off"}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _drawn_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("harness.training.lessons.decision_points", drawn_once)
+        yield
+
+
 @pytest.fixture(scope="module")
 def lessons(tmp_path_factory: pytest.TempPathFactory) -> Lessons:
     place = tmp_path_factory.mktemp("lessons")
@@ -61,15 +70,9 @@ def lessons(tmp_path_factory: pytest.TempPathFactory) -> Lessons:
 
 
 @pytest.fixture(scope="module")
-def folder(lessons: Lessons, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("distilled") / "seer"
-    of_layout: list[Any] = [[], []]
-    for scene in lessons.scenes:
-        point = Point(scene.record, lessons.labels[scene.id].tolist())
-        of_layout[scene.record.episode].append(point)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.training.lessons.decision_points", lambda scenario, seed, n: of_layout[n])
-        distill(Curriculum({SCENARIO: VERSIONS}, LAYOUTS, FIRST["train"]), PLAN, out, silent, silent, "cpu")
+    distill(Curriculum({SCENARIO: VERSIONS}, LAYOUTS, FIRST["train"]), PLAN, out, silent, silent, "cpu")
     return out
 
 

@@ -175,6 +175,7 @@ def test_what_is_quoted_is_cut_has_no_thought_and_is_else_as_it_was() -> None:
     assert (len(long), long[-1]) == (repair.QUOTED, "…")
 
 
+@pytest.mark.slow
 def test_a_hostile_answer_is_one_turn_for_the_model_that_ships(small: Dataset) -> None:
     """Its chat has as many turns as it should, whatever was answered, and is answered in a batch as alone."""
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")

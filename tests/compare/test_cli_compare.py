@@ -63,8 +63,14 @@ def test_gates_decide_the_exit_code(
     assert told["passed"] is not bool(failed)
     assert [where["condition"] for gate in told["gates"] for where in gate["failed_in"]] == failed
     assert [gate["gate"] for gate in told["gates"]] == gates
-    assert harness("compare", *worse, *options)[0] == code
-    assert harness("compare", *worse, *options, "--markdown")[0] == code
+
+
+@pytest.mark.parametrize(("gate", "code"), [("success_rate < -0.25", 0), ("success_rate <= -0.25", 1)])
+@pytest.mark.parametrize("form", [(), ("--markdown",)])
+def test_every_form_ends_with_the_exit_code_of_its_gates(
+    form: tuple[str, ...], gate: str, code: int, worse: tuple[Path, Path], harness: Harness
+) -> None:
+    assert harness("compare", *worse, *form, "--fail-if", gate)[0] == code
 
 
 def test_rounding_decides_no_gate(runs: tuple[Path, Path], harness: Harness) -> None:

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import one_way_crossing
 import pytest
+from tiers import QUICK
 
 from harness.coordination.consensus import Messages, inverse_distance_weights
 from harness.coordination.trust import Trust
@@ -22,7 +23,7 @@ from harness.world.scenario import Scenario
 from harness.world.state import Snapshot, WorldState
 from harness.world.world import World
 
-SEEDS = range(6)
+SEEDS = range(2 if QUICK else 6)
 
 
 @pytest.fixture(

@@ -42,7 +42,7 @@ def installed(tmp_path_factory):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("built") / "one-way"
-    build(SCENARIO, folder, 2, MEETING, 2, lambda done: None)
+    build(SCENARIO, folder, 2, MEETING, 1, lambda done: None)
     return folder
 
 
@@ -90,7 +90,7 @@ def test_its_dataset_is_sound_and_says_whose_it_is(folder, frozen, tmp_path):
     assert (frozen.scenario, frozen.actions) == (SCENARIO, SCENARIO.actions)
     assert [len(tree.levels) for tree in frozen.trees] == [4, 4]
     assert {s.record.danger.sector for s in scenes_of(frozen)} == {"west", None}
-    build(SCENARIO, tmp_path / "one-way", 2, MEETING, 1, lambda done: None)
+    build(SCENARIO, tmp_path / "one-way", 2, MEETING, 2, lambda done: None)
     assert (tmp_path / "one-way/manifest.json").read_bytes() == (folder / "manifest.json").read_bytes()
 
 

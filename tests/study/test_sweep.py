@@ -75,6 +75,7 @@ def test_every_axis_gives_its_panels(source: ReplayedRun, tmp_path: Path) -> Non
     assert json.loads((tmp_path / "sweep.json").read_text())["panels"]["consensus"][0]["value"] == "linear"
 
 
+@pytest.mark.slow
 def test_axes_that_are_crossed_give_every_combination_what_it_has_alone(
     source: ReplayedRun, tmp_path: Path
 ) -> None:
