@@ -3,10 +3,12 @@
 import fcntl
 import gc
 import os
+import re
 import resource
 import sys
 import time
 from collections.abc import Callable, Generator
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -46,16 +48,23 @@ os.fsync = lambda fd: None
 gc.disable()
 
 
+text = cache(Path.read_text)
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave out files whose tests are all slow, with the engines that they import, where none is run."""
     left_out = config.getoption("markexpr") == "not slow" and collection_path.suffix == ".py"
-    return True if left_out and "\npytestmark = pytest.mark.slow" in collection_path.read_text() else None
+    return True if left_out and "\npytestmark = pytest.mark.slow" in text(collection_path) else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first: the last tests are short, and no worker waits long for another."""
+    """Sort files: of engines first, for one worker alone to import them; then those with slow tests.
+
+    The last tests are short then, and no worker waits long for another.
+    """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    engines = {item.path for item in items if re.search(r"torch|llama_cpp|tiny_|swarm-tiny", text(item.path))}
+    items.sort(key=lambda item: (item.path not in engines, item.path not in slow))
 
 
 def pytest_collection_finish() -> None:
