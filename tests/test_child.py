@@ -216,7 +216,6 @@ def test_whatever_ends_the_run_ends_the_engine(tmp_path: Path, blow: signal.Sign
     until_dead(pid)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_in_an_answer_leaves_a_child_that_answers_the_next_question(tmp_path: Path) -> None:
     child = mortal(tmp_path)

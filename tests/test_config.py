@@ -178,7 +178,6 @@ def with_other(value: Any, path: tuple[Any, ...], other: Any) -> Any:
     return [with_other(each, path[1:], other) if n == path[0] else each for n, each in enumerate(value)]
 
 
-@pytest.mark.slow
 @given(st.data())
 def test_a_wrong_leaf_anywhere_in_any_record_is_one_line_that_names_it(data: st.DataObject) -> None:
     kind, good = data.draw(kinds())

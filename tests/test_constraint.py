@@ -67,7 +67,6 @@ def loose(draw: st.DrawFn) -> tuple[tuple[str, str], str]:
 # -- what fits ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @given(compact, st.sampled_from(PATTERNS), st.data())
 def test_what_the_pattern_allows_fits_and_so_does_its_beginning(
     made: tuple[tuple[str, str], str], kind: Kind, data: st.DataObject
@@ -112,7 +111,6 @@ def test_it_judges_a_changed_answer_as_the_pattern_does(
     assert (broken("vllm", asked, text, ended=True) is None) == bool(re.fullmatch(regex(asked), text))
 
 
-@pytest.mark.slow
 @given(loose(), spoilt)
 def test_it_judges_a_changed_answer_as_a_validator_does(
     made: tuple[tuple[str, str], str], how: tuple[int, int, str]

@@ -66,7 +66,6 @@ def assert_same(a: Coordination, b: Coordination, *but: str) -> None:
             np.testing.assert_allclose(getattr(a, field.name), getattr(b, field.name), 1e-12, 1e-15)
 
 
-@pytest.mark.slow
 @given(points, cases())
 def test_weights_and_policy_are_distributions(point, case):
     decision = coordinate(point, *case)
@@ -94,7 +93,6 @@ def test_every_scheduled_reply_is_on_time_late_or_lost(point, case):
     assert np.all(decision.messages <= point.ask.max_helpers)
 
 
-@pytest.mark.slow
 @given(points, cases())
 def test_a_decision_ends_after_the_egos_inference_and_every_arrival(point, case):
     decision = coordinate(point, *case)
@@ -103,7 +101,6 @@ def test_a_decision_ends_after_the_egos_inference_and_every_arrival(point, case)
     assert np.all(decision.latency_s[:, None] >= arrived)
 
 
-@pytest.mark.slow
 @given(points, cases(), st.data())
 def test_the_order_of_helpers_changes_nothing(point, case, data):
     order = data.draw(st.permutations(range(case[0].valid.shape[1])))
@@ -113,7 +110,6 @@ def test_the_order_of_helpers_changes_nothing(point, case, data):
     assert np.array_equal(decision.infers[:, order], other.infers)
 
 
-@pytest.mark.slow
 @given(st.sampled_from(COOPERATIVE[:2]), cases(), st.floats(0, 1), st.floats(0, 1))
 def test_more_loss_never_hears_more_helpers_with_the_same_draws(point, case, one, other):
     low, high = sorted((one, other))
@@ -122,7 +118,6 @@ def test_more_loss_never_hears_more_helpers_with_the_same_draws(point, case, one
     assert np.array_equal(more.latency_s, less.latency_s)
 
 
-@pytest.mark.slow
 @given(points, cases())
 def test_a_single_decision_is_a_row_of_the_batch(point, case):
     batch = coordinate(point, *case)
@@ -131,7 +126,6 @@ def test_a_single_decision_is_a_row_of_the_batch(point, case):
         assert_same(coordinate(point, *(each.take(i) for each in case)), row)
 
 
-@pytest.mark.slow
 @given(points, cases())
 def test_a_threshold_above_the_uniform_entropy_is_the_single_local_point(point, case):
     never = point.changed(tau_nats=math.log(case[0].own.shape[-1]) + 1e-9)

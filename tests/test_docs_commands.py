@@ -17,6 +17,7 @@ from reference import PAGE, all_typed, blocks, commands, pages, reference, typed
 from typer.main import get_command
 
 from harness.cli import app
+from harness.evaluate.replay import stills
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = dict(commands(get_command(app), "harness"))
@@ -52,6 +53,7 @@ CUT = {
     "harness study paper": "--episodes 10 --sweep-episodes 10",  # of 1500 and 300 a grid point
     "harness study closed-loop": "--episodes 1 --seeds 0 --workers 1",  # of 300 layouts with 5 seeds
     "harness dataset build": "--episodes 2 --workers 1",  # of 40 and of 1000
+    **{line: "--episodes 1 --workers 1" for line in TYPED if line.startswith("harness dataset build --env")},
     "harness dataset scenario drive": "--episodes 2 --workers 1",  # of 100 and of 500
     "harness dataset scenario audit": "--layouts 24 --workers 1",  # of 300
     "harness model distill": "--layouts 2 --samples 16,16,16,16 --workers 1",  # of 240 and 300 000
@@ -123,6 +125,7 @@ def test_a_page_can_be_followed(
     page: Path, harness: Callable[..., Any], small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that four episodes are two shards
+    monkeypatch.setattr("harness.report.drawing.video.stills", lambda played: [*stills(played)][::20])
     for file, stands_for in {**READER_HAS, "few": small_path}.items():
         (tmp_path / file).symlink_to(stands_for)
     known: dict[str, Any] = {}

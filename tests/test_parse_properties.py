@@ -107,7 +107,6 @@ def test_any_text_has_one_outcome(text: str, role: str, thinking: bool, finish_r
     )
 
 
-@pytest.mark.slow
 @unhurried
 @given(st.sampled_from(CASES), st.data())
 def test_any_piece_of_the_corpus_has_one_outcome(case: Any, data: st.DataObject) -> None:

@@ -115,7 +115,6 @@ def test_reasons_that_were_asked_for_change_nothing_of_a_verdict(reasons: str, v
     assert (asked.verdict == "failed") == (unasked.verdict == "failed") == (bare.verdict == "failed")
 
 
-@pytest.mark.slow
 @unhurried
 @given(ANSWERS, SHAPES, st.data())
 def test_strict_is_what_the_published_schema_says_of_a_text_with_a_slip(
@@ -155,7 +154,6 @@ def check_readings_agree(text: str, shape: Shape) -> None:
         assert strict == read(json.loads(text, parse_int=float), frozenset(), shape)
 
 
-@pytest.mark.slow
 @unhurried
 @given(NAMES.flatmap(lambda names: hundredths(tuple(names))), st.booleans())
 def test_a_valid_distribution_is_strict_and_comes_back_unchanged(

@@ -117,7 +117,6 @@ def test_hostile_words_in_a_graph_stay_words(version: str, role: str) -> None:
     assert count(WORDS) == count("plain-words".ljust(len(WORDS), "-"))
 
 
-@pytest.mark.slow
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(st.text(max_size=30), st.sampled_from(VERSIONS))
 def test_any_id_is_rendered_as_it_is(name: str, version: str) -> None:

@@ -159,7 +159,6 @@ CONTROL = (
 )  # fmt: skip
 
 
-@pytest.mark.slow
 @given(st.lists(st.one_of(st.sampled_from(CONTROL), st.text(max_size=8)), max_size=12).map("".join))
 def test_no_token_of_a_chat_template_survives(text: str) -> None:
     quoted = repair.quoted(text)

@@ -197,7 +197,6 @@ def over(name: str, **settings: Any) -> OperatingPoint:
     return named_point(name).changed(**settings)
 
 
-@pytest.mark.slow
 @given(radios, cases(), delays)
 def test_a_relay_loses_and_delays_nothing_that_came_directly(name, case, delay_s):
     direct, relayed = (
@@ -210,7 +209,6 @@ def test_a_relay_loses_and_delays_nothing_that_came_directly(name, case, delay_s
     assert np.all((relayed.airtime_s >= direct.airtime_s) | np.isnan(direct.airtime_s))
 
 
-@pytest.mark.slow
 @given(radios, cases())
 def test_settings_of_a_unit_that_is_not_there_change_nothing(name, case):
     there = over(name, edge_delay_s=0.5, edge_x_m=9.0, edge_antenna_m=9.0)
@@ -219,7 +217,6 @@ def test_settings_of_a_unit_that_is_not_there_change_nothing(name, case):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
 
 
-@pytest.mark.slow
 @given(radios, cases(), delays, st.sampled_from(["relay", "fusion"]), st.booleans())
 def test_a_single_decision_over_a_unit_is_a_row_of_the_batch(name, case, delay_s, edge, on_demand):
     beside = over(name, edge=edge, edge_delay_s=delay_s, on_demand=on_demand, window_s=0.3)

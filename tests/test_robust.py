@@ -203,7 +203,6 @@ def test_where_nobody_looked_nothing_is_held_against_anybody():
     assert fused.weights == pytest.approx(told.weights)
 
 
-@pytest.mark.slow
 @given(
     speed=arrays(float, 3, elements=st.floats(0, 40)),
     pulls=arrays(float, (5, 3), elements=st.floats(-8, 3)),

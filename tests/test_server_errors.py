@@ -134,7 +134,6 @@ json_values = st.recursive(
 )  # fmt: skip
 
 
-@pytest.mark.slow
 @given(json_values, st.booleans())
 def test_whatever_comes_is_a_fault_or_none(payload: Any, of_chat: bool) -> None:
     fault = fault_in(payload, of_chat)

@@ -145,7 +145,6 @@ def test_a_recommendation_keeps_its_confidence() -> None:
     )
 
 
-@pytest.mark.slow
 @given(st.data(), st.sampled_from(KINDS), st.sampled_from([THREE, FIVE, ("GO", 'say "x"\\')]))
 def test_every_filling_fits_the_schema_and_is_read_as_it_stands(
     data: st.DataObject, kind: tuple[str, str], actions: tuple[str, ...]

@@ -279,7 +279,6 @@ json_objects = st.recursive(
 ).filter(lambda value: isinstance(value, dict))
 
 
-@pytest.mark.slow
 @given(json_objects, st.text("xyz ,.", max_size=9))
 def test_reordered_json_says_the_same(value: dict[str, Any], around: str) -> None:
     text = f"{around}{json.dumps(value)}{around}"

@@ -19,7 +19,6 @@ def laid(made: list[tuple[int, float]]) -> Decided:
     return np.array([place for place, _ in made], dtype=np.int64), np.array([v for _, v in made], dtype=float)
 
 
-@pytest.mark.slow
 @given(st.data(), SEEDS)
 def test_the_difference_is_that_of_all_decisions_of_episodes_that_both_know(
     data: st.DataObject, n: int

@@ -28,7 +28,6 @@ from harness.world.world import World
 IDLE, SLOWER, FASTER, UNSURE = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.4, 0.3)
 
 
-@pytest.mark.slow
 def test_an_episode_played_by_hand():
     """Nobody is dangerous. At 1 s the ego is unsure: alone it goes on, over 6G its helpers make it brake.
 

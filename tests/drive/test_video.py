@@ -22,7 +22,7 @@ from harness.report.drawing.video import write_video
 @pytest.fixture(scope="module")
 def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("driven") / "run"
-    run(live_spec_of(episodes=3, first_seed=FROM_LEFT), folder)
+    run(live_spec_of("cruise", episodes=3, first_seed=FROM_LEFT), folder)
     return folder
 
 

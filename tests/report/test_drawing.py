@@ -46,7 +46,6 @@ def test_every_vehicle_is_labelled_with_id_and_kind_and_the_file_stays_light(dat
             assert {f"{v.id} {v.kind}" for v in scene.state.vehicles} <= set(texts(svg))
 
 
-@pytest.mark.slow
 def test_what_the_viewer_does_not_see_is_labelled_hidden(dataset):
     scene = scenes_of(dataset)[2]
     for viewer in scene.viewers:

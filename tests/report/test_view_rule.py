@@ -126,7 +126,6 @@ def test_a_video_does_not_jump():
     assert most < 0.2 * (max(v.width_m for v in shown) - min(v.width_m for v in shown))
 
 
-@pytest.mark.slow
 @given(
     st.lists(places.map(np.array), min_size=1, max_size=40),
     st.integers(1, 12),

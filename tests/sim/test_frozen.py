@@ -79,7 +79,6 @@ def test_what_an_action_comes_to_with_the_full_view_driver_is_a_leaf(two_steps: 
 # Real trees.
 
 
-@pytest.mark.slow
 def test_a_course_is_lost_by_one_decision_or_was_lost_from_the_start(small: Dataset) -> None:
     """Random walks: success is to have kept the value to the end, failure to have given it away once."""
     f, rng = small.forest, np.random.default_rng(0)

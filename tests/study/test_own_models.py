@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,25 +32,45 @@ basis = "b"
 STUDY = ("study", "attribute", "run", "--sample", "2")
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the project is kept, once a test has made it."""
+    return tmp_path_factory.mktemp("made") / "project"
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with serving(lambda asked: asked.reply(completion(GOOD))) as server:
+        yield server
+
+
 @pytest.fixture
-def run(harness: Callable[..., Said], small_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def run(
+    server: Server,
+    made: Path,
+    harness: Callable[..., Said],
+    small_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Server:
     """A run of a server of the user's own, in a project with its card."""
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     monkeypatch.setenv("SWARMDRIVE_CACHE", str(Path("cache").absolute()))
-    Path("models").mkdir()
-    Path("swarmdrive.toml").touch()
-    with serving(lambda asked: asked.reply(completion(GOOD))) as server:
+    if made.exists():
+        shutil.copytree(made, ".", dirs_exist_ok=True)
+    else:
+        Path("models").mkdir()
+        Path("swarmdrive.toml").touch()
         Path("models/mine.toml").write_text(CARD.format(url=server.url, more=""))
         said = harness(
             "eval", "--model", "mine", "--dataset", small_path, "--limit", "1", "--seeds", "0:1",
             "--condition", "6g", "--out", "run",
         )  # fmt: skip
         assert said[0] == 0, said
-        server.asked.clear()
-        yield server
+        shutil.copytree(".", made)
+    server.asked.clear()
+    return server
 
 
-@pytest.mark.slow
 def test_a_study_asks_the_server_of_the_users_card(run: Server, harness: Callable[..., Said]) -> None:
     assert harness(*STUDY)[0] == 0
     assert run.asked
@@ -78,7 +98,6 @@ def test_a_study_names_the_prompt_that_its_run_keeps(
     assert harness(*study)[0] == 0
 
 
-@pytest.mark.slow
 def test_what_the_run_says_of_a_server_changes_nothing(run: Server, harness: Callable[..., Said]) -> None:
     """Its card may have moved: the identity of what is opened is compared."""
     with serving(lambda asked: asked.reply(completion(GOOD))) as theirs:
@@ -87,7 +106,6 @@ def test_what_the_run_says_of_a_server_changes_nothing(run: Server, harness: Cal
         assert (len(theirs.asked), bool(run.asked)) == (0, True)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "said"),
     [
@@ -107,7 +125,6 @@ def test_a_card_that_asks_otherwise_is_refused(
     assert said in err
 
 
-@pytest.mark.slow
 def test_another_identity_is_refused_before_a_question(run: Server, harness: Callable[..., Said]) -> None:
     with serving(lambda asked: asked.reply(completion(GOOD))) as other:
         Path("models/mine.toml").write_text(CARD.format(url=other.url, more=""))
@@ -138,7 +155,6 @@ def test_a_model_that_is_no_card_is_not_asked_and_the_line_says_what_to_type(
     assert code == 2 or study[1] in ("trust", "schedule")
 
 
-@pytest.mark.slow
 def test_a_replay_asks_no_server_that_its_run_names(
     run: Server, harness: Callable[..., Said], small_path: Path
 ) -> None:
@@ -158,7 +174,6 @@ def test_a_name_of_a_shipped_card_does_not_lend_it_a_server() -> None:
     assert find_own(cards.load("proxy"), (), "run", "") == cards.load("proxy")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["../mine", "models/mine", "", "mine\0", "MINE", "proxy:", "a/b", "replay:run"]
 )
