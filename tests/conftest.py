@@ -63,7 +63,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     The last tests are short then, and no worker waits long for another.
     """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    engines = {item.path for item in items if re.search(r"torch|llama_cpp|tiny_|swarm-tiny", text(item.path))}
+    needs = re.compile(r'importorskip\("(torch|llama)|tiny_')
+    engines = {item.path for item in items if needs.search(text(item.path))}
     items.sort(key=lambda item: (item.path not in engines, item.path not in slow))
 
 

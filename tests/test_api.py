@@ -131,6 +131,7 @@ def test_spellings_of_0_2_work_with_a_warning(small: Dataset) -> None:
     assert not extend.Attack.by_scene
 
 
+@pytest.mark.slow
 def test_a_run_is_evaluated_with_the_command_lines_names(small_path: Path, tmp_path: Path) -> None:
     made = harness.run(
         model="local-view",

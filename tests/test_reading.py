@@ -111,7 +111,7 @@ def test_a_key_with_thousands_of_dots_is_refused_at_once() -> None:
     assert loads("a.b.c = 1", "it") == {"a": {"b": {"c": 1}}}
 
 
-QUICK = ("eval", "--limit", "1", "--seeds", "0", "--dry-run")
+QUICK = ("eval", "--dataset", "small", "--limit", "1", "--seeds", "0", "--dry-run")
 # Files of a project, and a command that reads each.
 READ: dict[str, tuple[str, ...]] = {
     "channels/mine.toml": ("radio", "show", "mine"),
@@ -130,10 +130,10 @@ READ: dict[str, tuple[str, ...]] = {
     "curves.csv": ("radio", "check", "mode4", "--against", "curves.csv"),
     "config.json": ("drive", "--env", "merge-v0", "--env-config", "config.json", "--episodes", "1"),
     "answer.txt": ("prompt", "parse", "answer.txt"),
-    "tokenizer.json": ("prompt", "check", "v2", "--tokenizer", "tokenizer.json"),
+    "tokenizer.json": ("prompt", "check", "v2", "--dataset", "small", "--tokenizer", "tokenizer.json"),
     "small/manifest.json": ("dataset", "check", "small"),
     "small/layouts.zip": ("dataset", "check", "small"),
-    "begun/.work/config.json": ("eval", "--limit", "1", "--out", "begun"),
+    "begun/.work/config.json": ("eval", "--dataset", "small", "--limit", "1", "--out", "begun"),
     "suite/suite.json": ("report", "suite"),
 }
 
@@ -144,8 +144,7 @@ def test_no_command_waits_for_what_is_no_file(
     file: str, make: Callable[[Path], None], harness: Command, small_path: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "swarmdrive.toml").touch()
-    if file.startswith("small/"):
-        shutil.copytree(small_path, tmp_path / "small")
+    shutil.copytree(small_path, tmp_path / "small")
     if file.startswith("prompts/"):
         shutil.copytree(folder("prompts") / "v6", tmp_path / "prompts/mine")
     (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)

@@ -218,13 +218,14 @@ def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check
     Raises:
         UserError: a file has no curves, or one states a setting that the radio, named `where`, does not have.
     """
+    curves = [compared(channel, curve, where) for file in files for curve in curves_of(file)]
     sends = isinstance(channel, Transceiver) and channel.rate_hz
     return Check(
         n,
         known(channel.busy_ratio()),
         gaps(channel, DISTANCES_M, n // 10) if isinstance(channel, Transceiver) and sends else [],
         drawn(channel, DISTANCES_M, n),
-        [compared(channel, curve, where) for file in files for curve in curves_of(file)],
+        curves,
     )
 
 

@@ -112,7 +112,7 @@ def test_two_runs_are_compared_and_the_older_is_a(browser: TestClient) -> None:
     [
         "/run?path=first",
         "/run?path=first%2Fsweep-tau",
-        "/report?path=first",
+        pytest.param("/report?path=first", marks=pytest.mark.slow),
         "/compare?path=first&path=second",
     ],
 )
@@ -160,9 +160,9 @@ def test_a_report_is_of_what_is_picked(browser: TestClient) -> None:
         ("/compare?path=first&path=first", "1 runs are picked"),
         ("/compare?path=first&path=first/sweep-tau", "first/sweep-tau is no finished run of a model"),
         ("/compare?path=first&path=killed", "killed is no finished run of a model; pick others"),
-        ("/compare?path=first&path=other", "first and "),
+        pytest.param("/compare?path=first&path=other", "first and ", marks=pytest.mark.slow),
         ("/report", "no run is picked"),
-        ("/report?path=first&path=other", "first and "),
+        pytest.param("/report?path=first&path=other", "first and ", marks=pytest.mark.slow),
         ("/run?path=killed", "killed is unfinished (the same command continues it); it has no page yet"),
         ("/run?path=cut", "cut has no decisions.parquet of its own; make the run again"),
         ("/run?path=garbled", "decisions.parquet is broken ("),
