@@ -6,7 +6,7 @@ How a backend batches or threads inside is its own matter; the rest of the progr
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from harness.core.files import canonical_json
 from harness.core.image import Image
@@ -180,12 +180,13 @@ def window(backend: Backend) -> int:
     return getattr(backend, "window", 0)
 
 
-class Served(NamedTuple):
+@dataclass(frozen=True)
+class Served:
     """Which server gave the answer of a request, and the model that it names; None if it names none."""
 
     id: str
     server: str
-    model: str | None
+    model: str | None = None
 
 
 def served(backend: Backend) -> list[Served]:

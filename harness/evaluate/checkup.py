@@ -46,12 +46,8 @@ class Check:
 def check(card: Card, thinking: bool, device: str | None, dtype: str | None, progress: Progress) -> Check:
     """Check a model, examine it if it answers by letters, and keep what was found.
 
-    Args:
-        card: a language model's.
-        thinking: whether it is asked to think.
-        device: where it runs; None leaves the choice to the engine.
-        dtype: number format of the weights; None takes the card's.
-        progress: counts answers.
+    The card is a language model's. Without a device or number format, `dtype`, the engine's choice and the
+    card's hold. `progress` counts answers.
     """
     data = load.load(load.find(DATASET), 1)
     ego = Agent(card, versions.load(PROMPT), thinking=thinking)

@@ -94,11 +94,9 @@ def evaluate(
         opens: replaces `open_backend` for frozen scenes; it may return a backend that is open already.
         given: answers by request id that need not be asked for; frozen scenes only.
 
-    Raises:
-        UserError: the folder holds another run or something else, or the model is not available. Nothing is
-            written then.
-        Unanswered: a question of the ego or a fusion call, or too many of the helpers', got no answer. The
-            folder keeps all answers, and the same call asks the others again.
+    Raises UserError if the folder holds another run or something else, or the model is not available; nothing
+    is written then. Raises Unanswered if a question of the ego or a fusion call, or too many of the helpers',
+    got no answer; the folder keeps all answers, and the same call asks the others again.
     """
     if (out / "run.json").exists() and (out / WORK).is_dir():
         return finished(spec, out)
@@ -171,8 +169,7 @@ def _walk(
 ) -> dict[str, bytes]:
     """Walk a chunk's episodes to their ends and return the files of this part of the run, by name.
 
-    Which servers gave answers that are not kept yet is one of them; it is no part of the run's tables.
-
+    One of them says which servers gave answers that are not kept yet; it is no part of the run's tables.
     Frozen scenes are walked for some seeds at a time: the decisions of all would not fit into memory.
     `asker_of` returns the asker of the n-th of these walks, which is given the answers so far.
     """

@@ -15,15 +15,9 @@ from harness.core.files import bytes_of, write_whole
 FILE = "servers.jsonl"
 
 
-class _Line(msgspec.Struct):
-    id: str
-    server: str
-    model: str | None = None
-
-
 def lines(served: Iterable[Served]) -> bytes:
     """Return one line of JSON for each answer."""
-    return msgspec.json.Encoder().encode_lines([_Line(*each) for each in served])
+    return msgspec.json.Encoder().encode_lines(list(served))
 
 
 def keep(work: Path, served: Iterable[Served] | bytes) -> None:
@@ -42,7 +36,7 @@ def write(out: Path, works: Iterable[Path]) -> None:
     for work in works:
         for line in bytes_of(work / FILE, "rows").splitlines() if (work / FILE).is_file() else ():
             with suppress(msgspec.MsgspecError):  # torn, if the run was killed
-                read = msgspec.json.decode(line, type=_Line)
-                last[read.id] = Served(read.id, read.server, read.model)
+                read = msgspec.json.decode(line, type=Served)
+                last[read.id] = read
     if last:
         write_whole(out / FILE, lines(last[name] for name in sorted(last)))

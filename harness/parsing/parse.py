@@ -84,10 +84,10 @@ def parse(
 
     Args:
         text: the completion as it came.
-        role: `ego` or `helper`.
+        role: `ego` or `helper`; with the next three, the `Shape` of the answer that was asked for.
         actions: meta-action names, in the environment's order.
-        form: the form that was asked for; None if any of the role's `FORMS` will do.
-        extension: schemas of further members that were asked for (`Shape.extension`); empty for none.
+        form: one of the role's `FORMS`; None if any of them will do.
+        extension: schemas of further members; empty for none.
         thinking: whether the text must hold a closed thought: the model was asked to think, and the engine
             did not take the thought out of the text.
         reasons_first: whether the prompt asked for reasons before the answer; then prose there is no repair.
@@ -95,8 +95,7 @@ def parse(
         finish_reason: the engine's finish reason; `length` means that the token limit cut the text off.
         error: the engine's message if it failed.
 
-    Raises:
-        UserError: unknown role.
+    Raises UserError for an unknown role.
     """
     if role not in ROLES:
         raise errors.unknown("role", role, ROLES)

@@ -36,13 +36,8 @@ def measure(
 ) -> Sizes:  # fmt: skip
     """Render the prompt of every viewer, and of the ego with the longest messages of one helper, of two, ...
 
-    Args:
-        prompt: the version, which fits the dataset's scenario.
-        data: the dataset.
-        scenes: the scenes to render.
-        count: returns the tokens of a chat's turns; None renders and counts nothing.
-        picture: tokens of the picture beside a text.
-        progress: called with 1 after each scene.
+    `count` returns the tokens of a chat's turns, None renders and counts nothing; a picture beside a text has
+    `picture` tokens. `progress` is called with 1 after each scene.
     """
     words, (least, most) = data.scenario.prompt_words, prompt.token_budget
     turns = {role: densest_repair(prompt, role, data.actions, words) for role in prompt.repair_turn}

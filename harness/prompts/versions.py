@@ -133,15 +133,10 @@ class Prompt:
         """Render the chat messages for one viewer's scene graph, exactly as a model is sent them.
 
         The graph's `role` chooses the template. Examples follow the system message as earlier turns. A
-        message with the key `image` has a picture before its text.
-
-        Args:
-            graph: the viewer's scene graph.
-            actions: meta-action names.
-            messages: helpers' messages to the ego, with `sender`, `evidence`, `risk`, `intent`,
-                `recommended_maneuver` and `confidence`.
-            words: texts by which the scenario describes itself, by name.
-            letter: whether a letter is asked for in place of the block `question` (`readout.asked`).
+        message with the key `image` has a picture before its text. `messages` are those of helpers to the
+        ego, with `sender`, `evidence`, `risk`, `intent`, `recommended_maneuver` and `confidence`; `words` are
+        texts by which the scenario describes itself. A `letter` is asked for in place of the block
+        `question` (`readout.asked`).
         """
         system, user = self._render_graph(graph, actions, messages, words, letter, "system", "user")
         turns = self._turns(graph.role, actions, words, letter)

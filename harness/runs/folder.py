@@ -363,13 +363,11 @@ def ordered(
 
 
 def dataset_of(run: Run, given: Path | None = None) -> Dataset:
-    """Return the dataset of a run on frozen scenes, wherever it lies now.
+    """Return the dataset of a run on frozen scenes, wherever it lies now, if it has the run's digest.
 
     It is looked for where the run states, at that path seen from each folder above the run's, and by its
-    name; only a dataset with the run's digest is taken.
-
-    If the user names its folder, `given`, it is looked for nowhere else. Raises UserError if it is not found,
-    or if what is there has another digest or is damaged.
+    name; nowhere else if the user names its folder, `given`. Raises UserError if it is not found, has another
+    digest, or is damaged.
     """
     stated = run.manifest.world
     assert isinstance(stated, FrozenScenes)
