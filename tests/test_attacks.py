@@ -12,7 +12,7 @@ from swarm_extras import MUMBLE
 
 from harness.coordination.attacks import ATTACKS, INSTRUCTIONS, Turn, attackers, attacks_of
 from harness.coordination.claims import Claims
-from harness.coordination.coordinate import Fusion, coordinate
+from harness.coordination.coordinate import FusionInputs, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, Rewrites, named_point
 from harness.core.errors import UserError
@@ -330,6 +330,6 @@ def test_the_majority_stands_against_a_fusion_call_that_was_talked_over():
 
     for defence, action in (("", 2), ("defence=majority,", 0)):
         point = named_point(f"6g:consensus=ego-prompt,{defence}tau_nats=0.1")
-        done = coordinate(point, truth, draws, Fusion(call))
+        done = coordinate(point, truth, draws, FusionInputs(call))
         assert done.action.tolist() == [action]
     assert done.fused[0] == pytest.approx([2 / 3, 0.2, 2 / 15])

@@ -10,7 +10,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from harness.coordination.coordinate import Coordination, Fusion, coordinate
+from harness.coordination.coordinate import Coordination, FusionInputs, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import CLOUD, POINTS, OperatingPoint
 from harness.radio.channel import Draws
@@ -40,7 +40,7 @@ def play(
         np.full(len(valid), 1000.0),
         np.array(inference_s),
     )
-    return coordinate(point, intents, Draws(np.array(link), np.array(jitter)), Fusion(fusion_call))
+    return coordinate(point, intents, Draws(np.array(link), np.array(jitter)), FusionInputs(fusion_call))
 
 
 def test_alone_the_ego_acts_on_its_own_intent_after_its_own_inference():

@@ -13,7 +13,7 @@ from swarm_extras import FOG, SMOOTHING, Fog
 
 from harness.coordination.claims import Claims
 from harness.coordination.consensus import Messages, Rule
-from harness.coordination.coordinate import Coordination, Fusion, coordinate
+from harness.coordination.coordinate import Coordination, FusionInputs, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.coordination.rules import RULES
@@ -47,7 +47,7 @@ def step(
         inference_s=np.full((*shape, 2), 0.1),
     )
     link = np.where(crosses, 0.99, 0.0)[..., None, None] * np.ones(2)
-    return coordinate(point, intents, Draws(link, np.zeros((*shape, 1))), Fusion(state=state))
+    return coordinate(point, intents, Draws(link, np.zeros((*shape, 1))), FusionInputs(state=state))
 
 
 def test_a_rule_with_memory_is_driven_step_by_step():

@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 from harness.backends import cards, registry
 from harness.backends.base import Completion, Request
 from harness.backends.card import Card
-from harness.coordination.coordinate import TIE, Fusion, coordinate
+from harness.coordination.coordinate import TIE, FusionInputs, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.errors import UserError
@@ -54,7 +54,7 @@ def taken(policies: Any, draws: Any = None) -> list[int]:
     intents = Intents(
         own, np.zeros((n, 0, own.shape[1])), none > 0, np.ones((n, 1)), none, none, np.ones((n, 1))
     )
-    fusion = Fusion(ties=None if draws is None else lambda tied: np.array(draws)[tied])
+    fusion = FusionInputs(ties=None if draws is None else lambda tied: np.array(draws)[tied])
     return coordinate(ALONE, intents, Draws(np.zeros((n, 0, 2)), none), fusion).action.tolist()
 
 

@@ -31,7 +31,7 @@ TIE = 1e-9  # probabilities that differ by less are equal: pooling rounds
 
 
 @dataclass(frozen=True)
-class Fusion:
+class FusionInputs:
     """What fusion needs beyond the messages."""
 
     call: FusionCall | None = None  # the fusion call; required if the point's consensus is `ego-prompt`
@@ -68,17 +68,17 @@ class Coordination(Exchange):
 
 
 def coordinate(
-    point: OperatingPoint, intents: Intents, draws: Draws, fusion: Fusion | None = None
+    point: OperatingPoint, intents: Intents, draws: Draws, fusion: FusionInputs | None = None
 ) -> Coordination:
     """Run trigger, channel and fusion for decisions `(...)` with up to H helpers and A actions each."""
     return fuse(point, exchange(point, intents, draws), intents, fusion)
 
 
 def fuse(
-    point: OperatingPoint, heard: Exchange, intents: Intents, fusion: Fusion | None = None
+    point: OperatingPoint, heard: Exchange, intents: Intents, fusion: FusionInputs | None = None
 ) -> Coordination:
     """Decide once it is known who was heard; the other arguments as in `coordinate`."""
-    fusion = fusion or Fusion()
+    fusion = fusion or FusionInputs()
     p = np.concatenate([heard.own[..., None, :], intents.helpers], axis=-2)
     distance_m = intents.distance_m
     if point.fusion.ego_distance_m is not None:

@@ -11,7 +11,7 @@ In seconds from the start of the decision:
                           max(heard, inference_s[1+h]); on demand heard + inference_s[1+h]
     + slots               replies are on air, one after another or at once, as the profile says; a slot is
                           nominal latency + payload / bandwidth + jitter, twice over a roadside edge
-    arrival_s[h]          the end of the helper's slot if request and reply crossed; else inf
+    arrival_s[h]          the end of the helper's slot if request and reply arrived; else inf
     window_s              what has arrived by now is fused
     exchange_s            the end of the last slot: the ego also waits for a lost or late reply
 
@@ -64,8 +64,8 @@ class Exchange:
     # packet loss, the probability that one transmission was lost, `(...)`: the mean over the helpers asked if
     # links differ; NaN without a channel
     loss: Floats
-    # whether the helper was asked, and request and reply crossed, `(..., H)`; if a unit fuses, its policy
-    # must have crossed, too
+    # whether the helper was asked, and request and reply arrived, `(..., H)`; if a unit fuses, its policy
+    # must have arrived, too
     delivered: Bools
     arrival_s: Floats  # end of the reply at whoever fuses, `(..., H)`; inf if lost or not asked
     on_time: Bools  # whether it arrived within the window and so is fused, `(..., H)`

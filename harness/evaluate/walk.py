@@ -11,7 +11,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from harness.coordination.claims import Claims
-from harness.coordination.coordinate import Coordination, Fusion, FusionCall, fuse
+from harness.coordination.coordinate import Coordination, FusionCall, FusionInputs, fuse
 from harness.coordination.exchange import Exchange, exchange, needed
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
@@ -170,7 +170,7 @@ def walk(
             call = (
                 calls[point.rewrites](due_here.at, shown(point, broadcast)) if point.has_fusion_call else None
             )
-            fusion = Fusion(call, memories[point].recall(due_here), tie_draws(due_here.draws, ties))
+            fusion = FusionInputs(call, memories[point].recall(due_here), tie_draws(due_here.draws, ties))
             result = fuse(point, sent[point], broadcast.intents, fusion)
             decided.append(Decided(point, decision_points, due_here, result, broadcast))
         for part in decided:

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from harness.backends.base import Request
-from harness.coordination.coordinate import Coordination, Fusion, fuse
+from harness.coordination.coordinate import Coordination, FusionInputs, fuse
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Ints
@@ -175,7 +175,7 @@ def _messages(
         attackers = shown(point, broadcast)
         codes = np.unique(codes_of(rest, at, attackers)[rest.any(axis=1)])
         call = stored.fusion_call(points, codes, point.rewrites)(at, attackers)
-    fusion = Fusion(call, None if state is None else state[decisions])
+    fusion = FusionInputs(call, None if state is None else state[decisions])
     less = fuse(point, replace(whole, on_time=rest), broadcast.intents, fusion)
     for n, voice in enumerate(helpers.tolist()):
         helper = voice if broadcast.intents.voice_of is None else int(broadcast.intents.voice_of[n, voice])

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from harness.coordination.coordinate import Fusion, fuse
+from harness.coordination.coordinate import FusionInputs, fuse
 from harness.coordination.exchange import exchange, worth_of
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
@@ -183,7 +183,7 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
     for who in sets[:, :width]:
         heard = fuse(
             point, exchange(point, intents, draws, np.broadcast_to(who, intents.valid.shape)), intents,
-            Fusion(ties=ties),
+            FusionInputs(ties=ties),
         )  # fmt: skip
         actions.append(heard.action.reshape(shape))
         energy_j = own_j[:, 0] + helpers_j(heard.infers, own_j) + stored.radio_j(point, heard)
