@@ -78,7 +78,7 @@ def command(
     silent = as_json or quiet
     if part and out:
         with bar(f"driving {printable(spec.ego.card.name, 30)}", quiet=silent) as progress:
-            mine = evaluate_shard(spec, out, part, progress, progress.more, who)
+            mine = evaluate_shard(spec, out, part, progress, who)
         if not silent:
             options.say_shard(part, out, f"{mine} of {driven} episodes")
         return

@@ -81,7 +81,7 @@ def command(
             name = f"trust-{file_name(model)}-{spec.ego.prompt.version}-{spec.source.name}"
             out = out or Path("reports") / name
             cache = default_file()
-            run = read_or_evaluate(spec, out / "run", progress, cache, progress.more, open_backend).path
+            run = read_or_evaluate(spec, out / "run", progress, cache, open_backend).path
         own = options.cards([model] if model else None)
         replayed = ReplayedRun(run, progress=progress, asks=not no_model, models=own)
         draws = parse_seeds(seeds) if seeds else replayed.seeds

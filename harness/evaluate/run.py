@@ -23,6 +23,7 @@ from harness.core.files import write_whole
 from harness.core.formats import WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
+from harness.core.progress import Progress
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
@@ -115,21 +116,17 @@ def evaluate(
         return _gather(out, as_finished(spec, begun), chunks, place, made_of)
 
 
-def evaluate_shard(
-    spec: Spec, out: Path, shard: Shard, progress: Callable[[int], None], more: Callable[[int], None],
-    workers: Workers = 1,
-) -> int:  # fmt: skip
+def evaluate_shard(spec: Spec, out: Path, shard: Shard, progress: Progress, workers: Workers = 1) -> int:
     """Drive one shard of a closed-loop run, which `harness run merge` combines; a stopped shard resumes.
 
-    `progress` is called with the number of episodes just driven, those that a stopped shard kept included;
-    `more` with the number that the shard has, which is returned. Raises UserError as `evaluate`, or if the
-    latency is to be measured.
+    `progress` counts episodes, those that a stopped shard kept included. Returns how many the shard has.
+    Raises UserError as `evaluate`, or if the latency is to be measured.
     """
     refuse_finished(out)
     made_of = sources(spec)
     begun, chunks = _begin_driving(spec, out, unfinished(spec, out, str(shard)), workers, str(shard))
     own_chunks = shard.part(chunks)
-    more(sum(map(len, own_chunks)))
+    progress.more(sum(map(len, own_chunks)))
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, own_chunks, place, progress, None, workers)
         kept_sources.write(place, made_of, place)
@@ -442,13 +439,13 @@ def _open_all(spec: Spec) -> list[Backend]:
 
 
 def read_or_evaluate(
-    spec: Spec, out: Path, progress: Callable[[int], None], cache: Path | None, more: Callable[[int], None],
-    opens: Opens, given: Mapping[str, Answer] = NOTHING,
+    spec: Spec, out: Path, progress: Progress, cache: Path | None, opens: Opens,
+    given: Mapping[str, Answer] = NOTHING,
 ) -> folder.Run:  # fmt: skip
     """Read the finished run in a folder, or run it with `evaluate` first; for studies of several runs."""
     if (out / "run.json").is_file() and not (out / WORK).is_dir():
         finished(spec, out)
     else:
-        evaluate(spec, out, progress, cache, more, opens=opens, given=given)
+        evaluate(spec, out, progress, cache, progress.more, opens=opens, given=given)
         work.tidy(out)
     return folder.read(out)

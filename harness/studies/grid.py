@@ -170,7 +170,7 @@ def run_cells(
         roles = {"ego": ego.name, "helper": helper.name, "blind": helper.name}
         given = {k: v for role in roles.items() for k, v in asked.get(role, {}).items()}
         folder = out / "cells" / f"{i}-{j}"
-        run = read_or_evaluate(of_pair, folder, progress, cache_file, progress.more, opens, given)
+        run = read_or_evaluate(of_pair, folder, progress, cache_file, opens, given)
         for answer in run.answers:
             if answer.role in roles and answer.error is None:
                 asked.setdefault((answer.role, roles[answer.role]), {})[answer.id] = answer

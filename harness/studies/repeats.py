@@ -58,7 +58,7 @@ def run_repeats(
     """
     opens = cache(open_backend)
     runs = [
-        read_or_evaluate(of, out / name, progress, cache_file, progress.more, opens)
+        read_or_evaluate(of, out / name, progress, cache_file, opens)
         for name, of in each(spec, repeats).items()
     ]
     return Repeats(out, tuple(runs))
