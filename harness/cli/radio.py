@@ -189,7 +189,8 @@ def crowd(
     from harness.core.config import settable
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS
-    from harness.radio.reception import SIGHTS, VEHICLES, crowds
+    from harness.radio.reception import VEHICLES, crowds
+    from harness.radio.trace import SIGHTS
 
     if sight not in SIGHTS:
         raise unknown("--sight", sight, SIGHTS)

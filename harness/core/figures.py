@@ -34,13 +34,7 @@ class Unit:
     factor: float = 1.0  # what a stored value is multiplied by
 
     def number(self, value: float | None, sign: str = "", digits: int | None = None) -> str:
-        """Write a value without the unit's name.
-
-        Args:
-            value: in the unit in which it is stored.
-            sign: `+` writes the sign of a positive number too.
-            digits: the most significant digits, all in all.
-        """
+        """Write a value without the unit's name; `digits` are the most significant digits, all in all."""
         if value is None or math.isnan(value):
             return DASH
         number, places = value * self.factor, self.decimals

@@ -54,9 +54,7 @@ LARGEST: dict[Kind, int] = {
 def opened(path: str | Path, kind: Kind) -> BufferedReader:
     """Open a file for reading; it is checked after it is opened, so nothing can take its place in between.
 
-    Raises:
-        OSError: the file cannot be opened.
-        Refused: it is not a regular file, or is larger than `LARGEST` of its kind.
+    Raises OSError, and Refused if it is not a regular file or is larger than `LARGEST` of its kind.
     """
     file = open(path, "rb", opener=_at_once)  # noqa: SIM115
     try:
@@ -171,11 +169,8 @@ def write_whole(path: Path, data: str | bytes) -> None:
 def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
     """Hold an exclusive lock on a file, which is created if missing. A killed process releases its lock.
 
-    On a system without such locks (Windows) nothing is locked.
-
-    Raises:
-        BlockingIOError: another process still holds the lock after `patience_s` seconds.
-        OSError: the file cannot be opened, or is a link, which is not followed.
+    On a system without such locks (Windows) nothing is locked. Raises BlockingIOError if another process
+    still holds it after `patience_s` seconds, and OSError if the file is a link or cannot be opened.
     """
     try:
         import fcntl

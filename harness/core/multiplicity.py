@@ -60,12 +60,8 @@ def holm(p_values: Sequence[float], comparisons: int | None = None) -> list[floa
     """Correct p-values for multiple comparisons by Holm's step-down method (Holm 1979); order is kept.
 
     If a difference is called real where its corrected p is at most `LEVEL`, at least one false alarm among
-    all of them has a probability of 5 % at most, however they depend on each other.
-
-    Args:
-        p_values: those of the comparisons that are shown.
-        comparisons: number of all comparisons, if those shown were picked among more; the others count as
-            less striking ones, which can only raise the result.
+    all of them has a probability of 5 % at most, however they depend on each other. If those given were
+    picked among more `comparisons`, the others count as less striking, which can only raise the result.
     """
     order = np.argsort(p_values, kind="stable")
     steps = np.array(p_values)[order] * ((comparisons or len(p_values)) - np.arange(len(p_values)))

@@ -78,7 +78,8 @@ def each(
 ) -> None:  # fmt: skip
     """Call `work` on every item, in any order, and handle each result once, in this process.
 
-    If `work` raises, or the call is interrupted, the items that still run are stopped.
+    If `work` raises, or the call is interrupted, the items that still run are stopped. Raises Unfinished if
+    the workers of some items died `TRIES` times; all other items are done.
 
     Args:
         work: the function; it and the items can be pickled.
@@ -87,9 +88,6 @@ def each(
         on_result: called with an item's place and its result as soon as the result arrives.
         label: gives an item's name in messages.
         repeatable: whether the same item must give the same result on another node; a difference is an error.
-
-    Raises:
-        Unfinished: the workers of some items died `TRIES` times; all other items are done.
     """
     inputs = list(items)
     if workers == 1 or not inputs:

@@ -54,8 +54,7 @@ def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserEr
 def find(kind: str, name: str) -> Path:
     """Return the path of a resource; if it does not exist, its path among the shipped ones.
 
-    Raises:
-        UserError: the project and the harness both have a resource of that name.
+    Raises UserError if the project and the harness both have a resource of that name.
     """
     candidates = list(dict.fromkeys(where / name for where in _folders(kind)))  # one, if `name` is absolute
     existing = [path for path in candidates if os.path.lexists(path)]

@@ -41,8 +41,7 @@ Kind = TypeVar("Kind", bound=WorkStart)
 def begun(out: Path, kind: type[Kind]) -> Kind | None:
     """Read what the unfinished work in a folder began with; None if the folder is new, empty or `idle`.
 
-    Raises:
-        UserError: the file is damaged, or the folder holds something else.
+    Raises UserError if the file is damaged, or the folder holds something else.
     """
     shown, file = printable(out), out / WORK / CONFIG
     try:

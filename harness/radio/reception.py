@@ -18,13 +18,13 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import known
 from harness.core.files import text_of
 from harness.core.statistics import Estimate, episode_interval, rate_interval, resampled
-from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Physical, Site
+from harness.radio.channel import CLEAR, Channel, Draws, Links, Physical, Site
 from harness.radio.constant import density_coupled_loss
 from harness.radio.fading import Trips
+from harness.radio.trace import SIGHTS
 from harness.radio.transceiver import Transceiver
 
 DISTANCES_M = (10, 20, 50, 100, 150, 200, 300, 400, 500)
-SIGHTS = {"clear": CLEAR, "vehicle": VEHICLE, "building": BUILDING}
 VEHICLES = (2, 4, 8, 16, 32, 64, 128)
 PAYLOAD_BITS = 800.0
 PACKETS, MPS = 200, 14.0  # of a trip, and its speed
@@ -104,21 +104,21 @@ def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int =
         loss = channel.loss(site, trips.shadow(xy_m, channel.decorrelation_m), channel.packet_bits)[..., 0]
         trip, packet = np.nonzero((uniforms >= loss) & (PACKETS * share > 10))
         same = np.diff(trip) == 0
-        waits_s, of = np.diff(packet)[same] / channel.rate_hz, trip[1:][same]
+        waits_s, trip = np.diff(packet)[same] / channel.rate_hz, trip[1:][same]
         independent_s = 1 / (channel.rate_hz * share) if share else math.inf
-        result.append(Gap(distance_m, episode_interval(waits_s, of), _p95(waits_s, of), independent_s))
+        result.append(Gap(distance_m, episode_interval(waits_s, trip), _p95(waits_s, trip), independent_s))
     return result
 
 
 def _p95(values: Floats, trips: Ints) -> Estimate:
     """Return the 95th percentile, with the bootstrap's interval over trips; NaN of none."""
-    there, of = np.unique(trips, return_inverse=True)
-    if not len(there):
+    present, place = np.unique(trips, return_inverse=True)
+    if not len(present):
         return Estimate(math.nan, math.nan, math.nan, 0, 0)
-    times = resampled(noise.generator("waits"), len(there), RESAMPLES)
-    value, *bootstrap = (np.quantile(np.repeat(values, row[of]), 0.95) for row in times)
+    times = resampled(noise.generator("waits"), len(present), RESAMPLES)
+    value, *bootstrap = (np.quantile(np.repeat(values, row[place]), 0.95) for row in times)
     low, high = np.quantile(bootstrap, [0.025, 0.975]).tolist()
-    return Estimate(float(value), low, high, len(there), 0)
+    return Estimate(float(value), low, high, len(present), 0)
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,7 @@ class _Row(msgspec.Struct, forbid_unknown_fields=True):
 def curves_of(path: Path) -> list[Curve]:
     """Read curves from a CSV: `distance_m`, `reception`, and if it has them `configuration` and `source`.
 
-    Raises:
-        UserError: it is none, or a value is not allowed: file, line, value.
+    Raises UserError, with file, line and value, if it is none or a value is not allowed.
     """
     shown = printable(path)
     try:
@@ -191,9 +190,9 @@ class Compared:
 
 def compared(channel: Channel, curve: Curve, where: str) -> Compared:
     """Compare the channel, with the curve's settings, with the curve. Raises UserError for an unknown one."""
-    there = changed(channel, pairs(curve.configuration), where)
-    assert isinstance(there, Physical)
-    return Compared(curve, there.reception(curve.distance_m))
+    adapted = changed(channel, pairs(curve.configuration), where)
+    assert isinstance(adapted, Physical)
+    return Compared(curve, adapted.reception(curve.distance_m))
 
 
 @dataclass(frozen=True)
@@ -215,15 +214,13 @@ class Check:
 def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check:
     """Simulate `n` messages at each of `DISTANCES_M`, and compare the radio with the curves of CSV files.
 
-    Raises:
-        UserError: a file has no curves, or one states a setting that the radio, named `where`, does not have.
+    Raises UserError if a file has no curves, or one states a setting that the radio `where` does not have.
     """
     curves = [compared(channel, curve, where) for file in files for curve in curves_of(file)]
-    sends = isinstance(channel, Transceiver) and channel.rate_hz
     return Check(
         n,
         known(channel.busy_ratio()),
-        gaps(channel, DISTANCES_M, n // 10) if isinstance(channel, Transceiver) and sends else [],
+        gaps(channel, DISTANCES_M, n // 10) if isinstance(channel, Transceiver) and channel.rate_hz else [],
         drawn(channel, DISTANCES_M, n),
         curves,
     )
@@ -234,22 +231,16 @@ def crowds(
 ) -> dict[str, Floats]:
     """Return the loss of one transmission among each of `VEHICLES`, by the name of a channel, `(n,)`.
 
-    Vehicles are within a radius; sender and receiver are two of them, the others the background's load,
-    evenly along one road through the radius. `paper` is the paper's line.
-
-    Args:
-        channels: channels, whose `density_per_km` the others are.
-        radius_m: the radius.
-        distance_m: between sender and receiver.
-        sight: what stands between, a key of `SIGHTS`.
+    Vehicles are within a radius; sender and receiver, `distance_m` apart with one of `SIGHTS` between, are
+    two of them, the others the background's load, evenly along one road. `paper` is the paper's line.
     """
     losses = {"paper": density_coupled_loss(np.array(VEHICLES))}
     for name, channel in channels.items():
         received = []
         for n in VEHICLES:
             per_km = max(n - 2, 0) / (2 * radius_m) * 1000
-            there = changed(channel, {"density_per_km": str(per_km)}, "channel")
-            assert isinstance(there, Physical)
-            received.append(there.reception(np.array([distance_m]), SIGHTS[sight])[0])
+            crowded = changed(channel, {"density_per_km": str(per_km)}, "channel")
+            assert isinstance(crowded, Physical)
+            received.append(crowded.reception(np.array([distance_m]), SIGHTS[sight])[0])
         losses[name] = 1 - np.array(received)
     return losses

@@ -61,17 +61,11 @@ def distill(
 ) -> dict[str, Any]:
     """Train a model in some scenarios and write checkpoint, tokenizer, GGUF file and model card to `out`.
 
-    Layouts and stages that a killed call finished are read, and a stage that it had begun resumes.
-
-    The name of `out`, a folder to make, becomes the model's. `drawing` is called with the number of layouts
-    just drawn, `progress` with the stage, the sequences seen in it and the loss. Without `threads`, PyTorch
-    chooses how many it takes on a CPU.
-
-    Returns:
-        What the model card states: data, plan, curves, and the KL of the read-out on held-out layouts.
-
-    Raises:
-        UserError: the folder holds a finished model or something else.
+    Layouts and stages that a killed call finished are read, and a stage that it had begun resumes. The name
+    of `out`, a folder to make, becomes the model's. `drawing` is called with the number of layouts just
+    drawn, `progress` with the stage, the sequences seen in it and the loss. Without `threads`, PyTorch
+    chooses how many it takes on a CPU. Returns what the model card states: data, plan, curves, and the KL of
+    the read-out on held-out layouts. Raises UserError if the folder holds a finished model or something else.
     """
     if threads:
         torch.set_num_threads(threads)

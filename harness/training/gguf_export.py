@@ -50,15 +50,10 @@ _DEEPSTACK = {"norm": "norm", "linear_fc1": "fc1", "linear_fc2": "fc2"}
 def export(checkpoint: Path, out: Path, dtype: Dtype = "F16") -> None:
     """Write a Qwen3 folder as a GGUF file, whole or not at all; of a Qwen3-VL its projector beside it.
 
-    Args:
-        checkpoint: folder of a `Qwen3ForCausalLM` or `Qwen3VLForConditionalGeneration` with config.json,
-            model.safetensors (float32, float16 or bfloat16), tokenizer.json, a chat template and, of the
-            latter, preprocessor_config.json.
-        out: the file to write; replaced if it exists. The projector is `mmproj-` and its name.
-        dtype: number format of the matrices; vectors are always F32.
-
-    Raises:
-        UserError: another architecture or tokenizer, or files that are not whole.
+    The folder has config.json, model.safetensors (float32, float16 or bfloat16), tokenizer.json, a chat
+    template and, of a Qwen3-VL, preprocessor_config.json. The projector is `mmproj-` and the name of `out`.
+    `dtype` is that of matrices; vectors are always F32. Raises UserError for another architecture or
+    tokenizer, and for files that are not whole.
     """
     shown = f"checkpoint {printable(checkpoint)}"
     try:

@@ -89,8 +89,7 @@ def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
 def take_over(model: Any, base: Path) -> None:
     """Give a model the weights of a model of texts whose vocabulary begins its own.
 
-    Raises:
-        UserError: the folder has no such weights, or those of another size.
+    Raises UserError if the folder has no such weights, or those of another size.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file

@@ -28,9 +28,8 @@ from harness.training.questions import question
 def write(run: Run, path: Path, report_seeds_too: bool, dataset: Path | None = None) -> Path:
     """Write a run's pairs to a file, and return its path.
 
-    Raises:
-        UserError: the run was driven, its dataset or prompt is not here as it was, or its layouts are those
-            that numbers are reported of and `report_seeds_too` is false.
+    Raises UserError if the run was driven, its dataset or prompt is not here as it was, or its layouts are
+    those that numbers are reported of and `report_seeds_too` is false.
     """
     if not isinstance(run.manifest.world, FrozenScenes):
         raise UserError(
@@ -53,10 +52,7 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
     """Yield what each viewer was asked, fusion calls included, and the answer that the tree asks for.
 
     A decision point after which no action succeeds teaches nothing and is left out. The dataset is the one
-    that the run states, or lies in `folder`.
-
-    Raises:
-        UserError: its dataset or prompt is not here as it was.
+    that the run states, or lies in `folder`. Raises UserError if it or the prompt is not here as it was.
     """
     prompts = {}
     for agent in (run.manifest.agent(0), *run.manifest.helpers):

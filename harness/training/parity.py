@@ -76,10 +76,8 @@ def compare(
 
     `reference` is a card on transformers: of a checkpoint, or of a GGUF file, which is unpacked. Of `asked`,
     requests for JSON, there may be none; `letters` ask for a read-out. `progress` is called with 1 after each
-    of `PASSES` passes over the prompts, or with those left out.
-
-    Raises:
-        UserError: weights that are not there or do not load.
+    of `PASSES` passes over the prompts, or with those left out. Raises UserError for weights that are not
+    there or do not load.
     """
     most_logit = SEEN if reference.vision else MOST_LOGIT
     plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")

@@ -28,10 +28,7 @@ def examples(
     the most careful of such actions first, and whose viewer sees a conflict, so that there is a reason to be
     seen; a keyed draw decides between equals. A layout in which nothing is safe is passed over, and so are a
     few whose best actions have all been shown oftener than others. `progress` is called with 1 for each
-    layout that gave examples.
-
-    Raises:
-        UserError: the train seeds end before there are enough.
+    layout that gave examples. Raises UserError if the train seeds end before there are enough.
     """
     chosen: dict[str, list[Example]] = {role: [] for role in ROLES}
     times = {role: [0] * len(scenario.actions) for role in ROLES}

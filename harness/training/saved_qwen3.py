@@ -39,11 +39,7 @@ class Saved(NamedTuple):
 
 
 def read(checkpoint: Path, shown: str) -> Saved:
-    """Read the small files of a checkpoint.
-
-    Raises:
-        UserError: one is not there, or says what no GGUF can.
-    """
+    """Read the small files of a checkpoint; UserError if one is not there, or says what no GGUF can."""
     texts = {
         name: text_of(checkpoint / name, "record")
         for name in ("config.json", "tokenizer.json", "tokenizer_config.json", "chat_template.jinja", _PIXELS)

@@ -88,8 +88,7 @@ class Student:
     def heard(self) -> list[Question]:
         """Return the ego's questions with messages in some scenes; the first stages' model states them.
 
-        Raises:
-            UserError: in the scenes that are taken no message reaches the ego.
+        Raises UserError if no message reaches the ego in the scenes that are taken.
         """
         prompts = sum(len(each.prompts) for each in self.lessons)
         most = self.plan.samples["messages"] // (4 * prompts)  # of each scenario

@@ -77,9 +77,7 @@ def run_stage(
     """Train on `count` sequences drawn from `samples`, resuming from the checkpoint `going` if there is one.
 
     `letters` and `digits` are the ids of the tokens that a read-out and a picture's tokens are fitted to.
-
-    Returns:
-        (sequences seen, mean loss since the last) along the way.
+    Returns, along the way, the sequences seen and the mean loss since the last.
     """
     device = next(model.parameters()).device
     blocks = [p for n, p in model.named_parameters() if p.ndim == 2 and "embed" not in n]

@@ -82,18 +82,13 @@ def drive_apart(
 def check(
     scenario: Scenario, episodes: int, seed: int, workers: Workers, progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Drive every reference driver through the same episodes.
-
-    Returns:
-        For each driver: success, collisions, late, time-outs and road departures as `Estimate`s (Wilson, n is
-        episodes), collisions by fault, and the number of crashes between other vehicles.
-    """
+    """Drive every reference driver through the same episodes; return the `summary` of each."""
     outcomes = drive_apart(scenario, range(seed, seed + episodes), workers, progress)
     return {driver: summary([o[driver] for o in outcomes]) for driver in DRIVERS}
 
 
 def summary(outcomes: list[Outcome]) -> dict[str, Any]:
-    """Return the rate of each result, and collisions by fault."""
+    """Return rates of results (Wilson, n is episodes), collisions by fault, and crashes of others."""
     rates = {
         result: rate_interval(np.array([float(outcome.result == result) for outcome in outcomes]))
         for result in ("cleared", "collision", "late", "time_out", "off_road")

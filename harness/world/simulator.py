@@ -33,11 +33,7 @@ FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)  # above this speed highwa
 
 
 class _Road(Road):  # type: ignore[misc]
-    """highway-env's road, which checks only vehicles for collisions that may touch within the frame.
-
-    Attributes:
-        time_s: simulated time at the beginning of the frame.
-    """
+    """highway-env's road, which checks only vehicles for collisions that may touch within the frame."""
 
     time_s = 0.0
 

@@ -55,11 +55,9 @@ LAMPS = AMBIENTS[DAY]  # lamps fade with distance as by day
 
 
 class Frame(Image):
-    """A picture of a vehicle's cameras.
+    """A picture of a vehicle's cameras, with the ids of the vehicles and buildings that it shows.
 
-    Attributes:
-        owners: index in `ids` of the object that each pixel shows, (height, width); -1 for road, grass, sky.
-        ids: ids of vehicles and buildings.
+    `owners` are the places in `ids` of what each pixel shows, (height, width); -1 for road, grass and sky.
     """
 
     def __init__(self, pixels: Pixels, owners: Places, ids: tuple[str, ...]) -> None:
