@@ -15,6 +15,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from harness.core.arrays import Floats
 
 REACH_M = 1500  # vehicles farther away are not sensed
+METRES: Floats = np.abs(np.arange(-REACH_M, REACH_M + 1.0))  # distances of all that may be
 
 # Share of the resources that must be left to choose from (TS 36.213, 14.1.1.6; TS 38.214, 8.1.4).
 LEAST_SHARE = 0.2
@@ -61,8 +62,8 @@ class Scheduling:
 
     def _taken(self, threshold_dbm: float, times: int) -> float:
         """Count the resources taken: those of `times` the sensed packets (29, 29.1; 32, 33)."""
-        metres = np.abs(np.arange(-REACH_M, REACH_M + 1.0))
-        return taken(times * self.per_m * float(self.sensed(metres, threshold_dbm).sum()), self.resources)
+        packets = times * self.per_m * float(self.sensed(METRES, threshold_dbm).sum())
+        return taken(packets, self.resources)
 
     def _same(self, apart_m: Floats, taken: float, threshold_dbm: float) -> Floats:
         """Apply (24) to (27) and (30): the nearer two vehicles are, the more remaining resources they share.
@@ -70,7 +71,7 @@ class Scheduling:
         The result is at least that of two vehicles that sense independently; the source's equations fall
         below that at a busy ratio of about 0.75 and more.
         """
-        sensed = self.sensed(np.abs(np.arange(-REACH_M, REACH_M + 1.0)), self.threshold_dbm)
+        sensed = self.sensed(METRES, self.threshold_dbm)
         size = 2 * sensed.size - 1
         length = next_fast_len(size, real=True)
         both_ways = irfft(rfft(sensed, length) * rfft(sensed[::-1], length), length)

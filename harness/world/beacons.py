@@ -48,12 +48,8 @@ ROUNDING_S = 1e-9
 
 def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
     """Return the newest beacon of the sender that the receiver has; None if it knows the truth instead."""
-    heard = [
-        b
-        for b in state.beacons
-        if b.sender == sender and receiver in b.heard_by and _is_there(b, state.time_s)
-    ]
-    return max(heard, key=lambda b: b.time_s, default=None)
+    heard = [b for b in state.beacons if b.sender == sender and receiver in b.heard_by]
+    return max((b for b in heard if _is_there(b, state.time_s)), key=lambda b: b.time_s, default=None)
 
 
 def known(state: WorldState, sender: str, receiver: str) -> VehicleState:
@@ -181,9 +177,8 @@ def _cam(beacon: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon |
         return replace(beacon, interval_s=round(age_s, 3), unmoved=0)
     if age_s >= last.interval_s:
         unmoved = min((last.unmoved or 0) + 1, UNMOVED)
-        return replace(
-            beacon, interval_s=LONGEST_S if unmoved == UNMOVED else last.interval_s, unmoved=unmoved
-        )
+        interval_s = LONGEST_S if unmoved == UNMOVED else last.interval_s
+        return replace(beacon, interval_s=interval_s, unmoved=unmoved)
     return None
 
 

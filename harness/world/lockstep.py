@@ -106,10 +106,8 @@ def compiled_fleet() -> "type[Fleet] | None":
     try:
         from harness.world.compiled import CompiledFleet
     except Exception as error:  # whatever goes wrong in there, NumPy's numbers are the same
-        print(
-            f"harness: frames are simulated without numba, which does not work here: {printable(error)}",
-            file=sys.stderr,
-        )
+        failed = f"frames are simulated without numba, which does not work here: {printable(error)}"
+        print(f"harness: {failed}", file=sys.stderr)
         return None
     return CompiledFleet
 
@@ -165,13 +163,9 @@ def _lanes(road: Callable[[], Road]) -> Lanes | None:
     arc = np.array([type(lane) is CircularLane for lane in lanes])
 
     def each(name: str, blank: Any, arcs: bool) -> Floats:
-        return np.array(
-            [
-                getattr(lane, name) if is_arc == arcs else blank
-                for lane, is_arc in zip(lanes, arc, strict=True)
-            ],
-            dtype=float,
-        )
+        has = (arc == arcs).tolist()
+        values = [getattr(lane, name) if its else blank for lane, its in zip(lanes, has, strict=True)]
+        return np.array(values, dtype=float)
 
     nowhere = np.zeros(2)
     return Lanes(

@@ -64,13 +64,12 @@ def striker(ego: VehicleState, other: VehicleState) -> str:
     overlap = outline(ego).intersection(outline(other))
     if not overlap.is_empty:
         contact = overlap.centroid
-    fronts = []
-    for v in (ego, other):
+    strikers = []
+    for name, v in (("ego", ego), ("other", other)):
         ahead = (contact.x - v.x_m) * np.cos(v.heading_rad) + (contact.y - v.y_m) * np.sin(v.heading_rad)
-        fronts.append(bool(ahead > v.length_m / 2 - 1.0))
-    return {(True, False): "ego", (False, True): "other", (True, True): "both", (False, False): "neither"}[
-        fronts[0], fronts[1]
-    ]
+        if ahead > v.length_m / 2 - 1.0:
+            strikers.append(name)
+    return "both" if len(strikers) == 2 else strikers[0] if strikers else "neither"
 
 
 def fault(ego: VehicleState, other: VehicleState, paths: Mapping[PathKey, Path]) -> str:

@@ -223,22 +223,16 @@ def vehicle_on(
     road: Any, scenario: Scenario, spawn: Spawn, section: int, position: Sequence[float], heading: float
 ) -> ControlledVehicle:
     """Create a vehicle on a section of its path."""
-    p = scenario.parameters
-    route = list(scenario.road().paths[spawn.approach, spawn.route].lanes)
-    arguments = {
-        "heading": heading,
-        "speed": spawn.speed_mps,
-        "target_lane_index": route[section],
-        "route": route,
-    }
+    p, static = scenario.parameters, scenario.road()
+    route = list(static.paths[spawn.approach, spawn.route].lanes)
+    start = position, heading, spawn.speed_mps, route[section]
     vehicle: ControlledVehicle
     if spawn.part == "ego":
-        vehicle = Ego(None, position, target_speeds=p.target_speeds_mps, **arguments)
+        vehicle = Ego(None, *start, target_speeds=p.target_speeds_mps, route=route)
         vehicle.limits_mps2 = (-p.braking_mps2, p.acceleration_mps2)
-        static = scenario.road()
         vehicle.ways = {static.paths[key].lanes[0]: key[1] for key in static.ways}
     else:
-        vehicle = KINDS[spawn.kind](None, position, **arguments)
+        vehicle = KINDS[spawn.kind](None, *start, route=route)
     vehicle.road = road  # only now: a vehicle that is created with a road searches all of its lanes
     vehicle.spawn = spawn
     vehicle.on_state_update()

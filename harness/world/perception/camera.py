@@ -233,10 +233,7 @@ def _building_walls() -> tuple[Pixels, Lit]:
 
 
 def _paint(
-    wall: Pixels,
-    part: tuple[float, float, float, float],
-    colour: Colour,
-    mirrored: bool = False,
+    wall: Pixels, part: tuple[float, float, float, float], colour: Colour, mirrored: bool = False
 ) -> None:
     """Paint a rectangle, given by shares of the wall's height and length (bottom, top, start, end)."""
     bottom, top, start, end = part
@@ -259,9 +256,8 @@ def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats) ->
         .astype(np.int32).clip(0, len(ground) - 1)
         for k in (0, 1)
     )  # fmt: skip
-    colours = _hazy(
-        ambient.light * np.array([GRASS, ASPHALT, PAINT]), depth_m[:, None], ambient
-    )  # of each row
+    # Of each row.
+    colours = _hazy(ambient.light * np.array([GRASS, ASPHALT, PAINT]), depth_m[:, None], ambient)
     what = ground[y, x] + 3 * np.arange(len(depth_m))[:, None]
     pixels[sky:] = colours.astype(np.uint8).reshape(-1, 3)[what]
     return pixels
