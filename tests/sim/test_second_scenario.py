@@ -33,7 +33,9 @@ def installed(tmp_path_factory):
     info = site / "one_way-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: one-way\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[swarmdrive.scenarios]\n{NAME} = one_way_crossing:SCENARIO\n")
+    (info / "entry_points.txt").write_text(
+        f"[swarmdrive.scenarios]\n{NAME} = one_way_crossing:SCENARIO\nbroken = one_way_crossing:NONE\n"
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(site)
         yield
@@ -49,6 +51,12 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def frozen(folder):
     return load(folder)
+
+
+def test_a_package_that_does_not_load_is_one_line():
+    assert "broken" in scenarios.names()
+    with pytest.raises(UserError, match=r"^plug-in 'broken' \(swarmdrive.scenarios\): .* does not load"):
+        scenarios.get("broken")
 
 
 def test_it_is_found_by_its_entry_point_and_travels_as_name_and_parameters():

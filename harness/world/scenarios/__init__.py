@@ -13,18 +13,18 @@ from typing import Any
 
 from harness.core.config import convert, value_of
 from harness.core.errors import UserError, printable, unknown
-from harness.core.plugins import entries
+from harness.core.plugins import Plugins
 from harness.world.environments import environment
 from harness.world.parameters import Parameters
 from harness.world.scenario import Scenario
 
-GROUP = "swarmdrive.scenarios"
+PLUG_INS = Plugins[Scenario]("swarmdrive.scenarios", Scenario, {})
 DEFAULT = "occluded-intersection"  # taken if none is named
 
 
 def names() -> tuple[str, ...]:
     """Return the names of all scenarios in alphabetical order."""
-    return tuple(sorted({*_files(), *entries(GROUP)}))
+    return tuple(sorted({*_files(), *PLUG_INS}))
 
 
 def get(text: str) -> Scenario:
@@ -65,9 +65,8 @@ def _named(name: str) -> Scenario:
     if is_here(name):
         scenario: Scenario = import_module(f"{__name__}.{name.replace('-', '_')}").SCENARIO
         return scenario
-    if plugin := entries(GROUP).get(name):
-        scenario = plugin.load()
-        return scenario
+    if name in PLUG_INS:
+        return PLUG_INS[name]
     raise unknown("scenario", name, names())
 
 
