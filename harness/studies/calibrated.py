@@ -13,7 +13,7 @@ What decides success is drawn stratified. Every seed has each kind of episode, b
 and who reads it rightly, in its share to within one, and each link's luck is spread evenly over each kind.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from operator import attrgetter
@@ -108,15 +108,15 @@ class _Drawn:
 
 
 def _below(parts: Sequence[_Drawn]) -> _Drawn:
-    """Drawn parts, one below the other."""
+    """Return drawn parts, one below the other."""
 
-    def joint(of: Callable[[_Drawn], Any]) -> Any:
-        return np.concatenate([of(part) for part in parts])
+    def joint(name: str) -> Any:
+        return np.concatenate([attrgetter(name)(part) for part in parts])
 
-    intents = Intents.joined([part.intents for part in parts])
-    draws = Draws(joint(attrgetter("draws.link")), joint(attrgetter("draws.jitter")))
-    right, knowing, witness = (joint(attrgetter(name)) for name in ("right", "knowing", "witness"))
-    return _Drawn(right, intents, knowing, witness, draws)
+    return _Drawn(
+        joint("right"), Intents.joined([part.intents for part in parts]), joint("knowing"), joint("witness"),
+        Draws(joint("draws.link"), joint("draws.jitter")),
+    )  # fmt: skip
 
 
 class CalibratedWorld:

@@ -163,14 +163,13 @@ def run_cells(
     opens, asked = cache(open_backend), dict[tuple[str, str], dict[str, Answer]]()
     cells = []
     pairs = list(product(enumerate(egos, 1), enumerate(helpers, 1)))
-    specs = [
-        replace(spec, ego=ego, helpers=(helper,)) for (_, ego), (_, helper) in pairs
-    ]  # all are checked first
-    for ((i, ego), (j, helper)), of_pair in zip(pairs, specs, strict=True):
+    # All are checked first.
+    specs = [replace(spec, ego=ego, helpers=(helper,)) for (_, ego), (_, helper) in pairs]
+    for ((i, ego), (j, helper)), both in zip(pairs, specs, strict=True):
         roles = {"ego": ego.name, "helper": helper.name, "blind": helper.name}
         given = {k: v for role in roles.items() for k, v in asked.get(role, {}).items()}
         folder = out / "cells" / f"{i}-{j}"
-        run = read_or_evaluate(of_pair, folder, progress, cache_file, opens, given)
+        run = read_or_evaluate(both, folder, progress, cache_file, opens, given)
         for answer in run.answers:
             if answer.role in roles and answer.error is None:
                 asked.setdefault((answer.role, roles[answer.role]), {})[answer.id] = answer
@@ -372,15 +371,13 @@ def _halves(grid: Grid, h: Halves) -> str:
 
 def front(cells: Sequence[Cell], condition: str) -> list[Cell]:
     """Return the cells that none beats in success without taking longer, fastest first."""
+
+    def success(cell: Cell) -> float:
+        return cell.estimate(SUCCESS, condition).value
+
     taken: list[Cell] = []
-    by_latency = sorted(
-        cells, key=lambda c: (c.estimate(LATENCY, condition).value, -c.estimate(SUCCESS, condition).value)
-    )
-    for cell in by_latency:
-        if (
-            not taken
-            or cell.estimate(SUCCESS, condition).value > taken[-1].estimate(SUCCESS, condition).value
-        ):
+    for cell in sorted(cells, key=lambda cell: (cell.estimate(LATENCY, condition).value, -success(cell))):
+        if not taken or success(cell) > success(taken[-1]):
             taken.append(cell)
     return taken
 

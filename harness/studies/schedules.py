@@ -139,16 +139,17 @@ class Compared:
     @property
     def paper(self) -> Play:
         """The paper's schedule at the operating point's tau, with all the helpers that it allows."""
-        return _at(self.plays[PAPER], self._paper)
-
-    @property
-    def _paper(self) -> Candidate:
-        return Candidate(PAPER, self.point.ask.tau_nats, self.point.ask.max_helpers)
+        return _at(self.plays[PAPER], self._untuned(PAPER))
 
     @property
     def everybody(self) -> Play:
         """Always asking all the helpers that the point allows."""
-        return _at(self.plays[ALWAYS], Candidate(ALWAYS, None, self.point.ask.max_helpers))
+        return _at(self.plays[ALWAYS], self._untuned(ALWAYS))
+
+    def _untuned(self, schedule: str) -> Candidate:
+        """Return a schedule at its own threshold, with all the helpers that the point allows."""
+        threshold = self.point.ask.tau_nats if schedule == PAPER else SCHEDULES[schedule].threshold
+        return Candidate(schedule, threshold, self.point.ask.max_helpers)
 
     @cached_property
     def weights(self) -> Floats:
@@ -159,13 +160,11 @@ class Compared:
     def chosen(self, schedule: str) -> Play:
         """Return the play with the most success on tune layouts within the budget; of equals the cheapest.
 
-        Where none is within the budget, it is the cheapest.
-        Without tune layouts it is at the schedule's own threshold, with all helpers that the point allows.
+        Where none is within the budget, it is the cheapest. Without tune layouts it is the untuned one.
         """
         if not self.tune:
-            threshold = self.point.ask.tau_nats if schedule == PAPER else SCHEDULES[schedule].threshold
-            return _at(self.plays[schedule], Candidate(schedule, threshold, self.point.ask.max_helpers))
-        budget = self.budget * _at(self.tune[PAPER], self._paper).messages.mean()
+            return _at(self.plays[schedule], self._untuned(schedule))
+        budget = self.budget * _at(self.tune[PAPER], self._untuned(PAPER)).messages.mean()
         cheapest = min(self.tune[schedule], key=lambda play: play.messages.mean())
         within = [play for play in self.tune[schedule] if play.messages.mean() <= budget] or [cheapest]
         best = max(within, key=lambda play: (round(float(play.success.mean()), 9), -play.messages.mean()))
@@ -196,7 +195,7 @@ class Compared:
         tuned = {play.candidate: play for of in self.tune.values() for play in of}
         return [(play, float(tuned.get(play.candidate, play).success.mean())) for play in every]
 
-    def of_oracle(self) -> list[Play]:
+    def oracle_front(self) -> list[Play]:
         """Return the oracle where a success may cost so many messages at most, from none on."""
         bound, alone = self.oracle, self.plays[NEVER][0].costs
         cheap = [bound.messages <= cap for cap in range(int(bound.messages.max()) + 1)]
@@ -207,7 +206,7 @@ class Compared:
 
     def area(self, schedule: str, cost: str = "messages") -> Estimate:
         """Return success averaged over budgets beyond never asking, with a bootstrap over episodes."""
-        of_bound = [(play, float(play.success.mean())) for play in self.of_oracle()]
+        of_bound = [(play, float(play.success.mean())) for play in self.oracle_front()]
         ranked = of_bound if schedule == ORACLE else self._ranked(schedule)
         success = self._resampled([play.success for play, _ in ranked])
         least = self._resampled([self.plays[NEVER][0].of(cost)])
@@ -426,7 +425,7 @@ def _steps(run: Compared, cost: str) -> Iterator[Steps]:
             name, run.front(name, cost), linestyle="-" if n < len(COLOURS) else ":", markersize=3,
             color=COLOURS[n % len(COLOURS)], marker=MARKERS[n % len(MARKERS)],
         )  # fmt: skip
-    yield steps("oracle, a bound", run.of_oracle(), linestyle="--", color=INK)
+    yield steps("oracle, a bound", run.oracle_front(), linestyle="--", color=INK)
     tau = f"entropy above {run.point.ask.tau_nats:g}"
     yield steps(tau, [run.paper], linestyle="", marker="*", color=INK, markersize=9)
 
