@@ -53,12 +53,8 @@ def run_closed_loop(
 ) -> Study:
     """Drive all grid points. A study that was stopped in `out` continues; `run/` there has the live run.
 
-    Args:
-        spec: the model and how it is asked; its conditions are those of `panels`.
-        out: the study's folder.
-        workers: who drives.
-        progress: called with the number of layouts just driven under all conditions and seeds.
-        cache: file of completions kept between runs.
+    The evaluation's conditions are those of `panels`. `progress` is called with the number of layouts just
+    driven under all of them.
     """
     if (out / RUN / "run.json").is_file():
         done = finished(spec, out / RUN)

@@ -74,40 +74,26 @@ def percent(row: Any, value: str, low: str, high: str) -> str:
 
 
 def write_study(study: Study, out: Path) -> Path:
-    """Write tables, figures, the page, and last the manifest, each file whole; return the page."""
+    """Write figures, tables, the page, and last the manifest, each file whole; return the page."""
     refuse_taken(out, study.kind)
-    write(out, study.figures, study.data)
-    pictures = {
-        stem: (
-            picture(bytes_of(out / f"{stem}.svg", "picture")),
-            round(min(WIDEST_REM, REM_PER_INCH * figure.get_size_inches()[0])),
-        )
-        for stem, figure in study.figures.items()
-    }
+    out.mkdir(parents=True, exist_ok=True)
+    pictures = {}
+    for stem, figure in study.figures.items():
+        lay_out(figure)
+        for kind in FORMATS:
+            save(figure, out / f"{stem}.{kind}", kind, dpi=300)
+        width_rem = round(min(WIDEST_REM, REM_PER_INCH * figure.get_size_inches()[0]))
+        pictures[stem] = picture(bytes_of(out / f"{stem}.svg", "picture")), width_rem
+    for stem, table in study.data.items():
+        write_table(table, out / stem)
     section = Section(
         study.title, study.headline, study.about, study.tables, caveats=study.caveats, pictures=pictures,
         more=study.more,
     )  # fmt: skip
     write_whole(out / "index.html", document([section]))
-    write_manifest(out, study.kind, study.manifest)
+    manifest = json.dumps({"format": f"swarmdrive-{study.kind}/1", **study.manifest}, allow_nan=False)
+    write_whole(out / f"{study.kind}.json", msgspec.json.format(manifest, indent=1) + "\n")
     return out / "index.html"
-
-
-def write(out: Path, figures: Mapping[str, Figure], data: "Mapping[str, pd.DataFrame]") -> None:
-    """Write figures as SVG, PDF and PNG, and tables."""
-    out.mkdir(parents=True, exist_ok=True)
-    for stem, figure in figures.items():
-        lay_out(figure)
-        for kind in FORMATS:
-            save(figure, out / f"{stem}.{kind}", kind, dpi=300)
-    for stem, table in data.items():
-        write_table(table, out / stem)
-
-
-def write_manifest(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
-    """Write what a study was made of as `<kind>.json`."""
-    text = json.dumps({"format": f"swarmdrive-{kind}/1", **manifest}, allow_nan=False)
-    write_whole(out / f"{kind}.json", msgspec.json.format(text, indent=1) + "\n")
 
 
 def write_table(table: "pd.DataFrame", path: Path) -> None:

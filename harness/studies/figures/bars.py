@@ -23,9 +23,7 @@ SHORT = 13  # characters of a name that fit under a bar
 def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) -> Figure:
     """Draw latency, success and communication of the operating points, with 95 % intervals.
 
-    Args:
-        core: the rows of a study's summary that are theirs.
-        paper: the paper's values beside (`harness.studies.ledger.marks`).
+    `core` has the rows of a study's summary that are theirs, `paper` the paper's values (`ledger.marks`).
     """
     figure = Figure(figsize=(7.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     latency, success, talk = drawn = figure.subplots(1, 3)

@@ -29,9 +29,8 @@ BESIDE = {"size": ("effective_loss", "packet loss"), "tau": ("trigger_rate", "tr
 def along(panels: "Sequence[pd.DataFrame]", paper: "pd.DataFrame | None" = None) -> Figure:
     """Draw success along one axis a panel, several sources in one, with loss or trigger rate beside it.
 
-    Args:
-        panels: parts of a study's summary.
-        paper: the paper's values (`harness.studies.ledger.marks`); its best band of tau is drawn with them.
+    Panels are parts of a study's summary. With the paper's values (`ledger.marks`), its best band of tau is
+    drawn.
     """
     figure = Figure(figsize=(2.5 * len(panels) + 0.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     drawn = figure.subplots(1, len(panels), squeeze=False)[0]

@@ -113,15 +113,9 @@ def ask(
 ) -> tuple[list[Pair], str]:
     """Ask about decision points and their twins; the same for any workers.
 
-    What was stopped there before goes on. The working folder stays until `work.tidy`, which whoever writes
-    the result calls.
-
-    Args:
-        questions: what is asked.
-        out: folder of the result.
-        progress: called with 1 for each episode that is done.
-        cache: file of completions kept between runs; None for no cache.
-        workers: who asks, each with a backend of its own.
+    What was stopped in the folder before goes on. The working folder stays until `work.tidy`, which whoever
+    writes the result calls. `progress` is called with 1 for each episode that is done. Completions are kept
+    between runs in the cache file, if there is one. Each worker has a backend of its own.
 
     Returns:
         The pairs of answers; and how many questions of helpers got none, in words, empty if all did. Their
