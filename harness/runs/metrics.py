@@ -155,6 +155,11 @@ def _valid(turns: int) -> Callable[[Answers], Floats]:
     return values
 
 
+def _label(name: str, role: Role) -> str:
+    """Return a label for people; files say `merge` of a fusion call."""
+    return f"{name} {'fusion' if role == 'merge' else role}".replace("_", " ")
+
+
 def _of_answers() -> Iterator[Metric]:
     """Yield the metrics of each role's answers, in the order of a summary's rows."""
     rates: tuple[tuple[tuple[str, str, Better, Callable[[Answers], Floats]], ...], ...] = (
@@ -178,8 +183,9 @@ def _of_answers() -> Iterator[Metric]:
         for role in ROLES:
             for name, meaning, better, values in group:
                 yield Metric(
-                    f"{name}_{role}", meaning, PERCENT, better, "rate", 1.0, answers=values, role=role
-                )
+                    f"{name}_{role}", meaning, PERCENT, better, "rate", 1.0, label=_label(name, role),
+                    answers=values, role=role,
+                )  # fmt: skip
     lengths: tuple[tuple[str, str, Unit, Better, float], ...] = (
         ("prompt_tokens", "tokens of a prompt", COUNT, "lower", math.inf),
         ("completion_tokens", "tokens of an answer", COUNT, "lower", math.inf),
@@ -192,7 +198,10 @@ def _of_answers() -> Iterator[Metric]:
     for role in ROLES:
         for name, meaning, unit, better, most in lengths:
             values = _stated(name)
-            yield Metric(f"{name}_{role}", meaning, unit, better, most=most, answers=values, role=role)
+            label = _label(name, role)
+            yield Metric(
+                f"{name}_{role}", meaning, unit, better, most=most, label=label, answers=values, role=role
+            )
 
 
 BUILT_IN = (
@@ -273,7 +282,7 @@ BUILT_IN = (
     Metric("fusion_ms", "part of the latency that fusion takes: 0 for a rule, which is arithmetic; "
            "ego-prompt calls the model again", MS, "lower", label="fusion", decisions=_column("fusion_ms")),
     _share("merge_failed_rate", "share of answers to fusion calls that could not be read; the ego then kept "
-           "its own intent", "fusion_failed"),
+           "its own intent", "fusion_failed", label="fusion failed rate"),
     Metric("message_count", "number of scheduled replies in the whole run; requests do not count", COUNT,
            "lower"),
     *(Metric(f"latency_p{p}_ms", f"{p} % of all decisions are at most this slow", MS, "lower",
