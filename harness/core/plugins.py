@@ -29,12 +29,8 @@ def _entries(group: str, path: tuple[str, ...]) -> Mapping[str, Any]:
 class Plugins(Mapping[str, T], Generic[T]):
     """Plug-ins by name. A package adds one by an entry point, which is loaded when its name is looked up.
 
-    Built-in ones cannot be replaced.
-
-    Attributes:
-        group: group of the entry points.
-        kind: class or runtime-checkable protocol that every plug-in must be an instance of.
-        built_in: those of the harness itself.
+    Each must be an instance of `kind`, a class or runtime-checkable protocol. Those that are `built_in`
+    cannot be replaced.
     """
 
     def __init__(self, group: str, kind: Any, built_in: Mapping[str, T]) -> None:

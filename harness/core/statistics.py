@@ -71,14 +71,10 @@ def episode_interval(
 ) -> Estimate:
     """Return the mean with Student's t interval over episodes; for shares see `rate_interval`.
 
-    If all episodes are alike, nothing tells how far others would be from them, so the ends are NaN.
-
-    Args:
-        values_by_episode: `(E,)`, or `(E, ...)` with more axes such as steps, over which the mean of an
-            episode's known values is taken; an episode that is all NaN is excluded.
-        episodes: the episode of each of the values `(n,)`, if there is not one value an episode. The mean is
-            then over values, and the variance is that of a ratio of totals (Cochran 1977, section 6.3).
-        level: of confidence.
+    If all episodes are alike, nothing tells how far others would be from them, so the ends are NaN. Values
+    are `(E,)`, or `(E, ...)` with more axes such as steps, over which the mean of an episode's known values
+    is taken; an episode that is all NaN is excluded. Or they are `(n,)` with the episode of each: the mean is
+    then over values, and the variance is that of a ratio of totals (Cochran 1977, section 6.3).
     """
     values = values_by_episode.reshape(len(values_by_episode), math.prod(values_by_episode.shape[1:]))
     means = known_mean(values, axis=-1)

@@ -52,13 +52,9 @@ class Propagation:
     ) -> Floats:
         """Return the mean loss `(...)` of links `(...)`, with the blockage of a vehicle between.
 
-        Args:
-            distance_m: straight distance.
-            sight: `CLEAR`, `VEHICLE` or `BUILDING`.
-            blocker_m: height of the vehicle between; None means the model's own.
-            corner_m: distances of the two ends to the crossing's centre, `(..., 2)`; NaN if the building is
-                not at a corner. Then the NLOS law of TR 37.885 holds for the straight distance.
-            first_m: height of the antenna at one end, if it is not `antenna_m`.
+        The height of a vehicle between, `blocker_m`, is the model's own if None; `first_m` is that of one
+        antenna, if it is not `antenna_m`. `corner_m` are the distances of both ends to the crossing's centre,
+        `(..., 2)`; NaN if the building is not at a corner. Then the NLOS law of TR 37.885 holds.
         """
         distance_m = np.maximum(distance_m, NEAREST_M)
         clear_db = self.clear_db(distance_m, first_m)

@@ -89,14 +89,9 @@ def by_unit(
     take the policy out of the window: it knows the slot that it has taken, and until when the ego waits. An
     ego without a policy by then acts alone.
 
-    Args:
-        channel: the channel of all links.
-        unit: the unit.
-        delay_s: time between what the unit has received and what it sends for that.
-        links: the helpers that the ego wants to be asked; their `ready_s` is not used.
-        draws: the channel's.
-        ready: gives when replies can leave, `(..., H)`, from when helpers have the request, `(..., 1)`.
-        left_s: time until the window closes, `(...)`.
+    `delay_s` lies between what the unit has received and what it sends for that. The `ready_s` of the links
+    is not used: `ready` gives when replies can leave, `(..., H)`, from when helpers have the request,
+    `(..., 1)`. The window closes in `left_s`, `(...)`.
     """
     bits, at_unit = links.request_bits, links.where.units[unit]
     to_ego, to_helpers = draws.of(".roadside-ego"), draws.of(".roadside")

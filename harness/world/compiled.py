@@ -43,11 +43,8 @@ _inner: Callable[[Loop], Loop] = njit(error_model="numpy")  # compiled into the 
 class CompiledFleet(Fleet):
     """A fleet whose frames are compiled; what it holds, and every number, is that of `Fleet`.
 
-    Attributes:
-        way: direction in which each vehicle last moved, rad.
-        cos: its cosine.
-        sin: its sine.
-        ego_lanes: the lanes that the ego may change between, (B, L).
+    It also holds the direction `way` in which each vehicle last moved, rad, with its cosine and sine, and the
+    lanes that the ego may change between, `ego_lanes`, (B, L).
     """
 
     def __init__(self, lanes: Lanes, worlds: Sequence[World]) -> None:

@@ -87,7 +87,7 @@ def network() -> Any:
 def road() -> Road:
     """Return the main road and its ramp; the conflict zone is where the ramp has run into the right lane."""
     ego, main = ("ramp", "merge"), ("main", "straight")
-    paths = paths_along(network(), {
+    ways = {
         main: ([("a", "b", 1), ("b", "c", 1)], ["right lane behind", "right lane"], 1),
         ("main left", "straight"): ([("a", "b", 0), ("b", "c", 0)], ["left lane behind", "left lane"], 1),
         ego: (
@@ -95,7 +95,8 @@ def road() -> Road:
             ["ramp", "merge", "merge", "right lane"],
             0,
         ),
-    })  # fmt: skip
+    }
+    paths = paths_along(network(), ways)
     back_m = np.linspace(*SECTOR_REACH_M, 16)
     return Road(
         facts={"kind": "ramp that merges", "lane_width_m": LANE_WIDTH_M, "ego": "/".join(ego)},

@@ -62,11 +62,12 @@ class Parameters(Common):
 @cache
 def road() -> Road:
     """Return a lane to the east and one to the west, as in highway-env's `TwoWayEnv`."""
-    paths = paths_along(network(), {
+    ways = {
         ("own", BESIDE): ([("a", "b", 0)], [BESIDE], 0),
         ("own", OWN): ([("a", "b", 1)], [OWN], 1),
         ("oncoming", "straight"): ([("b", "a", 0)], [BESIDE], 2),
-    })  # fmt: skip
+    }
+    paths = paths_along(network(), ways)
     ahead = np.linspace(-10.0, 100.0, 12)
     return Road(
         facts={"kind": "two-way road", "lane_width_m": LANE_WIDTH_M},

@@ -91,13 +91,14 @@ def road() -> Road:
     """Return the street. Its conflict zone is where the ego's way has come into the lane."""
     ego, behind = ("own", "pull-out"), ("behind", "straight")
     own = [("space", "pull", 0), ("pull", "swing", 0), ("swing", "out", 0), ("out", "east", 0)]
-    paths = paths_along(network(), {
+    ways = {
         behind: ([("west", "out", 0), own[-1]], ["lane behind", "lane ahead"], 1),
         ("oncoming", "straight"): ([("east", "west", 0)], ["oncoming lane"], 1),
         ("kerb", "parked"): ([("kerb", "end", 0)], ["kerb"], 0),
         ("opposite", "parked"): ([("opposite", "far", 0)], ["opposite kerb"], 0),
         ego: (own, ["own space", "pull-out", "pull-out", "lane ahead"], 0),
-    })  # fmt: skip
+    }
+    paths = paths_along(network(), ways)
     at = crossings(paths, ego)[behind]
     back_m = np.linspace(*SECTOR_REACH_M, 13)
     return Road(
