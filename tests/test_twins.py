@@ -35,7 +35,7 @@ from harness.world.scene_graph import SceneGraph
 
 SHIPPED = sorted(path.parent.name for path in folder("datasets").glob("*/manifest.json"))
 GRAPHS = [name for name, twin in TWINS.items() if twin.graph and not twin.text]
-SAME = [name for name in TWINS if TWINS[name].within is None and not TWINS[name].of_text]
+SAME = [name for name in TWINS if TWINS[name].within is None and not TWINS[name].text_only]
 
 
 @pytest.fixture(scope="module")
@@ -366,7 +366,7 @@ def test_what_always_gives_the_same_answer_holds_what_is_said_of_it(
     of, study = names or tuple(name for name in TWINS if name != "letters"), Questions(spec, tuple(TWINS), 0)
     rows = asked(spec, tmp_path / "out", *of)
     for row in rows:
-        assert row.invariance_rate.value == twins_page.of_constant(study, row.twin), row.twin.name
+        assert row.invariance_rate.value == twins_page.constant_holds(study, row.twin), row.twin.name
     said = twins_page.same_answer(study, rows)
     assert ("letters, of which it holds 0 %" in said) == (mode == "readout")
 

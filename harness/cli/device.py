@@ -58,7 +58,7 @@ def show(
     """
     from harness.runs import devices
     from harness.runs.folder import read
-    from harness.studies.device_fit import declared, fits, of_run
+    from harness.studies.device_fit import answers_of, declared, fits
 
     in_range("--prompt-tokens", prompt_tokens, 1, MOST_TOKENS)
     in_range("--answer-tokens", answer_tokens, 1, MOST_TOKENS)
@@ -66,7 +66,7 @@ def show(
         raise UserError(f"--window-ms {window_ms:g} is out of range; give more than 0, to {MOST_MS}")
     device = devices.load(name)
     rows = [devices.find_row(device, model)] if model else device.rows
-    answers = of_run(read(run)) if run else declared(prompt_tokens, answer_tokens)
+    answers = answers_of(read(run)) if run else declared(prompt_tokens, answer_tokens)
     results = fits(device, rows, answers, window_ms / 1000)
     if as_json:
         echo_json({

@@ -15,10 +15,9 @@ import msgspec
 import numpy as np
 
 from harness.backends.base import Request
-from harness.coordination.coordinate import Coordination, FusionInputs, fuse
+from harness.coordination.coordinate import FusionInputs, fuse
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
-from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import PERCENT, Unit, as_mapping
 from harness.core.figures import shown as figure
@@ -99,16 +98,16 @@ def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[d
     """
     run = stored.run
     here = run.decisions.codes("condition", run.conditions) == run.conditions.index(condition)
-    seeds, came = run.decisions.whole("seed"), dict[str, list[int]]()
+    seeds, by_scene = run.decisions.whole("seed"), dict[str, list[int]]()
     for scene, rows in run.decisions.scenes.items():
         if here_seeds := seeds[rows.start : rows.stop][here[rows.start : rows.stop]].tolist():
-            came[scene] = here_seeds
+            by_scene[scene] = here_seeds
 
     def chance(*key: object) -> float:
         return float(noise.uniforms((1,), "attribution", seed, *key)[0])
 
-    chosen = sorted(came, key=chance)[:sample]
-    return {scene: min(came[scene], key=lambda s: chance(scene, s)) for scene in chosen}, len(came)
+    chosen = sorted(by_scene, key=chance)[:sample]
+    return {scene: min(by_scene[scene], key=lambda s: chance(scene, s)) for scene in chosen}, len(by_scene)
 
 
 def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
@@ -168,7 +167,8 @@ def _messages(
     if not len(decisions):
         return
     broadcast = part.said.take(decisions)
-    whole, at = _taken(part.result, decisions), due.at[decisions]
+    taken = {field.name: getattr(part.result, field.name)[decisions] for field in fields(part.result)}
+    whole, at = replace(part.result, **taken), due.at[decisions]
     rest = whole.on_time & (np.arange(whole.on_time.shape[1]) != helpers[:, None])
     call = None
     if point.has_fusion_call:
@@ -189,10 +189,6 @@ def _messages(
                 scene, stored.dataset.actions, whole.fused[n].tolist(), q, seed=int(due.seed[decisions[n]]),
                 viewer=scene.viewers[0], role="fusion", item=sender, kind=SIGHT if sight else NO_SIGHT,
             )  # fmt: skip
-
-
-def _taken(result: Coordination, at: Ints) -> Coordination:
-    return replace(result, **{field.name: getattr(result, field.name)[at] for field in fields(result)})
 
 
 def _left_out(

@@ -99,7 +99,7 @@ class _Drawn:
             self.right[at], self.intents.take(at), self.knowing[at], self.witness[at], self.draws.take(at)
         )
 
-    def of_first(self, helpers: int) -> "_Drawn":
+    def nearest(self, helpers: int) -> "_Drawn":
         """Return the same with only the first helpers, whose draws no other moves."""
         draws = Draws(self.draws.link[:, :helpers], self.draws.jitter[:, :helpers])
         return replace(
@@ -205,7 +205,7 @@ class Calibrated:
             numbers = first + np.arange(min(CHUNK, self.episodes - first))
             steps = self._of_seeds(tuple(seeds), most, first)
             if setting.vehicles <= most:
-                steps = [step.of_first(setting.vehicles - 1) for step in steps]
+                steps = [step.nearest(setting.vehicles - 1) for step in steps]
             world = CalibratedWorld(steps, seeds, numbers)
             [(columns, places)] = walk_through(world, [setting.point], world, seeds, numbers, TIES)
             success = world.success.reshape(len(seeds), len(numbers)).astype(float)

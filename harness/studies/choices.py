@@ -170,9 +170,9 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
     scenes = dataset.scenes([forest.ids[n] for n in at.tolist()])
     intents = replace(stored.whole(scenes), outlook=outlook(scenario.road(), scenes))
     if point.physical:
-        moments = [(scene.state, scene.viewers) for scene in scenes]
+        places = [(scene.state, scene.viewers) for scene in scenes]
         units = [point.unit] if point.unit else []
-        intents = replace(intents, site=site(moments, units, scenario.road().zone_m))
+        intents = replace(intents, site=site(places, units, scenario.road().zone_m))
     seed, node = (index.ravel() for index in np.indices(shape))
     steps, width = scenario.parameters.decisions, intents.range_m.shape[1]
     draws = channel_draws(

@@ -52,7 +52,7 @@ def declared(prompt_tokens: int, answer_tokens: int) -> Answers:
     return Answers(np.array([float(prompt_tokens)]), output)
 
 
-def of_run(run: Run) -> Answers:
+def answers_of(run: Run) -> Answers:
     """Return the ego's answers of a run, as given, and as if one letter of each prompt were read out.
 
     Raises:

@@ -109,8 +109,8 @@ class ReplayedRun:
             "network": (manifest.networks, lambda name, then: same(asdict(network(name)), then)),
             "schedule": (manifest.schedules, lambda name, then: same(SCHEDULES.file_sha256(name), then)),
         }
-        for what, (of_run, unchanged) in stated.items():
-            for name, recorded in of_run.items():
+        for what, (by_name, unchanged) in stated.items():
+            for name, recorded in by_name.items():
                 if not unchanged(name, recorded):
                     raise UserError(
                         f"{printable(folder)}: {what} {printable(name)} has changed since; restore it or run "

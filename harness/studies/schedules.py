@@ -276,16 +276,16 @@ def compare(
         raise UserError(f"--condition {printable(point.name)}: no schedule changes anything: {why}")
     run = choices(stored, point, seeds, progress)
     tune_run = choices(tune, point, seeds, progress) if tune else None
-    of_run: dict[str, list[Play]] = {}
-    of_tune: dict[str, list[Play]] = {}
+    run_plays: dict[str, list[Play]] = {}
+    tune_plays: dict[str, list[Play]] = {}
     for name in dict.fromkeys((PAPER, NEVER, ALWAYS, RANDOM, *names)):
         tried = candidates(tune_run or run, point, name)
-        of_run[name] = plays(run, point, tried)
+        run_plays[name] = plays(run, point, tried)
         if tune_run:
-            of_tune[name] = plays(tune_run, point, tried)
+            tune_plays[name] = plays(tune_run, point, tried)
         progress(1)
     bound = Play(Candidate(ORACLE, None, point.ask.max_helpers), *run.oracle())
-    return Compared(stored.name, point, tuple(names), of_run, of_tune, bound, budget)
+    return Compared(stored.name, point, tuple(names), run_plays, tune_plays, bound, budget)
 
 
 def run_schedules(

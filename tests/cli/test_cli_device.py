@@ -13,7 +13,7 @@ from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.runs import devices, folder
-from harness.studies.device_fit import declared, fits, held, of_run
+from harness.studies.device_fit import answers_of, declared, fits, held
 
 Said = tuple[int, str, str]
 
@@ -56,7 +56,7 @@ def test_what_is_not_known_is_said(harness: Callable[..., Said]) -> None:
 def test_a_runs_own_tokens(alone: Path, harness: Callable[..., Said]) -> None:
     told, device = folder.read(alone), devices.load("agx-orin")
     row = devices.find_row(device, "qwen3-0.6b")
-    as_read_out, as_written = fits(device, [row], of_run(told), 0.2)
+    as_read_out, as_written = fits(device, [row], answers_of(told), 0.2)
     egos = [a for a in told.answers if a.role == "ego"]
     took = [a.prompt_tokens / 17277.3 + a.completion_tokens / 162.5 for a in egos]
     assert as_written.answer == "json"
@@ -108,7 +108,7 @@ def test_a_run_without_times_or_tokens_is_refused(small: Dataset, tmp_path: Path
     told = folder.read(tmp_path / "proxy")
     device = devices.load("laptop-cpu")
     with pytest.raises(UserError, match="has no token counts"):
-        of_run(told)
+        answers_of(told)
     with pytest.raises(UserError, match="no answer that was asked alone and timed; run it with --batch-size"):
         held(device, device.rows[0], told)
 

@@ -103,7 +103,7 @@ def lack(spec: Spec, twin: Twin) -> str | None:
     language_model = spec.ego.can.language_model
     if twin.actions and spec.scenario.one_sided is not None:
         return f"{twin.needs}: {spec.scenario.one_sided}"
-    if not language_model and twin.of_text:
+    if not language_model and twin.text_only:
         return "a language model"
     return twin.needs if spec.ego.answer not in twin.modes else None
 
@@ -143,7 +143,7 @@ def ask(
         by_episode: dict[int, list[Pair]] = {}
         tally = Tally()
 
-        def took(at: int, asked: tuple[list[Pair], list[Answer]]) -> None:
+        def keep(at: int, asked: tuple[list[Pair], list[Answer]]) -> None:
             by_episode[at], answers = asked
             tally.add(answers)
             answered = [answer for answer in answers if answer.error is None]
@@ -153,7 +153,7 @@ def ask(
         # These are files of one machine.
         files = (cache, place) if isinstance(workers, int) else (None, None)
         asked = partial(_asked, questions, *files)
-        each(asked, points, workers, took, lambda point: f"episode {point[0]}", repeatable=False)
+        each(asked, points, workers, keep, lambda point: f"episode {point[0]}", repeatable=False)
         if tally.missing:
             raise Unanswered(str(tally))
         pairs = [pair for at in range(len(points)) for pair in by_episode[at]]

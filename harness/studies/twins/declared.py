@@ -64,7 +64,7 @@ class Twin:
     constant: bool = True
 
     @property
-    def of_text(self) -> bool:
+    def text_only(self) -> bool:
         """Whether it says nothing to who reads the graph and no text."""
         return bool(self.text or self.senders) and not self.view
 

@@ -72,7 +72,7 @@ def _cells(questions: Questions, row: Row) -> list[str]:
     return [
         Markup('<span id="{}">{}</span>').format(name, row.twin.name), row.role, row.twin.holds,
         shown(row.invariance_rate), shown(row.tv_distance, DISTANCE), PERCENT.number(row.failed_rate.value),
-        str(row.invariance_rate.n), "100" if of_constant(questions, row.twin) else "0", str(row.episodes),
+        str(row.invariance_rate.n), "100" if constant_holds(questions, row.twin) else "0", str(row.episodes),
         row.twin.says, Markup(" ").join(links) or "–",
     ]  # fmt: skip
 
@@ -94,7 +94,7 @@ def mapping(
     table = [
         {
             "twin": row.twin.name, "role": row.role, "holds": row.twin.holds, "episodes": row.episodes,
-            "holds_of_constant": of_constant(questions, row.twin),
+            "holds_of_constant": constant_holds(questions, row.twin),
             **{metric: as_mapping(getattr(row, metric)) for metric in METRICS},
         }
         for row in rows
@@ -133,7 +133,7 @@ def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> li
     return sentences
 
 
-def of_constant(questions: Questions, twin: Twin) -> bool:
+def constant_holds(questions: Questions, twin: Twin) -> bool:
     """Return whether a twin holds of an ego that always gives the same answer: every time, or never.
 
     Over cyclic orders one letter is every action alike, which is the same for the twin.
@@ -143,7 +143,7 @@ def of_constant(questions: Questions, twin: Twin) -> bool:
 
 def same_answer(questions: Questions, rows: Sequence[Row]) -> str:
     """Say what these twins would say of an ego that reads nothing."""
-    broken = list(dict.fromkeys(row.twin.name for row in rows if not of_constant(questions, row.twin)))
+    broken = list(dict.fromkeys(row.twin.name for row in rows if not constant_holds(questions, row.twin)))
     but = f" of every twin but {', '.join(broken)}, of which it holds 0 %" if broken else " of every twin"
     return f"An ego that always gives the same answer holds 100 %{but}: to hold is not to read."
 
