@@ -108,7 +108,7 @@ def one_line(said: Said) -> str:
         (["prompt", "show", "v2"], "Missing option '--scene'"),
         (["prompt", "show", "v99", "--scene", "00000-0"], "unknown prompt 'v99'"),
         (["prompt", "show", "v2", "--scene", "99999-9"], "unknown scene '99999-9'"),
-        (["prompt", "show", "v2", "--scene", "00000-0", "--viewer", "v77"], "unknown viewer 'v77'"),
+        (["prompt", "show", "v2", "--scene", "00000-0", "--viewer", "v77"], "unknown viewer of scene"),
         (["prompt", "check", "v2", "--tokenizer", "absent.gguf"], "no tokenizer at absent.gguf"),
         (["prompt", "release", "v2"], "prompt v2 is released already; copy it to a new version"),
         (["prompt", "release", "v99"], "unknown prompt 'v99'"),

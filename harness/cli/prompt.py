@@ -13,7 +13,7 @@ from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.cli.terminal import console, echo_json
 from harness.core import extras, resources
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.seeds import FIRST
 
@@ -94,9 +94,7 @@ def show(
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
     at = data.scene(scene)
-    if viewer is not None and viewer not in at.viewers:
-        raise unknown("viewer", viewer, at.viewers)
-    viewers = at.viewers if viewer is None else [viewer]
+    viewers = at.viewers if viewer is None else [at.viewer(viewer)]
     words = data.scenario.prompt_words
     reader = pictures.picture_model(prompt, model)
     if reader is None and out:

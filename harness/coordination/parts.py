@@ -4,7 +4,7 @@ Each part checks itself and raises ValueError with the setting, its value and wh
 """
 
 import math
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, get_type_hints
 
 from msgspec import Meta, Struct, ValidationError, convert, structs
 
@@ -12,7 +12,7 @@ from harness.coordination.attacks import attacks_of
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
-from harness.core.config import LONGEST_S, Seconds
+from harness.core.config import LONGEST_S, Seconds, description
 from harness.core.errors import printable, unknown
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
@@ -41,7 +41,7 @@ class Part(Struct, frozen=True, kw_only=True):
                 if isinstance(converted, float) and not math.isfinite(converted):
                     raise ValidationError
             except (ValidationError, OverflowError):
-                raise wrong(key, value, _allowed(hint)) from None
+                raise wrong(key, value, str(description(hint))) from None
             structs.force_setattr(self, key, converted)
         self.check()
 
@@ -52,13 +52,6 @@ class Part(Struct, frozen=True, kw_only=True):
 def wrong(key: str, value: object, allowed: str) -> ValueError:
     """Return the error of a setting that is not allowed."""
     return ValueError(f"{key} is {printable(repr(value))}; it must be {allowed}")
-
-
-def _allowed(hint: Any) -> str:
-    for each in (hint, *getattr(hint, "__args__", ())):
-        for meta in getattr(each, "__metadata__", ()):
-            return str(meta.description)
-    raise AssertionError(hint)
 
 
 class Ask(Part, frozen=True, kw_only=True):

@@ -128,7 +128,7 @@ def check(record: Any) -> None:
         bounds = [meta for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, msgspec.Meta)]
         allowed = [str(choice) for choice in get_args(hint)] if get_origin(hint) is Literal else []
         if not all(meta.ge <= value <= meta.le for meta in bounds) or (allowed and str(value) not in allowed):
-            raise UserError(f"{name} is {value}: give {' or '.join(allowed) or _description(hint)}")
+            raise UserError(f"{name} is {value}: give {' or '.join(allowed) or description(hint)}")
 
 
 def settable(record: Any) -> list[str]:
@@ -200,9 +200,9 @@ def _mistake(table: Mapping[str, Any], kind: Any, where: str) -> UserError:
         return unknown(f"{key} in {_place(where, tables)}", str(value), choices)
     expected, _, got = problem.removeprefix("Expected ").replace("`", "").partition(", got ")
     kinds = " or ".join(_in_words(name) for name in expected.split(" | ") if name != "null")
-    allowed = (" or ".join(_choices(hint)) or kinds) if got else _description(hint) or kinds
+    allowed = (" or ".join(_choices(hint)) or kinds) if got else description(hint) or kinds
     if not problem.startswith("Expected"):
-        allowed = _description(hint) or "a number that a computer holds"
+        allowed = description(hint) or "a number that a computer holds"
     return UserError(f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}")
 
 
@@ -286,8 +286,8 @@ def _choices(hint: Any) -> list[str]:
     return [str(name) for kind in _members(hint) if get_origin(kind) is Literal for name in get_args(kind)]
 
 
-def _description(hint: Any) -> str | None:
+def description(hint: Any) -> str | None:
     """Return the text of a type's `Meta(description=...)`."""
     texts = (meta.description for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, msgspec.Meta))
     members = get_args(hint) if get_origin(hint) in (Annotated, Union, UnionType) else ()
-    return next(filter(None, (*texts, *map(_description, members))), None)
+    return next(filter(None, (*texts, *map(description, members))), None)
