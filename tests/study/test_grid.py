@@ -176,6 +176,17 @@ def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset
     assert page.count("<a href=") == page.count('<a href="cells/1-2/report.html">cells/1-2</a>') == 3
 
 
+def test_names_in_the_figure_stay_inside_of_its_axes() -> None:
+    figures = pytest.importorskip("harness.studies.figures.points", reason="needs the report extra")
+    steps = [figures.Steps("", [x], [x], name=letter * 30) for x, letter in ((0.0, "a"), (100.0, "b"))]
+    figure = figures.fronts([("", "latency of a decision, ms", steps)])
+    figure.draw_without_rendering()
+    [axes] = figure.axes
+    for name in axes.texts:
+        box = name.get_window_extent()
+        assert axes.bbox.x0 < box.x0 < box.x1 < axes.bbox.x1
+
+
 @pytest.mark.slow
 def test_a_grid_is_printed_as_json(harness: Callable[..., Any], small_path: Path) -> None:
     few = ("--dataset", str(small_path), "--limit", "1", "--seeds", "0:1", "--condition", "6g")
