@@ -29,7 +29,7 @@ results: .venv/dev ## docs/results.md and its picture: hours on a CPU; RESULTS="
 	$(BIN)/harness model pull smollm2-135m
 	$(BIN)/python benchmarks/results.py --page docs/results.md --picture docs/pictures/results.svg $(RESULTS)
 
-quick: .venv/dev ## nine tests of ten in a minute: all that are not marked slow
+quick: .venv/dev ## nine tests of ten in about two minutes: all that are not marked slow
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" --hypothesis-profile quick --cpu-limit 0.5
 
 test: check browser ## every check and every test
