@@ -53,6 +53,7 @@ COMMANDS = {
     "radio show": "radio:show",
     "radio check": "radio:check",
     "radio crowd": "radio:crowd",
+    "radio messages": "messages",
 }
 
 GROUPS = {
@@ -64,7 +65,7 @@ GROUPS = {
     "prompt": "List prompt versions; show, check, compare or release them.",
     "dataset": "Build, check, show and rank frozen datasets; list scenarios.",
     "dataset scenario": "List scenarios, show one, drive or audit it.",
-    "radio": "List radios, show one, or check one against published curves.",
+    "radio": "List radios, show or check one; show what messages take.",
 }
 
 # The panels of the first screen.

@@ -44,7 +44,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     from harness.radio.profiles import CHANNELS, outside
     from harness.radio.reception import DISTANCES_M, by_sight
 
-    profile_name, channel = _channel_of(name)
+    profile_name, channel = channel_of(name)
     profile, settings = CHANNELS.profile(profile_name), asdict(channel)
     beyond = outside(settings, profile.limits)
     curves: dict[str, list[float]] = {}
@@ -103,7 +103,7 @@ def check(
     from harness.radio.reception import check as checked
 
     in_range("-n", n, 100, MOST_TRIPS)
-    profile, channel = _channel_of(name)
+    profile, channel = channel_of(name)
     if not isinstance(channel, Physical):
         raise UserError(
             f"{printable(name)} loses the same at every distance, so there is no curve to check; give a "
@@ -195,7 +195,7 @@ def crowd(
     if sight not in SIGHTS:
         raise unknown("--sight", sight, SIGHTS)
     _refuse_format(out)
-    every = {name: _channel_of(name)[1] for name in names} if names else CHANNELS.usable()
+    every = {name: channel_of(name)[1] for name in names} if names else CHANNELS.usable()
     loaded = {
         name: channel for name, channel in every.items()
         if isinstance(channel, Physical) and "density_per_km" in settable(channel)
@@ -237,7 +237,7 @@ def _refuse_format(out: Path | None) -> None:
         raise unknown("--out, a file that ends in", out.suffix, [f".{known}" for known in FORMATS])
 
 
-def _channel_of(text: str) -> "tuple[str, Channel]":
+def channel_of(text: str) -> "tuple[str, Channel]":
     """Return the profile that a condition's text names, and its channel with the text's settings."""
     from harness.coordination.operating_point import named_point
     from harness.radio.wrapped import innermost

@@ -1,0 +1,77 @@
+"""`harness radio messages`: what messages take by the standards' encodings."""
+
+import typer
+
+from harness.cli import options
+from harness.cli.radio import channel_of
+from harness.cli.terminal import echo_json, table
+from harness.core.errors import UserError, in_range, printable, unknown
+from harness.core.figures import Unit
+
+
+def command(
+    name: str | None = typer.Argument(None, help="Message whose members to list, such as CPM."),
+    objects: int = typer.Option(3, help="Objects that a CPM or an SDSM lists, 0 to 255."),
+    optional: bool = typer.Option(
+        True,
+        help="Whether objects have what is optional and scene graphs know: in a CPM speed, heading and "
+        "class, in an SDSM class and lights.",
+    ),
+    points: int = typer.Option(0, help="Points of the path behind in a CAM or BSM, 0 to 23."),
+    actions: int = typer.Option(3, help="Probabilities in an intent, 0 to 255; 0 leaves its words."),
+    text_bytes: int = typer.Option(60, help="Bytes of an intent's evidence, 0 to 10000."),
+    helpers: int = typer.Option(3, help="Helpers that a request asks, 1 to 1000."),
+    channel: str | None = typer.Option(None, help="Physical radio, such as its-g5: adds the time on air."),
+    as_json: options.Json = False,
+) -> None:
+    """Show what messages take by the encodings of ETSI and SAE, in bytes.
+
+    The envelope is signed, with a digest of the sender's certificate or, once a second, the certificate. The
+    headers are those of network and transport. With a message's name, its members are listed, in bits.
+    """
+    from harness.radio.messages import NAMES, Counts, shares, size, wraps
+    from harness.radio.transceiver import Transceiver
+
+    in_range("--objects", objects, 0, 255)
+    in_range("--points", points, 0, 23)
+    in_range("--actions", actions, 0, 255)
+    in_range("--text-bytes", text_bytes, 0, 10_000)
+    in_range("--helpers", helpers, 1, 1000)
+    content = Counts(objects, optional, points, actions, text_bytes, helpers)
+    names = [name for names in NAMES.values() for name in names.values()]
+    if name is not None and name not in names:
+        raise unknown("message", name, names)
+    radio = channel_of(channel)[1] if channel else None
+    if radio is not None and not isinstance(radio, Transceiver):
+        raise UserError(f"--channel {printable(channel)}: give a physical radio, such as its-g5")
+    sizes = {each: size(each, content) for each in ([name] if name else names)}
+    airtimes_s = {each: float(radio.message_s(s.packet)) for each, s in sizes.items() if radio and s.packet}
+    members = []
+    if name and (bits := sizes[name].message):
+        members = [share for share in (*shares(name, content), *wraps(name, bits)) if share.bits]
+    if as_json:
+        echo_json({
+            "content": content._asdict(),
+            "messages": [
+                {"message": each, **{f"{part}_bits": float(bits) for part, bits in s._asdict().items()},
+                 "airtime_s": airtimes_s.get(each)}
+                for each, s in sizes.items()
+            ],
+            "members": [
+                {"member": ".".join(share.path), "bits": float(share.bits), "source": share.source}
+                for share in members
+            ],
+        })  # fmt: skip
+        return
+    heads = ["bytes", "message", "envelope", "headers", "packet", "with certificate"]
+    ms = Unit(decimals=2, factor=1000)
+    table(
+        [*heads, *(["on air, ms"] if radio else [])],
+        [
+            (each, *(f"{bits / 8:g}" for bits in s), *([ms.number(airtimes_s.get(each))] if radio else []))
+            for each, s in sizes.items()
+        ],
+    )
+    if members:
+        typer.echo()
+        table(["bits", ""], [(".".join(share.path), f"{share.bits:g}") for share in members])

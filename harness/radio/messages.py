@@ -1,0 +1,186 @@
+"""The bits of messages by the encoding rules of the standards.
+
+`messages.csv` lists the members of each message: what values a member may have, the bits of one, how often it
+is there, and where it is defined. Messages are in unaligned PER (ITU-T X.691): an integer of n values takes
+the bits of n - 1, as do an enumeration and a choice; an optional member of a sequence takes one bit more, and
+so does whatever may be extended. An open type fills whole octets, behind their number. The signed envelope is
+in OER (X.696), whole octets throughout. So no size depends on values, only on how much is listed.
+
+    etsi   CAM (TS 103 900, and bit for bit EN 302 637-2), CPM (TS 103 324), GeoNetworking and BTP-B
+    sae    BSM (J2735), SDSM (J3224), WSMP (IEEE 1609.3)
+    both   the envelope of IEEE 1609.2 by the profile of TS 103 097: a digest of the sender's certificate, and
+           once a second the certificate
+
+No standard has a message for an intent or for its request. Theirs are containers of our own, made of the
+standards' elements. All sizes are held against an encoder (`benchmarks/message_sizes.py`).
+
+The encoding `json` is the size of a reply's text: `harness.evaluate.asking.payload_bits`.
+"""
+
+import csv
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats
+from harness.core.files import text_of
+
+Encoding = Literal["etsi", "sae"]
+Count = Floats | Bools | float
+# Message by encoding and content. A text is an intent without probabilities.
+NAMES: Mapping[Encoding, Mapping[str, str]] = {
+    "etsi": {"beacon": "CAM", "objects": "CPM", "intent": "etsi-intent", "request": "etsi-request"},
+    "sae": {"beacon": "BSM", "objects": "SDSM", "intent": "sae-intent", "request": "sae-request"},
+}
+MOST = {"CPM": 255, "SDSM": 256}  # objects in one message
+CERTIFICATE_EVERY_S = 1.0
+# Number of an application (ITS-AID in TS 102 965, PSID in IEEE 1609.12). A container of ours has none yet: in
+# its place is any that takes two octets.
+PSIDS, OTHER_PSID = {"CAM": 36, "BSM": 32, "CPM": 639, "SDSM": 144}, 1000
+# Sizes in octets from which the number of octets takes one octet more: X.691 11.9, X.696 8.6.
+LENGTHS = {"open": (0, 128), "opaque": (0, 128, 256)}
+
+
+class Counts(NamedTuple):
+    """How much a message holds; each message has its part of it. Arrays broadcast."""
+
+    objects: Count = 0  # listed in a CPM or SDSM
+    # whether objects have what is optional and scene graphs know: in a CPM speed, heading and class, in an
+    # SDSM class and lights
+    optional: Count = True
+    points: Count = 0  # of the path behind, in a CAM's low-frequency container or a BSM's part II
+    actions: Count = 0  # whose probabilities are in an intent
+    text_bytes: Count = 0  # of an intent's evidence
+    helpers: Count = 1  # whom a request asks
+
+
+class Member(NamedTuple):
+    """A row of the table."""
+
+    type: str  # the message or sequence that it is a member of
+    member: str
+    values: str  # what it may be; or its type, `open` or `opaque` if that is in octets behind their number
+    bits: int | None  # None where a type says it
+    each: str  # what there is one of it for, such as a field of `Counts`; empty if nothing
+    source: str
+
+
+class Share(NamedTuple):
+    """What a member takes in a message, all of its kind together."""
+
+    path: tuple[str, ...]  # names of the member and of those that it is in, the outermost first
+    bits: Floats
+    source: str
+
+
+class Size(NamedTuple):
+    """What a message takes, in bits."""
+
+    message: Floats
+    envelope: Floats  # with the digest of the certificate
+    headers: Floats  # of network and transport
+    packet: Floats  # all three
+    with_certificate: Floats  # the packet that has the certificate
+
+
+@cache
+def table() -> Mapping[str, tuple[Member, ...]]:
+    """Return the members of each type, in their order."""
+    members: dict[str, tuple[Member, ...]] = {}
+    for row in csv.DictReader(text_of(Path(__file__).with_name("messages.csv")).splitlines()):
+        bits = int(row.pop("bits") or -1)
+        member = Member(**row, bits=None if bits < 0 else bits)
+        members[member.type] = (*members.get(member.type, ()), member)
+    return members
+
+
+def message_bits(name: str, content: Counts) -> Floats:
+    """Return the bits of a message of `NAMES`, in whole octets; 0 where none is sent.
+
+    An SDSM lists at least one object, so a vehicle that sees none sends none.
+
+    Raises:
+        ValueError: more objects than the message may list.
+    """
+    bits, objects = _total(shares(name, content)), np.asarray(content.objects)
+    if name in MOST and np.any(objects > MOST[name]):
+        raise ValueError(f"{name} of {np.max(objects):g} objects: it lists {MOST[name]} at most")
+    return np.where(objects > 0, bits, 0.0) if name == "SDSM" else bits
+
+
+def shares(name: str, content: Counts) -> list[Share]:
+    """Return what each member of a message takes; the last is what fills the octet."""
+    counts = {**content._asdict(), "path": np.asarray(content.points) > 0}
+    members = list(_shares(name, counts, 1.0, ()))
+    return [*members, Share(("filling",), -_total(members) % 8, "X.691 11.1")]
+
+
+def packet_bits(
+    name: str, bits: Floats | float, since_certificate_s: Floats | float = 0.0, headers: bool = True
+) -> Floats:
+    """Return the bits of a message with what `wraps` it, 0 where the message has none."""
+    bits = np.asarray(bits, dtype=float)
+    return np.where(bits > 0, bits + _total(wraps(name, bits, since_certificate_s, headers)), 0.0)
+
+
+def wraps(
+    name: str, bits: Floats | float, since_certificate_s: Floats | float = 0.0, headers: bool = True
+) -> list[Share]:
+    """Return what a message's signed envelope takes, and the headers of network and transport.
+
+    Args:
+        name: a message of `NAMES`.
+        bits: its bits.
+        since_certificate_s: seconds since the sender's last message with its certificate. From a second on
+            this one has it, else the certificate's digest.
+        headers: whether those of GeoNetworking and BTP-B, or of WSMP, count. Those of the radio never do:
+            `its-g5` adds its `header_bytes`, and a sidelink's blocks are taken as they are.
+    """
+    encoding = next(encoding for encoding, names in NAMES.items() if name in names.values())
+    certificate = np.asarray(since_certificate_s) >= CERTIFICATE_EVERY_S
+    psid = PSIDS.get(name, OTHER_PSID)
+    counts: dict[str, Count] = {
+        "psid": 1 + (psid > 255), "p_encoded_psid": 1 + (psid > 127),
+        "certificate": certificate, "digest": ~certificate,
+    }  # fmt: skip
+    added, octets = list[Share](), np.asarray(bits, dtype=float) / 8
+    for layer in (f"{encoding}-network", "envelope", f"{encoding}-link") if headers else ("envelope",):
+        inside = _shares(layer, {**counts, "payload": octets}, 1.0, (layer,))
+        own = [share for share in inside if share.path[-1] != "content"]
+        octets = octets + _total(own) / 8
+        added += own
+    return added
+
+
+def size(name: str, content: Counts) -> Size:
+    """Return what a message takes with its envelope and headers."""
+    bits = message_bits(name, content)
+    signed, packet = packet_bits(name, bits, headers=False), packet_bits(name, bits)
+    return Size(bits, signed - bits, packet - signed, packet, packet_bits(name, bits, CERTIFICATE_EVERY_S))
+
+
+def _total(shares: Iterable[Share]) -> Floats:
+    return np.asarray(sum(share.bits for share in shares), dtype=float)
+
+
+def _shares(
+    kind: str, counts: Mapping[str, Count], times: Floats | float, path: tuple[str, ...]
+) -> Iterator[Share]:
+    """Yield the shares of a type's members; one in octets behind their number is there once at most."""
+    for member in table()[kind]:
+        here = (*path, member.member)
+        number = np.asarray(times * (counts.get(member.each, 0) if member.each else 1), dtype=float)
+        if member.bits is not None:
+            yield Share(here, number * member.bits, member.source)
+            continue
+        wrap, _, inner = member.values.rpartition(" ")
+        inside = list(_shares(inner, counts, number, here))
+        yield from inside
+        if wrap:
+            bits = _total(inside)
+            octets = np.ceil(bits / 8)
+            length = np.searchsorted(LENGTHS[wrap], octets, side="right")
+            yield Share((*here, "length"), number * (8 * (length + octets) - bits), "X.691 11.9, X.696 8.6")
