@@ -206,15 +206,19 @@ def plugin(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(ATTACKS._loaded, "mumble", MUMBLE)
 
 
+def under(attack: str) -> OperatingPoint:
+    """The operating point that an attack is for."""
+    content = "both" if ATTACKS[attack.partition(":")[0]].in_objects else "intent"
+    return named_point(f"6g:content={content},attack={attack}")
+
+
 @pytest.mark.usefixtures("plugin")
 @pytest.mark.parametrize("name", [*ATTACKS, "mumble"])
 def test_every_attack_leaves_distributions_and_the_honest_alone(name: str):
     rng = np.random.default_rng(3)
     p = rng.dirichlet(np.ones(3), (40, 3))
     truth = replace(many(TRUTH, 40), helpers=p)
-    told = Attackers(named_point(f"6g:attack={name}")).said(
-        truth, drawn(range(40)), [(n, n) for n in range(40)]
-    )
+    told = Attackers(under(name)).said(truth, drawn(range(40)), [(n, n) for n in range(40)])
     assert told.intents.helpers.sum(axis=-1) == pytest.approx(1.0)
     honest = ~told.attackers[:, :3]
     assert (told.intents.helpers[:, :3][honest] == p[honest]).all()
@@ -225,7 +229,7 @@ def test_every_attack_leaves_distributions_and_the_honest_alone(name: str):
 @pytest.mark.usefixtures("plugin")
 @pytest.mark.parametrize("name", [*ATTACKS, "mumble"])
 def test_an_attack_of_nobody_changes_nothing(name: str):
-    told = Attackers(named_point(f"6g:attack={name}:share=0")).said(TRUTH, drawn([0]), [(0, 0)])
+    told = Attackers(under(f"{name}:share=0")).said(TRUTH, drawn([0]), [(0, 0)])
     assert not told.attackers.any()
     for field, array in TRUTH.arrays().items():
         assert np.array_equal(getattr(told.intents, field), array), field

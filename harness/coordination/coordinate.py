@@ -2,8 +2,8 @@
 
 First comes the exchange of messages (its timeline is in `exchange.py`), then fusion. A consensus rule is
 arithmetic and takes no time. `ego-prompt` makes a fusion call: after the exchange the ego's model answers
-with the messages in its prompt, and the decision takes that much longer. An ego that has heard nobody acts on
-its own intent at once.
+with the messages in its prompt, and the decision takes that much longer; so does a content that makes the
+ego's scene graph larger. An ego that has heard nobody acts on its own intent at once.
 """
 
 from collections.abc import Callable
@@ -89,18 +89,23 @@ def fuse(
     heard_any = any_of(heard.on_time)
     trust = np.full(heard.on_time.shape, np.nan)
     latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)
-    if point.fusion.consensus == EGO_PROMPT:
+    answers = point.has_fusion_call and (point.fusion.consensus == EGO_PROMPT or not point.content.intent)
+    if point.has_fusion_call:
         if fusion.call is None:
-            raise ValueError(f"consensus {point.fusion.consensus} needs a fusion call")
+            raise ValueError(f"operating point {point.name} needs a fusion call")
         fused, seconds = fusion.call(heard.on_time)
         if "majority" in point.guard.defences:
             voices = np.insert(heard.on_time, 0, True, axis=-1)
             fused = outvoted(fused, p, voices, np.sum(voices, axis=-1) // 2 + 1)
         failed = heard_any & np.any(np.isnan(fused), axis=-1)
-        weights = np.where(heard_any[..., None], np.nan, weights)
         latency_s = latency_s + np.where(heard_any, seconds, 0.0)
+        fused = np.where((heard_any & ~failed)[..., None], fused, heard.own)
+    if answers:
+        weights = np.where(heard_any[..., None], np.nan, weights)
         state = np.zeros((*failed.shape, 0))
     else:
+        if point.has_fusion_call:  # the ego's own intent is its answer to the larger graph
+            p[..., 0, :] = fused
         rule, (*batch, vehicles, actions) = RULES[point.fusion.consensus], p.shape
         messages = Messages(
             p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, intents.claims
@@ -108,7 +113,7 @@ def fuse(
         state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
         fused, weights, state, rule_trust = rule.fuse(messages, state)
         trust = trust if rule_trust is None else np.where(heard.on_time, rule_trust, np.nan)
-    fused = np.where((heard_any & ~failed)[..., None], fused, heard.own)
+    fused = np.where(heard_any[..., None], fused, heard.own)
     unknown = np.isnan(intents.inference_s[..., 0]) & (point.cloud.round_trip_s is None)
     return Coordination(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},

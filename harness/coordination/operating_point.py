@@ -7,7 +7,8 @@ from typing import Any, NamedTuple, get_type_hints
 
 from msgspec import structs
 
-from harness.coordination.attacks import attacks_of, in_text
+from harness.coordination.attacks import ATTACKS, Absent, attacks_of, in_question
+from harness.coordination.contents import CONTENTS, OBJECTS, Content
 from harness.coordination.parts import FUSION, RELAY, Ask, Cloud, Fusion, Guard, Part, Radio, wrong
 from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES
@@ -39,8 +40,10 @@ class Rewrites(NamedTuple):
     """How a fusion call shows messages."""
 
     blind: bool = False  # whether they come from helpers that are shown nothing
-    attack: str = ""  # the attack that changes attackers' messages (`attacks.in_text`); empty for none
+    attack: str = ""  # the attack that changes attackers' messages (`attacks.in_question`); empty for none
     defences: tuple[str, ...] = ()  # the defences that change every message
+    graph: str = ""  # what the ego's graph is extended by (`contents.Content`)
+    words: bool = True  # whether the prompt shows the messages
 
 
 AS_SENT = Rewrites()
@@ -76,17 +79,32 @@ class OperatingPoint:
         if self.cloud.round_trip and self.has_fusion_call:
             allowed = f"left out where consensus is {EGO_PROMPT}, which asks twice"
             raise wrong("round_trip", self.cloud.round_trip, allowed)
+        if self.content.graph and self.ask.messages == "shuffled":
+            raise wrong("messages", "shuffled", f"own or blind where content is {self.ask.content}")
+        attacks = attacks_of(self.guard.attack)
+        if any(attack.in_objects for attack in attacks) and self.content.graph != OBJECTS:
+            raise wrong("attack", self.guard.attack, "one on intents where content lists no objects")
+        on_objects = all(attack.in_objects or isinstance(attack, Absent) for attack in attacks)
+        if not (self.content.intent or on_objects):
+            able = ", ".join(name for name in ATTACKS if ATTACKS[name].in_objects)
+            where = f"where content is {self.ask.content}, which holds no intents"
+            raise wrong("attack", self.guard.attack, f"some of {able} and absent {where}")
+        if self.has_fusion_call and not all(attack.by_scene for attack in attacks):
+            allowed = "one that needs no past and adds no voices where the ego is asked twice"
+            raise wrong("attack", self.guard.attack, allowed)
         if self.fusion.consensus != EGO_PROMPT:
             if self.guard.defence:
                 raise wrong("defence", self.guard.defence, f"left out where consensus is not {EGO_PROMPT}")
             return
         where = f"where consensus is {EGO_PROMPT}"
+        if not self.content.intent:
+            raise wrong(
+                "content", self.ask.content, f"intent or both {where}, which reads the helpers' words"
+            )
         if self.radio.edge == FUSION:
             raise wrong("edge", FUSION, f"none or relay {where}: a unit has no model")
         if self.ask.messages == "shuffled":
             raise wrong("messages", "shuffled", f"own or blind {where}")
-        if not all(attack.by_scene for attack in attacks_of(self.guard.attack)):
-            raise wrong("attack", self.guard.attack, f"one that needs no past and adds no voices {where}")
 
     @classmethod
     def of(cls, name: str, profile: str | None = None, **settings: Any) -> "OperatingPoint":
@@ -248,9 +266,15 @@ class OperatingPoint:
         return frozenset(need for part in parts for need in getattr(part, "needs", ()))
 
     @property
+    def content(self) -> Content:
+        """What a message holds."""
+        return CONTENTS[self.ask.content]
+
+    @property
     def has_fusion_call(self) -> bool:
-        """Whether fusion asks the ego's model a second time, with the messages."""
-        return self.radio.profile is not None and self.fusion.consensus == EGO_PROMPT
+        """Whether fusion asks the ego's model a second time, with the messages or what they add."""
+        second = self.fusion.consensus == EGO_PROMPT or bool(self.content.graph)
+        return self.radio.profile is not None and second
 
     @property
     def blind_helpers(self) -> bool:
@@ -261,7 +285,10 @@ class OperatingPoint:
     def rewrites(self) -> "Rewrites":
         """How its fusion calls show messages."""
         shows = tuple(part for part in self.guard.defences if part != "majority")
-        return Rewrites(self.blind_helpers, in_text(self.guard.attack), shows)
+        words = self.fusion.consensus == EGO_PROMPT
+        graph = self.content.graph
+        attack = in_question(self.guard.attack, words, bool(graph))
+        return Rewrites(self.blind_helpers, attack, shows, graph, words)
 
     def _wrong(self, key: str, allowed: str) -> UserError:
         return _error_of(self.name, wrong(key, self.setting(key), allowed))

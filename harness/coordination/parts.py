@@ -9,6 +9,7 @@ from typing import Annotated, get_type_hints
 from msgspec import Meta, Struct, ValidationError, convert, structs
 
 from harness.coordination.attacks import attacks_of
+from harness.coordination.contents import CONTENTS, INTENT
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
@@ -75,10 +76,13 @@ class Ask(Part, frozen=True, kw_only=True):
     # What the ego hears: its `own` helpers, or as a control helpers of another layout (`shuffled`) or helpers
     # that are shown nothing (`blind`). A gain that remains under a control is not from what helpers see.
     messages: Text = "own"
+    content: Text = INTENT  # what a message holds (`harness.coordination.contents`)
 
     def check(self) -> None:
         if self.messages not in MESSAGES:
             raise unknown("messages", self.messages, MESSAGES)
+        if self.content not in CONTENTS:
+            raise unknown("content", self.content, CONTENTS)
         if self.schedule == ORACLE:
             raise ValueError(
                 f"schedule {ORACLE} looks at how scenes end; `harness study schedule compare` plays it, and "

@@ -25,6 +25,7 @@ from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of
 from harness.evaluate.kept_answers import KeptAnswers
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
+from harness.evaluate.sharing import shared_graphs
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Fuses
 from harness.parsing.parse import parse
@@ -32,6 +33,7 @@ from harness.runs.records import BLIND, REWRITTEN, Answer, Latency
 from harness.runs.records import Role as RecordedRole
 from harness.runs.unanswered import HELPERS, Tally
 from harness.world.perception.graph import truth_graph
+from harness.world.scene_graph import SceneGraph
 
 T = TypeVar("T")
 CHUNK = 64  # fewest requests that are asked, and kept, together
@@ -87,13 +89,21 @@ def _blank(spec: Spec, index: int, role: Role) -> Request:
 
 
 def fusion_request(
-    spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str]
-) -> Request:
-    """Return the fusion call with these senders' messages; `answers` has the same keys as `senders`."""
-    graph, heard = scene.graphs[scene.viewers[0]], messages_of(answers, senders, spec.actions)
-    messages = spec.ego.rendered(graph, spec.actions, heard, spec.scenario.prompt_words)
-    image = picture(spec, 0, scene, scene.viewers[0])
-    return _blank(spec, 0, "ego").alike(id=_fusion_id(scene, senders), messages=messages, image=image)
+    spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str],
+    graph: SceneGraph | None = None,
+) -> Request:  # fmt: skip
+    """Return the fusion call with these senders' messages; `answers` has the same keys as `senders`.
+
+    With a `graph`, the ego is asked with this one instead of its own.
+    """
+    own, heard = scene.graphs[scene.viewers[0]], messages_of(answers, senders, spec.actions)
+    words, name = spec.scenario.prompt_words, _fusion_id(scene, senders)
+    image = picture(spec, 0, scene, scene.viewers[0]) if spec.ego.sees else None
+    blank = _blank(spec, 0, "ego").alike(id=name, image=image, view=graph or own, scenario=spec.scenario)
+    if heard:
+        return blank.alike(messages=spec.ego.rendered(graph or own, spec.actions, heard, words))
+    truth = truth_graph(spec.scenario, scene.state) if spec.ego.card.privileged else None
+    return blank.alike(**spec.ego.chats(graph or own, spec.actions, words), truth=truth)
 
 
 def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:
@@ -360,11 +370,17 @@ class Asker:
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> list[Request]:
         """Return the requests of the fusion calls with these sets of messages."""
+        sets = list(_heard_sets(scenes, codes, rewrites))
+        missing = [each for each in sets if _fusion_id(*each) not in self.answers]
+        graphs = dict(
+            zip(map(id, missing), shared_graphs(self.spec.scenario, missing, rewrites), strict=True)
+        )
         calls = []
-        for scene, senders in _heard_sets(scenes, codes, rewrites):
-            keys = (key.partition(REWRITTEN)[0] for key in senders)
+        for heard in sets:
+            scene, senders = heard
+            keys = (key.partition(REWRITTEN)[0] for key in senders) if rewrites.words else ()
             sent = {key: a for key in keys if (a := self.answers.get(f"{scene.id}/{key}"))}
-            calls.append(fusion_request(self.spec, scene, sent, senders))
+            calls.append(fusion_request(self.spec, scene, sent, senders, graphs.get(id(heard))))
         return calls
 
     def answer(self, requests: Sequence[Request]) -> None:

@@ -13,12 +13,15 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.attacks import Turn, attacks_of
+from harness.coordination.contents import OBJECTS, TRUTH
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import Rewrites
 from harness.core.arrays import Bools, Floats, Ints
 from harness.evaluate.repair import as_text
 from harness.runs.records import BLIND, REWRITTEN, Answer
+
+WORDS = "words"  # in a key, after what the graph is extended by: the prompt shows the messages, too
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,13 @@ def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list
 
 
 def key_of(helper: str, rewrites: Rewrites, attacks: bool) -> str:
-    """Return the key of a helper's message in a fusion call, such as `v2`, `v2~blind` or `v3!liar&schema`."""
+    """Return the key of a helper's message in a fusion call.
+
+    Such as `v2`, `v2~blind`, `v3!liar&schema`, or `v2!objects` where the ego's graph has its objects.
+    """
     changed = [*([rewrites.attack] if attacks and rewrites.attack else []), *rewrites.defences]
+    if rewrites.graph:
+        changed += [rewrites.graph, *([WORDS] if rewrites.words else [])]
     return helper + BLIND * rewrites.blind + (REWRITTEN + "&".join(changed) if changed else "")
 
 
@@ -79,6 +87,8 @@ def messages_of(
         if (answer := answers.get(key)) and answer.intent and answer.message:
             message = {"intent": list(answer.intent), **answer.message}
             for change in filter(None, changes.split("&")):
+                if change in (WORDS, OBJECTS, TRUTH):
+                    continue
                 message = _rewritten(message, change, actions)
             # No special token of a chat template gets through.
             message["evidence"] = as_text(message["evidence"] or "")
@@ -93,6 +103,8 @@ def _rewritten(message: dict[str, Any], change: str, actions: Sequence[str]) -> 
     if change == "quoted":
         return {**message, "evidence": json.dumps(message["evidence"], ensure_ascii=False)}
     [attack] = attacks_of(change)
+    if attack.in_objects:
+        return message
     p = np.array([[message["intent"]]])
     one_helper = Intents(
         np.full((1, p.shape[-1]), np.nan), p, np.ones((1, 1), dtype=bool), np.zeros((1, 2)), np.zeros((1, 1)),

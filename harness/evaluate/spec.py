@@ -230,7 +230,7 @@ class Spec:
         shown, ego = f"condition {printable(point.name)}", self.ego
         if point.ask.messages == "shuffled" and self.source.kind != "frozen":
             raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
-        if not point.has_fusion_call:
+        if not (point.has_fusion_call and point.rewrites.words):
             return
         reason = self.fusion_obstacle
         if not ego.can.language_model:

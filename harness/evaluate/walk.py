@@ -23,6 +23,7 @@ from harness.evaluate.claims import claims
 from harness.evaluate.draws import tie_draws
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.outlook import outlook
+from harness.evaluate.sharing import object_bits
 from harness.radio.channel import Draws, Site, Unit
 from harness.world.scenario import Scenario
 from harness.world.sight_lines import site
@@ -80,6 +81,10 @@ class World(Protocol[DecisionPoint]):
         """Return what helpers claim in the points just shown, (n, ...); None in a world without places."""
         ...
 
+    def object_bits(self) -> Floats | None:
+        """Return the size of what helpers list, (n, H); None in a world without places."""
+        ...
+
     def step(self, decided: Sequence[Decided[DecisionPoint]]) -> None:
         """Act on the decisions, one `Decided` a condition, and advance to the next decision points."""
         ...
@@ -100,6 +105,10 @@ class SceneWorld:
 
     def claims(self) -> Claims:
         return claims(self.scenario, self.scenes)
+
+    def object_bits(self) -> Floats:
+        """Return the size of what the helpers of each scene list."""
+        return object_bits(self.scenes)
 
 
 class Fuses(Protocol):
@@ -151,6 +160,8 @@ def walk(
             intents = replace(intents, outlook=world.outlook())
         if any(point.needs("claims") for point in due):
             intents = replace(intents, claims=world.claims())
+        if any(point.content.graph for point in due):
+            intents = replace(intents, object_bits=world.object_bits())
         asked_blind = [each.at for point, each in due.items() if point.blind_helpers]
         blind = ask.blind(decision_points, np.unique(np.concatenate(asked_blind))) if asked_blind else None
         intents, blind = _asked(ask, decision_points, due, intents, blind)
@@ -215,6 +226,10 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
     """
     every = np.array_equal(due.at, np.arange(len(intents.own)))
     own = intents if every else intents.take(due.at)
+    if point.asks and point.content.graph:
+        own = own.with_objects(point.content.intent)
+    if not point.content.intent:
+        return own
     if point.blind_helpers:
         assert blind is not None
         source = blind.take(due.at)

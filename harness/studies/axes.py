@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.attacks import ATTACKS
+from harness.coordination.contents import CONTENTS
 from harness.coordination.operating_point import POINTS, SETTINGS, SHORT, OperatingPoint, setting_of
 from harness.coordination.rules import POOLS, names
 from harness.coordination.schedules import SCHEDULES
@@ -66,6 +67,7 @@ AXES = {
         Axis("latency", "nominal latency of the channel, ms", *SHORT["latency"], "0,5,10,25,50,100"),
         Axis("window", "decision window, ms", *SHORT["window"], "150:400:25"),
         Axis("consensus", "consensus", "consensus", 1.0, ",".join(POOLS), worded=True),
+        Axis("content", "content of a message", "content", 1.0, ",".join(CONTENTS), worded=True),
         Axis("attack", "attack", "attack", 1.0, ",".join((NONE, *USUAL_ATTACKS)), worded=True),
     )
 }

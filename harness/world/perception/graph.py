@@ -49,7 +49,7 @@ def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
 def truth_graphs(scenario: Scenario, states: Sequence[WorldState]) -> list[SceneGraph]:
     """Return the `truth_graph` of each state."""
     exact = [list(map(_exact, state.vehicles[1:])) for state in states]
-    return _graphs(scenario, [(state, state.ego) for state in states], exact, [[] for _ in states])
+    return listed_graphs(scenario, [(state, state.ego) for state in states], exact, [[] for _ in states])
 
 
 def _exact(v: VehicleState) -> Detection:
@@ -72,10 +72,10 @@ def _perceived(scenario: Scenario, looks: Sequence[Look], left_out: Collection[s
             reported[n, place] = True
     # An undetected vehicle must not reveal itself by what it hides.
     solid = ~around.vehicle | reported[around.viewer, around.place]
-    return _graphs(scenario, looks, detected, _sectors(scenario.road(), around, solid))
+    return listed_graphs(scenario, looks, detected, _sectors(scenario.road(), around, solid))
 
 
-def _graphs(
+def listed_graphs(
     scenario: Scenario, looks: Sequence[Look], detected: Sequence[Sequence[Detection]],
     sectors: Sequence[Sequence[Sector]],
 ) -> list[SceneGraph]:  # fmt: skip

@@ -26,6 +26,8 @@ HALF_FIELD_RAD = np.radians(60.0)
 LEAST_RAYS = 3  # rays on an object below which no sensor reports it
 # Standard deviations: the LiDAR's position on each axis, the radar's range.
 LIDAR_NOISE_M, RADAR_NOISE_M = 0.1, 0.4
+BEARING_NOISE_RAD = np.radians(1.0)  # of the radar
+SPEED_NOISE_MPS = {True: 0.2, False: 0.8}  # with the radar, or by the LiDAR's tracking alone
 # Names of the sensors that report, by whether each of them does.
 SENSORS = {
     flags: tuple(compress(("camera", "lidar", "radar"), flags)) for flags in product((False, True), repeat=3)
@@ -87,7 +89,7 @@ def detections(
         z[:, k] = draws.standard_normal(8)
 
     # Across the bearing the radar is far coarser than the LiDAR, whose position is taken if both see.
-    r, b = distance + RADAR_NOISE_M * z[0], bearing + np.radians(1.0) * z[1]
+    r, b = distance + RADAR_NOISE_M * z[0], bearing + BEARING_NOISE_RAD * z[1]
     x_m = np.where(lidar, x + LIDAR_NOISE_M * z[0], its_x + r * np.cos(b))
     y_m = np.where(lidar, y + LIDAR_NOISE_M * z[1], its_y + r * np.sin(b))
     # The velocity relative to the viewer.
@@ -95,7 +97,7 @@ def detections(
     ways = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
     rate = np.vecdot(np.stack(parting, axis=-1), ways) + 0.15 * z[2]
     its_heading_rad = heading + np.radians(2.0) * z[3]
-    speed_mps = np.maximum(speed + np.where(radar, 0.2, 0.8) * z[4], 0.0)
+    speed_mps = np.maximum(speed + np.where(radar, SPEED_NOISE_MPS[True], SPEED_NOISE_MPS[False]) * z[4], 0.0)
     columns = (camera, lidar, radar, reported, x_m, y_m, its_heading_rad, speed_mps, rate)
     return [
         Detection(

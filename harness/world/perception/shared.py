@@ -1,0 +1,212 @@
+"""Merge the objects that helpers share into the ego's scene graph, as a receiver of CPMs or SDSMs does.
+
+A helper's message says where it is, with the errors of a beacon, and lists what its sensors report in its
+own frame, with the regions that it has in sight (ETSI TS 103 324: originating vehicle, perceived objects,
+perception regions). Ids are the sender's own and do not say who is meant: reports of two senders are of one
+object if places and speeds agree as far as their errors go (the gate of a chi-squared test, as in tracking).
+The most precise report of an object stands. All see at the same moment, so nothing is extrapolated.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import cos, degrees, hypot, radians, sin
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import UNSET, structs
+
+from harness.core import noise
+from harness.core.arrays import Floats
+from harness.world.parameters import Parameters
+from harness.world.perception.conflicts import Seat, tenths
+from harness.world.perception.graph import listed_graphs
+from harness.world.perception.sensors import (
+    BEARING_NOISE_RAD,
+    LIDAR_NOISE_M,
+    RADAR_NOISE_M,
+    SPEED_NOISE_MPS,
+    Detection,
+)
+from harness.world.scenario import Scenario
+from harness.world.scene_graph import Node, SceneGraph, Sector
+from harness.world.state import VehicleState, WorldState
+
+# What a chi-squared value with three degrees of freedom (place and speed) exceeds once in 100 000.
+GATE = 25.90
+NOBODY, STANDS_M = "v99", 30.0  # id of a vehicle that does not exist, and how far ahead it stands
+ROUNDED_M = 0.1 / 12**0.5  # standard deviation of the rounding of a graph's places
+
+
+class Heard(NamedTuple):
+    """What the ego of a state sees itself and has heard."""
+
+    state: WorldState
+    own: SceneGraph  # the ego's graph
+    helpers: Sequence[SceneGraph]  # the graphs of the helpers that were heard
+
+
+@dataclass(frozen=True)
+class Report:
+    """One object as one sender reports it."""
+
+    detection: Detection  # in the frame of the road
+    node: Node | None  # the ego's own node; None in a message
+    place_m2: Floats  # covariance of the position, (2, 2)
+    speed_m2ps2: float  # variance of the speed
+
+    @property
+    def spread_m2(self) -> float:
+        """The variance of the position, both axes together."""
+        return float(np.trace(self.place_m2))
+
+
+def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
+    """Return the ego's graph of each case with the objects that messages add, or report more precisely."""
+    reports = [_reports(scenario.parameters, case) for case in cases]
+    kept = [[report.node.id for report in some if report.node] for some in reports]
+    heard = [[report.detection for report in some if report.node is None] for some in reports]
+    looks = [(case.state, case.state.ego) for case in cases]
+    graphs = listed_graphs(scenario, looks, heard, [() for _ in cases])
+    return [
+        structs.replace(
+            case.own,
+            nodes=(*(node for node in case.own.nodes if node.id in own), *graph.nodes),
+            conflicts=(*(c for c in case.own.conflicts if c.vehicle in own), *graph.conflicts),
+            sectors=_seen_together(case),
+        )
+        for case, own, graph in zip(cases, kept, graphs, strict=True)
+    ]
+
+
+def _reports(p: Parameters, case: Heard) -> list[Report]:
+    """Return one report of each object but the ego, the most precise."""
+    ego = case.state.ego
+    own = [_reported(p, ego, node, exact=True) for node in case.own.nodes]
+    accepted = [_itself(p, ego, exact=True)]
+    senders = [own]
+    for graph in case.helpers:
+        sender = stated(p, case.state, graph.viewer)
+        senders.append([_itself(p, sender), *(_reported(p, sender, node) for node in graph.nodes)])
+    for reports in senders:
+        accepted = _joined(accepted, reports)
+    return accepted[1:]
+
+
+def stated(p: Parameters, state: WorldState, sender: str) -> VehicleState:
+    """Return where a helper's message says that the helper is, with the errors of a beacon."""
+    vehicle = state.vehicle(sender)
+    if p.perfect_knowledge:
+        return vehicle
+    key = ("shared", state.episode_seed, state.step, sender)
+    x, y, turn, speed = noise.generator(*key).standard_normal(4).tolist()
+    return structs.replace(
+        vehicle,
+        x_m=vehicle.x_m + p.beacon_noise_m * x,
+        y_m=vehicle.y_m + p.beacon_noise_m * y,
+        heading_rad=vehicle.heading_rad + p.beacon_noise_rad * turn,
+        speed_mps=max(vehicle.speed_mps + p.beacon_noise_mps * speed, 0.0),
+    )
+
+
+def invented(scenario: Scenario, state: WorldState, viewer: str) -> Node:
+    """Return a car that does not exist and is in the ego's way, in a viewer's frame.
+
+    It comes on the first path that meets the ego's, as far from there as the ego and as fast; where no path
+    does, it stands `STANDS_M` ahead of the ego.
+    """
+    road, sender, ego = scenario.road(), state.vehicle(viewer), state.ego
+    path, speed_mps = road.paths[ego.approach, ego.route], 0.0
+    own_m = path.project(ego.x_m, ego.y_m)[0]
+    arc_m = own_m + STANDS_M
+    if meeting := next(iter(road.crossings.items()), None):
+        key, crossing = meeting
+        path, speed_mps = road.paths[key], ego.speed_mps
+        arc_m = crossing.other_arc_m - (crossing.ego_arc_m - own_m)
+    x, y, heading = (float(at[0]) for at in path.places(np.array([arc_m])))
+    seat = Seat(sender.x_m, sender.y_m, cos(sender.heading_rad), sin(sender.heading_rad))
+    at, turned = seat.relative(x, y), (degrees(sender.heading_rad - heading) + 180) % 360 - 180
+    lane, sensors = path.lane_role(arc_m), ("lidar", "radar")
+    return Node(
+        NOBODY, "car", at.forward_m, at.left_m, round(turned), tenths(speed_mps), None, lane, "off", sensors
+    )
+
+
+def _joined(accepted: Sequence[Report], reports: Sequence[Report]) -> list[Report]:
+    """Return the accepted reports with those of one more sender; of two reports of an object the better one.
+
+    Nearest pairs are joined first, and no report twice. The first accepted report, the ego, always stands.
+    """
+    apart = _distances(accepted, reports)
+    joined, new = list(accepted), dict(enumerate(reports))
+    taken: set[int] = set()
+    rows, columns = np.nonzero(apart <= GATE)
+    for _, row, column in sorted(
+        zip(apart[rows, columns].tolist(), rows.tolist(), columns.tolist(), strict=True)
+    ):
+        if row not in taken and column in new:
+            taken.add(row)
+            report = new.pop(column)
+            if row and report.spread_m2 < accepted[row].spread_m2:
+                joined[row] = report
+    return [*joined, *new.values()]
+
+
+def _distances(accepted: Sequence[Report], reports: Sequence[Report]) -> Floats:
+    """Return the squared Mahalanobis distance of each pair of reports, (accepted, reports)."""
+    place, speed, place_m2, speed_m2 = (
+        tuple(np.array([value(r) for r in some]).reshape(len(some), *shape) for some in (accepted, reports))
+        for value, shape in (
+            (lambda r: (r.detection.x_m, r.detection.y_m), (2,)),
+            (lambda r: r.detection.speed_mps, ()),
+            (lambda r: r.place_m2, (2, 2)),
+            (lambda r: r.speed_m2ps2, ()),
+        )
+    )
+    d = place[0][:, None] - place[1][None]
+    covariance = place_m2[0][:, None] + place_m2[1][None]
+    metres = np.einsum("...i,...i", d, np.linalg.solve(covariance, d[..., None])[..., 0])
+    return np.asarray(metres + (speed[0][:, None] - speed[1]) ** 2 / (speed_m2[0][:, None] + speed_m2[1]))
+
+
+def _itself(p: Parameters, v: VehicleState, exact: bool = False) -> Report:
+    """Return what a vehicle's message says of the vehicle itself."""
+    detection = Detection(
+        v.id, (f"v2v:{v.id}",), v.kind, v.indicator, v.x_m, v.y_m, v.heading_rad, v.speed_mps, None, v.braking
+    )
+    sure = exact or p.perfect_knowledge
+    place = ROUNDED_M if sure else hypot(ROUNDED_M, p.beacon_noise_m)
+    return Report(
+        detection, None, np.eye(2) * place**2, (0.1 if sure else hypot(0.1, p.beacon_noise_mps)) ** 2
+    )
+
+
+def _reported(p: Parameters, sender: VehicleState, node: Node, exact: bool = False) -> Report:
+    """Return a node of a sender's list, in the frame of the road, where headings are clockwise."""
+    c, s = cos(sender.heading_rad), sin(sender.heading_rad)
+    dx, dy = node.forward_m * c + node.left_m * s, node.forward_m * s - node.left_m * c
+    detection = Detection(
+        node.id, (f"v2v:{sender.id}",), None if node.type == "vehicle" else node.type, node.indicator,
+        sender.x_m + dx, sender.y_m + dy,
+        None if node.heading_deg is None else sender.heading_rad - radians(node.heading_deg),
+        node.speed_mps, None, None if node.braking is UNSET else node.braking,
+    )  # fmt: skip
+    away_m = max(hypot(dx, dy), 0.1)
+    seen = "lidar" in node.sensors
+    along, across = (LIDAR_NOISE_M,) * 2 if seen else (RADAR_NOISE_M, BEARING_NOISE_RAD * away_m)
+    own_m, own_rad = (0.0, 0.0) if exact or p.perfect_knowledge else (p.beacon_noise_m, p.beacon_noise_rad)
+    along, across = hypot(along, ROUNDED_M, own_m), hypot(across, ROUNDED_M, own_m, own_rad * away_m)
+    turn = np.array([[dx, -dy], [dy, dx]]) / away_m
+    return Report(
+        detection, node if exact else None, turn @ np.diag([along**2, across**2]) @ turn.T,
+        SPEED_NOISE_MPS["radar" in node.sensors] ** 2,
+    )  # fmt: skip
+
+
+def _seen_together(case: Heard) -> tuple[Sector, ...]:
+    """Return each sector as the viewer with the most of it in sight sees it, a lower bound of the union."""
+    sectors = {sector.sector: sector for sector in case.own.sectors}
+    for graph in case.helpers:
+        for sector in graph.sectors:
+            if sector.seen_share > sectors[sector.sector].seen_share:
+                sectors[sector.sector] = sector
+    return tuple(sectors.values())

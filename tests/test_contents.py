@@ -1,0 +1,350 @@
+"""What messages hold: intents, objects, both, or the truth."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluating import (
+    Walked,
+    all_scenes,
+    figure,
+    run,
+    same_files,
+    says,
+    scenes_of,
+    spec_of,
+    walked,
+)
+from msgspec import structs
+
+from harness.backends.base import Completion, Request
+from harness.backends.proxy import distribution
+from harness.coordination.contents import CONTENTS
+from harness.coordination.coordinate import FusionInputs, coordinate
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset, Scene
+from harness.evaluate.sharing import object_bits
+from harness.prompts import versions as prompts
+from harness.radio.channel import Draws
+from harness.world import scenarios
+from harness.world.perception.graph import scene_graph, truth_graph
+from harness.world.perception.shared import Heard, merged, stated
+from harness.world.scene_graph import SceneGraph
+from harness.world.state import Part, VehicleState, WorldState
+
+OBJECTS, BOTH, ORACLE = (named_point(f"6g:content={name}") for name in ("objects", "both", "oracle"))
+LOSSLESS = {name: named_point(f"6g:loss=0,content={name}") for name in CONTENTS}
+
+
+def heard_by_all(scene: Scene) -> Heard:
+    ego, *helpers = scene.viewers
+    return Heard(scene.state, scene.graphs[ego], [scene.graphs[helper] for helper in helpers])
+
+
+def shared(dataset: Dataset, scenes: Sequence[Scene]) -> list[SceneGraph]:
+    return merged(dataset.scenario, [heard_by_all(scene) for scene in scenes])
+
+
+# The larger graph
+
+
+def test_whoever_hears_nobody_knows_what_it_saw(small: Dataset) -> None:
+    cases = [heard_by_all(scene)._replace(helpers=()) for scene in all_scenes(small)[:50]]
+    assert merged(small.scenario, cases) == [case.own for case in cases]
+
+
+def test_it_lists_whatever_anybody_lists_and_each_sender_and_never_the_ego(small: Dataset) -> None:
+    for scene, graph in zip(all_scenes(small), shared(small, all_scenes(small)), strict=True):
+        ego, *helpers = scene.viewers
+        listed = {ego, *helpers}.union(*(scene.graphs[viewer].seen for viewer in scene.viewers))
+        assert set(graph.seen) == listed - {ego}
+
+
+def test_an_object_of_several_senders_is_one(small: Dataset) -> None:
+    graphs = shared(small, all_scenes(small))
+    assert all(len(graph.nodes) == len({*graph.seen}) for graph in graphs)
+
+
+def test_ids_do_not_say_what_is_one_object(small: Dataset) -> None:
+    """Helpers that call every vehicle by other names add as many objects at the same places."""
+    for scene in scenes_of(small):
+        case = heard_by_all(scene)
+        renamed = [
+            structs.replace(
+                graph,
+                nodes=tuple(structs.replace(n, id=f"v{90 - int(n.id[1:])}") for n in graph.nodes),
+            )
+            for graph in case.helpers
+        ]
+        plain, other = merged(small.scenario, [case, case._replace(helpers=renamed)])
+        places = [[(n.forward_m, n.left_m, n.speed_mps) for n in graph.nodes] for graph in (plain, other)]
+        assert places[0] == places[1]
+
+
+def test_what_only_a_helper_sees_is_where_it_is_and_meets_the_ego(small: Dataset) -> None:
+    """The danger behind the corner: its conflict is that of the truth, up to errors of sensors and places."""
+    met = 0
+    for scene, graph in zip(all_scenes(small), shared(small, all_scenes(small)), strict=True):
+        truth = {c.vehicle: c for c in truth_graph(small.scenario, scene.state).conflicts}
+        own = {c.vehicle for c in scene.graphs[scene.viewers[0]].conflicts}
+        for conflict in graph.conflicts:
+            if conflict.vehicle in truth.keys() - own and conflict.vehicle == scene.record.danger.vehicle:
+                met += 1
+                true = truth[conflict.vehicle]
+                assert conflict.sector == true.sector
+                assert conflict.other.arc_m == pytest.approx(true.other.arc_m, abs=6)
+                assert conflict.other.speed_mps == pytest.approx(true.other.speed_mps, abs=4)
+    assert met > 20
+
+
+NORTH = -math.pi / 2
+
+
+def test_the_more_precise_report_of_an_object_stands() -> None:
+    """A car 110 m ahead: the ego has it by radar alone, a helper 20 m from it by LiDAR."""
+    scenario = scenarios.get("occluded-intersection:perfect_knowledge=true")
+
+    def car(name: str, part: Part, y_m: float) -> VehicleState:
+        return VehicleState(name, "car", part, 2.0, y_m, NORTH, 10.0, "own", "straight", False)
+
+    cars = car("v1", "ego", 60.0), car("v2", "helper", -30.0), car("v3", "other", -50.0)
+    # The helper is beside, so that it does not hide the other from the ego.
+    vehicles = cars[0], structs.replace(cars[1], x_m=-6.0), cars[2]
+    state = WorldState("by hand", 0, 0, 0.0, 14.0, vehicles, ())
+    own, helper = (scene_graph(scenario, state, name) for name in ("v1", "v2"))
+    [mine] = [node for node in own.nodes if node.id == "v3"]
+    [graph] = merged(scenario, [Heard(state, own, [helper])])
+    [node] = [node for node in graph.nodes if node.id == "v3"]
+    assert mine.sensors == ("radar",)
+    assert node.sensors == ("v2v:v2",)
+    assert math.hypot(node.forward_m - 110.0, node.left_m) < 0.5
+    assert math.hypot(mine.forward_m - 110.0, mine.left_m) > math.hypot(node.forward_m - 110.0, node.left_m)
+
+
+def test_a_region_is_as_much_in_sight_as_to_who_sees_most_of_it(small: Dataset) -> None:
+    for scene, graph in zip(scenes_of(small), shared(small, scenes_of(small)), strict=True):
+        for n, sector in enumerate(graph.sectors):
+            assert sector.seen_share == max(scene.graphs[v].sectors[n].seen_share for v in scene.viewers)
+
+
+def test_a_message_says_where_its_sender_is_with_the_errors_of_a_beacon(small: Dataset) -> None:
+    p = small.scenario.parameters
+    apart = [
+        (said.x_m - true.x_m, said.y_m - true.y_m)
+        for scene in all_scenes(small) for viewer in scene.viewers[1:]
+        for said, true in [(stated(p, scene.state, viewer), scene.state.vehicle(viewer))]
+    ]  # fmt: skip
+    assert np.std(apart) == pytest.approx(p.beacon_noise_m, rel=0.4)
+    exact = replace(p, perfect_knowledge=True)
+    scene = all_scenes(small)[0]
+    assert stated(exact, scene.state, "v2") == scene.state.vehicle("v2")
+
+
+# Who is heard, and when
+
+
+def intents(own: Sequence[float], helpers: Sequence[Sequence[float]], object_bits: float = 800.0) -> Intents:
+    """One decision whose helpers take 5 s to think."""
+    n = len(helpers)
+    shape = np.ones((1, n))
+    return Intents(
+        np.array([own]), np.array([helpers]), shape > 0, np.full((1, 1 + n), 10.0), 20.0 * shape,
+        400.0 * shape, np.insert(5.0 * shape, 0, 0.1, axis=1), object_bits=object_bits * shape,
+    )  # fmt: skip
+
+
+CLEAR = Draws(np.full((1, 3, 2), 0.9), np.zeros((1, 3)))
+
+
+def decided(point: OperatingPoint, answer: Sequence[float]) -> Any:
+    said = intents([0.3, 0.4, 0.3], [[1.0, 0.0, 0.0]] * 3)
+    said = said.with_objects(point.content.intent) if point.content.graph else said
+    call = lambda on_time: (np.array([answer]), np.full(1, 0.05))  # noqa: E731
+    return coordinate(point, said, CLEAR, FusionInputs(call))
+
+
+def test_objects_do_not_wait_for_the_helpers_model() -> None:
+    """Helpers infer for 5 s: their intents miss the window, their objects do not."""
+    late, early = (decided(LOSSLESS[name], [0.0, 1.0, 0.0]) for name in ("intent", "objects"))
+    assert not late.on_time.any()
+    assert early.on_time.all()
+    assert early.fused[0].tolist() == [0.0, 1.0, 0.0]
+    assert early.latency_s[0] == pytest.approx(early.exchange_s[0] + 0.05)
+    assert np.isnan(early.weights).all()
+
+
+def test_what_is_sent_is_paid_for() -> None:
+    for name, bits in (("intent", 400), ("objects", 800), ("both", 1200)):
+        assert decided(LOSSLESS[name], [0.0, 1.0, 0.0]).reply_bits[0] == 3 * bits
+
+
+def test_with_both_the_ego_votes_as_it_sees_now() -> None:
+    """Three helpers are sure of the first action; the ego's new answer is one of four voices at 10 m."""
+    point = LOSSLESS["both"].changed(window_s=10.0)
+    both, failed = decided(point, [0.0, 0.0, 1.0]), decided(point, [math.nan] * 3)
+    assert both.fused[0].tolist() == pytest.approx([0.75, 0.0, 0.25])
+    assert failed.fusion_failed[0]
+    assert failed.fused[0].tolist() == pytest.approx([0.75 + 0.075, 0.1, 0.075])
+
+
+# Whole evaluations
+
+
+@pytest.fixture(scope="module")
+def planner(small: Dataset) -> Walked:
+    spec = spec_of(small, points=(*POINTS.values(), OBJECTS, BOTH, ORACLE), ask="used")
+    return walked(spec, Planner(small))
+
+
+class Planner:
+    """Answers as `proxy` does, and remembers what it was asked."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self.scenario, self.asked = dataset.scenario, list[Request]()
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        self.asked += requests
+        views = {r.id: r.view for r in requests if r.view is not None}
+        intents = {name: [*distribution(self.scenario, view).values()] for name, view in views.items()}
+        return [Completion(r.id, says(intents[r.id], r.role), None, None, "stop", None, 1) for r in requests]
+
+    def identity(self) -> dict[str, Any]:
+        return {"engine": "scripted"}
+
+
+def test_a_set_of_messages_is_one_question_whatever_else_is_done_with_its_answer(small: Dataset) -> None:
+    """`objects` and `both` ask the same; a helper's model is asked only where its intent is sent."""
+    asked = {}
+    for point in (OBJECTS, BOTH):
+        backend = Planner(small)
+        walked(spec_of(small, points=(point,), ask="used"), backend)
+        asked[point] = [r.id for r in backend.asked]
+        assert len(asked[point]) == len(set(asked[point]))
+    both = Planner(small)
+    walked(spec_of(small, points=(OBJECTS, BOTH), ask="used"), both)
+    assert {r.id for r in both.asked} == {*asked[OBJECTS], *asked[BOTH]}
+    assert not [name for name in asked[OBJECTS] if "/v1" not in name]
+    assert [name for name in asked[BOTH] if "/v1" not in name]
+    assert [name for name in asked[OBJECTS] if name.endswith("/v1+v2!objects+v3!objects+v4!objects")]
+
+
+def test_a_larger_graph_is_a_prompts_graph(small: Dataset) -> None:
+    backend, spec = Planner(small), spec_of(small, points=(OBJECTS,), ask="used")
+    walked(spec, backend)
+    scenes = {scene.id: scene for scene in all_scenes(small)}
+    for request in backend.asked:
+        if "!objects" in request.id:
+            scene = scenes[request.id.partition("/")[0]]
+            assert request.view is not None
+            new = set(request.view.seen) - set(scene.graphs["v1"].seen)
+            assert {*request.id.partition("/")[2].replace("!objects", "").split("+")[1:]} <= {
+                *request.view.seen
+            }
+            shown = request.messages[-1]["content"]
+            listed = prompts.listed(request.view, spec.ego.prompt.max_objects)
+            names = [request.view.nodes[n].id for n in listed]
+            assert all(f"\n{name} " in shown for name in names if name in new)
+
+
+def test_the_truth_is_no_worse_than_objects_and_these_no_worse_than_nothing(planner: Walked) -> None:
+    alone, objects, oracle = (
+        figure(planner, name, "success_rate").value for name in ("single-local", OBJECTS.name, ORACLE.name)
+    )
+    assert alone <= objects <= oracle
+
+
+def test_helpers_that_see_nothing_add_but_themselves(small: Dataset) -> None:
+    backend = Planner(small)
+    walked(spec_of(small, points=(OBJECTS.changed(messages="blind"),), ask="used"), backend)
+    scenes = {scene.id: scene for scene in all_scenes(small)}
+    asked = [r for r in backend.asked if "~blind!objects" in r.id]
+    assert asked
+    for request in asked:
+        own = scenes[request.id.partition("/")[0]].graphs["v1"].seen
+        assert request.view is not None
+        assert {*request.view.seen} <= {*own, "v2", "v3", "v4"}
+
+
+def test_bits_grow_with_what_is_listed(small: Dataset) -> None:
+    scenes = all_scenes(small)
+    bits = object_bits(scenes)
+    listed = np.array([[len(s.graphs[v].nodes) for v in s.viewers[1:]] for s in scenes])
+    assert np.corrcoef(bits.ravel(), listed.ravel())[0, 1] > 0.9
+    assert bits.min() >= 8 * len('{"from":"v2","objects":[],"seen":[],"speed_mps":0.0}')
+
+
+# Helpers that lie
+
+
+@pytest.mark.parametrize(
+    ("attack", "what"),
+    [
+        ("ghost", lambda true, said: "v99" in said - true),
+        (
+            "hide",
+            lambda true, said: not said - {"v2", "v3", "v4"} - true and said <= true | {"v2", "v3", "v4"},
+        ),
+    ],
+)
+def test_a_liar_invents_or_hides(small: Dataset, attack: str, what: Any) -> None:
+    """All helpers lie: what the ego's graph gains is a ghost, or only the helpers themselves."""
+    backend = Planner(small)
+    point = OBJECTS.changed(attack=f"{attack}:share=1")
+    walked(spec_of(small, points=(point,), ask="used"), backend)
+    scenes = {scene.id: scene for scene in all_scenes(small)}
+    asked = [r for r in backend.asked if f"!{attack}&objects" in r.id]
+    assert asked
+    for request in asked:
+        assert request.view is not None
+        assert what({*scenes[request.id.partition("/")[0]].graphs["v1"].seen}, {*request.view.seen})
+
+
+def test_a_ghost_stops_who_believes_it_and_none_is_believed_of_nobody(small: Dataset) -> None:
+    points = [OBJECTS.changed(name=f"{share}", attack=f"ghost:share={share}") for share in (0, 1)]
+    rows = walked(spec_of(small, points=tuple(points)), Planner(small))
+    honest = walked(spec_of(small, points=(OBJECTS,)), Planner(small))
+    assert figure(rows, "0", "success_rate").value == figure(honest, OBJECTS.name, "success_rate").value
+    assert figure(rows, "1", "success_rate").value < figure(rows, "0", "success_rate").value
+
+
+def test_a_shifted_object_is_another_object(small: Dataset) -> None:
+    """Both places are believed where the ego sees the object itself."""
+    backend = Planner(small)
+    walked(spec_of(small, points=(OBJECTS.changed(attack="shift:share=1:offset_m=12"),)), backend)
+    graphs = [r.view for r in backend.asked if "!shift:offset_m=12&objects" in r.id]
+    assert any(len(graph.seen) > len({*graph.seen}) for graph in graphs if graph)
+
+
+# The same whatever way
+
+
+def test_one_at_a_time_as_in_batches(small: Dataset, tmp_path: Path) -> None:
+    points = (POINTS["single-local"], OBJECTS, BOTH)
+    one, many = (
+        run(spec_of(small, points=points, batch_size=size), tmp_path / f"{size}").out for size in (1, 8)
+    )
+    assert same_files(one, many)
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("6g:content=word", "unknown content 'word'"),
+        ("6g:content=objects,consensus=ego-prompt", "content is 'objects'; it must be intent or both"),
+        ("6g:content=objects,attack=liar", "some of ghost, hide, shift and absent"),
+        ("6g:attack=ghost", "one on intents where content lists no objects"),
+        ("6g:content=oracle,attack=hide", "one on intents where content lists no objects"),
+        ("6g:content=objects,messages=shuffled", "own or blind where content is objects"),
+    ],
+)
+def test_what_does_not_go_together_is_one_line(text: str, wrong: str) -> None:
+    with pytest.raises(UserError) as error:
+        named_point(text)
+    assert wrong in str(error.value)
+    assert "\n" not in str(error.value)
