@@ -25,13 +25,15 @@ from harness.backends.base import Completion, Request
 from harness.backends.proxy import distribution
 from harness.coordination.contents import CONTENTS
 from harness.coordination.coordinate import FusionInputs, coordinate
+from harness.coordination.encodings import reply_bits
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.sharing import object_bits
+from harness.evaluate.sharing import listed
 from harness.prompts import versions as prompts
 from harness.radio.channel import Draws
+from harness.radio.messages import Counts, size
 from harness.world import scenarios
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.perception.shared import Heard, merged, stated
@@ -155,7 +157,8 @@ def intents(own: Sequence[float], helpers: Sequence[Sequence[float]], object_bit
     shape = np.ones((1, n))
     return Intents(
         np.array([own]), np.array([helpers]), shape > 0, np.full((1, 1 + n), 10.0), 20.0 * shape,
-        400.0 * shape, np.insert(5.0 * shape, 0, 0.1, axis=1), object_bits=object_bits * shape,
+        400.0 * shape, np.insert(5.0 * shape, 0, 0.1, axis=1),
+        objects=3 * shape, object_bits=object_bits * shape, text_bytes=40 * shape,
     )  # fmt: skip
 
 
@@ -164,7 +167,8 @@ CLEAR = Draws(np.full((1, 3, 2), 0.9), np.zeros((1, 3)))
 
 def decided(point: OperatingPoint, answer: Sequence[float]) -> Any:
     said = intents([0.3, 0.4, 0.3], [[1.0, 0.0, 0.0]] * 3)
-    said = said.with_objects(point.content.intent) if point.content.graph else said
+    said = said if point.content.intent else said.without_models()
+    said = replace(said, payload_bits=reply_bits(point.radio.encoding, point.content, said, headers=False))
     call = lambda on_time: (np.array([answer]), np.full(1, 0.05))  # noqa: E731
     return coordinate(point, said, CLEAR, FusionInputs(call))
 
@@ -182,6 +186,29 @@ def test_objects_do_not_wait_for_the_helpers_model() -> None:
 def test_what_is_sent_is_paid_for() -> None:
     for name, bits in (("intent", 400), ("objects", 800), ("both", 1200)):
         assert decided(LOSSLESS[name], [0.0, 1.0, 0.0]).reply_bits[0] == 3 * bits
+
+
+@pytest.mark.parametrize(
+    ("encoding", "intent", "objects"), [("etsi", "etsi-intent", "CPM"), ("sae", "sae-intent", "SDSM")]
+)
+def test_a_standards_encoding_has_the_sizes_of_its_messages(encoding: str, intent: str, objects: str) -> None:
+    """Three objects, 40 bytes of text, three actions; a message and its signed envelope."""
+    counts = Counts(objects=3, actions=3, text_bytes=40)
+    sizes = {name: size(name, counts) for name in (intent, objects)}
+    packets = {name: float(each.message + each.envelope) for name, each in sizes.items()}
+    by_content = {"intent": packets[intent], "objects": packets[objects], "both": sum(packets.values())}
+    for content, bits in by_content.items():
+        sent = decided(named_point(f"6g:loss=0,content={content},encoding={encoding}"), [0.0, 1.0, 0.0])
+        assert sent.reply_bits[0] == 3 * bits
+        assert sent.request_bits[0] != 400
+
+
+def test_headers_count_under_a_physical_radio() -> None:
+    said = intents([0.3, 0.4, 0.3], [[1.0, 0.0, 0.0]] * 3)
+    content = CONTENTS["both"]
+    paper, radio = (reply_bits("etsi", content, said, headers) for headers in (False, True))
+    assert (radio > paper + 2 * 8 * 40).all()
+    assert (reply_bits("json", content, said, True) == reply_bits("json", content, said, False)).all()
 
 
 def test_with_both_the_ego_votes_as_it_sees_now() -> None:
@@ -273,9 +300,9 @@ def test_helpers_that_see_nothing_add_but_themselves(small: Dataset) -> None:
 
 def test_bits_grow_with_what_is_listed(small: Dataset) -> None:
     scenes = all_scenes(small)
-    bits = object_bits(scenes)
-    listed = np.array([[len(s.graphs[v].nodes) for v in s.viewers[1:]] for s in scenes])
-    assert np.corrcoef(bits.ravel(), listed.ravel())[0, 1] > 0.9
+    counts, bits = listed(scenes)
+    assert counts.tolist() == [[len(s.graphs[v].nodes) for v in s.viewers[1:]] for s in scenes]
+    assert np.corrcoef(bits.ravel(), counts.ravel())[0, 1] > 0.9
     assert bits.min() >= 8 * len('{"from":"v2","objects":[],"seen":[],"speed_mps":0.0}')
 
 

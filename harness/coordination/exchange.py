@@ -176,7 +176,7 @@ def _ask_helpers(
 
     links = Links(
         asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & opens_round,
-        point.ask.request_bits, intents.site,
+        point.request_bits, intents.site,
     )  # fmt: skip
     if point.radio.edge == FUSION and point.physical and point.unit:
         until_s = np.maximum(point.fusion.window_s, request_s[..., 0])

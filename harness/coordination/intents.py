@@ -36,8 +36,11 @@ class Intents:
     outlook: Outlook | None = None
     # what helpers claim about themselves, if a rule or an attack needs it; else None
     claims: Claims | None = None
-    # size of what each helper lists, `(..., H)`, if messages hold objects; else None
-    object_bits: Floats | None = None
+    # bytes of each reply's text, `(..., H)`; None if replies have none
+    text_bytes: Floats | None = None
+    # how many objects each helper lists, `(..., H)`, if messages hold objects; else None
+    objects: Floats | None = None
+    object_bits: Floats | None = None  # size of these lists as compact JSON, `(..., H)`
     # whether the helper's model was not asked yet, `(..., H)`; until then it counts as valid. None if the
     # models of all were
     unasked: Bools | None = None
@@ -59,19 +62,12 @@ class Intents:
             arrays[name][at] = values
         return replace(self, **arrays)
 
-    def with_objects(self, intent: bool) -> "Intents":
-        """Return what helpers send whose messages hold objects, with their `intent` or alone.
-
-        Alone they need no model: every helper that is present sends, and at once.
-        """
-        assert self.object_bits is not None
-        if intent:
-            return replace(self, payload_bits=self.payload_bits + self.object_bits)
+    def without_models(self) -> "Intents":
+        """Return what helpers send whose messages hold objects alone: whoever is present, and at once."""
         own_s = self.inference_s[..., :1]
         return replace(
             self,
             valid=np.isfinite(self.range_m),
-            payload_bits=self.object_bits,
             inference_s=np.concatenate([own_s, np.zeros(self.range_m.shape)], axis=-1),
             unasked=None,
         )

@@ -9,6 +9,7 @@ from msgspec import structs
 
 from harness.coordination.attacks import ATTACKS, Absent, attacks_of, in_question
 from harness.coordination.contents import CONTENTS, OBJECTS, Content
+from harness.coordination.encodings import JSON, request_bits
 from harness.coordination.parts import FUSION, RELAY, Ask, Cloud, Fusion, Guard, Part, Radio, wrong
 from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES
@@ -233,6 +234,8 @@ class OperatingPoint:
             return "max_helpers is 0, so it asks nobody"
         if setting == "tau_nats" and ask.schedule != PAPER and not self.radio.helper_rounds:
             return f"schedule {ask.schedule} has a threshold of its own"
+        if setting == "request_bits" and self.radio.encoding != JSON:
+            return f"encoding {self.radio.encoding} has a size of its own for requests"
         if setting in UNIT and self.radio.edge == "none":
             return "it has no roadside unit (edge is none)"
         if setting in WEIGHING and (consensus == EGO_PROMPT or isinstance(RULES[consensus], Heads)):
@@ -269,6 +272,13 @@ class OperatingPoint:
     def content(self) -> Content:
         """What a message holds."""
         return CONTENTS[self.ask.content]
+
+    @property
+    def request_bits(self) -> float:
+        """Size of a request."""
+        if self.radio.encoding == JSON:
+            return self.ask.request_bits
+        return request_bits(self.radio.encoding, self.ask.max_helpers, self.physical is not None)
 
     @property
     def has_fusion_call(self) -> bool:

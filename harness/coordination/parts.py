@@ -10,6 +10,7 @@ from msgspec import Meta, Struct, ValidationError, convert, structs
 
 from harness.coordination.attacks import attacks_of
 from harness.coordination.contents import CONTENTS, INTENT
+from harness.coordination.encodings import ENCODINGS, JSON
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
@@ -126,6 +127,8 @@ class Radio(Part, frozen=True, kw_only=True):
     edge_y_m: Place = 0.0  # to the south
     # Height of the unit's antenna; by default that of TR 37.885, table 6.1.4-1, a roadside unit.
     edge_antenna_m: Annotated[float, Meta(ge=1, le=100, description="metres from 1 to 100")] = 5.0
+    # How messages are encoded, which is their size (`harness.coordination.encodings`).
+    encoding: Text = JSON
     further: Text = ""  # further settings of the profile's channel, such as `density_per_km=200`
 
     def check(self) -> None:
@@ -133,6 +136,8 @@ class Radio(Part, frozen=True, kw_only=True):
             raise unknown("channel profile", self.profile, CHANNELS, "; leave it out to disable V2V")
         if self.edge not in EDGES:
             raise unknown("edge", self.edge, EDGES)
+        if self.encoding not in ENCODINGS:
+            raise unknown("encoding", self.encoding, ENCODINGS)
 
 
 class Fusion(Part, frozen=True, kw_only=True):

@@ -334,7 +334,7 @@ class Asker:
         ]
         width = max(width, *map(len, answers))
         unknown = (math.nan,) * len(self.spec.actions)
-        p, distances_m, ranges_m, bits, unasked = [], [], [], [], []
+        p, distances_m, ranges_m, bits, texts_b, unasked = [], [], [], [], [], []
         for scene, row in zip(scenes, answers, strict=True):
             record, (ego, *helpers) = scene.record, scene.viewers
             absent = width - len(row)
@@ -347,6 +347,7 @@ class Asker:
             xy_m = {v.id: (v.x_m, v.y_m) for v in scene.state.vehicles}
             sent = zip(helpers, row[1:], strict=False)
             bits.append([*[payload_bits(xy_m[v], a) if a else 0 for v, a in sent], *[0] * absent])
+            texts_b.append([len(_text(answer).encode()) for answer in row[1:]])
         intents = np.array(p, dtype=float)
         valid = ~np.isnan(intents[:, 1:]).any(axis=-1)
         shape = len(scenes), width - 1
@@ -355,6 +356,7 @@ class Asker:
             intents[:, 0], intents[:, 1:], valid if not_yet is None else valid | not_yet,
             np.array(distances_m, dtype=float), np.array(ranges_m, dtype=float).reshape(shape),
             np.array(bits, dtype=float).reshape(shape), inference_s(self.latency, answers), unasked=not_yet,
+            text_bytes=np.array(texts_b, dtype=float).reshape(shape),
         )  # fmt: skip
 
     def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
@@ -414,6 +416,11 @@ def _heard_sets(
         at, heard, attacking = heard_in(code, helpers, bool(rewrites.attack))
         scene = scenes[at]
         yield scene, [key_of(scene.viewers[1 + h], rewrites, h in attacking) for h in heard]
+
+
+def _text(answer: Answer | None) -> str:
+    """Return the words of a helper's message; none of a failed answer."""
+    return str(answer.message.get("evidence") or "") if answer and answer.message else ""
 
 
 def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:

@@ -44,21 +44,25 @@ def shared_graphs(
     return merged(scenario, cases)
 
 
-def object_bits(scenes: Sequence[Scene]) -> Floats:
-    """Return the bits of each helper's list of objects, as compact JSON, (n, H); 0 where there is no helper.
+def listed(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
+    """Return how many objects each helper lists, and in how many bits as compact JSON, both (n, H).
 
-    Each object has its id, class, place in metres to one decimal, heading in degrees, and speed.
+    Each object has its id, class, place in metres to one decimal, heading in degrees, speed and indicator;
+    each region the share that is in sight. Both are 0 where there is no helper.
     """
-    bits = np.zeros((len(scenes), max(len(scene.viewers) for scene in scenes) - 1))
-    for row, scene in zip(bits, scenes, strict=True):
+    counts, bits = np.zeros((2, len(scenes), max(len(scene.viewers) for scene in scenes) - 1))
+    for n, scene in enumerate(scenes):
+        graphs = [scene.graphs[viewer] for viewer in scene.viewers[1:]]
         if (kept := scene.notes.get("object_bits")) is None:
-            graphs = [scene.graphs[viewer] for viewer in scene.viewers[1:]]
-            kept = scene.notes["object_bits"] = [8 * len(canonical_bytes(_listed(graph))) for graph in graphs]
-        row[: len(kept)] = kept
-    return bits
+            kept = scene.notes["object_bits"] = [
+                8 * len(canonical_bytes(_message(graph))) for graph in graphs
+            ]
+        bits[n, : len(graphs)] = kept
+        counts[n, : len(graphs)] = [len(graph.nodes) for graph in graphs]
+    return counts, bits
 
 
-def _listed(graph: SceneGraph) -> dict[str, object]:
+def _message(graph: SceneGraph) -> dict[str, object]:
     objects = [
         [n.id, n.type, n.forward_m, n.left_m, n.heading_deg, n.speed_mps, n.indicator] for n in graph.nodes
     ]

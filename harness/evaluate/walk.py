@@ -12,6 +12,7 @@ import numpy as np
 
 from harness.coordination.claims import Claims
 from harness.coordination.coordinate import Coordination, FusionCall, FusionInputs, fuse
+from harness.coordination.encodings import JSON, reply_bits
 from harness.coordination.exchange import Exchange, exchange, needed
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
@@ -23,7 +24,7 @@ from harness.evaluate.claims import claims
 from harness.evaluate.draws import tie_draws
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.outlook import outlook
-from harness.evaluate.sharing import object_bits
+from harness.evaluate.sharing import listed
 from harness.radio.channel import Draws, Site, Unit
 from harness.world.scenario import Scenario
 from harness.world.sight_lines import site
@@ -81,8 +82,8 @@ class World(Protocol[DecisionPoint]):
         """Return what helpers claim in the points just shown, (n, ...); None in a world without places."""
         ...
 
-    def object_bits(self) -> Floats | None:
-        """Return the size of what helpers list, (n, H); None in a world without places."""
+    def listed(self) -> tuple[Floats, Floats] | None:
+        """Return how many objects helpers list, and in how many bits, (n, H); None without places."""
         ...
 
     def step(self, decided: Sequence[Decided[DecisionPoint]]) -> None:
@@ -106,9 +107,9 @@ class SceneWorld:
     def claims(self) -> Claims:
         return claims(self.scenario, self.scenes)
 
-    def object_bits(self) -> Floats:
-        """Return the size of what the helpers of each scene list."""
-        return object_bits(self.scenes)
+    def listed(self) -> tuple[Floats, Floats]:
+        """Return how many objects the helpers of each scene list, and in how many bits."""
+        return listed(self.scenes)
 
 
 class Fuses(Protocol):
@@ -161,7 +162,8 @@ def walk(
         if any(point.needs("claims") for point in due):
             intents = replace(intents, claims=world.claims())
         if any(point.content.graph for point in due):
-            intents = replace(intents, object_bits=world.object_bits())
+            counts, bits = world.listed() or (None, None)
+            intents = replace(intents, objects=counts, object_bits=bits)
         asked_blind = [each.at for point, each in due.items() if point.blind_helpers]
         blind = ask.blind(decision_points, np.unique(np.concatenate(asked_blind))) if asked_blind else None
         intents, blind = _asked(ask, decision_points, due, intents, blind)
@@ -226,25 +228,29 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
     """
     every = np.array_equal(due.at, np.arange(len(intents.own)))
     own = intents if every else intents.take(due.at)
-    if point.asks and point.content.graph:
-        own = own.with_objects(point.content.intent)
-    if not point.content.intent:
-        return own
     if point.blind_helpers:
         assert blind is not None
         source = blind.take(due.at)
-        return _with_helpers(own, source, source.valid)
-    if point.ask.messages != "shuffled":
-        return own
-    places = _sources(point, due)
-    source, alone = own.take(places), places == np.arange(len(places))
-    return _with_helpers(own, source, source.valid & ~alone[:, None])
+        own = _with_helpers(own, source, source.valid)
+    elif point.ask.messages == "shuffled":
+        places = _sources(point, due)
+        source, alone = own.take(places), places == np.arange(len(places))
+        own = _with_helpers(own, source, source.valid & ~alone[:, None])
+    return _as_sent(point, own) if point.asks else own
 
 
 def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:
-    return replace(
-        own, helpers=source.helpers, valid=valid, payload_bits=source.payload_bits, unasked=source.unasked
-    )
+    names = ("helpers", "payload_bits", "text_bytes", "unasked")
+    return replace(own, valid=valid, **{name: getattr(source, name) for name in names})
+
+
+def _as_sent(point: OperatingPoint, intents: Intents) -> Intents:
+    """Return what helpers send by the point's content and encoding."""
+    content, encoding = point.content, point.radio.encoding
+    if encoding == JSON and not content.graph:
+        return intents
+    sent = intents if content.intent else intents.without_models()
+    return replace(sent, payload_bits=reply_bits(encoding, content, sent, point.physical is not None))
 
 
 def _sources(point: OperatingPoint, due: Due) -> Ints:

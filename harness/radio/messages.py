@@ -14,7 +14,7 @@ in OER (X.696), whole octets throughout. So no size depends on values, only on h
 No standard has a message for an intent or for its request. Theirs are containers of our own, made of the
 standards' elements. All sizes are held against an encoder (`benchmarks/message_sizes.py`).
 
-The encoding `json` is the size of a reply's text: `harness.evaluate.asking.payload_bits`.
+`harness.coordination.encodings` chooses among these and the size of a reply's text.
 """
 
 import csv

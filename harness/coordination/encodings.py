@@ -1,0 +1,45 @@
+"""Compute the sizes of requests and replies by how messages are encoded.
+
+    json  compact JSON without a signature or headers, the paper's profiles' default
+    etsi  CPMs, and containers of our own for intents and requests, in PER; signed, with a digest of the
+          certificate, which beacons carry once a second
+    sae   SDSMs, and the same
+
+Under a physical radio the headers of network and transport count as well; those of the radio are its own.
+"""
+
+import numpy as np
+
+from harness.coordination.contents import Content
+from harness.coordination.intents import Intents
+from harness.core.arrays import Floats
+from harness.radio.messages import NAMES, Counts, Encoding, message_bits, packet_bits
+
+JSON = "json"
+ENCODINGS = (JSON, *NAMES)
+
+
+def reply_bits(encoding: str, content: Content, intents: Intents, headers: bool) -> Floats:
+    """Return the size of each helper's reply, `(..., H)`; one that holds both is two messages."""
+    bits = np.zeros(intents.payload_bits.shape)
+    if content.intent:
+        text_bytes = 0.0 if intents.text_bytes is None else intents.text_bytes
+        counts = Counts(actions=intents.own.shape[-1], text_bytes=text_bytes)
+        bits += intents.payload_bits if encoding == JSON else _packet(encoding, "intent", counts, headers)
+    if content.graph:
+        assert intents.object_bits is not None
+        assert intents.objects is not None
+        counts = Counts(objects=intents.objects)
+        bits += intents.object_bits if encoding == JSON else _packet(encoding, "objects", counts, headers)
+    return bits
+
+
+def request_bits(encoding: str, helpers: int, headers: bool) -> float:
+    """Return the size of a request to so many helpers, by an encoding that is not `json`."""
+    return float(_packet(encoding, "request", Counts(helpers=helpers), headers))
+
+
+def _packet(encoding: str, content: str, counts: Counts, headers: bool) -> Floats:
+    by_name: Encoding = "sae" if encoding == "sae" else "etsi"
+    name = NAMES[by_name][content]
+    return packet_bits(name, message_bits(name, counts), headers=headers)
