@@ -29,11 +29,16 @@ from harness.coordination.encodings import reply_bits
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.errors import UserError
+from harness.core.files import digest
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.sharing import listed
+from harness.evaluate.fusion import messages_of
+from harness.evaluate.sharing import as_asked, listed
 from harness.prompts import versions as prompts
 from harness.radio.channel import Draws
 from harness.radio.messages import Counts, size
+from harness.report.details import prompts_of
+from harness.runs import folder
+from harness.training.pairs import pairs
 from harness.world import scenarios
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.perception.shared import Heard, merged, stated
@@ -357,6 +362,34 @@ def test_one_at_a_time_as_in_batches(small: Dataset, tmp_path: Path) -> None:
         run(spec_of(small, points=points, batch_size=size), tmp_path / f"{size}").out for size in (1, 8)
     )
     assert same_files(one, many)
+
+
+def test_whoever_reads_a_run_sees_what_the_ego_was_asked(small: Dataset, tmp_path: Path) -> None:
+    """The prompt of every answer can be shown as it was sent, and a pair for training has it."""
+    spec = spec_of(small, points=(OBJECTS, BOTH, OBJECTS.changed(attack="ghost:share=1/3", name="lied to")))
+    stored = folder.read(run(spec, tmp_path / "run").out)
+    sent = prompts_of(stored)
+    assert sent is not None
+    scenes = {scene.id: scene for scene in all_scenes(small)}
+    shared = 0
+    for name, answers in stored.answers_by_scene.items():
+        by_key = {answer.key: answer for answer in answers}
+        for answer in answers:
+            heard = messages_of(by_key, answer.heard, small.actions)
+            messages = sent(as_asked(small.scenario, scenes[name], answer), answer.viewer, heard)
+            assert digest(messages) == answer.prompt_sha256
+            shared += any("objects" in key for key in answer.heard)
+    assert shared > 10
+    asked = {answer.prompt_sha256 for answers in stored.answers_by_scene.values() for answer in answers}
+    assert {digest(pair["prompt"]) for pair in pairs(stored)} <= asked
+
+
+@pytest.mark.parametrize("heard", ["v9!objects", "v2!shift:offset_m=x&objects"])
+def test_a_stranger_who_heard_nobody_is_one_line(small: Dataset, proxy_run: Path, heard: str) -> None:
+    answer = structs.replace(next(iter(folder.read(proxy_run).answers)), role="merge", heard=(heard,))
+    with pytest.raises(UserError) as error:
+        as_asked(small.scenario, all_scenes(small)[0], answer)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(

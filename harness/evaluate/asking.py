@@ -374,13 +374,11 @@ class Asker:
         """Return the requests of the fusion calls with these sets of messages."""
         sets = list(_heard_sets(scenes, codes, rewrites))
         missing = [each for each in sets if _fusion_id(*each) not in self.answers]
-        graphs = dict(
-            zip(map(id, missing), shared_graphs(self.spec.scenario, missing, rewrites), strict=True)
-        )
+        graphs = dict(zip(map(id, missing), shared_graphs(self.spec.scenario, missing), strict=True))
         calls = []
         for heard in sets:
             scene, senders = heard
-            keys = (key.partition(REWRITTEN)[0] for key in senders) if rewrites.words else ()
+            keys = (key.partition(REWRITTEN)[0] for key in senders)
             sent = {key: a for key in keys if (a := self.answers.get(f"{scene.id}/{key}"))}
             calls.append(fusion_request(self.spec, scene, sent, senders, graphs.get(id(heard))))
         return calls

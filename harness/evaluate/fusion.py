@@ -77,19 +77,25 @@ def key_of(helper: str, rewrites: Rewrites, attacks: bool) -> str:
     return helper + BLIND * rewrites.blind + (REWRITTEN + "&".join(changed) if changed else "")
 
 
+def changes_of(key: str) -> list[str]:
+    """Return how the message of a sender's key was changed, and what it holds if not an intent alone."""
+    return [change for change in key.partition(REWRITTEN)[2].split("&") if change]
+
+
 def messages_of(
     answers: Mapping[str, Answer], senders: Sequence[str], actions: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Return these helpers' messages as a prompt takes them; `answers` are a point's, by key."""
     messages = []
     for sender in senders:
-        key, _, changes = sender.partition(REWRITTEN)
+        key, changes = sender.partition(REWRITTEN)[0], changes_of(sender)
+        holds = {WORDS, OBJECTS, TRUTH}.intersection(changes)
+        if holds and WORDS not in holds:
+            continue  # its objects are in the graph
         if (answer := answers.get(key)) and answer.intent and answer.message:
             message = {"intent": list(answer.intent), **answer.message}
-            for change in filter(None, changes.split("&")):
-                if change in (WORDS, OBJECTS, TRUTH):
-                    continue
-                message = _rewritten(message, change, actions)
+            for change in changes:
+                message = message if change in holds else _rewritten(message, change, actions)
             # No special token of a chat template gets through.
             message["evidence"] = as_text(message["evidence"] or "")
             messages.append({"sender": key.removesuffix(BLIND), **message})

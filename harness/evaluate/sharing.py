@@ -5,12 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from harness.coordination.attacks import ATTACKS, attacks_of
-from harness.coordination.contents import TRUTH
-from harness.coordination.operating_point import Rewrites
+from harness.coordination.contents import OBJECTS, TRUTH
 from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
 from harness.dataset.load import Scene
-from harness.runs.records import BLIND, REWRITTEN
+from harness.evaluate.fusion import changes_of
+from harness.runs.records import BLIND, REWRITTEN, Answer
 from harness.world.perception.graph import truth_graphs
 from harness.world.perception.shared import Heard, invented, merged
 from harness.world.scenario import Scenario
@@ -18,30 +19,58 @@ from harness.world.scene_graph import SceneGraph
 
 
 def shared_graphs(
-    scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]], rewrites: Rewrites
+    scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]]
 ) -> Sequence[SceneGraph | None]:
-    """Return the ego's graph for each scene and the keys of those who were heard in it.
+    """Return the ego's graph for each scene and the keys of those who were heard in it (`fusion.key_of`).
 
-    None where messages hold no objects.
+    None where their messages hold no objects. All sets have messages of one content.
     """
-    if not rewrites.graph:
-        return [None] * len(sets)
-    if rewrites.graph == TRUTH:
+    changes = {change for _, senders in sets for key in senders for change in changes_of(key)}
+    if TRUTH in changes:
         return truth_graphs(scenario, [scene.state for scene, _ in sets])
-    cases = []
-    for scene, senders in sets:
-        heard = []
-        for key in senders:
-            sender, _, changes = key.partition(REWRITTEN)
-            graph = scene.graphs[sender.removesuffix(BLIND)]
-            graph = graph.blinded() if sender.endswith(BLIND) else graph
-            for name in changes.split("&") if rewrites.attack else ():
-                if name.partition(":")[0] in ATTACKS:
-                    [attack] = attacks_of(name)
-                    graph = attack.listed(graph, invented(scenario, scene.state, graph.viewer))
-            heard.append(graph)
-        cases.append(Heard(scene.state, scene.graphs[scene.viewers[0]], heard))
+    if OBJECTS not in changes:
+        return [None] * len(sets)
+    cases = [
+        Heard(
+            scene.state,
+            scene.graphs[scene.viewers[0]],
+            [_sent(scenario, scene, key) for key in senders],
+        )
+        for scene, senders in sets
+    ]
     return merged(scenario, cases)
+
+
+def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
+    """Return the graph that a message of this key is made of."""
+    sender = key.partition(REWRITTEN)[0]
+    graph = scene.graphs[sender.removesuffix(BLIND)]
+    graph = graph.blinded() if sender.endswith(BLIND) else graph
+    for name in changes_of(key):
+        if name.partition(":")[0] in ATTACKS:
+            [attack] = attacks_of(name)
+            graph = attack.listed(graph, invented(scenario, scene.state, graph.viewer))
+    return graph
+
+
+def as_asked(scenario: Scenario, scene: Scene, answer: Answer) -> Scene:
+    """Return a decision point as it was shown to who gave an answer.
+
+    A blind helper saw nothing; an ego that was asked again may have had the objects of others.
+
+    Raises:
+        UserError: the answer names a sender or an attack that there is not, as only a stranger's can.
+    """
+    if answer.role == "blind":
+        return scene.changed(graphs={viewer: graph.blinded() for viewer, graph in scene.graphs.items()})
+    try:
+        [graph] = shared_graphs(scenario, [(scene, answer.heard)])
+    except KeyError as error:
+        raise UserError(
+            f"answers.jsonl has an answer in scene {printable(scene.id)} that heard {printable(error)}, "
+            "who is not there; make the run again"
+        ) from None
+    return scene if graph is None else scene.changed(graphs={**scene.graphs, answer.viewer: graph})
 
 
 def listed(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:

@@ -19,6 +19,7 @@ from harness.dataset.load import Scene
 from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.device import answer_s
 from harness.evaluate.fusion import messages_of
+from harness.evaluate.sharing import as_asked
 from harness.parsing.parse import spans
 from harness.prompts.versions import Prompt
 from harness.report.drawing.geometry import conflict_points, spots, view_of
@@ -79,13 +80,6 @@ def prompts_of(run: Run) -> Sent | None:
             return ()
 
     return sent
-
-
-def as_shown(scene: Scene, answer: Answer) -> Scene:
-    """Return a decision point as it was shown to who answered."""
-    if answer.role != "blind":
-        return scene
-    return scene.changed(graphs={viewer: graph.blinded() for viewer, graph in scene.graphs.items()})
 
 
 @dataclass(frozen=True)
@@ -162,8 +156,8 @@ class Details:
             shown |= {key: text(shown[key]) for key in ("error", "detail") if key in shown}
             asked = None
             if scene and prompts:
-                shown_to = as_shown(scene, answer)
-                messages = prompts(shown_to, answer.viewer, messages_of(by_viewer, answer.heard, run.actions))
+                heard = messages_of(by_viewer, answer.heard, run.actions)
+                messages = prompts(as_asked(self.runs.scenario, scene, answer), answer.viewer, heard)
                 key = digest(messages)
                 if answer.prompt_sha256 == key:
                     sent.setdefault(key, messages)

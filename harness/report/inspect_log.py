@@ -16,9 +16,10 @@ from inspect_ai.viewer import ViewerConfig
 from harness.core.errors import UserError
 from harness.core.files import digest, replacing
 from harness.core.places import nameless, text
-from harness.dataset.load import Scene
+from harness.dataset.load import Dataset, Scene
 from harness.evaluate.fusion import messages_of
-from harness.report.details import as_shown, prompts_of
+from harness.evaluate.sharing import as_asked
+from harness.report.details import prompts_of
 from harness.report.page import refuse_less
 from harness.runs.folder import Run, check_scenes, dataset_of
 from harness.runs.records import Answer, FrozenScenes
@@ -37,24 +38,24 @@ def write(run: Run, path: Path, dataset: Path | None = None) -> Path:
     Raises:
         UserError: the file is there already, and would lose the prompts.
     """
-    scenes = _scenes(run, dataset)
+    frozen, scenes = _scenes(run, dataset)
     if isinstance(run.manifest.world, FrozenScenes):
         why = lacking(run) or (None if scenes else "its dataset is not here")
         refuse_less(path, {"prompts": why} if why else {}, "--inspect")
     with replacing(path) as part:
         log.write_eval_log(
-            log_of(run, scenes), str(part), format="json" if path.suffix == ".json" else "eval"
+            log_of(run, frozen, scenes), str(part), format="json" if path.suffix == ".json" else "eval"
         )
     return path
 
 
-def log_of(run: Run, scenes: Mapping[str, Scene]) -> log.EvalLog:
+def log_of(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> log.EvalLog:
     """Return the log: its task is dataset and prompt version, its results the run's summary over episodes."""
     manifest, variant = run.manifest, run.manifest.variant
     whole = msgspec.to_builtins(manifest)
     stated = nameless(whole)
     asked = ("prompt", "helpers", "answer", "thinking", "seeds", "conditions")
-    samples = list(_samples(run, scenes))
+    samples = list(_samples(run, dataset, scenes))
     name = digest(whole)[:22]
     return log.EvalLog(
         status="success",
@@ -87,7 +88,7 @@ def _results(run: Run) -> Iterator[log.EvalScore]:
         yield log.EvalScore(name=condition, scorer="swarmdrive-harness", metrics=metrics)
 
 
-def _samples(run: Run, scenes: Mapping[str, Scene]) -> Iterator[log.EvalSample]:
+def _samples(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> Iterator[log.EvalSample]:
     sent = prompts_of(run)
     d = run.decisions
     regret, safe = d["regret"], d.of_actions("safe")
@@ -100,9 +101,9 @@ def _samples(run: Run, scenes: Mapping[str, Scene]) -> Iterator[log.EvalSample]:
         facts = {"scene": name, "episode": int(episode[rows.start]), "step": int(step[rows.start])}
         for answer in answers.values():
             asked: Sequence[Mapping[str, str]] = ()
-            if sent and name in scenes:
+            if sent and dataset and name in scenes:
                 heard = messages_of(answers, answer.heard, run.actions)
-                asked = sent(as_shown(scenes[name], answer), answer.viewer, heard)
+                asked = sent(as_asked(dataset.scenario, scenes[name], answer), answer.viewer, heard)
             yield _sample(run, answer, asked, target, kept if answer.role in ("ego", "merge") else {}, facts)
 
 
@@ -150,15 +151,15 @@ def _kept(run: Run, condition: Any, regret: Any) -> dict[str, Score]:
     return scores
 
 
-def _scenes(run: Run, folder: Path | None) -> dict[str, Scene]:
-    """Return the run's decision points; none where its dataset is not here as it was, or it was driven."""
+def _scenes(run: Run, folder: Path | None) -> tuple[Dataset | None, dict[str, Scene]]:
+    """Return the run's dataset and decision points; none if it is not here as it was, or it was driven."""
     if not isinstance(run.manifest.world, FrozenScenes):
-        return {}
+        return None, {}
     try:
         names, dataset = list(run.decisions.scenes), dataset_of(run, folder)
         check_scenes(run, dataset)
-        return dict(zip(names, dataset.scenes(names), strict=True))
+        return dataset, dict(zip(names, dataset.scenes(names), strict=True))
     except UserError:
         if folder:
             raise
-        return {}
+        return None, {}

@@ -16,6 +16,7 @@ from harness.core.files import write_whole
 from harness.core.seeds import FIRST, purpose, stated
 from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.fusion import messages_of
+from harness.evaluate.sharing import as_asked
 from harness.prompts import readout
 from harness.runs.folder import Run, check_scenes, dataset_of
 from harness.runs.records import BLIND, FrozenScenes
@@ -90,7 +91,8 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
             agent = run.agent(stored)
             prompt = prompts[agent["prompt"]["version"]]
             messages = messages_of(answers, stored.heard, run.actions)
-            q = question(lessons, scene, stored.viewer, prompt, messages)
+            asked_with = as_asked(dataset.scenario, scene, stored)
+            q = question(lessons, asked_with, stored.viewer, prompt, messages)
             texts = shown(agent["image"], q.messages)
             sent = in_mode(agent["answer"], prompt, texts, q.graph.role, q.actions)
             completion = answer(prompt, q.graph, q.label, q.actions)

@@ -14,8 +14,12 @@ function highlighted(raw, spans) {
 const distribution = (actions, p) => (p ? actions.map((a, n) => `${a} ${number(p[n], 2)}`).join(", ") : "none");
 
 const sender = (answer) => answer.viewer.replace("~blind", "");
+// Who answered, and whom it had heard: "v1 + v2 (objects) + v3 blind (objects), fusion".
+const heard = (key) =>
+  key.replaceAll("+", " + ").replaceAll("~blind", " blind").replace(/!([^ ]+)/g, (_, what) => ` (${what.replaceAll("&", ", ")})`);
 const who = (answer) =>
-  answer.role === "blind" ? `${sender(answer)}, blind helper` : `${answer.viewer}, ${answer.role}`;
+  answer.role === "blind" ? `${sender(answer)}, blind helper`
+    : `${heard(answer.viewer)}, ${answer.role === "merge" ? "fusion" : answer.role}`;
 
 const signed = (value) => `${value < 0 ? "−" : "+"}${number(Math.abs(value), 2)}`;
 
