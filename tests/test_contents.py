@@ -31,6 +31,7 @@ from harness.coordination.operating_point import POINTS, OperatingPoint, named_p
 from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset, Scene
+from harness.evaluate.dry_run import count
 from harness.evaluate.fusion import messages_of
 from harness.evaluate.sharing import as_asked, listed
 from harness.prompts import versions as prompts
@@ -309,6 +310,18 @@ def test_bits_grow_with_what_is_listed(small: Dataset) -> None:
     assert counts.tolist() == [[len(s.graphs[v].nodes) for v in s.viewers[1:]] for s in scenes]
     assert np.corrcoef(bits.ravel(), counts.ravel())[0, 1] > 0.9
     assert bits.min() >= 8 * len('{"from":"v2","objects":[],"seen":[],"speed_mps":0.0}')
+
+
+def test_a_dry_run_counts_the_questions_of_a_content(small: Dataset) -> None:
+    """Seven sets of three helpers, and none of their models; more sets with a liar among them."""
+    plain, lied, both = (
+        count(spec_of(small, points=(point,), ask="used"), small, None)
+        for point in (OBJECTS, OBJECTS.changed(attack="ghost:share=1/3"), BOTH)
+    )
+    n = plain["scenes"]
+    assert plain["requests_by_role"] == {"ego": n, "fusion": 7 * n}
+    assert lied["requests_by_role"] == {"ego": n, "fusion": 26 * n}
+    assert both["requests_by_role"] == {"ego": n, "helper": 3 * n, "fusion": 7 * n}
 
 
 # Helpers that lie

@@ -138,6 +138,10 @@ def _show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
     by_role, requests = counted["requests_by_role"], f"{counted['requests']} requests"
     if "helper" in by_role and not spec.asks_all:
         requests = f"{by_role['ego']} requests to the ego and at most {by_role['helper']} to helpers"
+    elif "fusion" in by_role:
+        requests = f"{counted['requests'] - by_role['fusion']} requests"
+    if "fusion" in by_role:
+        requests += f", at most {by_role['fusion']} fusion calls"
     typer.echo(
         f"{spec.source.name}: {requests}{repeated} for the {counted['scenes']} scenes "
         f"on the reference drivers' courses; would score {len(spec.points)} conditions × {len(spec.seeds)} "
