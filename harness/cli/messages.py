@@ -24,10 +24,11 @@ def command(
     channel: str | None = typer.Option(None, help="Physical radio, such as its-g5: adds the time on air."),
     as_json: options.Json = False,
 ) -> None:
-    """Show what messages take by the encodings of ETSI and SAE, in bytes.
+    """Show what messages take as ETSI and SAE encode them.
 
-    The envelope is signed, with a digest of the sender's certificate or, once a second, the certificate. The
-    headers are those of network and transport. With a message's name, its members are listed, in bits.
+    Sizes are in bytes. The envelope is signed, with a digest of the sender's certificate or, once a second,
+    the certificate. The headers are those of network and transport. With a message's name, its members are
+    listed, in bits.
     """
     from harness.radio.messages import NAMES, Counts, shares, size, wraps
     from harness.radio.transceiver import Transceiver

@@ -32,8 +32,8 @@ def command(
     attacks: str = typer.Option(
         "all",
         help="Attacks, separated by commas: liar, stuck, stale, replay, spoof, sybil, flood, brake, silent, "
-        "overconfident, random, injection, jump or absent. + combines some, and a colon changes a setting: "
-        "liar+spoof,stale:decisions=2. all: the usual ones.",
+        "overconfident, random, injection, jump or absent; on objects ghost, hide or shift. + combines some, "
+        "and a colon changes a setting: liar+spoof,stale:decisions=2. all: the usual ones.",
     ),
     rules: str = typer.Option(
         "all",

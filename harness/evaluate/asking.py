@@ -97,13 +97,15 @@ def fusion_request(
     With a `graph`, the ego is asked with this one instead of its own.
     """
     own, heard = scene.graphs[scene.viewers[0]], messages_of(answers, senders, spec.actions)
-    words, name = spec.scenario.prompt_words, _fusion_id(scene, senders)
-    image = picture(spec, 0, scene, scene.viewers[0]) if spec.ego.sees else None
-    blank = _blank(spec, 0, "ego").alike(id=name, image=image, view=graph or own, scenario=spec.scenario)
-    if heard:
-        return blank.alike(messages=spec.ego.rendered(graph or own, spec.actions, heard, words))
+    words, image = spec.scenario.prompt_words, picture(spec, 0, scene, scene.viewers[0])
+    blank = _blank(spec, 0, "ego").alike(id=_fusion_id(scene, senders), image=image)
+    if graph is None:
+        return blank.alike(messages=spec.ego.rendered(own, spec.actions, heard, words))
     truth = truth_graph(spec.scenario, scene.state) if spec.ego.card.privileged else None
-    return blank.alike(**spec.ego.chats(graph or own, spec.actions, words), truth=truth)
+    blank = blank.alike(view=graph, truth=truth, scenario=spec.scenario)
+    if heard:
+        return blank.alike(messages=spec.ego.rendered(graph, spec.actions, heard, words))
+    return blank.alike(**spec.ego.chats(graph, spec.actions, words))
 
 
 def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:

@@ -64,6 +64,8 @@ CONDITION: Mapping[str, Added] = {
     "edge_antenna_m": Added("2026-11-23", 5.0, "roadside units with a place"),
     "attack": Added("2026-11-23", "", "attacks; all helpers were honest"),
     "defence": Added("2026-11-23", "", "guarded fusion prompts"),
+    "content": Added("2026-11-27", "intent", "messages that hold objects; all held intents"),
+    "encoding": Added("2026-11-27", "json", "the standards' sizes of messages; all were JSON"),
     "weight_cap": Added("2026-11-23", 1.0, "a cap on one helper's weight"),
 }
 # Of `versions`, in run.json and in the record that a run begins with.
