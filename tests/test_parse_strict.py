@@ -163,3 +163,12 @@ def test_a_valid_distribution_is_strict_and_comes_back_unchanged(
     parsed = parse(text, role="ego", actions=tuple(distribution))
     assert parsed.status is Status.STRICT
     assert parsed.intent == pytest.approx(tuple(distribution.values()), abs=1e-12)
+
+
+@pytest.mark.parametrize("key", [r"\ud800", r"note\udc00", r"IDLE\ud800"])
+@pytest.mark.parametrize("role", FORMS)
+def test_a_key_that_no_text_can_hold_is_no_strict_answer_and_no_fault_of_ours(role: str, key: str) -> None:
+    """JSON may escape a lone surrogate, and a name with one cannot be written as UTF-8."""
+    shares = '{"SLOWER":0.2,"IDLE":0.5,"FASTER":0.3}'
+    for text in (f'{{"{key}":1,"action_distribution":{shares}}}', f'{{"{key}":{shares}}}'):
+        assert parse(text, **Shape(role, ACTIONS)._asdict()).status is not Status.STRICT

@@ -31,7 +31,7 @@ def fitting(text: str, shape: Shape) -> Answer | None:
     for form in _forms(shape):
         try:
             return _answer(msgspec.convert(value, form), shape, extension)
-        except msgspec.ValidationError:
+        except ValueError:  # a form that it is not, or a key with a lone surrogate, which is legal JSON
             continue
     return None
 
