@@ -187,6 +187,8 @@ def test_objects_do_not_wait_for_the_helpers_model() -> None:
     assert early.fused[0].tolist() == [0.0, 1.0, 0.0]
     assert early.latency_s[0] == pytest.approx(early.exchange_s[0] + 0.05)
     assert np.isnan(early.weights).all()
+    assert late.infers.all()
+    assert not early.infers.any()
 
 
 def test_what_is_sent_is_paid_for() -> None:

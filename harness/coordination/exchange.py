@@ -51,7 +51,7 @@ class Exchange:
     triggered: Bools
     asked: Bools  # which helpers are asked; each has a scheduled reply, `(..., H)`
     # which helpers' computers infer for this decision, `(..., H)`: those in the radius, asked or not, or on
-    # demand those that are asked. None without a channel
+    # demand those that are asked. None without a channel, or where messages hold no intents
     infers: Bools
     # number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of a unit that asks for
     # the ego; 0 if nobody is asked
@@ -122,7 +122,7 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         entropy_nats=known.entropy_nats,
         triggered=any_of(asked),
         asked=outcome.asked,
-        infers=outcome.asked if in_turn else np.asarray(intents.range_m <= point.ask.radius_m),
+        infers=point.content.intent & (outcome.asked if in_turn else intents.range_m <= point.ask.radius_m),
         requests=outcome.requests,
         request_bits=outcome.request_bits,
         reply_bits=np.sum(np.where(outcome.asked, intents.payload_bits, 0.0), axis=-1) + outcome.policy_bits,

@@ -236,7 +236,7 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
         places = _sources(point, due)
         source, alone = own.take(places), places == np.arange(len(places))
         own = _with_helpers(own, source, source.valid & ~alone[:, None])
-    return _as_sent(point, own) if point.asks else own
+    return as_sent(point, own) if point.asks else own
 
 
 def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:
@@ -244,7 +244,7 @@ def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:
     return replace(own, valid=valid, **{name: getattr(source, name) for name in names})
 
 
-def _as_sent(point: OperatingPoint, intents: Intents) -> Intents:
+def as_sent(point: OperatingPoint, intents: Intents) -> Intents:
     """Return what helpers send by the point's content and encoding."""
     content, encoding = point.content, point.radio.encoding
     if encoding == JSON and not content.graph:

@@ -11,6 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
+from harness.coordination.contents import INTENT
 from harness.coordination.coordinate import FusionInputs, fuse
 from harness.coordination.exchange import exchange, worth_of
 from harness.coordination.intents import Intents
@@ -23,6 +24,7 @@ from harness.dataset.forest import Forest
 from harness.evaluate.device import helpers_j
 from harness.evaluate.draws import channel_draws, tie_draws
 from harness.evaluate.outlook import outlook
+from harness.evaluate.walk import as_sent
 from harness.radio.channel import Draws
 from harness.studies.replayed_run import ReplayedRun
 from harness.world.sight_lines import site
@@ -128,7 +130,7 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
             f"--condition {shown}: consensus {consensus} is no function of who is heard now, so that "
             "the oracle would be none; give linear, or another without memory"
         )
-    for setting, honest in (("messages", "own"), ("attack", "")):
+    for setting, honest in (("messages", "own"), ("attack", ""), ("content", INTENT)):
         if point.setting(setting) != honest:
             raise UserError(f"--condition {shown}: the oracle knows no {setting}; leave it out")
 
@@ -178,7 +180,7 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
     draws = channel_draws(
         seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps, width
     )
-    intents, ties = intents.take(node), tie_draws(draws, stored.spec.ties)
+    intents, ties = as_sent(point, intents.take(node)), tie_draws(draws, stored.spec.ties)
     own_j, actions, costs = stored.joules(scenes, point)[node], [], []
     for who in sets[:, :width]:
         heard = fuse(

@@ -89,6 +89,7 @@ def test_of_nobody_to_ask_the_oracle_is_the_ego_alone(stored: ReplayedRun):
         ("6g:consensus=ego-prompt", "consensus ego-prompt is no function of who is heard now"),
         ("6g:messages=shuffled", "the oracle knows no messages; leave it out"),
         ("6g:attack=liar", "the oracle knows no attack; leave it out"),
+        ("6g:content=objects", "the oracle knows no content; leave it out"),
     ],
 )
 def test_what_the_oracle_cannot_bound_is_refused(stored: ReplayedRun, text: str, says: str):
