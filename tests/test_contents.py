@@ -407,6 +407,16 @@ def test_a_stranger_who_heard_nobody_is_one_line(small: Dataset, proxy_run: Path
     assert "\n" not in str(error.value)
 
 
+def test_a_stranger_who_names_two_attacks_at_once_gets_both(small: Dataset, proxy_run: Path) -> None:
+    scene = all_scenes(small)[0]
+    answer = next(iter(folder.read(proxy_run).answers))
+    twice, apart = (
+        as_asked(small.scenario, scene, structs.replace(answer, role="merge", heard=(f"v2!{text}&objects",)))
+        for text in ("shift:offset_m=6+hide", "shift:offset_m=6&hide")
+    )
+    assert twice.graphs == apart.graphs
+
+
 @pytest.mark.parametrize(
     ("text", "wrong"),
     [

@@ -48,8 +48,8 @@ def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
     graph = graph.blinded() if sender.endswith(BLIND) else graph
     for name in changes_of(key):
         if name.partition(":")[0] in ATTACKS:
-            [attack] = attacks_of(name)
-            graph = attack.listed(graph, invented(scenario, scene.state, graph.viewer))
+            for attack in attacks_of(name):  # a run of ours has one, a stranger's may have more
+                graph = attack.listed(graph, invented(scenario, scene.state, graph.viewer))
     return graph
 
 
