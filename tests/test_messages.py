@@ -4,6 +4,7 @@ import json
 import math
 import re
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from harness.coordination.operating_point import OperatingPoint
 from harness.radio.its_g5 import ItsG5
 from harness.radio.messages import (
     NAMES,
     PSIDS,
     Counts,
     Member,
+    beacon_bytes,
     message_bits,
     packet_bits,
     shares,
@@ -25,6 +28,7 @@ from harness.radio.messages import (
     table,
     wraps,
 )
+from harness.radio.profiles import CHANNELS
 
 # What pycrate writes: benchmarks/message_sizes.py.
 ENCODED = json.loads((Path(__file__).parent / "golden/message-sizes.json").read_text())
@@ -46,7 +50,7 @@ def test_a_message_has_the_bits_that_an_encoder_writes(name: str):
 def test_an_envelope_has_the_bits_that_an_encoder_writes():
     names = {psid: name for name, psid in PSIDS.items()}
     for case in ENCODED["envelopes"]:
-        age_s = 1.0 if case["certificate"] else 0.99
+        age_s = math.inf if case["certificate"] else 0.0
         signed = packet_bits(names[case["psid"]], case["payload_bits"], age_s, headers=False)
         assert signed == case["bits"], case
 
@@ -100,12 +104,28 @@ def test_who_lists_nothing_sends_a_cpm_but_no_sdsm():
         message_bits("SDSM", Counts(objects=np.array([3, 257])))
 
 
-def test_the_certificate_goes_along_once_a_second():
+def test_beacons_load_the_channel_with_the_size_that_their_encoding_gives():
+    """By hand: one CAM in ten and one BSM in five has the 141 bytes of a certificate more."""
+    assert beacon_bytes("etsi", 10) == math.ceil(178 + 141 / 10)
+    assert beacon_bytes("sae", 10) == math.ceil(138 + 141 / 5)
+    assert beacon_bytes("sae", 0) == 138 + 141
+    for profile in ("its-g5", "mode2"):
+        declared = OperatingPoint.of("p", profile)
+        at_20_hz = declared.changed(encoding="etsi").of_radio({"rate_hz": "20"})
+        written_out = at_20_hz.of_radio({"packet_bytes": "300"})
+        assert asdict(at_20_hz.channel)["packet_bytes"] == math.ceil(178 + 141 / 20)
+        assert asdict(written_out.channel)["packet_bytes"] == 300
+        assert declared.channel == CHANNELS[profile]
+    assert OperatingPoint.of("p", "mode4", encoding="etsi").channel == CHANNELS["mode4"]
+
+
+def test_the_certificate_goes_along_when_it_is_due():
     age_s = np.array([0.0, 0.9, 1.0, 5.0])
     packets = packet_bits("CAM", 328, age_s) / 8
     assert packets.tolist() == [178, 178, 319, 319]
     signed = packet_bits("CAM", np.array([328, 0, 328, 328]), age_s, headers=False) / 8
     assert signed.tolist() == [134, 0, 275, 275]
+    assert (packet_bits("BSM", 320, np.array([0.44, 0.45])) / 8).tolist() == [138, 279]
 
 
 @pytest.mark.parametrize("name", MESSAGES)

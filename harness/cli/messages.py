@@ -26,7 +26,7 @@ def command(
 ) -> None:
     """Show what messages take as ETSI and SAE encode them.
 
-    Sizes are in bytes. The envelope is signed, with a digest of the sender's certificate or, once a second,
+    Sizes are in bytes. The envelope is signed, with a digest of the sender's certificate or, now and then,
     the certificate. The headers are those of network and transport. With a message's name, its members are
     listed, in bits.
     """

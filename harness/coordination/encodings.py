@@ -2,10 +2,11 @@
 
     json  compact JSON without a signature or headers, the paper's profiles' default
     etsi  CPMs, and containers of our own for intents and requests, in PER; signed, with a digest of the
-          certificate, which beacons carry once a second
+          certificate, which beacons carry now and then
     sae   SDSMs, and the same
 
-Under a physical radio the headers of network and transport count as well; those of the radio are its own.
+The background's packets are then CAMs or BSMs. Under a physical radio the headers of network and transport
+count as well; those of the radio are its own.
 """
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from harness.coordination.contents import Content
 from harness.coordination.intents import Intents
 from harness.core.arrays import Floats
+from harness.radio import messages
 from harness.radio.messages import NAMES, Counts, Encoding, message_bits, packet_bits
 
 JSON = "json"
@@ -39,7 +41,15 @@ def request_bits(encoding: str, helpers: int, headers: bool) -> float:
     return float(_packet(encoding, "request", Counts(helpers=helpers), headers))
 
 
+def beacon_bytes(encoding: str, rate_hz: float) -> int:
+    """Return the mean size of a vehicle's beacons by an encoding that is not `json`, at so many a second."""
+    return messages.beacon_bytes(_standard(encoding), rate_hz)
+
+
+def _standard(encoding: str) -> Encoding:
+    return "sae" if encoding == "sae" else "etsi"
+
+
 def _packet(encoding: str, content: str, counts: Counts, headers: bool) -> Floats:
-    by_name: Encoding = "sae" if encoding == "sae" else "etsi"
-    name = NAMES[by_name][content]
+    name = NAMES[_standard(encoding)][content]
     return packet_bits(name, message_bits(name, counts), headers=headers)

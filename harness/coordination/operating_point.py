@@ -9,7 +9,7 @@ from msgspec import structs
 
 from harness.coordination.attacks import ATTACKS, Absent, attacks_of, in_question
 from harness.coordination.contents import CONTENTS, OBJECTS, Content
-from harness.coordination.encodings import JSON, request_bits
+from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.parts import FUSION, RELAY, Ask, Cloud, Fusion, Guard, Part, Radio, wrong
 from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES
@@ -171,8 +171,12 @@ class OperatingPoint:
         for key in overrides:
             if key not in {field.name for field in fields(channel)}:
                 raise self._wrong(key, f"left out: channel profile {radio.profile} has no such setting")
-        if radio.further:
-            channel = changed(channel, pairs(radio.further), f"channel profile {radio.profile}")
+        further: Mapping[str, str] = pairs(radio.further) if radio.further else {}
+        if further:
+            channel = changed(channel, further, f"channel profile {radio.profile}")
+        known = vars(channel) if isinstance(channel, Physical) else {}
+        if radio.encoding != JSON and "packet_bytes" in known and "packet_bytes" not in further:
+            overrides["packet_bytes"] = beacon_bytes(radio.encoding, known["rate_hz"])
         channel = replace(channel, **overrides)
         if isinstance(channel, Physical):
             channel = channel if loss is None else AtLoss(channel, loss)

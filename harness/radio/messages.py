@@ -9,7 +9,7 @@ in OER (X.696), whole octets throughout. So no size depends on values, only on h
     etsi   CAM (TS 103 900, and bit for bit EN 302 637-2), CPM (TS 103 324), GeoNetworking and BTP-B
     sae    BSM (J2735), SDSM (J3224), WSMP (IEEE 1609.3)
     both   the envelope of IEEE 1609.2 by the profile of TS 103 097: a digest of the sender's certificate, and
-           once a second the certificate
+           now and then the certificate
 
 No standard has a message for an intent or for its request. Theirs are containers of our own, made of the
 standards' elements. All sizes are held against an encoder (`benchmarks/message_sizes.py`).
@@ -18,6 +18,7 @@ standards' elements. All sizes are held against an encoder (`benchmarks/message_
 """
 
 import csv
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -36,7 +37,9 @@ NAMES: Mapping[Encoding, Mapping[str, str]] = {
     "sae": {"beacon": "BSM", "objects": "SDSM", "intent": "sae-intent", "request": "sae-request"},
 }
 MOST = {"CPM": 255, "SDSM": 256}  # objects in one message
-CERTIFICATE_EVERY_S = 1.0
+# Seconds after which a message has the certificate again: TS 103 097 7.1.1, and CertAttachInt of J2945/1 as
+# Rostami, Krishnan and Gruteser (2018), table 1, give it. TS 103 097 adds one for new neighbours, left out.
+CERTIFICATE_EVERY_S: Mapping[Encoding, float] = {"etsi": 1.0, "sae": 0.45}
 # Number of an application (ITS-AID in TS 102 965, PSID in IEEE 1609.12). A container of ours has none yet: in
 # its place is any that takes two octets.
 PSIDS, OTHER_PSID = {"CAM": 36, "BSM": 32, "CPM": 639, "SDSM": 144}, 1000
@@ -134,13 +137,13 @@ def wraps(
     Args:
         name: a message of `NAMES`.
         bits: its bits.
-        since_certificate_s: seconds since the sender's last message with its certificate. From a second on
-            this one has it, else the certificate's digest.
+        since_certificate_s: seconds since the sender's last message with its certificate. From
+            `CERTIFICATE_EVERY_S` on this one has it, else the certificate's digest.
         headers: whether those of GeoNetworking and BTP-B, or of WSMP, count. Those of the radio never do:
             `its-g5` adds its `header_bytes`, and a sidelink's blocks are taken as they are.
     """
-    encoding = next(encoding for encoding, names in NAMES.items() if name in names.values())
-    certificate = np.asarray(since_certificate_s) >= CERTIFICATE_EVERY_S
+    encoding = _encoding_of(name)
+    certificate = np.asarray(since_certificate_s) >= CERTIFICATE_EVERY_S[encoding]
     psid = PSIDS.get(name, OTHER_PSID)
     counts: dict[str, Count] = {
         "psid": 1 + (psid > 255), "p_encoded_psid": 1 + (psid > 127),
@@ -159,7 +162,21 @@ def size(name: str, content: Counts) -> Size:
     """Return what a message takes with its envelope and headers."""
     bits = message_bits(name, content)
     signed, packet = packet_bits(name, bits, headers=False), packet_bits(name, bits)
-    return Size(bits, signed - bits, packet - signed, packet, packet_bits(name, bits, CERTIFICATE_EVERY_S))
+    return Size(bits, signed - bits, packet - signed, packet, packet_bits(name, bits, np.inf))
+
+
+def beacon_bytes(encoding: Encoding, rate_hz: float) -> int:
+    """Return the mean size of a vehicle's beacons, rounded up to a byte, without a path behind it.
+
+    One in so many has the certificate: the first that is due.
+    """
+    beacon = size(NAMES[encoding]["beacon"], Counts())
+    every = max(1, math.ceil(CERTIFICATE_EVERY_S[encoding] * rate_hz))
+    return math.ceil((beacon.packet + (beacon.with_certificate - beacon.packet) / every) / 8)
+
+
+def _encoding_of(name: str) -> Encoding:
+    return next(encoding for encoding, names in NAMES.items() if name in names.values())
 
 
 def _total(shares: Iterable[Share]) -> Floats:
