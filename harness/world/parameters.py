@@ -21,6 +21,8 @@ BOUNDS = {
     "_s": (0.0, MOST_FRAMES), "_m": (-1000.0, 1000.0), "_mps": (0.0, 200.0), "_mps2": (0.0, 200.0),
     "_hz": (0.0, 1000.0), "_share": (0.0, 1.0), "_shares": (0.0, 1.0),
 }  # fmt: skip
+WITNESSES = ("any", "each", "0", "1", "2", "3")
+VERSIONS = (1, 2)
 ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
 
 
@@ -60,6 +62,12 @@ class Parameters:
     beacon_noise_mps: float = 0.1  # standard deviation of a beacon's speed
     beacon_noise_rad: float = 0.0035  # standard deviation of a beacon's heading
     ambient: str = DAY  # light and weather, one of `harness.world.ambient`
+    # how many helpers have the danger in sight at the first decision: `0` to `3`; `each` of these in a
+    # quarter of the layouts; or `any`, as many as the scene happens to give
+    witnesses: str = "any"
+    radio_share: float = 0.0  # probability that a vehicle which does not help sends beacons, too
+    limits: int = 1  # version of the rule that says which delay is a failure (`harness.world.outcome`)
+    perception: int = 1  # version of what sensors make of a vehicle that is not reported
 
     def __post_init__(self) -> None:
         speeds, total_frames = len(self.target_speeds_mps), self.time_limit_s * self.simulation_hz
@@ -76,6 +84,8 @@ class Parameters:
             "beacon_delay_s": (0 <= self.beacon_delay_s <= 1, "seconds from 0 to 1"),
             "beacon_loss": (0 <= self.beacon_loss < 1, "a probability from 0, below 1"),
             "beacon_noise_rad": (0 <= self.beacon_noise_rad <= 7, "from 0 to 7"),
+            "witnesses": (self.witnesses in WITNESSES, " or ".join(WITNESSES)),
+            **{name: (getattr(self, name) in VERSIONS, "1 or 2") for name in ("limits", "perception")},
         }
         for field in fields(self):
             value = getattr(self, field.name)
@@ -108,7 +118,10 @@ class Parameters:
 
 
 # Parameters that were added later, with the values of the earlier behaviour.
-LATER = (("ambient", DAY), ("beacon_rule", "fixed"), ("beacon_channel", ""))
+LATER = (
+    ("ambient", DAY), ("beacon_rule", "fixed"), ("beacon_channel", ""),
+    ("witnesses", "any"), ("radio_share", 0.0), ("limits", 1), ("perception", 1),
+)  # fmt: skip
 
 
 @lru_cache(maxsize=64)
@@ -133,3 +146,5 @@ def beacon_radio(text: str) -> Physical | None:
 DIALS = tuple(
     field.name for field in fields(Parameters) if field.name.startswith(("beacon_", "perfect_", "ambient"))
 )
+# Further ones that a name may set: who is there, and what counts.
+SETTABLE = (*DIALS, "witnesses", "radio_share", "limits", "perception")

@@ -8,7 +8,7 @@ from warnings import warn
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world import parameters as _parameters
-from harness.world.parameters import DIALS, Parameters
+from harness.world.parameters import SETTABLE, Parameters
 from harness.world.road import Road
 from harness.world.state import Building, Kind, Part
 
@@ -91,7 +91,7 @@ class Scenario:
     prompt: str = "v4"  # default prompt version
     # why scenes with left and right swapped are not valid scenes; None if they are
     one_sided: str | None = "nothing says that a mirrored scene is one of it"
-    dials: tuple[str, ...] = DIALS  # parameters that a name may set: `NAME:beacon_loss=0.3`
+    dials: tuple[str, ...] = SETTABLE  # parameters that a name may set: `NAME:beacon_loss=0.3`
     # subclass of `World` whose episodes an environment simulates; None for the harness's own simulator
     world: type[Any] | None = None
     # spelling of 0.2, until 0.4.0: what starts an episode of such a world, `(scenario, seed)`

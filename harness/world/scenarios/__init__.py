@@ -15,7 +15,7 @@ from harness.core.config import convert, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.core.plugins import Plugins
 from harness.world.environments import environment
-from harness.world.parameters import Parameters
+from harness.world.parameters import LATER, Parameters
 from harness.world.scenario import Scenario
 
 PLUG_INS = Plugins[Scenario]("swarmdrive.scenarios", Scenario, {})
@@ -88,6 +88,7 @@ def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
             f"{where} has other parameters here (not {printable(extra[0])}); "
             "use the version that its manifest names"
         )
+    earlier = {key: value for key, value in LATER if key in here}
     # Numbers in a manifest are decoded as floats.
     values = {
         key: int(value)
@@ -95,7 +96,9 @@ def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
         else value
         for key, value in parameters.items()
     }
-    return replace(scenario, parameters=convert({**here, **values}, type(scenario.parameters), where))
+    return replace(
+        scenario, parameters=convert({**here, **earlier, **values}, type(scenario.parameters), where)
+    )
 
 
 def restore(name: str, parameters: Parameters) -> Scenario:
