@@ -204,7 +204,15 @@ IDLE = [
     ("6g:consensus=ego-prompt", "weight_cap", "consensus ego-prompt weighs no distances"),
     ("6g:consensus=bayes", "min_distance_m", "consensus bayes weighs no distances"),
     ("cloud", "tau_nats", "it has no channel"),
-]
+    *(
+        (f"6g:content={content}", setting, f"content {content} holds no intents")
+        for content, setting in (
+            ("objects", "consensus"), ("objects", "weight_cap"), ("objects", "min_distance_m"),
+            ("objects", "ego_distance_m"), ("objects", "on_demand"), ("oracle", "consensus"),
+            ("oracle", "helper_rounds"),
+        )
+    ),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("condition", "setting", "why"), IDLE)
@@ -219,6 +227,8 @@ def test_a_setting_that_changes_nothing_says_why(project, condition, setting, wh
         ("mode4:edge=relay", "edge_delay_s"), ("6g:schedule=margin,helper_rounds=true", "tau_nats"),
         ("6g:schedule=never", "schedule"), ("6g:max_helpers=0", "max_helpers"), ("6g", None),
         ("6g:schedule=never", "fallback"), ("6g", "weight_cap"), ("cloud", "round_trip_s"),
+        ("6g:content=both", "consensus"), ("6g:content=objects", "fallback"),
+        ("6g:content=objects", "content"),
     ],
 )  # fmt: skip
 def test_a_setting_that_may_change_something_says_nothing(project, condition, setting):

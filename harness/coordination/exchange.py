@@ -165,9 +165,8 @@ def _ask_helpers(
     point: OperatingPoint, intents: Intents, asked: Bools, in_radius: Bools, draws: Draws
 ) -> tuple[Floats, Consulted, Floats]:
     """Return when the ego asks, `(..., 1)`, the outcome, and until when it waits at most, `(...)`."""
-    opens_round = (
-        triggered(intents.helpers, point.ask.tau_nats) if point.radio.helper_rounds else np.zeros_like(asked)
-    )
+    intends = point.radio.helper_rounds and point.content.intent
+    opens_round = triggered(intents.helpers, point.ask.tau_nats) if intends else np.zeros_like(asked)
     inference_s = np.nan_to_num(inferred_s(point, intents, draws))
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
 

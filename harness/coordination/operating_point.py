@@ -28,6 +28,8 @@ OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a 
 UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")  # settings of a roadside unit with a place
 ALONE = ("fallback", "round_trip", "round_trip_s", "window_s")  # settings of an ego that asks nobody
 WEIGHING = ("weight_cap", "min_distance_m", "ego_distance_m")  # settings of the weights by distance
+# Settings of helpers' intents: how they are fused, and when a helper's model is asked.
+OF_INTENTS = ("consensus", *WEIGHING, "on_demand", "helper_rounds")
 LONGEST_NAME = 1000
 PARTS: dict[str, type[Part]] = {
     "radio": Radio, "ask": Ask, "fusion": Fusion, "guard": Guard, "cloud": Cloud,
@@ -242,6 +244,8 @@ class OperatingPoint:
             return f"encoding {self.radio.encoding} has a size of its own for requests"
         if setting in UNIT and self.radio.edge == "none":
             return "it has no roadside unit (edge is none)"
+        if setting in OF_INTENTS and not self.content.intent:
+            return f"content {ask.content} holds no intents"
         if setting in WEIGHING and (consensus == EGO_PROMPT or isinstance(RULES[consensus], Heads)):
             return f"consensus {consensus} weighs no distances"
         counts_rounds = isinstance(self.channel, constant.Radio) and not self.channel.density_coupled

@@ -175,6 +175,10 @@ def test_what_cannot_be_is_one_line(
         ("v2x:max_helpers=0", "consensus", ("linear", "median")),
         ("v2x:consensus=bayes", "weight_cap", (0.1, 1.0)),
         ("v2x:consensus=geometric-median", "min_distance_m", (1.0, 1000.0)),
+        ("6g:content=objects", "consensus", ("linear", "trust")),
+        ("6g:content=objects", "ego_distance_m", (3.5, 300.0)),
+        ("v2x:content=objects,latency_s=0.01", "on_demand", ("false", "true")),
+        ("v2x:content=objects", "helper_rounds", ("false", "true")),
     ],
 )
 def test_a_setting_that_is_refused_as_idle_changes_nothing(
