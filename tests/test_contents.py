@@ -42,7 +42,7 @@ from harness.runs import folder
 from harness.training.pairs import pairs
 from harness.world import scenarios
 from harness.world.perception.graph import scene_graph, truth_graph
-from harness.world.perception.shared import Heard, merged, stated
+from harness.world.perception.shared import NOBODY, Heard, merged, stated
 from harness.world.scene_graph import SceneGraph
 from harness.world.state import Part, VehicleState, WorldState
 
@@ -368,6 +368,34 @@ def test_a_shifted_object_is_another_object(small: Dataset) -> None:
     assert any(len(graph.seen) > len({*graph.seen}) for graph in graphs if graph)
 
 
+@pytest.mark.parametrize("text", ["ghost+hide", "hide+ghost"])
+def test_whoever_hides_all_and_invents_a_car_lists_that_car_alone(small: Dataset, text: str) -> None:
+    """In whatever order both are named, and as one question."""
+    attack = "+".join(f"{name}:share=1" for name in text.split("+"))
+    backend = Planner(small)
+    walked(spec_of(small, points=(OBJECTS.changed(attack=attack),)), backend)
+    scenes = {scene.id: scene for scene in all_scenes(small)}
+    asked = [r for r in backend.asked if "+" in r.id]
+    assert asked
+    for request in asked:
+        name, _, senders = request.id.partition("/")
+        assert request.view is not None
+        assert {key.partition("!")[2] for key in senders.split("+")[1:]} == {"hide&ghost&objects"}
+        helpers = {key.partition("!")[0] for key in senders.split("+")[1:]}
+        assert {*request.view.seen} - {*scenes[name].graphs["v1"].seen} - helpers == {NOBODY}
+
+
+def test_a_ghost_is_where_it_was_meant_whatever_else_is_moved(small: Dataset, proxy_run: Path) -> None:
+    scene = all_scenes(small)[0]
+    answer = structs.replace(next(iter(folder.read(proxy_run).answers)), role="merge", viewer="v1")
+    alone, moved = (
+        as_asked(small.scenario, scene, structs.replace(answer, heard=(f"v2!{text}&objects",)))
+        for text in ("ghost", "ghost&shift")
+    )
+    ghosts = [[n for n in each.graphs["v1"].nodes if n.id == NOBODY] for each in (alone, moved)]
+    assert ghosts[0] == ghosts[1] != []
+
+
 # The same whatever way
 
 
@@ -426,6 +454,10 @@ def test_a_stranger_who_names_two_attacks_at_once_gets_both(small: Dataset, prox
         ("6g:attack=ghost", "one on intents where content lists no objects"),
         ("6g:content=oracle,attack=hide", "one on intents where content lists no objects"),
         ("6g:content=objects,messages=shuffled", "own or blind where content is objects"),
+        ("6g:content=objects,attack=ghost:share=1/3+hide:share=1", "attacks of one share where content is"),
+        ("6g:content=both,attack=liar+ghost:share=1", "attacks of one share where content is both"),
+        ("mode2:content=both,edge=fusion", "none or relay where content is both: a unit sends a policy"),
+        ("6g:content=objects,round_trip=us-drive", "left out where content is objects, which asks twice"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(text: str, wrong: str) -> None:

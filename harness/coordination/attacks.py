@@ -50,6 +50,7 @@ class Attack:
     by_scene: ClassVar[bool] = False  # whether it depends only on the scene and on who attacks
     in_text: ClassVar[bool] = False  # whether it changes what a fusion prompt shows
     in_objects: ClassVar[bool] = False  # whether it changes the objects that a message lists
+    adds: ClassVar[bool] = False  # whether it adds voices or objects, which no other attack then changes
     risk: ClassVar[str] = ""  # the risk that it states there, without reasons; empty leaves both as they are
 
     def __init_subclass__(cls) -> None:
@@ -65,8 +66,11 @@ class Attack:
         return 0
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
-        """Return what is sent and claimed instead; `sent` is the truth as earlier attacks have changed it."""
-        raise NotImplementedError
+        """Return what is sent and claimed instead; `sent` is the truth as earlier attacks have changed it.
+
+        By default its intent and its claims stay true.
+        """
+        return sent
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         """Return an attacker's message as a fusion prompt shows it (`in_text`), except for its intent."""
@@ -257,6 +261,7 @@ class Sybil(Attack):
     """
 
     voices: Annotated[int, Meta(ge=2, le=MOST_VOICES)] = 3  # the number of voices of each attacker
+    adds: ClassVar[bool] = True
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         return with_voices(sent, turn.attackers, self.voices)
@@ -287,9 +292,6 @@ class Injection(Attack):
         if self.language not in INSTRUCTIONS:
             raise unknown("language of an injection", self.language, INSTRUCTIONS)
 
-    def act(self, sent: Intents, turn: Turn) -> Intents:
-        return sent
-
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         """Return the message with instructions to choose the last action, the boldest one."""
         return {**message, "evidence": INSTRUCTIONS[self.language].format(action=actions[-1])}
@@ -302,13 +304,12 @@ class _OfObjects(Attack):
     by_scene: ClassVar[bool] = True
     in_objects: ClassVar[bool] = True
 
-    def act(self, sent: Intents, turn: Turn) -> Intents:
-        return sent
-
 
 @dataclass(frozen=True)
 class Ghost(_OfObjects):
     """Invents a car that the ego would meet (`harness.world.perception.shared.invented`)."""
+
+    adds: ClassVar[bool] = True
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
         """Return the graph with that car."""
@@ -361,20 +362,21 @@ ATTACKS: Plugins[Attack] = Plugins(
 
 @lru_cache(maxsize=256)
 def attacks_of(text: str) -> tuple[Attack, ...]:
-    """Return the attacks that a text such as `liar:share=1/3+spoof` names; those that add voices come last.
+    """Return the attacks that a text such as `liar:share=1/3+spoof` names; those that add come last.
 
     Raises UserError for an unknown attack or setting.
     """
     attacks = [_attack(part) for part in text.split("+")] if text else []
-    return tuple(sorted(attacks, key=lambda attack: isinstance(attack, Sybil)))
+    return tuple(sorted(attacks, key=lambda attack: attack.adds))
 
 
 def in_question(text: str, words: bool, objects: bool) -> str:
     """Return the attacks in such a text that change what the ego is asked, without shares, joined by `&`.
 
-    Those that change `words` and those that change `objects`, as far as either is shown.
+    Those that change `words` and those that change `objects`, as far as either is shown, in the order in
+    which they act.
     """
-    named = (part.split(":") for part in text.split("+") if part)
+    named = sorted((part.split(":") for part in text.split("+") if part), key=lambda p: ATTACKS[p[0]].adds)
     return "&".join(
         ":".join([name, *(setting for setting in settings if not setting.startswith("share="))])
         for name, *settings in named

@@ -80,10 +80,13 @@ class OperatingPoint:
         if self.guard.attack and self.radio.profile is None:
             raise wrong("attack", self.guard.attack, "left out where there is no channel")
         if self.cloud.round_trip and self.has_fusion_call:
-            allowed = f"left out where consensus is {EGO_PROMPT}, which asks twice"
-            raise wrong("round_trip", self.cloud.round_trip, allowed)
+            twice = f"content is {self.ask.content}" if self.content.graph else f"consensus is {EGO_PROMPT}"
+            raise wrong("round_trip", self.cloud.round_trip, f"left out where {twice}, which asks twice")
         if self.content.graph and self.ask.messages == "shuffled":
             raise wrong("messages", "shuffled", f"own or blind where content is {self.ask.content}")
+        if self.content.graph and self.radio.edge == FUSION:
+            where = f"where content is {self.ask.content}"
+            raise wrong("edge", FUSION, f"none or relay {where}: a unit sends a policy and no objects")
         attacks = attacks_of(self.guard.attack)
         if any(attack.in_objects for attack in attacks) and self.content.graph != OBJECTS:
             raise wrong("attack", self.guard.attack, "one on intents where content lists no objects")
@@ -92,6 +95,9 @@ class OperatingPoint:
             able = ", ".join(name for name in ATTACKS if ATTACKS[name].in_objects)
             where = f"where content is {self.ask.content}, which holds no intents"
             raise wrong("attack", self.guard.attack, f"some of {able} and absent {where}")
+        if self.content.graph and len({attack.share for attack in attacks}) > 1:
+            allowed = f"attacks of one share where content is {self.ask.content}, as the same vehicles do all"
+            raise wrong("attack", self.guard.attack, allowed)
         if self.has_fusion_call and not all(attack.by_scene for attack in attacks):
             allowed = "one that needs no past and adds no voices where the ego is asked twice"
             raise wrong("attack", self.guard.attack, allowed)

@@ -46,10 +46,9 @@ def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
     sender = key.partition(REWRITTEN)[0]
     graph = scene.graphs[sender.removesuffix(BLIND)]
     graph = graph.blinded() if sender.endswith(BLIND) else graph
-    for name in changes_of(key):
-        if name.partition(":")[0] in ATTACKS:
-            for attack in attacks_of(name):  # a run of ours has one, a stranger's may have more
-                graph = attack.listed(graph, invented(scenario, scene.state, graph.viewer))
+    named = [name for name in changes_of(key) if name.partition(":")[0] in ATTACKS]
+    for attack in attacks_of("+".join(named)):
+        graph = attack.listed(graph, invented(scenario, scene.state, graph.viewer))
     return graph
 
 
