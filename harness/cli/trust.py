@@ -33,7 +33,8 @@ def command(
         "all",
         help="Attacks, separated by commas: liar, stuck, stale, replay, spoof, sybil, flood, brake, silent, "
         "overconfident, random, injection, jump or absent; on objects ghost, hide or shift. + combines some, "
-        "and a colon changes a setting: liar+spoof,stale:decisions=2. all: the usual ones.",
+        "and a colon changes a setting: liar+spoof,stale:decisions=2. all: the usual "
+        "ones that the condition allows.",
     ),
     rules: str = typer.Option(
         "all",
@@ -66,12 +67,11 @@ def command(
     from harness.coordination.attacks import ATTACKS
     from harness.coordination.rules import RULES
     from harness.evaluate.run import read_or_evaluate
-    from harness.studies.axes import USUAL_ATTACKS
     from harness.studies.replayed_run import ReplayedRun
-    from harness.studies.trust import CAPPED, names_of, run_bench, shares_of, trust_study
+    from harness.studies.trust import names_of, run_bench, shares_of, trust_study
 
-    attack_names = names_of("--attacks", attacks, USUAL_ATTACKS, tuple(ATTACKS))
-    rule_names, shares = names_of("--rules", rules, (*RULES, CAPPED), tuple(RULES)), shares_of(share)
+    attack_names = names_of("--attacks", attacks, tuple(ATTACKS))
+    rule_names, shares = names_of("--rules", rules, tuple(RULES)), shares_of(share)
     if (run is None and model is None) or (run and prompt):
         raise UserError("give either RUN, the folder of a finished run, or --model, with its --prompt")
     with bar("rules under attack", quiet=as_json or quiet, grows=True) as progress:

@@ -20,10 +20,11 @@ MOST_POINTS = 1000
 CORE = "core"  # the panel that compares operating points
 CROSS = " × "  # between axes that are crossed
 NONE = "none"  # of attacks
-# The usual attacks: each alone, and a false place and several voices with a lie.
+# The usual attacks: each alone, and a false place and several voices with a lie; at a point those it allows.
 USUAL_ATTACKS = (
     "liar", "liar+spoof", "liar:says=permuted", "brake", "brake+spoof", "random", "stuck", "stale", "replay",
-    "silent", "overconfident", "sybil", "liar+sybil", "flood", "spoof", "jump", "liar+jump",
+    "silent", "overconfident", "sybil", "liar+sybil", "flood", "spoof", "jump", "liar+jump", "ghost", "hide",
+    "shift",
 )  # fmt: skip
 
 Value = float | str
@@ -106,6 +107,19 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     if axis.field is None and any(value != int(value) or value < 1 for value in values):
         raise UserError(f"--grid {printable(text)}: give whole numbers of vehicles, 1 or more")
     return tuple(dict.fromkeys(values))
+
+
+def usual_at(axis: Axis, point: OperatingPoint) -> tuple[Value, ...]:
+    """Return the usual values of an axis, of words those that the point allows. Raises UserError for none."""
+    return tuple(value for value in grid(axis) if not axis.worded or _allows(axis, point, value))
+
+
+def _allows(axis: Axis, point: OperatingPoint, value: Value) -> bool:
+    try:
+        axis.at(point, value)
+    except UserError:
+        return False
+    return True
 
 
 def _usual() -> dict[str, object]:

@@ -13,7 +13,20 @@ from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.report.document import Table
 from harness.runs.metrics import SUCCESS
-from harness.studies.axes import AXES, CORE, CROSS, Axis, Setting, Value, axis_of, crossed, described, grid
+from harness.studies.axes import (
+    AXES,
+    CORE,
+    CROSS,
+    NONE,
+    Axis,
+    Setting,
+    Value,
+    axis_of,
+    crossed,
+    described,
+    grid,
+    usual_at,
+)
 from harness.studies.figures.axes import interval_of
 from harness.studies.figures.bars import operating_points
 from harness.studies.figures.heat_map import heat_map
@@ -40,10 +53,12 @@ PAIRED = (
 def settings(
     sources: Sequence[Source],
     axes: Sequence[Axis],
-    grids: Sequence[Sequence[Value]],
+    grids: Sequence[Sequence[Value] | None],
     conditions: Sequence[str],
 ) -> tuple[Setting, ...]:
     """Return the grid points of one axis, or of several that are crossed, for each condition.
+
+    A grid of None has the axis's usual values that the condition allows.
 
     Raises:
         UserError: no such condition, one without a channel or in which an axis changes nothing, more
@@ -52,15 +67,19 @@ def settings(
     runs = [source for source in sources if isinstance(source, ReplayedRun)]
     vehicles = min(run.vehicles for run in runs)
     name, result = CROSS.join(axis.name for axis in axes), list[Setting]()
-    for axis, values in zip(axes, grids, strict=True):
-        if axis.field is None and max(map(float, values)) > vehicles:
-            raise UserError(
-                f"--grid: {max(map(float, values)):g} vehicles; the run's scenes have {vehicles} at most"
-            )
     for condition in conditions:
         start = point_of(runs, condition)
+        lists = [given or usual_at(axis, start) for axis, given in zip(axes, grids, strict=True)]
+        for axis, some in zip(axes, lists, strict=True):
+            if axis.worded and some in ((), (NONE,)):
+                raise UserError(
+                    f"--over {axis.name}: {printable(condition)} allows none of its usual values; give "
+                    "others with --grid, or another --condition"
+                )
+            if axis.field is None and (most := max(map(float, some))) > vehicles:
+                raise UserError(f"--grid: {most:g} vehicles; the run's scenes have {vehicles} at most")
         idle: list[dict[str, str | None]] = []
-        for values in crossed(axes, grids):
+        for values in crossed(axes, lists):
             point, size = start, vehicles
             for axis, value in zip(axes, values, strict=True):
                 point, size = axis.at(point, value), size if axis.field else int(value)
@@ -110,7 +129,7 @@ def panels_over(
     Args:
         runs: whose answers are scored.
         over: names of axes; without any, the paper's panels are returned.
-        grids: the values of each, in the same order; the axis's usual ones where there is none.
+        grids: the values of each, in the same order; the usual ones that a condition allows without any.
         conditions: names of the operating points that are varied.
         apart: whether each axis has a panel of its own, instead of all in one, crossed.
 
@@ -123,7 +142,7 @@ def panels_over(
             f"--grid: {len(grids)} given for {len(axes)} of --over; give one for each --over, in the same "
             "order"
         )
-    values = [grid(axis, text) for axis, text in zip_longest(axes, grids)]
+    values = [None if text is None else grid(axis, text) for axis, text in zip_longest(axes, grids)]
     parts = [slice(n, n + 1) for n in range(len(axes))] if apart else [slice(None)]
     panels = {
         CROSS.join(axis.name for axis in axes[part]): settings(runs, axes[part], values[part], conditions)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint, setting_of
-from harness.coordination.rules import EGO_PROMPT
+from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
@@ -30,7 +30,7 @@ from harness.evaluate.walk import Decided
 from harness.radio.profiles import CHANNELS
 from harness.report.document import Table, strong
 from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
-from harness.studies.axes import Setting
+from harness.studies.axes import AXES, NONE, Setting, usual_at
 from harness.studies.figures.heat_map import heat_map
 from harness.studies.play import WalkResult
 from harness.studies.replayed_run import ReplayedRun
@@ -106,10 +106,10 @@ def under(point: OperatingPoint, rule: str, attack: str, share: float) -> Operat
     return point.changed(name=name, consensus=consensus, attack=text, **more)
 
 
-def names_of(option: str, text: str, usual: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of a list such as `liar,brake`, or the usual ones for `all`. Raises UserError."""
+def names_of(option: str, text: str, known: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of a list such as `liar,brake`; none for `all`. Raises UserError."""
     if text == "all":
-        return tuple(usual)
+        return ()
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
     for part in (part for name in names for part in name.split("+")):
         if part.partition(":")[0] not in known:
@@ -183,6 +183,7 @@ class Bench:
     cells: Mapping[Key, Cell]
     alone: Floats  # success of an ego that never asks, (S, E)
     caveats: tuple[str, ...] = ()  # what the run lacks
+    unfused: str | None = None  # why no rule fuses here, where the only one is the linear pool in name
 
     @cached_property
     def rules(self) -> tuple[str, ...]:
@@ -242,30 +243,41 @@ def run_bench(
 ) -> Bench:  # fmt: skip
     """Play every cell that the folder has not; it keeps them.
 
-    The linear pool is added to the rules. Attacks have no shares of their own, and `shares` are above 0.
+    Without rules or attacks the usual ones are played, as far as the point allows them. The linear pool is
+    added to the rules. Attacks have no shares of their own, and `shares` are above 0.
 
     Raises:
-        UserError: the point has no channel, or asks nobody, or its rule is a fusion call; or the folder has
-            the study of another run or condition.
+        UserError: the point has no channel, or asks nobody, or its rule is a fusion call, or none of the
+            rules changes anything; or the folder has the study of another run or condition.
     """
     point = point_of([run], condition)
     if why := point.idle("attack"):
         raise UserError(f"--condition {printable(condition)}: no attack changes anything: {why}")
     if point.guard.attack or EGO_PROMPT in rules:
+        asked_again = f"{condition}{',' if ':' in condition else ':'}consensus={EGO_PROMPT}"
         raise UserError(
             "harness study trust: give a condition without attack, and rules that are arithmetic; a fusion "
-            f"call is attacked by `harness eval --condition {condition}:consensus={EGO_PROMPT} --attack "
-            "injection`"
+            f"call is attacked by `harness eval --condition {printable(asked_again)} --attack injection`"
         )
-    refuse_other(
-        out, "trust", {"sources": [{"name": run.name}], "dataset": run.run.source, "condition": condition}
-    )
-    every_rule = dict.fromkeys([BASE, *rules])
+    attacks = attacks or [str(name) for name in usual_at(AXES["attack"], point) if name != NONE]
+    if not attacks:
+        raise UserError(
+            f"--condition {printable(condition)}: it allows none of the usual attacks; give another"
+        )
+    unfused = point.idle("consensus")
+    if unfused and set(rules) - {BASE}:
+        raise UserError(f"--rules {','.join(rules)}: no rule changes anything: {unfused}; leave it out")
+    every_rule = dict.fromkeys([BASE, *(rules or (() if unfused else (*RULES, CAPPED)))])
     every: list[Key] = [
         *((rule, PEACE, 0.0) for rule in every_rule),
         *((BASE, EXCLUDED, share) for share in shares),
         *product(every_rule, attacks, shares),
     ]
+    for key in every:
+        under(point, *key)  # which checks that they go together
+    refuse_other(
+        out, "trust", {"sources": [{"name": run.name}], "dataset": run.run.source, "condition": condition}
+    )
     depends_on = [
         run.manifest(), str(run.run.manifest.identity), point.record(), list(seeds),
         point.radio.profile and CHANNELS.record(point.radio.profile), versions(),
@@ -283,7 +295,9 @@ def run_bench(
         progress(1)
     [[alone]] = run.walked([Setting(condition, OperatingPoint.of("never asks"), run.vehicles)], seeds)
     run.settle()
-    return Bench(run.name, run.run.source, condition, tuple(seeds), cells, alone.ends[SUCCESS], run.caveats)
+    return Bench(
+        run.name, run.run.source, condition, tuple(seeds), cells, alone.ends[SUCCESS], run.caveats, unfused
+    )
 
 
 def trust_study(bench: Bench) -> Study:
@@ -330,6 +344,14 @@ def headline(bench: Bench) -> list[str]:
     """Say what asking is worth in peace, what the worst attack takes from linear, and who withstands it."""
     share, peace = bench.shares[0], bench.success(BASE)
     alone, worst = over_episodes(SUCCESS, bench.alone), bench.worst(BASE, share)
+    if bench.unfused:
+        return [
+            f"While nobody attacks, {shown(peace)} % of episodes succeed, and {shown(alone)} % with an ego "
+            "that never asks.",
+            f"If {100 * share:.0f} % of the helpers attack, {worst} harms most: "
+            f"{shown(bench.success(BASE, worst, share))} % succeed. No rule fuses anything, since "
+            f"{bench.unfused}; what is called linear is the ego's own answer.",
+        ]
     best = max(bench.rules, key=lambda rule: bench.mean(rule, share).value)
     sentences = [
         f"While nobody attacks, {shown(peace)} % of episodes succeed under the linear pool, and "

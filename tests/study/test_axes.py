@@ -2,10 +2,10 @@
 
 import pytest
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.operating_point import POINTS, named_point
 from harness.coordination.rules import POOLS
 from harness.core.errors import UserError
-from harness.studies.axes import AXES, axis_of, grid
+from harness.studies.axes import AXES, axis_of, grid, usual_at
 
 
 @pytest.mark.parametrize(
@@ -36,8 +36,38 @@ def test_vehicles_are_whole() -> None:
 
 def test_every_axis_has_a_usual_grid_that_its_point_allows() -> None:
     for axis in AXES.values():
-        for value in grid(axis):
+        values = usual_at(axis, POINTS["6g"])
+        assert len(values) > 1
+        for value in values:
             axis.at(POINTS["6g"], value)
+
+
+OF_SCENES = (
+    "liar", "liar+spoof", "liar:says=permuted", "brake", "brake+spoof", "silent", "overconfident", "spoof",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("condition", "name", "usual"),
+    [
+        ("6g:content=objects", "attack", ("none", "ghost", "hide", "shift")),
+        ("6g:content=both", "attack", ("none", *OF_SCENES, "ghost", "hide", "shift")),
+        ("6g:content=oracle", "attack", ("none",)),
+        ("6g:consensus=ego-prompt", "attack", ("none", *OF_SCENES)),
+        ("6g:consensus=ego-prompt", "content", ("intent", "both")),
+        ("mode4", "latency", (0, 5, 10, 25, 50, 100)),
+    ],
+)
+def test_usual_words_are_those_that_a_point_allows(
+    condition: str, name: str, usual: tuple[float | str, ...]
+) -> None:
+    assert usual_at(AXES[name], named_point(condition)) == usual
+
+
+def test_of_intents_no_attack_on_objects_is_usual() -> None:
+    attacks = usual_at(AXES["attack"], POINTS["6g"])
+    assert len(attacks) == 18
+    assert not {"ghost", "hide", "shift"} & {*attacks}
 
 
 def test_values_take_the_axis_unit() -> None:

@@ -135,8 +135,8 @@ def test_its_folder_has_a_page_figures_and_a_picture(bench: Bench, tmp_path: Pat
         (lambda: shares_of("0,2"), "--share 0,2"),
         (lambda: shares_of("1/0"), "--share 1/0"),
         (lambda: shares_of("0"), "nobody attacks"),
-        (lambda: names_of("--attacks", "liar,lair", (), ("liar",)), "unknown --attacks 'lair'"),
-        (lambda: names_of("--attacks", "liar:share=1", (), ("liar",)), "--share"),
+        (lambda: names_of("--attacks", "liar,lair", ("liar",)), "unknown --attacks 'lair'"),
+        (lambda: names_of("--attacks", "liar:share=1", ("liar",)), "--share"),
         (lambda: trust.under(named_point("6g"), "linear:tau=1", "", 0.0), "weight_cap"),
     ],
 )
@@ -204,6 +204,35 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
         code, _, err = harness(*wrong)
         assert code == 2
         assert "give either RUN, the folder of a finished run, or --model, with its --prompt" in err
+
+
+def test_objects_are_attacked_by_the_usual_attacks_on_objects(done: Evaluated, tmp_path: Path) -> None:
+    stored = ReplayedRun(done.out)
+    bench = run_bench(stored, "6g:content=objects", (), (), (1.0,), (0,), tmp_path, Watched())
+    assert (bench.rules, bench.attacks) == (("linear",), ("ghost", "hide", "shift"))
+    peace = bench.success("linear").value
+    assert min(bench.success("linear", attack, 1.0).value for attack in bench.attacks) < peace
+    said = " ".join(headline(bench))
+    assert "linear pool" not in said
+    assert "content objects holds no intents" in said
+    assert write_study(trust_study(bench), tmp_path).is_file()
+
+
+@pytest.mark.parametrize(
+    ("condition", "rules", "attacks", "said"),
+    [
+        ("6g:content=oracle", (), (), "none of the usual attacks"),
+        ("6g:content=objects", ("trust",), (), "no rule changes anything: content objects holds no intents"),
+        ("6g:content=objects", (), ("ghost", "liar"), "some of ghost, hide, shift and absent"),
+    ],
+)
+def test_what_no_message_holds_cannot_be_attacked(
+    done: Evaluated, tmp_path: Path, condition: str, rules: Any, attacks: Any, said: str
+) -> None:
+    with pytest.raises(UserError, match=said) as problem:
+        run_bench(ReplayedRun(done.out), condition, rules, attacks, (THIRD,), (0,), tmp_path, Watched())
+    assert "\n" not in str(problem.value)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_fusion_calls_are_attacked_elsewhere(done: Evaluated, tmp_path: Path) -> None:
