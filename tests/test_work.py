@@ -6,7 +6,9 @@ import sys
 from pathlib import Path
 from threading import Thread
 
+import pyarrow as pa
 import pytest
+from pyarrow import csv as pacsv
 
 from harness.core import work
 from harness.core.errors import UserError
@@ -144,6 +146,16 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
 def _until_gone(pid: int) -> None:
     while Path(f"/proc/{pid}").exists():
         pass
+
+
+def test_a_table_may_lie_in_a_folder_whose_name_looks_like_an_address(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as `6g:loss=0/decisions.parquet`, relative, as it is typed."""
+    monkeypatch.chdir(tmp_path)
+    with replacing(Path("6g:loss=0/table.csv")) as part, pacsv.CSVWriter(part, pa.schema({"n": pa.int64()})):
+        pass
+    assert Path("6g:loss=0/table.csv").read_text() == '"n"\n'
 
 
 def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:

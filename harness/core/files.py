@@ -140,7 +140,8 @@ def replacing(path: Path) -> Iterator[Path]:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     forget_halves(path.parent, escape(path.name))
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # Arrow takes a relative path with a colon, such as `6g:loss=0/x`, for an address.
+    part = path.absolute().with_name(f".{path.name}.{os.getpid()}.part")
     part.unlink(missing_ok=True)  # it may be a link, or left by an earlier process with this id
     try:
         with alone(part):
