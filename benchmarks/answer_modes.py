@@ -12,7 +12,8 @@ reads its letters once, `cyclic` over all cyclic orders. Without `json` among th
 baselines. CPU seconds of
 this process (wall on CUDA), the median of repeats in turn; what llama.cpp does in its own process is its
 answers' wall time. The limit has the matrix products alone, of each prompt's tokens after what all begin with
-and of the answer's, at the rate of one such product.
+and of the answer's, at the rate of one such product. At batch 1 a second limit is nearer: each pass reads all
+weights, so it takes as long as the product of one row with each of them.
 """
 
 import argparse
@@ -76,7 +77,7 @@ def main() -> None:
         if given.shape:
             model = str(shapes.build(given.shape, given.tokenizer, Path(folder) / "shape"))
         card = cards.resolve(model, "transformers")
-        rates, limits = measure(card, given)
+        rates, limits, limits_at_one = measure(card, given)
         if not given.shape:
             rates |= of_llama(cards.resolve(given.model, "llama-cpp"), given)
     peers = {"(a)": rates.get(PLAIN), "(b)": rates.get(PEER)}
@@ -93,11 +94,16 @@ def main() -> None:
         print(
             f"{mode}: limit {limit:.2f} decisions/s{compared(limit)}{aimed}; reached {ours / limit:.2f} of it"
         )
+        streamed, alone = limits_at_one[mode], rates[f"{mode}, batch 1"]
+        print(
+            f"{mode}, batch 1: limit by reading weights {streamed:.2f}; reached {alone / streamed:.2f} of it"
+        )
     if {"readout", "cyclic"} <= {*given.modes}:
         for size in (f"batch {n}" for n in dict.fromkeys((1, given.batch_size))):
             times = rates[f"readout, {size}"] / rates[f"cyclic, {size}"]
             print(f"cyclic, {size}: {times:.2f} times one pass, aim {CYCLIC_AIM}")
-    print(json.dumps({"rates": rates, "limits": limits, **vars(given)}, default=str))
+    found = {"rates": rates, "limits": limits, "limits_at_one": limits_at_one}
+    print(json.dumps(found | vars(given), default=str))
 
 
 def asked_of(card: Card, mode: str, count: int, most: int | None) -> list[Request]:
@@ -113,8 +119,10 @@ def asked_of(card: Card, mode: str, count: int, most: int | None) -> list[Reques
     return [replace(r, max_tokens=most) for r in egos] if most and mode == "json" else egos
 
 
-def measure(card: Card, given: argparse.Namespace) -> tuple[dict[str, float], dict[str, Any]]:
-    """Rates of transformers, plain, by lm-evaluation-harness and by ours; and the `limit` of each mode."""
+def measure(
+    card: Card, given: argparse.Namespace
+) -> tuple[dict[str, float], dict[str, Any], dict[str, float]]:
+    """Rates of transformers, plain, by lm-evaluation-harness and by ours; and the limits of each mode."""
     most = JSON_TOKENS if given.shape else None
     asked = {mode: asked_of(card, mode, given.prompts, most) for mode in given.modes}
     backend = open_backend(card, device=given.device, dtype=given.dtype, batch_size=given.batch_size)
@@ -137,7 +145,38 @@ def measure(card: Card, given: argparse.Namespace) -> tuple[dict[str, float], di
             found[name].append(given.prompts / seconds_of(each))
     flops_per_s = product_rate(engine.model)
     limits = {mode: limit(backend, asked[mode], flops_per_s) for mode in given.modes}
-    return {name: median(rates) for name, rates in found.items()}, limits
+    pass_s = reading_s(engine.model)
+    at_one = {mode: 1 / (pass_s * passes(backend, asked[mode])) for mode in given.modes}
+    return {name: median(rates) for name, rates in found.items()}, limits, at_one
+
+
+def passes(backend: Any, asked: Sequence[Request]) -> float:
+    """Mean number of times that an answer at batch 1 reads all weights: prompt, and each further token."""
+    tokens = [
+        1 if r.orders else c.completion_tokens for r, c in zip(asked, backend.complete(asked), strict=True)
+    ]
+    return sum(tokens) / len(tokens)
+
+
+def reading_s(model: Any) -> float:
+    """Seconds that one row's products with all matrices of layers and output take."""
+    import torch
+
+    matrices = [weights for weights in model.model.layers.parameters() if weights.ndim == 2]
+    matrices.append(model.get_output_embeddings().weight)
+    rows = {
+        size: torch.ones(1, size, dtype=model.dtype, device=model.device)
+        for size in {weights.shape[1] for weights in matrices}
+    }
+
+    def work() -> None:
+        for weights in matrices:
+            product = torch.nn.functional.linear(rows[weights.shape[1]], weights)
+        product.sum().item()
+
+    with torch.inference_mode():
+        work()
+        return min(seconds_of(work) for _ in range(5))
 
 
 def product_rate(model: Any) -> float:
