@@ -124,6 +124,7 @@ def check(
     """
     from harness.runs import devices
     from harness.runs.folder import read
+    from harness.runs.records import role_word
     from harness.studies.device_fit import held
 
     device, done = devices.load(name), read(run)
@@ -138,7 +139,7 @@ def check(
         ["role", "what", "measured", f"{printable(device.name)} says", "n"],
         [
             (
-                each.role,
+                role_word(each.role),
                 scales[each.what][0],
                 shown(each.measured, Unit(factor=scales[each.what][1])),
                 _known(each.stated, f"{each.stated * scales[each.what][1]:.1f}"),

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import msgspec
 import typer
@@ -208,13 +208,15 @@ def of_letter(figures: "Mapping[tuple[str, str], Score]", role: str) -> str | No
 def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: str = "") -> Iterator[str]:
     """Where a run's times come from and how its answers were read; `means` says what shares are means of."""
     from harness.report.words import energy, pace
+    from harness.runs.records import Role, role_word
 
     yield from pace(m)
     yield f"latency: {m.latency.source} ({printable(m.latency.basis)})"
     yield from energy(m, lambda condition, metric: figures.get((condition, metric)))
     for role, took in m.answer_times.items():
         low, half, high = (f"{1000 * s:.1f}" for s in (took.p5_s, took.median_s, took.p95_s))
-        yield f"{role} answers took {half} ms (5-95 %: {low} to {high}, n = {took.n}); not used as latency"
+        took_ms = f"{half} ms (5-95 %: {low} to {high}, n = {took.n})"
+        yield f"{role_word(role)} answers took {took_ms}; not used as latency"
     if m.cached_answers:
         yield f"{m.cached_answers} answers came from the cache (--no-cache asks the model again)"
     if m.engine_errors:
@@ -225,21 +227,22 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: st
         )
     if m.retries:
         yield f"{m.retries} attempts failed before an answer came; answers.jsonl counts them as retries"
-    for role in ("ego", "helper", "merge", "blind"):
+    for role in get_args(Role):
+        word = role_word(role)
         shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
         if shares[0] is not None:
             values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
-            yield f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}{means}"
+            yield f"{word} answers strict / recovered / failed: {values} % of {shares[0].n}{means}"
         if divided := figures.get(("all", f"divided_rate_{role}")):
             share = f"{100 * (divided.value or 0):.1f}"
-            yield f"{role} answers divided by their sum: {share} % of {divided.n}{means}"
+            yield f"{word} answers divided by their sum: {share} % of {divided.n}{means}"
         if (mass := figures.get(("all", f"label_mass_{role}"))) is not None:
             read = of_letter(figures, role) or "letters read once"
             if flip := figures.get(("all", f"flip_rate_{role}")):
                 hits = round((flip.value or 0) * flip.n)
                 read += f"; the reversed list changes the likeliest action in {hits} of {flip.n}"
-            yield f"{role} read-outs: {read}; mass on the letters {mass.value or 0:.2f}{means}"
+            yield f"{word} read-outs: {read}; mass on the letters {mass.value or 0:.2f}{means}"
         for when in ("at_first", "after_repair"):
             if turn := figures.get(("all", f"valid_{when}_rate_{role}")):
                 share = Column("", turn.metric, interval=True).cell(turn)
-                yield f"{role} answers valid {when.replace('_', ' ')}: {share} % of {turn.n}{means}"
+                yield f"{word} answers valid {when.replace('_', ' ')}: {share} % of {turn.n}{means}"

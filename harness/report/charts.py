@@ -32,8 +32,8 @@ VERDICTS = {"strict": [GOOD], "recovered": [LATE], "failed": FAILURES}
 REPLIES = {"on time": GOOD, "late": LATE, "lost": BAD}
 ENERGIES = {"ego's inference": ROLES["ego"], "helpers' inference": ROLES["helper"], "radios": BAD}
 TIMES = {
-    "inference": PALE, "reply on time": GOOD, "reply late": LATE, "reply lost": BAD, "fusion": ROLES["merge"],
-    "decision": GREY,
+    "inference": PALE, "reply on time": GOOD, "reply late": LATE, "reply lost": BAD,
+    "fusion": ROLES["fusion"], "decision": GREY,
 }  # fmt: skip
 APART = 0.05  # of success between two names of lines, the height of one
 # The paper's table of operating points: ms and success rate.

@@ -18,7 +18,7 @@ from harness.report.references import driven, in_trees, label, sentences
 from harness.report.runs import Runs
 from harness.runs.folder import Run
 from harness.runs.metrics import LATENCY, SUCCESS
-from harness.runs.records import Score
+from harness.runs.records import Score, role_word
 
 Table = list[dict[str, Any]]
 ENTROPY_NATS, TOKENS, ARRIVAL_MS = 0.1, 25, 10.0  # widths of bins
@@ -164,8 +164,9 @@ def success(run: Run) -> Table:
 def statuses(run: Run) -> Table:
     """Return how many answers of each role have which status."""
     order = {status: n for n, status in enumerate(map(str, Status))}
-    count = Counter((a.role, order.get(a.status, -1), a.status, a.verdict) for a in run.answers)
-    of = Counter(a.role for a in run.answers)
+    roles = [(role_word(a.role), a) for a in run.answers]
+    count = Counter((role, order.get(a.status, -1), a.status, a.verdict) for role, a in roles)
+    of = Counter(role for role, _ in roles)
     return [
         {"role": role, "status": status, "verdict": verdict, "count": n, "share": n / of[role], "n": of[role]}
         for (role, _, status, verdict), n in sorted(count.items())
@@ -214,7 +215,7 @@ def tokens(run: Run) -> Table:
     by_role: dict[str, list[float]] = {}
     for answer in run.answers:
         if answer.prompt_tokens is not None:
-            by_role.setdefault(answer.role, []).append(answer.prompt_tokens)
+            by_role.setdefault(role_word(answer.role), []).append(answer.prompt_tokens)
     return [{"role": role, **bar} for role, of in by_role.items() for bar in _histogram(of, TOKENS, "tokens")]
 
 

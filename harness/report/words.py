@@ -14,7 +14,7 @@ from harness.core.statistics import mean_of
 from harness.runs import metrics
 from harness.runs.folder import Run
 from harness.runs.metrics import BASELINE, GAIN, LATENCY, SUCCESS, entry
-from harness.runs.records import Latency, Manifest, Score, Times
+from harness.runs.records import Latency, Manifest, Score, Times, role_word
 from harness.runs.suite import SuiteRun
 
 
@@ -151,7 +151,7 @@ def answer_times(times: Mapping[str, Times]) -> str:
     parts = []
     for role, took in times.items():
         low, half, high = (f"{1000 * s:.0f}" for s in (took.p5_s, took.median_s, took.p95_s))
-        parts.append(f"{role} {half} ms (5 to 95 %: {low} to {high}; n = {took.n})")
+        parts.append(f"{role_word(role)} {half} ms (5 to 95 %: {low} to {high}; n = {took.n})")
     return ", ".join(parts) or "unknown, since no answer was asked alone"
 
 
@@ -163,17 +163,17 @@ def pace(m: Manifest) -> Iterator[str]:
     """
     own = {role: took for role, took in m.answer_times.items() if took.first_token}
     for role, took in (m.latency.sample | own).items():
-        first = took.first_token
+        first, word = took.first_token, printable(role_word(role))
         if first is None:
             continue
         if first.n == took.n and took.median_s:
             share = 100 * first.median_s / took.median_s
             text = f"{share:.0f} % of the median answer is prefill"
-            yield f"{printable(role)}: {text} (batch 1, measured where it ran)"
+            yield f"{word}: {text} (batch 1, measured where it ran)"
         for what, of in (("TTFT", first), ("TPOT", took.token)):
             if of:
                 half, high = _milliseconds(of.median_s, of.median_ci_s), _milliseconds(of.p95_s, of.p95_ci_s)
-                yield f"  {printable(role)} {what} {half} ms, p95 {high}, n = {of.n}"
+                yield f"  {word} {what} {half} ms, p95 {high}, n = {of.n}"
 
 
 def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:

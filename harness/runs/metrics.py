@@ -31,7 +31,7 @@ from harness.core.statistics import (
 )
 from harness.parsing.status import Repair
 from harness.runs.decisions import Decisions
-from harness.runs.records import Answer, AnswerFacts, Episode, Role, Score
+from harness.runs.records import Answer, AnswerFacts, Episode, Role, Score, role_word
 
 World = Literal["frozen", "closed-loop"]
 Better = Literal["higher", "lower", "neither"]
@@ -156,8 +156,8 @@ def _valid(turns: int) -> Callable[[Answers], Floats]:
 
 
 def _label(name: str, role: Role) -> str:
-    """Return a label for people; files say `merge` of a fusion call."""
-    return f"{name} {'fusion' if role == 'merge' else role}".replace("_", " ")
+    """Return a label for people."""
+    return f"{name} {role_word(role)}".replace("_", " ")
 
 
 def _of_answers() -> Iterator[Metric]:

@@ -11,6 +11,13 @@ from harness.core.statistics import Estimate
 from harness.runs.devices import Device, Speed
 
 Role = Literal["ego", "helper", "merge", "blind"]
+
+
+def role_word(role: str) -> str:
+    """Return what people call a role; files say `merge` of a fusion call."""
+    return "fusion" if role == "merge" else role
+
+
 BLIND = "~blind"  # ends the key of a blind helper's answer
 REWRITTEN = "!"  # in a sender's key, before the attack and the defences that change its message
 TURNS = ("turns", "first_status", "first_raw")  # an answer's properties that tables show as columns

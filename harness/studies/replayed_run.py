@@ -290,7 +290,7 @@ class ReplayedRun:
         if not self._asks:
             raise UserError(
                 f"--no-model: {printable(self.run.path)} may lack answers to other sets of messages, which "
-                "consensus ego-prompt needs; leave it out"
+                "a fusion call needs; leave it out"
             )
         with self._writing():
             return self._asker.fusion_call(scenes, codes, rewrites)

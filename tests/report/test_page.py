@@ -25,6 +25,7 @@ from typer.testing import CliRunner
 
 from harness.backends.base import Completion
 from harness.cli.report import command
+from harness.cli.run import origins
 from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.evaluate.asking import answer_of, requests
@@ -385,7 +386,7 @@ def test_the_source_of_latency_in_words(latency, words):
 def test_what_answers_took_in_words():
     assert answer_times({}) == "unknown, since no answer was asked alone"
     told = answer_times({"ego": Times(240, 0.0312, 0.0281, 0.0403), "merge": Times(1, 0.2, 0.2, 0.2)})
-    assert told == "ego 31 ms (5 to 95 %: 28 to 40; n = 240), merge 200 ms (5 to 95 %: 200 to 200; n = 1)"
+    assert told == "ego 31 ms (5 to 95 %: 28 to 40; n = 240), fusion 200 ms (5 to 95 %: 200 to 200; n = 1)"
 
 
 def test_prefill_and_decode_in_words(run):
@@ -407,6 +408,23 @@ def test_prefill_and_decode_in_words(run):
     ]
     assert all(len(line) <= 80 for line in pace(manifest))
     assert list(pace(msgspec.structs.replace(manifest, answer_times={}))) == []
+    fusing = msgspec.structs.replace(manifest, answer_times={"merge": ego})
+    assert next(pace(fusing)).startswith("fusion: 50 % of the median")
+
+
+def test_people_read_fusion_where_files_say_merge(run):
+    """In the terminal's lines on times and on how answers were read."""
+    shares = {f"{kind}_rate_merge": kind == "strict" for kind in ("strict", "recovered", "failed")}
+    figures = {
+        ("all", name): Score("all", name, float(value), None, None, 8, 0, "answers")
+        for name, value in shares.items()
+    }
+    manifest = msgspec.structs.replace(read(run).manifest, answer_times={"merge": Times(1, 0.2, 0.2, 0.2)})
+    lines = [line for line in origins(manifest, figures) if line.startswith("fusion ")]
+    assert lines == [
+        "fusion answers took 200.0 ms (5-95 %: 200.0 to 200.0, n = 1); not used as latency",
+        "fusion answers strict / recovered / failed: 100.0 / 0.0 / 0.0 % of 8",
+    ]
 
 
 def copied(run, tmp_path):

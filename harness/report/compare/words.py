@@ -14,6 +14,7 @@ from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.words import p_value, pace
 from harness.runs.metrics import SUCCESS, entry
+from harness.runs.records import role_word
 
 BETTER, WORSE, HINT = "better", "worse", "hint"
 SIGNS = {BETTER: "✓", WORSE: "✗", HINT: "?", "": ""}
@@ -262,7 +263,7 @@ def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
     """Return how many answers of a role changed their verdict, and up to so many of them."""
     return [
         (
-            f"{t.role} {t.a} → {t.b}: {len(t.requests)} of {comparison.answers_in_both[t.role]}",
+            f"{role_word(t.role)} {t.a} → {t.b}: {len(t.requests)} of {comparison.answers_in_both[t.role]}",
             _listed(t.requests[:most], len(t.requests), most),
         )
         for t in comparison.answers

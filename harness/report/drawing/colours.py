@@ -10,7 +10,7 @@ from collections.abc import Iterable
 INK, GREY, PALE, FAINT, WHITE = "#222222", "#777777", "#DDDDDD", "#ECECEC", "#FFFFFF"
 GOOD, LATE, BAD = "#009E73", "#BA7F00", "#C8321F"
 OUTCOMES = {"good": GOOD, "late": LATE, "bad": BAD}
-ROLES = {"ego": "#9645B0", "helper": "#B07CC6", "danger": "#D6246E", "merge": "#85709F", "other": "#FFFFFF"}
+ROLES = {"ego": "#9645B0", "helper": "#B07CC6", "danger": "#D6246E", "fusion": "#85709F", "other": "#FFFFFF"}
 CONDITIONS = {"single-local": "#6B7480", "v2x": "#0072B2", "6g": "#2F97DB"}
 FAILURES = (BAD, "#E2685A", "#9C2416", "#F0988D", "#6E160B", "#F7C4BD")  # a shade a kind
 HATCHED = ("#E3CCEB", "#6A3D80")  # a helper on paper: between its lines, and the lines
