@@ -10,6 +10,7 @@ COMMANDS = {
     "report": "report",
     "view": "view",
     "study sweep": "sweep",
+    "study contents": "contents",
     "study trust": "trust",
     "study schedule compare": "schedule:compare",
     "study schedule learn": "schedule:learn",
@@ -57,7 +58,7 @@ COMMANDS = {
 }
 
 GROUPS = {
-    "study": "Vary settings: sweeps, attacks, schedules, grids, twins.",
+    "study": "Vary settings: sweeps, contents, attacks, schedules, grids.",
     "study schedule": "Compare schedules (whom to ask, and when), or learn one.",
     "run": "List finished runs; merge, export or film them.",
     "model": "List, download, test and train models; list on-board computers.",

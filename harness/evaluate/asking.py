@@ -98,7 +98,7 @@ def fusion_request(
     """
     own, heard = scene.graphs[scene.viewers[0]], messages_of(answers, senders, spec.actions)
     words, image = spec.scenario.prompt_words, picture(spec, 0, scene, scene.viewers[0])
-    blank = _blank(spec, 0, "ego").alike(id=_fusion_id(scene, senders), image=image)
+    blank = _blank(spec, 0, "ego").alike(id=fusion_id(scene, senders), image=image)
     if graph is None:
         return blank.alike(messages=spec.ego.rendered(own, spec.actions, heard, words))
     truth = truth_graph(spec.scenario, scene.state) if spec.ego.card.privileged else None
@@ -108,7 +108,8 @@ def fusion_request(
     return blank.alike(**spec.ego.chats(graph, spec.actions, words))
 
 
-def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:
+def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
+    """Return the id of the fusion call with the messages of these keys."""
     return f"{scene.id}/{'+'.join((scene.viewers[0], *senders))}"
 
 
@@ -362,7 +363,7 @@ class Asker:
         )  # fmt: skip
 
     def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
-        ids = [_fusion_id(*each) for each in _heard_sets(scenes, codes, rewrites)]
+        ids = [fusion_id(*each) for each in _heard_sets(scenes, codes, rewrites)]
         if not self.answers.keys() >= set(ids):
             self.answer(self.fusion_requests(scenes, codes, rewrites))
         answers = [self.answers[name] for name in ids]
@@ -375,7 +376,7 @@ class Asker:
     ) -> list[Request]:
         """Return the requests of the fusion calls with these sets of messages."""
         sets = list(_heard_sets(scenes, codes, rewrites))
-        missing = [each for each in sets if _fusion_id(*each) not in self.answers]
+        missing = [each for each in sets if fusion_id(*each) not in self.answers]
         graphs = dict(zip(map(id, missing), shared_graphs(self.spec.scenario, missing), strict=True))
         calls = []
         for heard in sets:

@@ -1,15 +1,16 @@
 """Count what an evaluation would ask, without a model."""
 
 from collections import Counter
-from itertools import chain
-from math import comb
+from collections.abc import Container, Iterator, Sequence
+from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any
 
 from harness.backends.tokens import counter, summarize_counts
 from harness.coordination.operating_point import Rewrites
-from harness.dataset.load import Dataset
-from harness.evaluate.asking import EGO, requests
+from harness.dataset.load import Dataset, Scene
+from harness.evaluate.asking import EGO, fusion_id, requests
+from harness.evaluate.fusion import key_of
 from harness.evaluate.spec import Spec
 
 
@@ -32,7 +33,7 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
             vision = spec.agents[request.agent].card.vision if request.image else None
             tokens = tokens_of(request.messages) + (vision.tokens if vision else 0)
             sizes.setdefault(request.role, []).append(tokens)
-    if calls := sum(_fusion_calls(spec, len(scene.viewers) - 1) for scene in scenes):
+    if calls := sum(1 for scene in scenes for _ in _fusion_calls(spec, scene)):
         asked["fusion"] = calls
     stats = {role: summarize_counts(n) for role, n in sizes.items()}
     return {
@@ -41,14 +42,31 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     }  # fmt: skip
 
 
-def _fusion_calls(spec: Spec, helpers: int) -> int:
-    """Return how many fusion calls a scene with so many helpers needs at most."""
+def lacking(spec: Spec, dataset: Dataset, scenes: Sequence[str], answers: Container[str]) -> dict[str, int]:
+    """Return how many questions about some scenes have no answer yet, by role; `answers` are request ids.
+
+    All are counted that may be asked there, whoever is heard.
+    """
+    lacks, sends = Counter[str](), any(point.asks and point.content.intent for point in spec.points)
+    for scene in dataset.scenes(scenes):
+        viewers = spec.viewers(scene)
+        own = {"ego": viewers[:1], "helper": viewers[1:] if sends else ()}
+        for role, those in own.items():
+            lacks[role] += sum(f"{scene.id}/{viewer}" not in answers for viewer in those)
+        lacks["fusion"] += sum(name not in answers for name in _fusion_calls(spec, scene))
+    return dict(lacks)
+
+
+def _fusion_calls(spec: Spec, scene: Scene) -> Iterator[str]:
+    """Yield the ids of the fusion calls that a scene needs at most."""
     most: dict[Rewrites, int] = {}
     for point in spec.points:
         if point.has_fusion_call and point.asks:
             most[point.rewrites] = max(point.ask.max_helpers, most.get(point.rewrites, 0))
-    return sum(
-        comb(helpers, heard) * (2**heard if rewrites.attack else 1)
-        for rewrites, others in most.items()
-        for heard in range(1, min(others, helpers) + 1)
-    )
+    helpers = scene.viewers[1:]
+    for rewrites, others in most.items():
+        for n in range(1, min(others, len(helpers)) + 1):
+            for heard in combinations(helpers, n):
+                for attacks in product((False, True) if rewrites.attack else (False,), repeat=n):
+                    keys = [key_of(helper, rewrites, a) for helper, a in zip(heard, attacks, strict=True)]
+                    yield fusion_id(scene, keys)

@@ -20,6 +20,7 @@ DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop s
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
 STUDIES = {
     "sweep.json": "sweep",
+    "contents.json": "contents",
     "grid.json": "grid",
     "repeats.json": "repeats",
     "trust.json": "trust",

@@ -34,10 +34,13 @@ EPISODE_COLUMNS = {
 }  # fmt: skip
 ENDS = ("success_rate", "unsafe_rate", "late_rate")
 PER_DECISION = (
-    "latency_proxy_ms", "deadline_miss_rate", "trigger_rate", "messages_per_episode", "effective_loss",
-    "observed_reply_loss",
+    "latency_proxy_ms", "deadline_miss_rate", "trigger_rate", "messages_per_episode", "bits_per_episode",
+    "effective_loss", "observed_reply_loss",
 )  # fmt: skip
-COLUMNS = ("latency_ms", "deadline_missed", "triggered", "messages", "effective_loss", "observed_loss")
+COLUMNS = (
+    "latency_ms", "deadline_missed", "triggered", "messages", "request_bits", "reply_bits", "effective_loss",
+    "observed_loss",
+)  # fmt: skip
 Read = Callable[[Decided[Any]], dict[str, Floats]]  # columns of decisions, (n, ...)
 
 
@@ -162,15 +165,21 @@ class _Part(NamedTuple):
 
 
 def _part(walked: WalkResult, seeds: int) -> _Part:
-    n, left_out = len(walked.episodes), np.isnan(walked.ends["success_rate"])
+    n = len(walked.episodes)
+    seed, latency_ms = walked.places // n, walked.columns["latency_ms"]
+    metrics = {**{name: walked.ends[name] for name in ENDS}, **by_episode(walked, PER_DECISION)}
+    return _Part(walked.episodes, metrics, [latency_ms[seed == place] for place in range(seeds)])
+
+
+def by_episode(walked: WalkResult, names: Sequence[str]) -> dict[str, Floats]:
+    """Return metrics of decisions by name, each (S, E); NaN where an episode was left out."""
+    success = walked.ends["success_rate"]
 
     def metric(name: str) -> Floats:
-        values = of_decisions(METRICS[name], walked.columns, walked.places, seeds * n).reshape(seeds, n)
-        return np.where(left_out, np.nan, values)
+        values = of_decisions(METRICS[name], walked.columns, walked.places, success.size)
+        return np.where(np.isnan(success), np.nan, values.reshape(success.shape))
 
-    seed, latency_ms = walked.places // n, walked.columns["latency_ms"]
-    metrics = {**{name: walked.ends[name] for name in ENDS}, **{name: metric(name) for name in PER_DECISION}}
-    return _Part(walked.episodes, metrics, [latency_ms[seed == place] for place in range(seeds)])
+    return {name: metric(name) for name in names}
 
 
 def _estimates(

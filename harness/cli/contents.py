@@ -1,0 +1,76 @@
+"""`harness study contents`: intents, objects, both or nothing, over bits, loss, delay and density."""
+
+from pathlib import Path
+
+import typer
+
+from harness.cli import options
+from harness.cli.progress import bar
+from harness.cli.show import finish
+from harness.cli.terminal import echo_json
+from harness.core.errors import printable
+from harness.evaluate.settings import parse_seeds
+
+Runs = typer.Argument(
+    help="Folders of finished runs of `harness eval`, or of suites. Several families of scenes are averaged.",
+    metavar="RUN...",
+)
+
+
+def command(
+    runs: list[Path] = Runs,
+    condition: list[str] = typer.Option(
+        [],
+        help="Operating point to play every content in: 6g:encoding=etsi. Repeatable. Default: that, and "
+        "mode2:encoding=etsi over density.",
+    ),
+    over: list[str] = typer.Option(
+        [],
+        help="Setting to vary in each condition, alone: loss, latency (ms), tau, max_helpers, or any other. "
+        "Repeatable. Default: these, if no --condition is given.",
+    ),
+    grid: list[str] = typer.Option(
+        [], help="Values to try: 0,10,20 or from:to:step. Give one --grid for each --over, in the same order."
+    ),
+    seeds: options.RunSeeds = None,
+    latency: options.RunLatency = "run",
+    model: options.RunModel = None,
+    no_model: options.NoModel = False,
+    dry_run: bool = typer.Option(
+        False, "--dry-run", help="Only count the questions that the runs may lack; ask and write nothing."
+    ),
+    out: Path | None = typer.Option(
+        None, help="Folder to write. Default: RUN/contents, in the first folder."
+    ),
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Compare what messages may hold: nothing, intents, objects or both.
+
+    Each is played at every point from stored answers. The model is asked only where the runs have no answer.
+    If the study is stopped, the same command continues it.
+    """
+    from harness.core import extras
+    from harness.studies.contents import asked_at_most, folders, models, panels_of, run_contents
+    from harness.studies.replayed_run import ReplayedRun
+
+    extras.need("harness study contents", "matplotlib")
+    with bar("points", quiet=as_json or quiet or dry_run, grows=True) as progress:
+        own = options.cards(model)
+        replayed = [ReplayedRun(run, latency, progress, not no_model, None, own) for run in folders(runs)]
+        panels = panels_of(replayed, condition, over, grid)
+        swarms = models(replayed, [setting.point for panel in panels for setting in panel.settings])
+        if dry_run:
+            counts = {each.name: asked_at_most(each, panels) for each in swarms}
+            if as_json:
+                echo_json(counts)
+            elif not quiet:
+                for name, by_family in counts.items():
+                    for family, by_role in by_family.items():
+                        lacks = ", ".join(f"{count} of {role}" for role, count in by_role.items())
+                        typer.echo(f"{printable(name)}, {printable(family)}: at most {lacks}")
+            return
+        draws = parse_seeds(seeds) if seeds else replayed[0].seeds
+        where = out or runs[0] / "contents"
+        study = run_contents(swarms, panels, draws, where, progress)
+    finish(study, where, as_json, quiet)

@@ -1,0 +1,159 @@
+"""Intents, objects, both or nothing, at every point of a study."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from evaluating import run, spec_of
+
+from harness.coordination.operating_point import named_point
+from harness.core.statistics import mean_of
+from harness.dataset.load import Dataset
+from harness.report.suite import MEAN
+from harness.runs.folder import read
+from harness.runs.metrics import SUCCESS, difference, over_episodes
+from harness.studies.contents import NOTHING, Outcome, holding, witnesses
+from harness.studies.replayed_run import ReplayedRun
+
+Said = tuple[int, str, str]
+VARIED = ("--condition", "6g", "--over", "loss", "--grid", "0,1")
+
+
+@pytest.fixture(scope="module")
+def done(proxy_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy, since the study keeps answers in the run's folder."""
+    return shutil.copytree(proxy_run, tmp_path_factory.mktemp("contents") / "run")
+
+
+@pytest.fixture(scope="module")
+def played(done: Path, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+    from harness.core.progress import Progress
+    from harness.studies.contents import models, panels_of, run_contents
+
+    source = ReplayedRun(done)
+    panels = panels_of([source], ["6g"], ["loss"], ["0,1"])
+    swarms = models([source], [setting.point for panel in panels for setting in panel.settings])
+    out = tmp_path_factory.mktemp("study")
+    return run_contents(swarms, panels, source.seeds, out, Progress()).data["points"]
+
+
+def cell(points: pd.DataFrame, content: str, column: str, loss: float | None = None) -> float:
+    at = points.value == loss if loss is not None else points.variable == ""
+    return float(points[(points.content == content) & at][column].item())
+
+
+@pytest.mark.slow
+def test_each_content_is_what_a_run_of_it_comes_to(
+    played: pd.DataFrame, small: Dataset, done: Path, tmp_path: Path
+) -> None:
+    contents = ("objects", "both", "oracle")
+    points = tuple(named_point(f"6g:content={content}") for content in contents)
+    directly = read(run(spec_of(small, points=points), tmp_path / "run").out)
+    for content, point in zip(contents, points, strict=True):
+        score = directly.score(point.name, SUCCESS)
+        assert score is not None
+        assert cell(played, content, "success") == score.value
+        assert cell(played, content, "success_low") == score.low
+    own = read(done)
+    for content, condition in (("intent", "6g"), (NOTHING, "single-local")):
+        for column, metric in (("success", SUCCESS), ("latency_proxy_ms", "latency_proxy_ms"),
+                               ("bits_per_episode", "bits_per_episode")):  # fmt: skip
+            score = own.score(condition, metric)
+            assert score is not None
+            assert cell(played, content, column) == pytest.approx(score.value)
+
+
+@pytest.mark.slow
+def test_where_nothing_arrives_every_content_is_worth_nothing(played: pd.DataFrame) -> None:
+    contents = played.content.unique()
+    alone = cell(played, NOTHING, "success")
+    assert {cell(played, content, "success", 1) for content in contents} == {alone}
+    assert cell(played, NOTHING, "bits_per_episode") == 0
+    assert all(cell(played, content, "bits_per_episode", 1) > 0 for content in contents if content != NOTHING)
+    assert cell(played, "objects", "off_lag_rate", 1) == 0  # nobody is heard, so it is not asked again
+    assert (
+        cell(played, "objects", "off_lag_rate", 0) == cell(played, "objects", "deadline_miss_rate", 0) > 0.5
+    )
+    assert cell(played, "objects", "over_intent", 1) == 0
+
+
+def test_a_mean_gives_families_the_same_weight_and_differences_are_paired_within_them() -> None:
+    draws = np.random.default_rng(0)
+    a, b = (
+        {name: (draws.random((2, n)) < share).astype(float) for name, n in (("one", 30), ("two", 90))}
+        for share in (0.9, 0.4)
+    )
+    better, worse = (Outcome({name: {SUCCESS: values} for name, values in each.items()}) for each in (a, b))
+    each = [over_episodes(SUCCESS, values) for values in a.values()]
+    assert better.estimate(SUCCESS) == mean_of(each)
+    assert better.estimate(SUCCESS, "two") == each[1]
+    gains = [difference(SUCCESS, a[name].T, b[name].T) for name in a]
+    assert better.over(worse) == better.over(worse, MEAN) == mean_of(gains)
+    p = better.p_over(worse)
+    assert p is not None
+    assert p < 1e-6
+    assert better.pooled({"one": np.arange(30) < 2, "two": np.arange(90) < 3}).shape == (2, 5)
+
+
+def test_witnesses_are_the_helpers_that_list_the_danger(done: Path) -> None:
+    source = ReplayedRun(done)
+    forest = source.dataset.forest
+    counts = witnesses(source)
+    assert ((counts == -1) == [danger is None for danger in forest.dangers]).all()
+    [scene] = source.dataset.scenes([forest.ids[forest.root[int(np.argmax(counts))]]])
+    danger = scene.record.danger.vehicle
+    lists = [danger in [node.id for node in scene.graphs[viewer].nodes] for viewer in scene.viewers[1:]]
+    assert counts.max() == sum(lists) > 0
+
+
+def test_who_holds_nothing_asks_nobody() -> None:
+    for text in ("6g", "6g:schedule=margin,threshold=0.2", "mode2:encoding=etsi"):
+        assert not holding(named_point(text), NOTHING).asks
+    assert holding(named_point("6g"), "both") == named_point("6g").changed(content="both")
+
+
+@pytest.mark.slow
+def test_it_is_counted_first_then_played_and_goes_on(harness: Callable[..., Said], proxy_run: Path) -> None:
+    here = shutil.copytree(proxy_run, Path("run"))
+    code, out, err = harness("study", "contents", here, *VARIED, "--dry-run", "--json")
+    assert (code, err) == (0, "")
+    [by_family] = json.loads(out).values()
+    most = by_family["occluded-intersection"]
+    assert not (here / "more-answers.jsonl").exists()
+    assert not (here / "contents").exists()
+
+    code, out, err = harness("study", "contents", here, *VARIED)
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 80
+    assert out.startswith("Intent or objects?\nproxy · json, 6g, points over intents: objects ")
+    page = (here / "contents" / "index.html").read_text()
+    for text in ("at the bits of intents", "at the age of intents", "by who sees the danger", "6g over loss"):
+        assert text in page
+    asked = (here / "more-answers.jsonl").read_text().splitlines()
+    assert 0 < len(asked) <= sum(most.values())
+
+    code, again, _ = harness("study", "contents", here, *VARIED)
+    assert (code, again) == (0, out)
+    assert (here / "more-answers.jsonl").read_text().splitlines() == asked
+    code, _, err = harness("study", "contents", here, "--condition", "v2x")
+    assert code == 2
+    assert "run/contents holds another contents, with other panels; name another folder" in err
+
+
+@pytest.mark.slow
+def test_what_cannot_be_played_is_refused_in_a_line(harness: Callable[..., Said], done: Path) -> None:
+    for words, reason in (
+        ([done, done], f"{done} and {done} are both of proxy · json on occluded-intersection; give one of"),
+        ([done, "--grid", "1,2"], "--grid: 1 given for 0 of --over; give one for each, in order"),
+        ([done, "--condition", "single-local"], "--condition single-local has no channel"),
+        ([done, "--condition", "6g:consensus=ego-prompt"], "proxy · json: "),
+    ):
+        code, out, err = harness("study", "contents", *words)
+        assert (code, out) == (2, "")
+        assert reason in err
+        assert err.count("\n") == 1
+        assert not (done / "contents").exists()
