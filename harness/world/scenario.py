@@ -1,7 +1,7 @@
 """The interface of a scenario: parameters, layout, road, goal. Other code takes a scenario as an argument."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import InitVar, dataclass
+from dataclasses import InitVar, dataclass, field
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
@@ -19,9 +19,12 @@ class Draws:
 
     scenario: str
     seed: int
+    attempt: int = 0  # number of earlier draws that did not fit (`harness.world.lookouts`)
+    seats: tuple[str, ...] = ()  # names of the cars in blind seats
 
     def share(self, what: str) -> float:
-        return float(noise.uniforms((1,), self.scenario, self.seed, what)[0])
+        again = (self.attempt,) if self.attempt else ()
+        return float(noise.uniforms((1,), self.scenario, self.seed, what, *again)[0])
 
     def between(self, what: str, bounds: tuple[float, float]) -> float:
         return bounds[0] + self.share(what) * (bounds[1] - bounds[0])
@@ -29,8 +32,9 @@ class Draws:
     def ids(self, names: Collection[str]) -> dict[str, str]:
         """Draw ids, after those of the ego and three helpers, so that an id tells nothing about its vehicle.
 
-        Absent vehicles have ids, too, so a gap between two ids tells nothing either.
+        Absent vehicles have ids, too, so a gap between two ids tells nothing either; so have `seats`.
         """
+        names = (*names, *self.seats)
         order = noise.generator(self.scenario, self.seed, "ids").permutation(len(names)).tolist()
         return {name: f"v{5 + number}" for name, number in zip(names, order, strict=True)}
 
@@ -49,13 +53,14 @@ class Spawn:
     brakes_at_s: float | None = None  # when it begins to brake by itself; None if it does not
     brakes_mps2: float = 0.0  # its deceleration then
     brakes_to_mps: float = 0.0  # the speed down to which it brakes
+    radio: bool = field(default=False, kw_only=True)  # whether one that does not help sends beacons
 
 
 @dataclass(frozen=True)
 class Layout:
     """The start of one episode."""
 
-    spawns: tuple[Spawn, ...]  # vehicles in spawn order, the ego first, then the helpers
+    spawns: tuple[Spawn, ...]  # vehicles in spawn order, the ego first
     buildings: tuple[Building, ...]  # obstacles to sight besides vehicles
     danger: str | None  # sector that the danger comes from; None without a danger
     danger_id: str | None  # id of the dangerous vehicle; None without a danger

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
+from harness.world.lookouts import Draft, placed, queue
 from harness.world.parameters import Parameters as Common
 from harness.world.road import Road, crossings, paths_along, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
@@ -30,6 +31,9 @@ CONVERGE_M = 40.0  # along the road, from the ramp's straight to where it has ru
 WALL_M = 2.7, 3.5  # from the middle of the right lane to the wall's faces
 BEGIN_M, END_M = -250.0, 250.0  # of the main road, to the east; the ramp has merged at 0
 SECTOR_REACH_M = (15.0, 60.0)  # stretch of the right lane before that point that is looked at
+# Blind seats: cars that have just turned onto the ramp, too slow to reach the ego wherever it stops.
+SEATS_M = (45.0, 55.0), (12.0, 18.0), (12.0, 18.0)  # from the ego to the first, and from one to the next
+SEATS_MPS = (3.0, 4.5)
 
 
 @dataclass(frozen=True)
@@ -111,8 +115,11 @@ def road() -> Road:
 
 def layout(seed: int, parameters: Parameters) -> Layout:
     """Draw one episode."""
-    draws = Draws(NAME, seed)
-    p, (at,) = parameters, road().crossings.values()
+    return placed(SCENARIO, _draft, seed, parameters)
+
+
+def _draft(draws: Draws, p: Parameters) -> Draft:
+    (at,) = road().crossings.values()
 
     start = draws.between("ego_start", p.ego_start_m)
 
@@ -123,7 +130,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     truck = draws.between("truck_speed", p.truck_mps), draws.between("truck_offset", p.truck_offset_s)
     spawns = [
-        Spawn("v1", "car", "ego", "ramp", "merge", at.ego_arc_m - start, p.ego_speed_mps),
+        (ego := Spawn("v1", "car", "ego", "ramp", "merge", at.ego_arc_m - start, p.ego_speed_mps)),
         timed("v2", "truck", "helper", "main left", *truck),
     ]
     for id_, approach in (("v3", "main"), ("v4", "main left")):
@@ -137,14 +144,17 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         "late": ("main", p.late_share, p.late_offset_s),
     }
     ids = draws.ids(cars)
-    for name, (approach, share, offset_s) in cars.items():
-        if draws.share(name) < share:
-            speed = draws.between(f"{name}_speed", p.main_mps)
-            late_s = draws.between(f"{name}_offset", offset_s)
-            spawns.append(timed(ids[name], "car", "other", approach, speed, late_s))
+
+    def car(name: str) -> Spawn:
+        approach, _, offset_s = cars[name]
+        speed, late_s = draws.between(f"{name}_speed", p.main_mps), draws.between(f"{name}_offset", offset_s)
+        return timed(ids[name], "car", "other", approach, speed, late_s)
+
+    spawns += [car(name) for name, (_, share, _) in cars.items() if draws.share(name) < share]
     danger = "main" if draws.share("danger") < p.danger_share else None
     wall = Building("b1", BEGIN_M, WALL_M[0], -draws.between("wall_end", p.wall_end_m), WALL_M[1])
-    return Layout.arranged(spawns, danger, ids["danger"], [wall])
+    made = Layout.arranged(spawns, danger, ids["danger"], [wall])
+    return Draft(made, (car("danger"),), queue(draws, ids, ego, SEATS_M, SEATS_MPS))
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:

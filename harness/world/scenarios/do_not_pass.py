@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
+from harness.world.lookouts import Draft, placed, queue
 from harness.world.parameters import Parameters as Common
 from harness.world.road import Road, paths_along, straights
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
@@ -30,6 +31,10 @@ LANE_WIDTH_M = 4.0
 BEGIN_M, END_M = -150.0, 350.0  # of the road, to the east
 OWN, BESIDE = "own lane", "oncoming lane"  # the ego's ways
 CAR, TRUCK = SIZES_M["car"][0], SIZES_M["truck"][0]
+# Where witnesses are declared, the third lookout is a second car ahead of the truck, from centre to centre,
+# and the blind seats are behind the ego, which hides what the truck does not.
+SECOND_M = 10.0, 16.0
+SEATS_M = (8.0, 9.5), (7.5, 8.5), (7.5, 8.5)  # from the ego to the first, and from one to the next
 
 
 @dataclass(frozen=True)
@@ -97,8 +102,10 @@ def network() -> Any:
 
 def layout(seed: int, parameters: Parameters) -> Layout:
     """Draw one episode."""
-    draws = Draws(NAME, seed)
-    p = parameters
+    return placed(SCENARIO, _draft, seed, parameters)
+
+
+def _draft(draws: Draws, p: Parameters) -> Draft:
 
     def own(id_: str, kind: Kind, part: Any, arc_m: float, speed_mps: float = p.speed_mps) -> Spawn:
         return Spawn(id_, kind, part, "own", OWN, arc_m, speed_mps)
@@ -107,10 +114,12 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     truck = ego + (CAR + TRUCK) / 2 + draws.between("gap", p.gap_m)
     leader = truck + (CAR + TRUCK) / 2 + draws.between("leader", p.leader_m)
     spawns = [
-        own("v1", "car", "ego", ego),
+        (itself := own("v1", "car", "ego", ego)),
         own("v2", "truck", "helper", truck),
-        own("v3", "car", "helper", leader, draws.between("leader_mps", p.leader_mps)),
-        own("v4", "car", "helper", ego - CAR - draws.between("follower", p.follower_m)),
+        own("v3", "car", "helper", leader, leader_mps := draws.between("leader_mps", p.leader_mps)),
+        own("v4", "car", "helper", leader + draws.between("second", SECOND_M), leader_mps)
+        if draws.seats
+        else own("v4", "car", "helper", ego - CAR - draws.between("follower", p.follower_m)),
     ]
 
     def oncoming(id_: str, after_s: float) -> Spawn:
@@ -119,12 +128,14 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         return Spawn(id_, "car", "other", "oncoming", "straight", arc, speed)
 
     ids = draws.ids(("danger", "late"))
+    coming = oncoming(ids["danger"], draws.between("danger_s", p.danger_s))
     danger = "oncoming" if draws.share("danger") < p.danger_share else None
     if danger:
-        spawns.append(oncoming(ids["danger"], draws.between("danger_s", p.danger_s)))
+        spawns.append(coming)
     if draws.share("late") < p.late_share:
         spawns.append(oncoming(ids["late"], draws.between("late_s", p.late_s)))
-    return Layout.arranged(spawns, danger, ids["danger"])
+    made = Layout.arranged(spawns, danger, ids["danger"])
+    return Draft(made, (coming,), queue(draws, ids, itself, SEATS_M, (p.speed_mps, p.speed_mps)))
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:

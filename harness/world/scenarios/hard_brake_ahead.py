@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
+from harness.world.lookouts import Draft, placed, queue
 from harness.world.parameters import Parameters as Common
 from harness.world.road import Road, paths_along
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
@@ -30,6 +31,10 @@ LANE_WIDTH_M = 4.0
 BEGIN_M, END_M = -150.0, 350.0  # of the motorway, to the east
 ZONE_M = 18.0  # the conflict zone, where a car that brakes hard comes to stand
 LEFT, RIGHT = "left lane", "right lane"
+# Blind seats: cars behind the ego that have just begun to drive on, too slow to reach it wherever it stops;
+# from centre to centre.
+SEATS_M = (42.0, 46.0), (11.0, 14.0), (11.0, 14.0)
+SEATS_MPS = (3.0, 4.5)
 
 
 @dataclass(frozen=True)
@@ -90,8 +95,10 @@ def network() -> Any:
 
 def layout(seed: int, parameters: Parameters) -> Layout:
     """Draw one episode."""
-    draws = Draws(NAME, seed)
-    p = parameters
+    return placed(SCENARIO, _draft, seed, parameters)
+
+
+def _draft(draws: Draws, p: Parameters) -> Draft:
 
     def spawn(id_: str, kind: Kind, part: Any, lane: str, arc_m: float, *brakes: float) -> Spawn:
         return Spawn(id_, kind, part, "own", lane, arc_m, p.speed_mps, *brakes)
@@ -116,7 +123,9 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         spawn("v5", "car", "other", RIGHT, lead, *(brakes if danger else ())),
         spawn("v6", "car", "other", LEFT, slow, *(eases if slows else ())),
     ]
-    return Layout.arranged(spawns, "ahead" if danger else None, "v5")
+    made = Layout.arranged(spawns, "ahead" if danger else None, "v5")
+    ids = dict(zip(draws.seats, ("v7", "v8", "v9"), strict=False))
+    return Draft(made, (spawns[4],), queue(draws, ids, spawns[0], SEATS_M, SEATS_MPS))
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:

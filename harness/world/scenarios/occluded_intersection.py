@@ -11,11 +11,13 @@ without knowing of the danger. Where the two would touch, the danger gives way: 
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.crossroads import JUNCTION_M, SECTORS, road
+from harness.world.lookouts import Draft, placed, queue
 from harness.world.parameters import Parameters as Common
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, Building, Kind
@@ -23,6 +25,11 @@ from harness.world.state import SIZES_M, Building, Kind
 NAME = "occluded-intersection"
 BUILDING_END_M = 70.0  # outer walls, from the centre lines
 ROUTES = {"left": "straight", "right": "straight", "oncoming": "left"}  # of what comes from a sector
+# Where witnesses are declared, the lookouts are still in the junction, m behind its end, to see every arm.
+LOOKOUTS_M = -5.0, -1.0
+# Blind seats: slow cars behind the ego, which they never reach; from centre to centre.
+SEATS_M = (17.0, 20.0), (8.5, 10.0), (8.5, 10.0)
+SEATS_MPS = (2.0, 3.5)
 SPARE_S = 0.15  # more than rounding, between the truck's tail and a car that crosses behind it
 
 
@@ -62,8 +69,11 @@ class Parameters(Common):
 
 def layout(seed: int, parameters: Parameters) -> Layout:
     """Draw one episode."""
-    draws = Draws(NAME, seed)
-    p, paths, crossings = parameters, road().paths, road().crossings
+    return placed(SCENARIO, _draft, seed, parameters)
+
+
+def _draft(draws: Draws, p: Parameters) -> Draft:
+    paths, crossings = road().paths, road().crossings
 
     danger = None
     if draws.share("danger") < p.danger_share:
@@ -84,16 +94,21 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     traffic: dict[str, tuple[Kind, str, str, float, float]] = {
         "truck": ("truck", "oncoming", "straight", truck_arc, truck_speed)
     }
-    if danger == "oncoming":
-        arc = truck_arc - draws.between("follow", p.follow_m)
-        traffic["danger"] = ("car", danger, ROUTES[danger], arc, truck_speed)
-    elif danger:
+
+    def coming(sector: str) -> tuple[Kind, str, str, float, float]:
+        """Return the danger of a sector."""
+        route = ROUTES[sector]
+        if sector == "oncoming":
+            return "car", sector, route, truck_arc - draws.between("follow", p.follow_m), truck_speed
         speed = draws.between("crossing_speed", p.crossing_speed_mps)
-        ego_s = (crossings[danger, ROUTES[danger]].ego_arc_m - ego_arc) / p.ego_speed_mps
+        ego_s = (crossings[sector, route].ego_arc_m - ego_arc) / p.ego_speed_mps
         soonest, latest = p.danger_offset_s
-        soonest = max(soonest, behind_truck_s(danger, speed, truck_arc, truck_speed) - ego_s)
+        soonest = max(soonest, behind_truck_s(sector, speed, truck_arc, truck_speed) - ego_s)
         offset = draws.between("danger_offset", (soonest, max(soonest, latest)))
-        traffic["danger"] = ("car", danger, ROUTES[danger], timed(danger, speed, offset), speed)
+        return "car", sector, route, timed(sector, speed, offset), speed
+
+    if danger:
+        traffic["danger"] = coming(danger)
     if draws.share("late") < p.late_share:
         arm = SECTORS[int(draws.share("late_sector") * len(SECTORS))]
         speed = draws.between("late_speed", p.truck_speed_mps if arm == "oncoming" else p.crossing_speed_mps)
@@ -103,22 +118,27 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     spawns = [Spawn("v1", "car", "ego", "own", "straight", ego_arc, p.ego_speed_mps)]
     for n, (approach, exit_name) in enumerate((("right", "left"), ("left", "right"), ("own", "ahead"))):
         arc = paths[approach, "straight"].ends_m[1]
-        arc += draws.between(f"helper_start_{exit_name}", p.helper_start_m)
-        if exit_name == "ahead":
+        arc += draws.between(f"helper_start_{exit_name}", LOOKOUTS_M if draws.seats else p.helper_start_m)
+        if exit_name == "ahead" and not draws.seats:
             arc += 4.0  # stays clear of the ego that follows it out of the junction
         speed = draws.between(f"helper_speed_{exit_name}", p.helper_speed_mps)
         spawns.append(Spawn(f"v{n + 2}", "car", "helper", approach, "straight", arc, speed))
 
     ids = draws.ids(("danger", "truck", "late"))
-    for name, (kind, approach, route, arc, speed) in traffic.items():
-        spawns.append(Spawn(ids[name], kind, "other", approach, route, arc, speed))
+
+    def other(name: str, kind: Kind, *way: Any) -> Spawn:
+        return Spawn(ids[name], kind, "other", *way)
+
+    spawns += [other(name, *vehicle) for name, vehicle in traffic.items()]
 
     buildings = []
     for n, (east, south) in enumerate(((-1, 1), (1, 1), (-1, -1), (1, -1))):
         xs = sorted((east * draws.between(f"corner_{n}_x", p.corner_m), east * BUILDING_END_M))
         ys = sorted((south * draws.between(f"corner_{n}_y", p.corner_m), south * BUILDING_END_M))
         buildings.append(Building(f"b{n + 1}", xs[0], ys[0], xs[1], ys[1]))
-    return Layout.arranged(spawns, danger, ids["danger"], buildings)
+    made = Layout.arranged(spawns, danger, ids["danger"], buildings)
+    phantoms = tuple(other("danger", *coming(sector)) for sector in SECTORS)
+    return Draft(made, phantoms, queue(draws, ids, spawns[0], SEATS_M, SEATS_MPS))
 
 
 def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mps: float) -> float:

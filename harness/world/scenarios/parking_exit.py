@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
+from harness.world.lookouts import Draft, placed
 from harness.world.parameters import Parameters as Common
 from harness.world.road import Road, crossings, paths_along, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
@@ -33,6 +34,7 @@ PULL_OUT_M = 10.0  # along the street, from the space into the lane, in two arcs
 OUT_M = 0.0  # where the ego's way has come into the lane
 SECTOR_REACH_M = (15.0, 45.0)  # stretch of the lane before that point that is looked at
 VAN = SIZES_M["van"][0]
+SEATS_M = 6.0, 7.5  # blind seats: cars parked ahead of the van ahead, from centre to centre
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,11 @@ def road() -> Road:
 
 def layout(seed: int, parameters: Parameters) -> Layout:
     """Draw one episode."""
-    draws = Draws(NAME, seed)
-    p, (at,) = parameters, road().crossings.values()
+    return placed(SCENARIO, _draft, seed, parameters)
+
+
+def _draft(draws: Draws, p: Parameters) -> Draft:
+    (at,) = road().crossings.values()
 
     start = OUT_M - PULL_OUT_M - draws.between("ego_start", p.ego_start_m)
     ego = start - BEGIN_M
@@ -147,16 +152,21 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         standing(ids["second van"], "van", "other", row[1]),
         standing(ids["van ahead"], "van", "other", ahead),
     ]
+    comes = coming("danger", p.danger_offset_s)
     danger = "behind" if draws.share("danger") < p.danger_share else None
     if danger:
-        spawns.append(coming("danger", p.danger_offset_s))
+        spawns.append(comes)
     if draws.share("late") < p.late_share:
         spawns.append(coming("late", p.late_offset_s))
     if draws.share("oncoming") < p.oncoming_share:
         arc = END_M - start - draws.between("oncoming", p.oncoming_m)
         speed = draws.between("oncoming_speed", p.lane_mps)
         spawns.append(Spawn(ids["oncoming"], "car", "other", "oncoming", "straight", arc, speed))
-    return Layout.arranged(spawns, danger, ids["danger"])
+    seats = []
+    for name in draws.seats:
+        ahead += draws.between(name, SEATS_M)
+        seats.append(standing(ids[name], "car", "helper", ahead))
+    return Draft(Layout.arranged(spawns, danger, ids["danger"]), (comes,), tuple(seats))
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:

@@ -13,7 +13,7 @@ later) is drawn without knowing of the danger.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
+from harness.world.lookouts import Draft, placed, queue
 from harness.world.parameters import Parameters as Common
 from harness.world.road import Lane, Path, PathKey, Road, crossings
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
@@ -38,6 +39,12 @@ ARMS = {"own": 0, "right": 1, "oncoming": 2, "left": 3}  # quarter turns from th
 SECTORS = ("left", "oncoming")  # the arm that a danger has come from
 SECTOR_REACH_M = (8.0, 45.0)  # stretch before the point of entry that is looked at
 RING = ("se", "ex", "ee", "nx", "ne", "wx", "we", "sx")  # as in highway-env: entries and exits in order
+# Where witnesses are declared, the third lookout is a second car that leaves at the west arm, this far behind
+# the first.
+SECOND_M = 8.0, 10.0
+# Blind seats: slow cars behind the ego, which they never reach; from centre to centre.
+SEATS_M = (14.0, 18.0), (9.0, 11.0), (9.0, 11.0)
+SEATS_MPS = (1.0, 2.0)
 SEEN_AS = {"own": "south", "right": "east", "oncoming": "north", "left": "west"}
 
 
@@ -167,8 +174,11 @@ def road() -> Road:
 
 def layout(seed: int, parameters: Parameters) -> Layout:
     """Draw one episode."""
-    draws = Draws(NAME, seed)
-    p, paths, meetings = parameters, road().paths, road().crossings
+    return placed(SCENARIO, _draft, seed, parameters)
+
+
+def _draft(draws: Draws, p: Parameters) -> Draft:
+    paths, meetings = road().paths, road().crossings
 
     def arm(what: str) -> str:
         return SECTORS[int(draws.share(what) >= p.sector_shares[0])]
@@ -186,6 +196,9 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         helper("v3", crosses, paths[crosses].ends_m[-2], "west", p.helper_west_m),
         helper("v4", enters, road().zone_arc_m, "ahead", p.helper_ahead_m),
     ]
+    if draws.seats:
+        second = spawns[2].arc_m - draws.between("second", SECOND_M)
+        spawns[3] = replace(spawns[2], id="v4", arc_m=second)
 
     def car(name: str, sector: str, route: str, bounds: tuple[float, float]) -> Spawn:
         """Return a car that is, or would be, where the ego enters so long after a cruising ego."""
@@ -195,8 +208,9 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     ids = draws.ids(("round", "before", "late"))
     danger = arm("sector") if draws.share("danger") < p.danger_share else None
+    phantoms = {sector: car("round", sector, "straight", p.danger_offset_s) for sector in SECTORS}
     if danger:
-        spawns.append(car("round", danger, "straight", p.danger_offset_s))
+        spawns.append(phantoms[danger])
     elif draws.share("leaver") < p.leaver_share:
         spawns.append(car("round", arm("sector"), "right", p.danger_offset_s))
     if draws.share("before") < p.before_share:
@@ -210,7 +224,8 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         x, y = mound * math.cos(math.radians(degrees)), mound * math.sin(math.radians(degrees))
         boxes.append((-x, -y, x, y))
     buildings = [Building(f"b{n}", *box) for n, box in enumerate(boxes, 1)]
-    return Layout.arranged(spawns, danger, ids["round"], buildings)
+    made = Layout.arranged(spawns, danger, ids["round"], buildings)
+    return Draft(made, (*phantoms.values(),), queue(draws, ids, spawns[0], SEATS_M, SEATS_MPS))
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:

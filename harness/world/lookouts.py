@@ -1,0 +1,136 @@
+"""Layouts with a declared number of witnesses: helpers with the danger in sight at the first decision.
+
+Three lookouts have in sight wherever a danger may be; three cars in blind seats and the ego do not. All six
+are there whatever the number of witnesses is, and whether or not there is a danger: only the radio moves.
+With k witnesses, k lookouts and the first 3 - k blind seats help, in an order that is drawn; lookouts without
+a radio stay as traffic, and further blind seats stay empty.
+
+So that this holds without telling anything, a layout is drawn again, as a whole, until the sensors find it so
+with a phantom of the danger of each sector in turn, drawn as the danger would be, there or not.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+from harness.core import noise
+from harness.core.errors import UserError
+from harness.world.parameters import Parameters
+from harness.world.perception.rays import Look, rays_on_vehicles, surfaces
+from harness.world.perception.sensors import LEAST_RAYS, detections
+from harness.world.scenario import Draws, Layout, Scenario, Spawn
+from harness.world.state import WorldState
+
+LOOKOUTS = ("v2", "v3", "v4")
+SEATS = ("first seat", "second seat", "third seat")
+MOST_ATTEMPTS = 2000
+
+
+@dataclass(frozen=True)
+class Draft:
+    """One draw of an episode's start."""
+
+    layout: Layout  # with the lookouts as helpers, and nobody in the blind seats
+    phantoms: tuple[Spawn, ...]  # the danger of each sector, as it would be; it stands for who has its id
+    seats: tuple[Spawn, ...]  # cars in blind seats; empty if the draws name none
+
+
+def placed(
+    scenario: Scenario, draft: Callable[[Draws, Any], Draft], seed: int, parameters: Parameters
+) -> Layout:
+    """Return the layout of a seed, with as many witnesses and radios as the parameters declare.
+
+    Raises UserError if no draw gives so many witnesses.
+    """
+    if parameters.witnesses == "any":
+        layout = draft(Draws(scenario.name, seed), parameters).layout
+    else:
+        layout = _witnessed(scenario, draft, seed, parameters)
+    if not parameters.radio_share:
+        return layout
+    return replace(layout, spawns=tuple(_equipped(s, scenario, seed, parameters) for s in layout.spawns))
+
+
+def witnesses(parameters: Parameters, seed: int) -> int | None:
+    """Return the number of witnesses that a layout is drawn with; None where none is declared.
+
+    `each` goes by the seed, so seeds in a row are balanced and no draw decides.
+    """
+    if parameters.witnesses == "any":
+        return None
+    return seed % (len(LOOKOUTS) + 1) if parameters.witnesses == "each" else int(parameters.witnesses)
+
+
+def queue(
+    draws: Draws, ids: dict[str, str], ego: Spawn, gaps_m: tuple[tuple[float, float], ...],
+    speed_mps: tuple[float, float],
+) -> tuple[Spawn, ...]:  # fmt: skip
+    """Return cars in blind seats one behind another on the ego's path; gaps are from centre to centre."""
+    mps, arc_m, cars = draws.between("seats_speed", speed_mps), ego.arc_m, []
+    for name, bounds in zip(draws.seats, gaps_m, strict=False):
+        arc_m -= draws.between(name, bounds)
+        cars.append(Spawn(ids[name], "car", "helper", ego.approach, ego.route, arc_m, mps))
+    return tuple(cars)
+
+
+def _equipped(spawn: Spawn, scenario: Scenario, seed: int, p: Parameters) -> Spawn:
+    draw = noise.uniforms((1,), scenario.name, seed, "radio", spawn.id)[0]
+    return replace(spawn, radio=spawn.part == "other" and bool(draw < p.radio_share))
+
+
+@lru_cache(maxsize=256)  # a frozen scene asks again for each action that it follows
+def _witnessed(
+    scenario: Scenario, draft: Callable[[Draws, Any], Draft], seed: int, parameters: Parameters
+) -> Layout:
+    for attempt in range(MOST_ATTEMPTS):
+        made = draft(Draws(scenario.name, seed, attempt, SEATS), parameters)
+        if all(_fits(scenario, made, phantom, seed) for phantom in made.phantoms):
+            break
+    else:
+        raise UserError(
+            f"scenario {scenario.name}: none of {MOST_ATTEMPTS} draws of layout seed {seed} gives "
+            f"witnesses={parameters.witnesses}; it needs other parameters"
+        )
+    count = witnesses(parameters, seed)
+    assert count is not None
+    order = noise.generator(scenario.name, seed, "radios").permutation(len(LOOKOUTS)).tolist()
+    silent = {LOOKOUTS[n] for n in order[count:]}
+    spawns = [replace(s, part="other") if s.id in silent else s for s in made.layout.spawns]
+    seats = [made.seats[n] for n in order[count:]]
+    danger, danger_id = made.layout.danger, made.phantoms[0].id
+    return Layout.arranged([*spawns, *seats], danger, danger_id, made.layout.buildings)
+
+
+def _fits(scenario: Scenario, made: Draft, phantom: Spawn, seed: int) -> bool:
+    """Return whether exactly the lookouts have a phantom of the danger in sight.
+
+    They have it with all blind seats taken, and nobody else has it with no other one taken: so it holds
+    whichever seats are.
+    """
+    there = [*(s for s in made.layout.spawns if s.id != phantom.id), phantom]
+    full = _state(scenario, made.layout, [*there, *made.seats], seed)
+    if not all(_see(scenario, [(full, full.vehicle(id_)) for id_ in LOOKOUTS], phantom.id)):
+        return False
+    bare = _state(scenario, made.layout, there, seed)
+    blind = [bare.ego, *(full.vehicle(seat.id) for seat in made.seats)]
+    return not any(_see(scenario, [(bare, vehicle) for vehicle in blind], phantom.id))
+
+
+def _state(scenario: Scenario, layout: Layout, spawns: Sequence[Spawn], seed: int) -> WorldState:
+    """Return the state in which some vehicles start; the ego is first."""
+    from harness.world.simulator import populated, state_of  # imports highway-env
+
+    road = populated(scenario, replace(layout, spawns=tuple(spawns)))
+    vehicles = tuple(state_of(v, origin_m=scenario.road().origin_m) for v in road.vehicles)
+    return WorldState(scenario.name, seed, 0, 0.0, 0.0, vehicles, layout.buildings)
+
+
+def _see(scenario: Scenario, looks: Sequence[Look], target: str) -> list[bool]:
+    """Return whether each viewer's sensors report a vehicle."""
+    around = surfaces(looks)
+    hits = around.by_viewer(rays_on_vehicles(around)) >= LEAST_RAYS
+    hit = [bool(row[ids.index(target)]) for row, ids in zip(hits, around.ids, strict=True)]
+    pairs = [(state, viewer, state.vehicle(target)) for state, viewer in looks]
+    reports = detections(pairs, scenario.parameters.light)
+    return [met and report is not None for met, report in zip(hit, reports, strict=True)]
