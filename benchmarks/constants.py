@@ -1,55 +1,71 @@
 """How many tune layouts of each scenario an ego clears that always takes one action.
 
-`python benchmarks/constants.py` drives 240 layouts of each in some minutes, prints what each action
-clears, and writes `harness/world/constants.csv`, from which the driver `constant` takes its action.
+`python benchmarks/constants.py` drives 240 layouts of each, as they are drawn and judged under either version
+of the limits, in some minutes. It prints what each action clears, and writes `harness/world/constants.csv`,
+from which the driver `constant` takes its action.
 """
 
 import csv
 import sys
+from collections.abc import Iterator
 
 import numpy as np
 
+from harness.core.arrays import Bools
 from harness.core.seeds import FIRST, stated
-from harness.core.statistics import rate_interval
+from harness.core.statistics import mean_of, rate_interval
 from harness.world import reference, scenarios
 from harness.world.drivers import CONSTANTS, PRIVILEGED
+from harness.world.scenario import Scenario
 from harness.world.world import World
 
 LAYOUTS = 240
+# How layouts are drawn that are judged by each version.
+VERSIONS = {1: "limits=1,witnesses=any,radio_share=0,perception=1", 2: "limits=2,witnesses=each"}
+HEADS = ("scenario", "limits", "action", "cleared", "layouts", "harmless_cleared", "harmless", "first_seed")
 
 
-def cleared(name: str, layouts: int) -> dict[str, list[bool]]:
-    """Whether each constant action succeeds in each of the first tune layouts, by action."""
-    scenario = scenarios.get(name)
-    drivers = [*scenario.actions, PRIVILEGED]
-    found: dict[str, list[bool]] = {action: [] for action in scenario.actions}
+def cleared(scenario: Scenario, layouts: int) -> tuple[Bools, dict[str, Bools]]:
+    """Return which of the first tune layouts have a danger, and in which each action succeeds, (layouts,)."""
+    drivers, p = [*scenario.actions, PRIVILEGED], scenario.parameters
+    dangerous: list[bool] = []
+    success: dict[str, list[bool]] = {action: [] for action in scenario.actions}
     for first in range(FIRST["tune"], FIRST["tune"] + layouts, reference.TOGETHER):
         seeds = range(first, min(first + reference.TOGETHER, FIRST["tune"] + layouts))
         worlds = [World.start(scenario, seed) for seed in seeds for _ in drivers]
+        dangers = [world.layout.danger for world in worlds[:: len(drivers)]]
         ended = iter(reference.finish(worlds, drivers * len(seeds)))
-        for _ in seeds:
+        for danger in dangers:
             *constant, full_view = [next(ended) for _ in drivers]
+            dangerous.append(danger is not None)
             for action, outcome in zip(scenario.actions, constant, strict=True):
-                found[action].append(outcome.judged(full_view, scenario.parameters).success)
-    return found
+                success[action].append(outcome.judged(full_view, danger, p).success)
+    return np.array(dangerous), {action: np.array(of) for action, of in success.items()}
+
+
+def measured(name: str, limits: int, layouts: int) -> Iterator[tuple[object, ...]]:
+    """Print what each action clears in percent, and yield the rows of the table."""
+    dangerous, success = cleared(scenarios.get(f"{name}:{VERSIONS[limits]}"), layouts)
+    for action, of in success.items():
+        halves = [rate_interval(of[half].astype(float)) for half in (dangerous, ~dangerous)]
+        rates = (rate_interval(of.astype(float)), mean_of(halves), *halves)
+        shown = (f"{100 * e.value:5.1f} [{100 * e.low:4.1f}, {100 * e.high:5.1f}]" for e in rates)
+        print(f"{name:22} {limits}  {action:11}", *shown, sep="  ")
+        counts = of.sum(), layouts, of[~dangerous].sum(), (~dangerous).sum()
+        yield name, limits, action, *map(int, counts), FIRST["tune"]
 
 
 def main() -> None:
     """Measure, print and write."""
     layouts = int(sys.argv[1]) if len(sys.argv) > 1 else LAYOUTS
-    rows = []
     print(f"success % [95 % interval] of {layouts} layouts each, {stated(FIRST['tune'], layouts)}")
-    for name in sorted(scenarios.names()):
-        for action, success in cleared(name, layouts).items():
-            rate = rate_interval(np.array(success, dtype=float))
-            print(
-                f"{name:24}{action:14}{100 * rate.value:5.1f} [{100 * rate.low:.1f}, {100 * rate.high:.1f}]"
-            )
-            rows.append((name, action, sum(success), layouts, FIRST["tune"]))
+    print(f"{'scenario':22} limits  action   of all, balanced over dangerous and harmless, of each")
+    names = [(limits, name) for limits in VERSIONS for name in sorted(scenarios.names())]
+    rows = [row for limits, name in names for row in measured(name, limits, layouts)]
     if layouts == LAYOUTS:
         with CONSTANTS.open("w", encoding="utf-8", newline="") as file:
             table = csv.writer(file, lineterminator="\n")
-            table.writerow(("scenario", "action", "cleared", "layouts", "first_seed"))
+            table.writerow(HEADS)
             table.writerows(rows)
 
 

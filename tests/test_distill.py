@@ -152,7 +152,7 @@ def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(fe
                     world = World.start(scenario, seed)
                     world.act(action)
                     [outcome] = finish([world], ["local-view"])
-                    safe.append(outcome.judged(reference, scenario.parameters).success)
+                    safe.append(outcome.judged(reference, world.layout.danger, scenario.parameters).success)
                 assert (each.labels[scene.id] > 0).tolist() == safe
 
 

@@ -35,7 +35,7 @@ class DriverBackend:
             raise ValueError(f"request {requests[0].id} has no scenario; a driver needs its road")
         if self.driver == UNIFORM:
             return [self._answer(request, request.actions) for request in requests]
-        driver = self.driver if self.driver != CONSTANT else constant(scenario.name)
+        driver = self.driver if self.driver != CONSTANT else constant(scenario)
         if driver is None:
             raise UserError(
                 f"driver {CONSTANT}: none was chosen for {printable(scenario.name)}; give brake or cruise"

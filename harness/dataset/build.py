@@ -153,7 +153,7 @@ def _write_dataset(
     episodes, seed = config["episodes"], config["seed"]
     texts = _join_layouts(place, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
-    forest = Forest.of(trees, scenario.actions, scenario.parameters.delay_allowance_s)
+    forest = Forest.of(trees, scenario.actions, scenario.parameters)
     audited = None
     if audits:
         more(episodes)
@@ -199,7 +199,7 @@ def _freeze_layout(scenario: Scenario, seed: int, episode: int) -> bytes:
 
 def _check(scenario: Scenario, tree: Tree) -> None:
     """Drive the layout in closed loop; a reference driver that ends otherwise than in the tree is a bug."""
-    forest = Forest.of([tree], scenario.actions, scenario.parameters.delay_allowance_s)
+    forest = Forest.of([tree], scenario.actions, scenario.parameters)
     [driven] = drive_all(scenario, [tree.episode_seed])
     for driver, outcome in driven.items():
         end = forest.end(int(forest.last_edge(forest.drivers[driver])[0]))

@@ -1,11 +1,16 @@
 """Hold the decision trees of a dataset as arrays: where each action leads, its worth, and how a walk ends.
 
-The rule: an episode succeeds if the ego reaches its goal no later than the delay allowance after the
-full-view driver of the same layout, which decides as often and with the same lag. A pass from the leaves
-backwards gives, exactly, the earliest time at which the goal can still be reached after each action.
-An action is *safe* if that is early enough for success. A decision that is not safe, though a safe one was
-possible, has *lost* the episode: its regret is 1. A safe decision costs the *delay* in seconds by which the
-earliest time grows.
+The rule: an episode succeeds if the ego reaches its goal no later than an allowance after the full-view
+driver of the same layout, which decides as often and with the same lag (`Parameters.allowance_s`). A pass
+from the leaves backwards gives, exactly, the earliest time at which the goal can still be reached after each
+action. An action is *safe* if that is early enough for success. A decision that is not safe, though a safe
+one was possible, has *lost* the episode: its regret is 1. A safe decision costs the *delay* in seconds by
+which the earliest time grows.
+
+A second pass says after which actions harm, a collision or leaving the road, can still be avoided. A decision
+after which it cannot, though it could be before, is a *miss*. A decision that has lost the episode to time
+alone, since harm can be avoided after it, is a *false alarm*. An episode has at most one of each: one that
+ends in harm has a miss, one that ends late or stuck a false alarm, unless that was inevitable from the start.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +22,8 @@ import numpy as np
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.schema import Edge, End, Tree
 from harness.world.drivers import PRIVILEGED
-from harness.world.outcome import ROUNDING_S
+from harness.world.outcome import RATINGS, ROUNDING_S
+from harness.world.parameters import Parameters
 
 
 @dataclass(frozen=True)
@@ -25,7 +31,8 @@ class Forest:
     """E trees with N decision points and A actions; within a tree, decision points are ordered by level."""
 
     actions: tuple[str, ...]  # the meta-actions
-    allowance_s: float  # needless delay that an episode may have
+    allowance_s: Floats  # needless delay that an episode of each tree may have, (E,)
+    time_limit_s: float  # when every episode ends
     episodes: Ints  # the episode's number of each tree, (E,)
     seeds: Ints  # the layout seed of each tree, (E,)
     dangers: tuple[str | None, ...]  # the sector from which each tree's danger comes; None without one
@@ -39,7 +46,7 @@ class Forest:
     drivers: Mapping[str, Ints]  # the index of each reference driver's action, (N,)
 
     @classmethod
-    def of(cls, trees: Sequence[Tree], actions: tuple[str, ...], allowance_s: float) -> "Forest":
+    def of(cls, trees: Sequence[Tree], actions: tuple[str, ...], parameters: Parameters) -> "Forest":
         action_index = {action: n for n, action in enumerate(actions)}
         starts, total = [], 0  # the first index of each level of each tree
         for tree in trees:
@@ -63,7 +70,8 @@ class Forest:
             child.append(leads)
         sizes = [list(map(len, tree.levels)) for tree in trees]
         return cls(
-            actions, allowance_s, np.array([t.episode for t in trees]),
+            actions, np.array([parameters.allowance_s(t.danger.sector) for t in trees]),
+            parameters.time_limit_s, np.array([t.episode for t in trees]),
             np.array([t.episode_seed for t in trees]), tuple(t.danger.sector for t in trees),
             np.array([tree_starts[0] for tree_starts in starts]), tuple(point.scene for point in points),
             np.repeat(np.arange(len(trees)), list(map(sum, sizes))),
@@ -94,6 +102,26 @@ class Forest:
         return earliest_s
 
     @cached_property
+    def avoids_harm(self) -> Bools:
+        """Whether an end without a collision and on the road is still possible after each action, (N, A)."""
+        ratings = [edge.end and RATINGS[edge.end.result] for edge in self.edges]
+        avoids = np.array([rating in ("success", "late", "stuck") for rating in ratings])[self.edge]
+        for rows in self._levels_backwards():
+            child = self.child[rows]
+            avoids[rows] = np.where(child >= 0, avoids[child].any(axis=-1), avoids[rows])
+        return np.asarray(avoids)
+
+    @cached_property
+    def miss(self) -> Bools:
+        """Whether harm is inevitable after each action, though it was not before, (N, A)."""
+        return np.asarray(self.avoids_harm.any(axis=-1, keepdims=True) & ~self.avoids_harm)
+
+    @cached_property
+    def false_alarm(self) -> Bools:
+        """Whether each action gives success away, though harm can still be avoided after it, (N, A)."""
+        return np.asarray(self.value[:, None] & ~self.safe & self.avoids_harm)
+
+    @cached_property
     def then_full_view(self) -> Ints:
         """The last edge after each action if the full-view driver decides from there, (N, A)."""
         last, chosen = self.edge.copy(), self.drivers[PRIVILEGED]
@@ -112,8 +140,8 @@ class Forest:
 
     @cached_property
     def limit_s(self) -> Floats:
-        """The latest time of a success, (E,); inf if the full-view driver fails."""
-        return self.reference_s + self.allowance_s + ROUNDING_S
+        """The latest time of a success, (E,): the time limit if the full-view driver fails."""
+        return np.minimum(self.reference_s + self.allowance_s, self.time_limit_s) + ROUNDING_S
 
     @cached_property
     def safe(self) -> Bools:

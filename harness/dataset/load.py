@@ -139,7 +139,7 @@ class Dataset:
 
     @cached_property
     def forest(self) -> Forest:
-        return Forest.of(tuple(self.trees), self.actions, self.scenario.parameters.delay_allowance_s)
+        return Forest.of(tuple(self.trees), self.actions, self.scenario.parameters)
 
     @property
     def lost(self) -> int:
@@ -160,7 +160,7 @@ class Dataset:
         The references are the drivers, `uniform`, and `constant` where its action is known.
         """
         parts: dict[str, list[Floats]] = {}
-        action = constant(self.scenario.name)
+        action = constant(self.scenario)
         for start in range(0, len(self.trees), TREES_AT_ONCE):
             forest = self.of_episodes(self.episodes[start : start + TREES_AT_ONCE]).forest
             for name in forest.drivers:

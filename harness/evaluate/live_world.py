@@ -199,7 +199,7 @@ def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) 
     """Return how an episode ended; it is `late` if it cleared too long after the full-view driver."""
     world = trajectory.world
     ended = world.outcome
-    outcome = ended.judged(full_view, world.scenario.parameters) if full_view else ended
+    outcome = ended.judged(full_view, world.layout.danger, world.scenario.parameters) if full_view else ended
     delay_s = None
     if full_view and full_view.time_s is not None and full_view.success and ended.success:
         delay_s = round((ended.time_s or 0.0) - full_view.time_s, 3)

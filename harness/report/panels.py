@@ -54,7 +54,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
     windows_ms = sorted({c["window_s"] * 1000 for c in points})
 
     if rows := joined(success):
-        references, scenario = _references(runs), runs.scenario.name
+        references, scenario = _references(runs), runs.scenario
         rates = {label(name, scenario): s.value for name, s in references.items() if s.value is not None}
         yield Panel(
             "success-latency", "overview", "Success and latency",

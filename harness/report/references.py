@@ -10,6 +10,7 @@ from harness.runs.folder import Run
 from harness.runs.metrics import SUCCESS
 from harness.runs.records import Score
 from harness.world.drivers import CONSTANT, UNIFORM, constant
+from harness.world.scenario import Scenario
 
 BESIDE = (CONSTANT, UNIFORM)  # rows beside a model's on the terminal, the best first
 
@@ -30,7 +31,7 @@ def driven(runs: Iterable[Run]) -> dict[str, Score]:
     return {name: score for name, score in scores.items() if score and score.value is not None}
 
 
-def label(name: str, scenario: str) -> str:
+def label(name: str, scenario: Scenario) -> str:
     """Return a reference's name for people; that of `constant` says which action it takes."""
     action = constant(scenario) if name == CONSTANT else None
     return f"{name} {action}" if action else name
@@ -44,7 +45,7 @@ def meaning(name: str) -> str:
     }[name]
 
 
-def sentences(references: Mapping[str, Score], scenario: str) -> str:
+def sentences(references: Mapping[str, Score], scenario: Scenario) -> str:
     """Say how well each reference does, the best first, and what those that look at nothing do."""
     if not references:
         return ""

@@ -128,7 +128,8 @@ def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
                 for edge in out:
                     end = edge.end
                     outcome = Outcome(end.result, end.time_s) if end else outcomes[edge.to or 0]
-                    if outcome.judged(reference, scenario.parameters).success and outcome.time_s is not None:
+                    judged = outcome.judged(reference, world.layout.danger, scenario.parameters)
+                    if judged.success and outcome.time_s is not None:
                         ends_s.update(dict.fromkeys(edge.actions, outcome.time_s))
                 if np.isfinite(list(ends_s.values())).any():
                     taken += 1

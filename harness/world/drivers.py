@@ -5,7 +5,8 @@
 
 Two references look at nothing at all. `uniform` holds every action for equally likely. `constant` always
 takes the action that did best in a scenario's tune layouts: `constants.csv` has what each clears, and
-`benchmarks/constants.py` writes it.
+`benchmarks/constants.py` writes it. Where `limits` is 2, best is success balanced over dangerous and harmless
+layouts.
 """
 
 import csv
@@ -44,20 +45,30 @@ def choices(
     return [always.get(driver) or next(planned) for driver, *_ in asked]
 
 
-def constant(scenario: str) -> str | None:
+def constant(scenario: Scenario) -> str | None:
     """Return the action of the driver `constant` in a scenario; None where nobody has measured it."""
-    return _constants().get(scenario.partition(":")[0])
+    return _constants().get((scenario.name.partition(":")[0], scenario.parameters.limits))
 
 
 @cache
-def _constants() -> Mapping[str, str]:
-    """Return the best action of each scenario; of equally good ones the most careful."""
-    best: dict[str, dict[str, str]] = {}
+def _constants() -> Mapping[tuple[str, int], str]:
+    """Return the best action of each scenario and version of limits; of equals the most careful."""
+    best: dict[tuple[str, int], dict[str, str]] = {}
     for row in csv.DictReader(text_of(CONSTANTS).splitlines()):
-        before = best.setdefault(row["scenario"], row)
-        if int(row["cleared"]) > int(before["cleared"]):
-            best[row["scenario"]] = row
-    return {name: row["action"] for name, row in best.items()}
+        before = best.setdefault((row["scenario"], int(row["limits"])), row)
+        if _score(row) > _score(before):
+            best[row["scenario"], int(row["limits"])] = row
+    return {key: row["action"] for key, row in best.items()}
+
+
+def _score(row: Mapping[str, str]) -> int:
+    """Return a number that grows with success, or with balanced success where `limits` is 2."""
+    cleared, layouts, harmless_cleared, harmless = (
+        int(row[name]) for name in ("cleared", "layouts", "harmless_cleared", "harmless")
+    )
+    if row["limits"] == "1":
+        return cleared
+    return (cleared - harmless_cleared) * harmless + harmless_cleared * (layouts - harmless)
 
 
 def _read(driver: str, graph: SceneGraph | None, truth: SceneGraph | None) -> SceneGraph:

@@ -13,6 +13,11 @@ from harness.world.road import Path, PathKey
 from harness.world.state import VehicleState
 
 Result = Literal["running", "cleared", "late", "collision", "time_out", "off_road"]
+Rating = Literal["success", "late", "unsafe", "stuck"]
+# Every result of an episode that has ended, in one of the four words in which outcomes are counted.
+RATINGS: Mapping[str, Rating] = {
+    "cleared": "success", "late": "late", "collision": "unsafe", "off_road": "unsafe", "time_out": "stuck",
+}  # fmt: skip
 
 ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 
@@ -41,11 +46,19 @@ class Outcome:
         """Whether the ego reached its goal without a collision and without a forced failure."""
         return self.result == "cleared"
 
-    def judged(self, reference: "Outcome", parameters: Parameters) -> "Outcome":
-        """Return this outcome, as `late` if the ego came too long after the full-view `reference`."""
+    @property
+    def rating(self) -> Rating | None:
+        """The outcome in one of four words; None while running."""
+        return RATINGS.get(self.result)
+
+    def judged(self, reference: "Outcome", danger: str | None, parameters: Parameters) -> "Outcome":
+        """Return this outcome, as `late` if the ego came too long after the full-view `reference`.
+
+        How long is too long depends on whether the layout has a danger (`Parameters.allowance_s`).
+        """
         if not self.success or not reference.success or self.time_s is None or reference.time_s is None:
             return self
-        late = self.time_s - reference.time_s > parameters.delay_allowance_s + ROUNDING_S
+        late = self.time_s - reference.time_s > parameters.allowance_s(danger) + ROUNDING_S
         return replace(self, result="late") if late else self
 
     def ending(self, result: Result, time_s: float, **how: str) -> "Outcome":

@@ -47,6 +47,9 @@ class Parameters:
     simulation_hz: int = 50  # frames a second
     time_limit_s: float = 10.0  # an ego that has not reached its goal by then has failed
     delay_allowance_s: float = 1.0  # how much later than the full-view driver an ego may reach its goal
+    # the same in a layout without a danger, where `limits` is 2: half of what one needless SLOWER costs
+    # (`benchmarks/caution.py`)
+    harmless_allowance_s: float = 0.25
     # whether the ego and the helpers know each other's true state instead of beacons
     perfect_knowledge: bool = False
     # when a vehicle sends a beacon: `fixed`, or `cam`, depending on its motion (ETSI EN 302 637-2);
@@ -111,6 +114,10 @@ class Parameters:
         """`decision_lag_s` in whole frames."""
         return frames(self.decision_lag_s, self.simulation_hz)
 
+    def allowance_s(self, danger: str | None) -> float:
+        """Return how much later than the full-view driver an ego may be, in a layout with this danger."""
+        return self.delay_allowance_s if danger or self.limits == 1 else self.harmless_allowance_s
+
     def due_frame(self, step: int) -> int:
         """Return the frame in which a decision is due; after the last decision, that of the time limit."""
         due_s = self.time_limit_s if step >= self.decisions else step * self.decision_period_s
@@ -121,6 +128,7 @@ class Parameters:
 LATER = (
     ("ambient", DAY), ("beacon_rule", "fixed"), ("beacon_channel", ""),
     ("witnesses", "any"), ("radio_share", 0.0), ("limits", 1), ("perception", 1),
+    ("harmless_allowance_s", 0.25),
 )  # fmt: skip
 
 

@@ -57,9 +57,10 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcom
     worlds = [World.start(scenario, seed) for seed in seeds for _ in DRIVERS]
     ended = iter(finish(worlds, DRIVERS * len(seeds)))
     outcomes = [{driver: next(ended) for driver in DRIVERS} for _ in seeds]
+    dangers = [world.layout.danger for world in worlds[:: len(DRIVERS)]]
     return [
-        {driver: outcome.judged(of[PRIVILEGED], scenario.parameters) for driver, outcome in of.items()}
-        for of in outcomes
+        {driver: out.judged(of[PRIVILEGED], danger, scenario.parameters) for driver, out in of.items()}
+        for of, danger in zip(outcomes, dangers, strict=True)
     ]
 
 

@@ -1,6 +1,8 @@
 """What needs no model beside a model: the drivers, the best constant action, and any action at all."""
 
 import csv
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -64,20 +66,25 @@ def test_a_constant_action_clears_what_the_driver_of_that_action_does(small: Dat
 
 def test_the_constant_of_each_scenario_was_chosen_on_tune_layouts() -> None:
     rows = list(csv.DictReader(CONSTANTS.read_text(encoding="utf-8").splitlines()))
-    for name in {row["scenario"] for row in rows} | scenarios._files():
-        scenario = scenarios.get(name)
-        of = {row["action"]: row for row in rows if row["scenario"] == scenario.name}
-        assert list(of) == list(scenario.actions)
-        for row in of.values():
-            assert int(row["layouts"]) >= 200
-            assert purpose(int(row["first_seed"]), int(row["layouts"])) == "tune"
-        most = max(int(row["cleared"]) for row in of.values())
-        assert int(of[str(constant(scenario.name))]["cleared"]) == most
+    for name, limits in product({row["scenario"] for row in rows} | scenarios._files(), (1, 2)):
+        scenario = scenarios.get(f"{name}:limits={limits}")
+        best = {}
+        for row in (row for row in rows if (row["scenario"], row["limits"]) == (name, str(limits))):
+            cleared, layouts, safely, harmless = (
+                int(row[column]) for column in ("cleared", "layouts", "harmless_cleared", "harmless")
+            )
+            assert layouts >= 200
+            assert purpose(int(row["first_seed"]), layouts) == "tune"
+            halves = (cleared - safely) / (layouts - harmless), safely / harmless
+            best[row["action"]] = cleared / layouts if limits == 1 else fmean(halves)
+        assert list(best) == list(scenario.actions)
+        assert best[str(constant(scenario))] == pytest.approx(max(best.values()))
 
 
 def test_a_scenario_in_which_nobody_measured_has_no_constant() -> None:
-    assert constant("of-somebody-else") is None
-    assert label("constant", "of-somebody-else") == "constant"
+    somebodys = replace(scenarios.get("do-not-pass"), name="of-somebody-else")
+    assert constant(somebodys) is None
+    assert label("constant", somebodys) == "constant"
 
 
 def test_a_driver_may_be_an_action() -> None:

@@ -1,10 +1,11 @@
 """Who hit whom, who was to blame, and when clearing is too late."""
 
 import math
+from typing import get_args
 
 import pytest
 
-from harness.world.outcome import Outcome, fault, outline, striker
+from harness.world.outcome import Outcome, Result, fault, outline, striker
 from harness.world.scenarios.occluded_intersection import SCENARIO, Parameters
 from harness.world.state import VehicleState
 
@@ -54,17 +55,35 @@ def test_blame_goes_by_right_of_way_and_not_by_who_struck(hit):
 
 def test_an_ego_that_clears_within_the_allowance_of_the_full_view_driver_succeeds():
     reference = Outcome("cleared", 6.0)
-    assert Outcome("cleared", 7.0).judged(reference, Parameters()).success
-    assert Outcome("cleared", 5.0).judged(reference, Parameters()).success
+    assert Outcome("cleared", 7.0).judged(reference, None, Parameters()).success
+    assert Outcome("cleared", 5.0).judged(reference, None, Parameters()).success
 
 
 def test_an_ego_that_clears_one_frame_beyond_the_allowance_is_late():
-    late = Outcome("cleared", 7.02).judged(Outcome("cleared", 6.0), Parameters())
+    late = Outcome("cleared", 7.02).judged(Outcome("cleared", 6.0), "left", Parameters())
     assert (late.result, late.success, late.ended) == ("late", False, True)
 
 
 @pytest.mark.parametrize("result", ["collision", "time_out", "off_road"])
 def test_a_failure_stays_what_it_is_and_makes_nobody_late(result):
     failed = Outcome(result, 3.0)
-    assert failed.judged(Outcome("cleared", 1.0), Parameters()) == failed
-    assert Outcome("cleared", 9.0).judged(failed, Parameters()).success
+    assert failed.judged(Outcome("cleared", 1.0), None, Parameters()) == failed
+    assert Outcome("cleared", 9.0).judged(failed, None, Parameters(limits=2)).success
+
+
+@pytest.mark.parametrize(
+    ("limits", "danger", "allowed_s"), [(1, None, 1.0), (1, "left", 1.0), (2, None, 0.25), (2, "left", 1.0)]
+)
+def test_the_second_limits_forgive_less_where_there_is_no_danger(limits, danger, allowed_s):
+    p = Parameters(limits=limits)
+    for over_s, rating in ((allowed_s, "success"), (allowed_s + 0.02, "late")):
+        outcome = Outcome("cleared", 6.0 + over_s).judged(Outcome("cleared", 6.0), danger, p)
+        assert outcome.rating == rating
+
+
+def test_every_end_has_one_of_four_ratings():
+    ended = {result: Outcome(result).rating for result in get_args(Result)}
+    assert ended == {
+        "running": None, "cleared": "success", "late": "late", "collision": "unsafe", "off_road": "unsafe",
+        "time_out": "stuck",
+    }  # fmt: skip
