@@ -51,9 +51,11 @@ def with_ego(spec: Spec, **changes: Any) -> Spec:
     return replace(spec, ego=replace(spec.ego, **changes))
 
 
-def live_spec_of(model: str = "proxy", episodes: int = 2, first_seed: int = 0, **options: Any) -> Spec:
+def live_spec_of(
+    model: str = "proxy", episodes: int = 2, first_seed: int = 0, prompt: str = "v2", **options: Any
+) -> Spec:
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
-    ego = Agent(cards.resolve(model), prompts.load("v2"))
+    ego = Agent(cards.resolve(model), prompts.load(prompt))
     return Spec(ego, LiveSource(first_seed, episodes), **options)
 
 

@@ -49,6 +49,7 @@ class Attack:
     share: Share = 1 / 3
     by_scene: ClassVar[bool] = False  # whether it depends only on the scene and on who attacks
     in_text: ClassVar[bool] = False  # whether it changes what a fusion prompt shows
+    in_words: ClassVar[bool] = False  # whether it writes words of its own
     in_objects: ClassVar[bool] = False  # whether it changes the objects that a message lists
     adds: ClassVar[bool] = False  # whether it adds voices or objects, which no other attack then changes
     risk: ClassVar[str] = ""  # the risk that it states there, without reasons; empty leaves both as they are
@@ -286,6 +287,7 @@ class Injection(Attack):
     language: str = "english"  # language of the instructions, a key of `INSTRUCTIONS`
     by_scene: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
+    in_words: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Raise UserError for an unknown language."""

@@ -1,13 +1,14 @@
-"""Define what a helper's message holds: its intent, the objects that it lists, both, or the whole truth.
+"""Define what a helper's message holds: its intent, its words, the objects that it lists, or the whole truth.
 
-What a message lists makes the ego's scene graph larger, and the ego's model is asked once more with that
-graph. A list of objects needs no model: it can leave as soon as the request is there, while an intent waits
-for the helper's inference.
+What a message holds besides an intent is for the ego's model, which is asked once more: with the helpers'
+words in its prompt, or with a scene graph that their objects make larger. A list of objects needs no model:
+it can leave as soon as the request is there, while an intent and words wait for the helper's inference.
 """
 
 from typing import Final, Literal, NamedTuple
 
 INTENT: Final = "intent"
+TEXT: Final = "text"
 OBJECTS: Final = "objects"
 TRUTH: Final = "truth"
 
@@ -15,15 +16,30 @@ TRUTH: Final = "truth"
 class Content(NamedTuple):
     """What a message holds."""
 
-    intent: bool  # whether it holds the helper's intent, for which the helper's model is asked
+    intent: bool  # whether it holds the helper's intent, with the words beside it
     # what extends the ego's graph before its model is asked again: the `objects` of those who were heard, or
     # the `truth`, which no message can hold; empty where it is not asked again
-    graph: Literal["", "objects", "truth"]
+    graph: Literal["", "objects", "truth"] = ""
+    words: bool = False  # whether it holds the helper's words and nothing else
+
+    @property
+    def asks_helpers(self) -> bool:
+        """Whether the helper's model is asked for it."""
+        return self.intent or self.words
+
+    @property
+    def asks_again(self) -> bool:
+        """Whether the ego's model is asked once more with it."""
+        return bool(self.graph) or self.words
 
 
 CONTENTS = {
-    INTENT: Content(True, ""),  # the paper's
-    OBJECTS: Content(False, OBJECTS),  # as a CPM or an SDSM; the ego acts on its answer to the larger graph
-    "both": Content(True, OBJECTS),  # the ego's answer to the larger graph is fused with the helpers' intents
-    "oracle": Content(False, TRUTH),  # the ceiling: an ego that hears anybody sees everything, without noise
+    INTENT: Content(intent=True),  # the paper's
+    TEXT: Content(intent=False, words=True),  # the ego acts on its answer to the helpers' words
+    # as a CPM or an SDSM; the ego acts on its answer to the larger graph
+    OBJECTS: Content(intent=False, graph=OBJECTS),
+    # the ego's answer to the larger graph is fused with the helpers' intents
+    "both": Content(intent=True, graph=OBJECTS),
+    # the ceiling: an ego that hears anybody sees everything, without noise
+    "oracle": Content(intent=False, graph=TRUTH),
 }

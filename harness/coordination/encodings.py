@@ -19,14 +19,17 @@ from harness.radio.messages import NAMES, Counts, Encoding, message_bits, packet
 
 JSON = "json"
 ENCODINGS = (JSON, *NAMES)
+SAYS = '{"from":"v2","says":""}'  # what compact JSON puts around words
 
 
 def reply_bits(encoding: str, content: Content, intents: Intents, headers: bool) -> Floats:
     """Return the size of each helper's reply, `(..., H)`; one that holds both is two messages."""
     bits = np.zeros(intents.payload_bits.shape)
-    if content.intent:
-        text_bytes = 0.0 if intents.text_bytes is None else intents.text_bytes
-        counts = Counts(actions=intents.own.shape[-1], text_bytes=text_bytes)
+    text_bytes = 0.0 if intents.text_bytes is None else intents.text_bytes
+    if content.words and encoding == JSON:
+        bits += 8 * (len(SAYS) + text_bytes)
+    elif content.asks_helpers:
+        counts = Counts(actions=intents.own.shape[-1] * content.intent, text_bytes=text_bytes)
         bits += intents.payload_bits if encoding == JSON else _packet(encoding, "intent", counts, headers)
     if content.graph:
         assert intents.object_bits is not None

@@ -122,7 +122,8 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         entropy_nats=known.entropy_nats,
         triggered=any_of(asked),
         asked=outcome.asked,
-        infers=point.content.intent & (outcome.asked if in_turn else intents.range_m <= point.ask.radius_m),
+        infers=point.content.asks_helpers
+        & (outcome.asked if in_turn else intents.range_m <= point.ask.radius_m),
         requests=outcome.requests,
         request_bits=outcome.request_bits,
         reply_bits=np.sum(np.where(outcome.asked, intents.payload_bits, 0.0), axis=-1) + outcome.policy_bits,

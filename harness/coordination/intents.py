@@ -72,6 +72,12 @@ class Intents:
             unasked=None,
         )
 
+    def with_words(self) -> "Intents":
+        """Return what helpers send whose messages hold words alone: one without words sends nothing."""
+        said = np.zeros(self.valid.shape) if self.text_bytes is None else self.text_bytes
+        unasked = np.zeros(self.valid.shape, dtype=bool) if self.unasked is None else self.unasked
+        return replace(self, valid=self.valid & ((said > 0) | unasked))
+
     @classmethod
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":
         """Concatenate decisions with the same number of vehicles; none has a site, an outlook or claims."""

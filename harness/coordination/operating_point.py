@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, Literal, NamedTuple, get_type_hints
 
 from msgspec import structs
 
 from harness.coordination.attacks import ATTACKS, Absent, attacks_of, in_question
-from harness.coordination.contents import CONTENTS, OBJECTS, Content
+from harness.coordination.contents import CONTENTS, INTENT, OBJECTS, Content
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.parts import FUSION, RELAY, Ask, Cloud, Fusion, Guard, Part, Radio, wrong
 from harness.coordination.robust import Heads
@@ -46,7 +46,8 @@ class Rewrites(NamedTuple):
     attack: str = ""  # the attack that changes attackers' messages (`attacks.in_question`); empty for none
     defences: tuple[str, ...] = ()  # the defences that change every message
     graph: str = ""  # what the ego's graph is extended by (`contents.Content`)
-    words: bool = True  # whether the prompt shows the messages
+    # what the prompt shows of messages: all of each, its words alone, or nothing
+    shows: Literal["message", "words", ""] = "message"
 
 
 AS_SENT = Rewrites()
@@ -77,27 +78,32 @@ class OperatingPoint:
         _ = self.channel
 
     def _check_together(self) -> None:
+        holds = f"content is {self.ask.content}"
         if self.guard.attack and self.radio.profile is None:
             raise wrong("attack", self.guard.attack, "left out where there is no channel")
         if self.cloud.round_trip and self.has_fusion_call:
-            twice = f"content is {self.ask.content}" if self.content.graph else f"consensus is {EGO_PROMPT}"
+            twice = f"consensus is {EGO_PROMPT}" if self.content == CONTENTS[INTENT] else holds
             raise wrong("round_trip", self.cloud.round_trip, f"left out where {twice}, which asks twice")
-        if self.content.graph and self.ask.messages == "shuffled":
-            raise wrong("messages", "shuffled", f"own or blind where content is {self.ask.content}")
-        if self.content.graph and self.radio.edge == FUSION:
-            where = f"where content is {self.ask.content}"
-            raise wrong("edge", FUSION, f"none or relay {where}: a unit sends a policy and no objects")
+        if self.content.asks_again and self.ask.messages == "shuffled":
+            raise wrong("messages", "shuffled", f"own or blind where {holds}")
+        if self.content.asks_again and self.radio.edge == FUSION:
+            raise wrong(
+                "edge", FUSION, f"none or relay where {holds}: a unit sends a policy and nothing else"
+            )
         attacks = attacks_of(self.guard.attack)
         if any(attack.in_objects for attack in attacks) and self.content.graph != OBJECTS:
             raise wrong("attack", self.guard.attack, "one on intents where content lists no objects")
-        on_objects = all(attack.in_objects or isinstance(attack, Absent) for attack in attacks)
-        if not (self.content.intent or on_objects):
-            able = ", ".join(name for name in ATTACKS if ATTACKS[name].in_objects)
-            where = f"where content is {self.ask.content}, which holds no intents"
-            raise wrong("attack", self.guard.attack, f"some of {able} and absent {where}")
-        if self.content.graph and len({attack.share for attack in attacks}) > 1:
-            allowed = f"attacks of one share where content is {self.ask.content}, as the same vehicles do all"
+        kind = "in_words" if self.content.words else "in_objects"
+        apt = all(getattr(attack, kind) or isinstance(attack, Absent) for attack in attacks)
+        if not (self.content.intent or apt):
+            able = ", ".join(name for name in ATTACKS if getattr(ATTACKS[name], kind))
+            allowed = f"some of {able} and absent where {holds}, which holds no intents"
             raise wrong("attack", self.guard.attack, allowed)
+        if self.content.graph and len({attack.share for attack in attacks}) > 1:
+            allowed = f"attacks of one share where {holds}, as the same vehicles do all"
+            raise wrong("attack", self.guard.attack, allowed)
+        if self.content.words and self.guard.defence not in ("", "quoted"):
+            raise wrong("defence", self.guard.defence, f"quoted or left out where {holds}")
         if self.has_fusion_call and not all(attack.by_scene for attack in attacks):
             allowed = "one that needs no past and adds no voices where the ego is asked twice"
             raise wrong("attack", self.guard.attack, allowed)
@@ -106,10 +112,9 @@ class OperatingPoint:
                 raise wrong("defence", self.guard.defence, f"left out where consensus is not {EGO_PROMPT}")
             return
         where = f"where consensus is {EGO_PROMPT}"
-        if not self.content.intent:
-            raise wrong(
-                "content", self.ask.content, f"intent or both {where}, which reads the helpers' words"
-            )
+        if not self.content.asks_helpers:
+            allowed = f"intent, text or both {where}, which reads the helpers' words"
+            raise wrong("content", self.ask.content, allowed)
         if self.radio.edge == FUSION:
             raise wrong("edge", FUSION, f"none or relay {where}: a unit has no model")
         if self.ask.messages == "shuffled":
@@ -250,7 +255,8 @@ class OperatingPoint:
             return f"encoding {self.radio.encoding} has a size of its own for requests"
         if setting in UNIT and self.radio.edge == "none":
             return "it has no roadside unit (edge is none)"
-        if setting in OF_INTENTS and not self.content.intent:
+        on_demand = setting == "on_demand" and self.content.asks_helpers
+        if setting in OF_INTENTS and not (self.content.intent or on_demand):
             return f"content {ask.content} holds no intents"
         if setting in WEIGHING and (consensus == EGO_PROMPT or isinstance(RULES[consensus], Heads)):
             return f"consensus {consensus} weighs no distances"
@@ -297,7 +303,7 @@ class OperatingPoint:
     @property
     def has_fusion_call(self) -> bool:
         """Whether fusion asks the ego's model a second time, with the messages or what they add."""
-        second = self.fusion.consensus == EGO_PROMPT or bool(self.content.graph)
+        second = self.fusion.consensus == EGO_PROMPT or self.content.asks_again
         return self.radio.profile is not None and second
 
     @property
@@ -308,11 +314,12 @@ class OperatingPoint:
     @property
     def rewrites(self) -> "Rewrites":
         """How its fusion calls show messages."""
-        shows = tuple(part for part in self.guard.defences if part != "majority")
-        words = self.fusion.consensus == EGO_PROMPT
+        defences = tuple(part for part in self.guard.defences if part != "majority")
+        whole: Literal["message", ""] = "message" if self.fusion.consensus == EGO_PROMPT else ""
+        shows: Literal["message", "words", ""] = "words" if self.content.words else whole
         graph = self.content.graph
-        attack = in_question(self.guard.attack, words, bool(graph))
-        return Rewrites(self.blind_helpers, attack, shows, graph, words)
+        attack = in_question(self.guard.attack, bool(shows), bool(graph))
+        return Rewrites(self.blind_helpers, attack, defences, graph, shows)
 
     def _wrong(self, key: str, allowed: str) -> UserError:
         return _error_of(self.name, wrong(key, self.setting(key), allowed))

@@ -23,7 +23,7 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     tokens_of = counter(tokenizer, spec.ego.card)
     sizes: dict[str, list[int]] = {}
     asked, scenes = Counter[str](), dataset.scenes(dataset.courses())
-    intents = [point for point in spec.points if point.asks and point.content.intent]
+    intents = [point for point in spec.points if point.asks and point.content.asks_helpers]
     sighted = spec.asks_all or any(not point.blind_helpers for point in intents)
     blind = any(point.blind_helpers for point in (spec.points if spec.asks_all else intents))
     own = requests(spec, scenes, places=None if sighted else [EGO] * len(scenes))

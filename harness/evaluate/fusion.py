@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.attacks import Turn, attacks_of
-from harness.coordination.contents import OBJECTS, TRUTH
+from harness.coordination.contents import OBJECTS, TEXT, TRUTH
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import Rewrites
@@ -69,11 +69,14 @@ def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list
 def key_of(helper: str, rewrites: Rewrites, attacks: bool) -> str:
     """Return the key of a helper's message in a fusion call.
 
-    Such as `v2`, `v2~blind`, `v3!liar&schema`, or `v2!objects` where the ego's graph has its objects.
+    Such as `v2`, `v2~blind`, `v3!liar&schema`, `v2!text` where it holds words alone, or `v2!objects` where
+    the ego's graph has its objects.
     """
     changed = [*([rewrites.attack] if attacks and rewrites.attack else []), *rewrites.defences]
     if rewrites.graph:
-        changed += [rewrites.graph, *([WORDS] if rewrites.words else [])]
+        changed += [rewrites.graph, *([WORDS] if rewrites.shows else [])]
+    elif rewrites.shows == "words":
+        changed.append(TEXT)
     return helper + BLIND * rewrites.blind + (REWRITTEN + "&".join(changed) if changed else "")
 
 
@@ -85,12 +88,15 @@ def changes_of(key: str) -> list[str]:
 def messages_of(
     answers: Mapping[str, Answer], senders: Sequence[str], actions: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return these helpers' messages as a prompt takes them; `answers` are a point's, by key."""
+    """Return these helpers' messages as a prompt takes them; `answers` are a point's, by key.
+
+    One that holds words alone has a `sender` and `evidence`, in one line.
+    """
     messages = []
     for sender in senders:
         key, changes = sender.partition(REWRITTEN)[0], changes_of(sender)
-        holds = {WORDS, OBJECTS, TRUTH}.intersection(changes)
-        if holds and WORDS not in holds:
+        holds = {WORDS, TEXT, OBJECTS, TRUTH}.intersection(changes)
+        if holds and holds.isdisjoint((WORDS, TEXT)):
             continue  # its objects are in the graph
         if (answer := answers.get(key)) and answer.intent and answer.message:
             message = {"intent": list(answer.intent), **answer.message}
@@ -98,6 +104,8 @@ def messages_of(
                 message = message if change in holds else _rewritten(message, change, actions)
             # No special token of a chat template gets through.
             message["evidence"] = as_text(message["evidence"] or "")
+            if TEXT in holds:
+                message = {"evidence": " ".join(message["evidence"].split())}
             messages.append({"sender": key.removesuffix(BLIND), **message})
     return messages
 

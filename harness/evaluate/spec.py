@@ -230,9 +230,12 @@ class Spec:
         shown, ego = f"condition {printable(point.name)}", self.ego
         if point.ask.messages == "shuffled" and self.source.kind != "frozen":
             raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
-        if not (point.has_fusion_call and point.rewrites.words):
+        if not (point.has_fusion_call and point.rewrites.shows):
             return
         reason = self.fusion_obstacle
+        if point.content.words and not ego.prompt.shows_words:
+            version = ego.prompt.version
+            reason = f"prompt {version} cannot show words without an intent; use --prompt v11 or v12"
         if not ego.can.language_model:
             reason = f"{printable(ego.card.name)} is no language model and cannot fuse messages"
         if reason:

@@ -227,10 +227,10 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
     is none, the ego hears nobody. Who is asked, the distances and the times stay the same.
     """
     every = np.array_equal(due.at, np.arange(len(intents.own)))
-    own = intents if every else intents.take(due.at)
+    own = _able(point, intents if every else intents.take(due.at))
     if point.blind_helpers:
         assert blind is not None
-        source = blind.take(due.at)
+        source = _able(point, blind.take(due.at))
         own = _with_helpers(own, source, source.valid)
     elif point.ask.messages == "shuffled":
         places = _sources(point, due)
@@ -244,13 +244,19 @@ def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:
     return replace(own, valid=valid, **{name: getattr(source, name) for name in names})
 
 
+def _able(point: OperatingPoint, intents: Intents) -> Intents:
+    """Return the intents where only those helpers count as valid that have what the content wants."""
+    if point.content.words:
+        return intents.with_words()
+    return intents if point.content.intent or not point.asks else intents.without_models()
+
+
 def as_sent(point: OperatingPoint, intents: Intents) -> Intents:
     """Return what helpers send by the point's content and encoding."""
     content, encoding = point.content, point.radio.encoding
-    if encoding == JSON and not content.graph:
+    if encoding == JSON and not content.asks_again:
         return intents
-    sent = intents if content.intent else intents.without_models()
-    return replace(sent, payload_bits=reply_bits(encoding, content, sent, point.physical is not None))
+    return replace(intents, payload_bits=reply_bits(encoding, content, intents, point.physical is not None))
 
 
 def _sources(point: OperatingPoint, due: Due) -> Ints:

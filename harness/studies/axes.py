@@ -59,6 +59,7 @@ class Axis:
         return freed.changed(**{self.field: setting})
 
 
+OF_ANY_MODEL = [name for name, content in CONTENTS.items() if not content.words]
 AXES = {
     axis.name: axis
     for axis in (
@@ -68,7 +69,7 @@ AXES = {
         Axis("latency", "nominal latency of the channel, ms", *SHORT["latency"], "0,5,10,25,50,100"),
         Axis("window", "decision window, ms", *SHORT["window"], "150:400:25"),
         Axis("consensus", "consensus", "consensus", 1.0, ",".join(POOLS), worded=True),
-        Axis("content", "content of a message", "content", 1.0, ",".join(CONTENTS), worded=True),
+        Axis("content", "content of a message", "content", 1.0, ",".join(OF_ANY_MODEL), worded=True),
         Axis("attack", "attack", "attack", 1.0, ",".join((NONE, *USUAL_ATTACKS)), worded=True),
     )
 }

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from evaluating import live_spec_of, run, spec_of
 
-from harness.coordination.contents import CONTENTS
+from harness.coordination.contents import CONTENTS, TEXT
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.resources import DATASET
 from harness.dataset.load import find, load
@@ -24,6 +24,7 @@ from harness.world.drivers import DRIVERS
 
 LAYOUTS = 40  # of the reference drivers, and half of them for the others, who take ten times as long
 ALONE, OVER_6G = POINTS["single-local"], POINTS["6g"]
+CONTENT = {name: named_point(f"6g:content={name}") for name in CONTENTS}
 SAME = (
     "layout_seed", "danger", "success", "failure", "time_s", "delay_s", "partner", "striker", "fault",
     "least_gap_m", "hard_brakings", "other_crashes", "decisions", "messages", "trigger_rate", "latency_ms",
@@ -58,17 +59,19 @@ def off_lag(of: Run) -> set[Place]:
         ("proxy", (ALONE, OVER_6G), (0, 1), 0.8),
         ("proxy", (named_point("its-g5"),), (0, 1), 0.5),
         ("proxy-faulty", (ALONE, OVER_6G), (0, 1), 0.4),
-        ("proxy", tuple(named_point(f"6g:content={name}") for name in CONTENTS), (0,), 0.8),
+        ("proxy", tuple(point for name, point in CONTENT.items() if name != TEXT), (0,), 0.8),
+        ("swarm-tiny-six", (CONTENT[TEXT],), (0,), 0.8),
     ],
 )
 def test_what_the_tree_says_is_what_driving_gives(
     tmp_path: Path, model: str, points: Sequence[OperatingPoint], seeds: Sequence[int], least: float
 ) -> None:
     """`least` is the share of episodes that is not left out, at least."""
-    frozen = load(find(DATASET), LAYOUTS if model in DRIVERS else LAYOUTS // 2)
+    spoken = points == (CONTENT[TEXT],)
+    frozen = load(find(DATASET), LAYOUTS if model in DRIVERS else 3 if spoken else LAYOUTS // 2)
     how: dict[str, Any] = {"points": points, "seeds": seeds}
-    if len(points) == len(CONTENTS):  # the ego's second answer would come after the lag
-        how["latency"] = "ego=0.145,helper=0.145,fusion=0"
+    if set(points) & {*CONTENT.values()}:  # the ego's second answer would come after the lag
+        how |= {"latency": "ego=0.145,helper=0.145,fusion=0", "prompt": "v12" if spoken else "v2"}
     driven = live_spec_of(model, len(frozen.episodes), frozen.manifest.seed, **how)
     walked, drove = (
         folder.read(run(spec, tmp_path / name).out)
