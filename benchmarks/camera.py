@@ -18,7 +18,6 @@ import numpy as np
 from harness.dataset.load import Dataset, Scene, find, load
 from harness.dataset.suites import named
 from harness.world.perception.camera import SIZE_PX, frame
-from harness.world.perception.rays import sweep
 from harness.world.perception.sensors import detect
 
 AIM_MS = 10.0
@@ -62,7 +61,8 @@ def measured(dataset: Dataset, scenes: list[Scene]) -> tuple[list[float], int]:
             made = frame(dataset.scenario, state, viewer)
             took.append(1000 * (process_time() - begun_s))
             eye = state.vehicle(viewer)
-            allowed = {d.id for d in detect(state, eye, sweep(state, eye))} | {b.id for b in state.buildings}
+            reported = detect(state, eye, dataset.scenario.parameters)
+            allowed = {d.id for d in reported} | {b.id for b in state.buildings}
             leaks += len(made.boxes().keys() - allowed)
     return took, leaks
 

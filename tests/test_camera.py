@@ -55,7 +55,7 @@ def test_a_hidden_vehicle_changes_no_pixel(dataset: Dataset):
     hidden = 0
     for state, viewer in moments(dataset):
         eye = state.vehicle(viewer)
-        reported = {d.id for d in detect(state, eye, sweep(state, eye))} | {viewer}
+        reported = {d.id for d in detect(state, eye, dataset.scenario.parameters)} | {viewer}
         without = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
         hidden += len(state.vehicles) - len(without.vehicles)
         seen = frame(dataset.scenario, state, viewer)
@@ -71,7 +71,7 @@ def test_a_vehicle_in_sight_and_in_the_field_owns_pixels(dataset: Dataset):
         eye = state.vehicle(viewer)
         seen, view = frame(dataset.scenario, state, viewer).boxes(), sweep(state, eye)
         off = np.abs((view.bearing_rad - eye.heading_rad + np.pi / 2) % np.pi - np.pi / 2)
-        for d in detect(state, eye, view):
+        for d in detect(state, eye, dataset.scenario.parameters):
             if np.count_nonzero(off[view.hits[d.id]] < HALF_FIELD_RAD) >= LEAST_RAYS:
                 owners += 1
                 assert d.id in seen, (state.episode_seed, state.step, viewer, d.id)

@@ -17,8 +17,8 @@ from typing import Any
 from harness.core import noise
 from harness.core.errors import UserError
 from harness.world.parameters import Parameters
-from harness.world.perception.rays import Look, rays_on_vehicles, surfaces
-from harness.world.perception.sensors import LEAST_RAYS, detections
+from harness.world.perception.rays import Look, surfaces
+from harness.world.perception.sensors import reports
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import WorldState
 
@@ -85,7 +85,7 @@ def _witnessed(
 ) -> Layout:
     for attempt in range(MOST_ATTEMPTS):
         made = draft(Draws(scenario.name, seed, attempt, SEATS), parameters)
-        if all(_fits(scenario, made, phantom, seed) for phantom in made.phantoms):
+        if all(_fits(scenario, made, phantom, seed, parameters) for phantom in made.phantoms):
             break
     else:
         raise UserError(
@@ -102,7 +102,7 @@ def _witnessed(
     return Layout.arranged([*spawns, *seats], danger, danger_id, made.layout.buildings)
 
 
-def _fits(scenario: Scenario, made: Draft, phantom: Spawn, seed: int) -> bool:
+def _fits(scenario: Scenario, made: Draft, phantom: Spawn, seed: int, parameters: Parameters) -> bool:
     """Return whether exactly the lookouts have a phantom of the danger in sight.
 
     They have it with all blind seats taken, and nobody else has it with no other one taken: so it holds
@@ -110,11 +110,11 @@ def _fits(scenario: Scenario, made: Draft, phantom: Spawn, seed: int) -> bool:
     """
     there = [*(s for s in made.layout.spawns if s.id != phantom.id), phantom]
     full = _state(scenario, made.layout, [*there, *made.seats], seed)
-    if not all(_see(scenario, [(full, full.vehicle(id_)) for id_ in LOOKOUTS], phantom.id)):
+    if not all(_see(parameters, [(full, full.vehicle(id_)) for id_ in LOOKOUTS], phantom.id)):
         return False
     bare = _state(scenario, made.layout, there, seed)
     blind = [bare.ego, *(full.vehicle(seat.id) for seat in made.seats)]
-    return not any(_see(scenario, [(bare, vehicle) for vehicle in blind], phantom.id))
+    return not any(_see(parameters, [(bare, vehicle) for vehicle in blind], phantom.id))
 
 
 def _state(scenario: Scenario, layout: Layout, spawns: Sequence[Spawn], seed: int) -> WorldState:
@@ -126,11 +126,8 @@ def _state(scenario: Scenario, layout: Layout, spawns: Sequence[Spawn], seed: in
     return WorldState(scenario.name, seed, 0, 0.0, 0.0, vehicles, layout.buildings)
 
 
-def _see(scenario: Scenario, looks: Sequence[Look], target: str) -> list[bool]:
+def _see(parameters: Parameters, looks: Sequence[Look], target: str) -> list[bool]:
     """Return whether each viewer's sensors report a vehicle."""
     around = surfaces(looks)
-    hits = around.by_viewer(rays_on_vehicles(around)) >= LEAST_RAYS
-    hit = [bool(row[ids.index(target)]) for row, ids in zip(hits, around.ids, strict=True)]
-    pairs = [(state, viewer, state.vehicle(target)) for state, viewer in looks]
-    reports = detections(pairs, scenario.parameters.light)
-    return [met and report is not None for met, report in zip(hit, reports, strict=True)]
+    reported = reports(looks, around, parameters)
+    return [(n, ids.index(target)) in reported for n, ids in enumerate(around.ids)]

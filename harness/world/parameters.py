@@ -70,7 +70,9 @@ class Parameters:
     witnesses: str = "any"
     radio_share: float = 0.0  # probability that a vehicle which does not help sends beacons, too
     limits: int = 1  # version of the rule that says which delay is a failure (`harness.world.outcome`)
-    perception: int = 1  # version of what sensors make of a vehicle that is not reported
+    # version of what sensors make of a vehicle that they do not report: it hides who is behind it (1), or
+    # hides nothing (2), so that nothing tells of it
+    perception: int = 1
 
     def __post_init__(self) -> None:
         speeds, total_frames = len(self.target_speeds_mps), self.time_limit_s * self.simulation_hz

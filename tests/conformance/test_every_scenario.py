@@ -24,6 +24,7 @@ from harness.world.state import Snapshot, WorldState
 from harness.world.world import World
 
 SEEDS = range(2 if QUICK else 6)
+UNLISTED = (0, 6 if QUICK else 40)  # layout seeds
 
 
 @pytest.fixture(
@@ -139,6 +140,24 @@ def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenar
             assert fused.trust is not None
             assert (fused.trust[there] > 0.8).all()
             state = fused.state
+
+
+def test_a_graph_is_the_same_without_a_vehicle_that_it_does_not_list(scenario: Scenario) -> None:
+    scenario = replace(scenario, parameters=replace(scenario.parameters, perception=2))
+    looks, less = list[tuple[WorldState, str]](), list[tuple[WorldState, str, int]]()
+    for seed in range(*UNLISTED):
+        world = World.start(scenario, seed)
+        world.act(scenario.actions[seed % len(scenario.actions)])
+        state = world.state()
+        looks += [(state, v.id) for v in (state.ego, *state.helpers)]
+    graphs = scene_graphs(scenario, looks)
+    for n, ((state, viewer), graph) in enumerate(zip(looks, graphs, strict=True)):
+        listed = {node.id for node in graph.nodes} | {viewer, state.ego.id}
+        for unlisted in {v.id for v in state.vehicles} - listed:
+            rest = tuple(v for v in state.vehicles if v.id != unlisted)
+            less.append((msgspec.structs.replace(state, vehicles=rest), viewer, n))
+    assert [graphs[n] for *_, n in less] == scene_graphs(scenario, [each[:2] for each in less])
+    assert scenario.name == one_way_crossing.SCENARIO.name or len(less) > 5
 
 
 def test_many_viewers_see_together_what_each_sees_alone(scenario: Scenario) -> None:

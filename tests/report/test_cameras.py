@@ -17,7 +17,6 @@ from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import read
 from harness.world.perception.camera import frame
-from harness.world.perception.rays import sweep
 from harness.world.perception.sensors import detect
 
 image = pytest.importorskip("PIL.Image", reason="needs the report extra")
@@ -42,7 +41,7 @@ def test_each_viewer_has_its_picture_and_boxes_around_what_its_sensors_list(run,
             difference = pixels(shown["picture"]).astype(int) - seen.pixels
             assert np.abs(difference).max() < 8, "a shade and no more"
             eye = state.vehicle(viewer)
-            listed = {d.id for d in detect(state, eye, sweep(state, eye))}
+            listed = {d.id for d in detect(state, eye, dataset.scenario.parameters)}
             of = {id: found for id, found in seen.boxes().items() if id in listed}
             assert shown["boxes"] == [[id, *box] for id in of for box in of[id]]
             boxes += len(shown["boxes"])

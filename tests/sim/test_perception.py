@@ -1,5 +1,6 @@
 """Sensors, lines of sight and scene graphs, on scenes placed by hand, and that nothing hidden leaks."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -8,7 +9,7 @@ from msgspec.structs import replace
 
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.perception.rays import RAYS, blocked_by, sweep
-from harness.world.perception.sensors import detect
+from harness.world.perception.sensors import detect, detections
 from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.scene_graph import Arrival, EgoArrival, Point, Sector
 from harness.world.state import Building, VehicleState, WorldState
@@ -29,7 +30,7 @@ def scene(*others, buildings=(), ego=EGO, step=0, seed=0):
 def seen(state, viewer=None):
     """Detections by id."""
     viewer = viewer or state.ego
-    return {d.id: d for d in detect(state, viewer, sweep(state, viewer))}
+    return {d.id: d for d in detect(state, viewer, SCENARIO.parameters)}
 
 
 def ahead(distance_m, off_axis_deg=0.0, **kwargs):
@@ -123,11 +124,40 @@ def test_range_rate_is_negative_while_closing_and_positive_while_parting():
     assert seen(scene(ahead(50.0, 90.0)))["v5"].range_rate_mps is None
 
 
+# A vehicle that is not reported, under `perception` 2.
+
+TRANSPARENT = dataclasses.replace(SCENARIO.parameters, perception=2)
+
+
+def reported(state, parameters=TRANSPARENT):
+    return [d.id for d in detect(state, EGO, parameters)]
+
+
+def test_a_van_on_which_too_few_rays_end_does_not_hide_the_car_behind_it():
+    # Past the corner one ray ends on the van and two on the car, which has three to itself.
+    van, car = other(17.0, 5.0, kind="van"), other(23.4, -10.0, vehicle="v6")
+    for state in (scene(van, car, buildings=[WALL]), scene(car, buildings=[WALL])):
+        assert reported(state) == ["v6"]
+    assert reported(scene(van, car, buildings=[WALL]), SCENARIO.parameters) == []
+
+
+def test_a_truck_that_is_reported_hides_the_car_right_behind_it():
+    assert reported(scene(other(2.0, 20.0, kind="truck"), other(2.0, 5.0, vehicle="v6"))) == ["v5"]
+
+
+def test_of_two_that_would_take_turns_in_hiding_each_other_none_is_reported():
+    # Crashed into each other far away: three rays come to each alone, and fewer to either beside the other.
+    one, two = other(1.204, -86.629, heading=-1.585), other(1.3734, -86.6521, heading=-1.519, vehicle="v6")
+    assert reported(scene(one)) == ["v5"]
+    assert reported(scene(two)) == ["v6"]
+    assert reported(scene(one, two)) == []
+
+
 def draws(distance_m, off_axis_deg=0.0, n=4000):
     """Many detections of one car, one a step."""
     first = scene(ahead(distance_m, off_axis_deg, heading=WEST, speed=10.0))
-    view = sweep(first, EGO)
-    return [detect(replace(first, step=step), EGO, view)[0] for step in range(n)]
+    pairs = [(replace(first, step=step), EGO, first.vehicles[1]) for step in range(n)]
+    return detections(pairs, SCENARIO.parameters.light)
 
 
 def spread(values):
@@ -168,8 +198,8 @@ def test_a_standing_car_never_has_a_negative_speed():
 
 def draws_of(vehicle, n=200):
     first = scene(vehicle)
-    view = sweep(first, EGO)
-    return [detect(replace(first, step=step), EGO, view)[0] for step in range(n)]
+    pairs = [(replace(first, step=step), EGO, first.vehicles[1]) for step in range(n)]
+    return detections(pairs, SCENARIO.parameters.light)
 
 
 # The graph.

@@ -21,7 +21,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.image import Image, Pixels
 from harness.world.ambient import AMBIENTS, DAY, Ambient, Colour, sun_rad
-from harness.world.perception.rays import meetings, sweep, turned
+from harness.world.perception.rays import meetings, turned
 from harness.world.perception.sensors import HALF_FIELD_RAD, detect
 from harness.world.road import NORTH
 from harness.world.scenario import Scenario
@@ -81,7 +81,7 @@ def frame(scenario: Scenario, state: WorldState, viewer_id: str, size_px: tuple[
     width, height = size_px
     viewer = state.vehicle(viewer_id)
     ambient = scenario.parameters.light
-    reported = detect(state, viewer, sweep(state, viewer), ambient)
+    reported = detect(state, viewer, scenario.parameters)
     boxes = [
         *(_vehicle(state, state.vehicle(d.id)) for d in reported),
         *(_building(b.id, b.corners()) for b in state.buildings),

@@ -8,8 +8,8 @@ from msgspec import UNSET
 from harness.core.arrays import Bools
 from harness.world.beacons import estimated, last_heard
 from harness.world.perception.conflicts import Encounter, Seat, conflicts, places, tenths
-from harness.world.perception.rays import Look, Surfaces, hidden, rays_on_vehicles, surfaces
-from harness.world.perception.sensors import LEAST_RAYS, Detection, detections
+from harness.world.perception.rays import Look, Surfaces, hidden, surfaces
+from harness.world.perception.sensors import Detection, among, reports
 from harness.world.road import Road
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import Conflict, Ego, Node, Role, SceneGraph, Sector, Viewer
@@ -60,18 +60,13 @@ def _exact(v: VehicleState) -> Detection:
 
 def _perceived(scenario: Scenario, looks: Sequence[Look], left_out: Collection[str]) -> list[SceneGraph]:
     around = surfaces(looks)
-    hit = around.by_viewer(rays_on_vehicles(around)) >= LEAST_RAYS
-    nearby = [[v for v in state.vehicles if v.id != viewer.id] for state, viewer in looks]
-    in_sight = list(zip(*(numbers.tolist() for numbers in np.nonzero(hit)), strict=True))
-    known = detections([(*looks[n], nearby[n][place]) for n, place in in_sight], scenario.parameters.light)
+    reported = reports(looks, around, scenario.parameters)
     detected: list[list[Detection]] = [[] for _ in looks]
-    reported = np.zeros_like(hit)
-    for (n, place), d in zip(in_sight, known, strict=True):
-        if d and d.id not in left_out:
-            detected[n].append(d)
-            reported[n, place] = True
+    listed = {place: d for place, d in reported.items() if d.id not in left_out}
+    for (n, _), d in listed.items():
+        detected[n].append(d)
     # An undetected vehicle must not reveal itself by what it hides.
-    solid = ~around.vehicle | reported[around.viewer, around.place]
+    solid = ~around.vehicle | among(around, listed)
     return listed_graphs(scenario, looks, detected, _sectors(scenario.road(), around, solid))
 
 

@@ -122,35 +122,54 @@ def _first(surface: Ints, target: Ints, t: Floats, targets: int) -> tuple[Floats
     return least, met
 
 
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Where rays may meet surfaces, by ascending number of the surface."""
+
+    surface: Ints  # number of the surface, (m,)
+    target: Ints  # number of the ray, RAYS for each viewer, (m,)
+    t: Floats  # distance, m; inf if the ray passes by, (m,)
+
+    def of(self, which: Bools) -> "Rays":
+        return Rays(self.surface[which], self.target[which], self.t[which])
+
+
 def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
     """Cast rays in all directions from a vehicle."""
     around = surfaces([(state, viewer)])
-    distance, met = _swept(around, np.ones(len(around.place), dtype=bool))
+    rays = cast(around, np.ones(len(around.place), dtype=bool))
+    distance, met = _first(rays.surface, rays.target, rays.t, RAYS)
     hits = {name: np.flatnonzero(met == n) for n, name in enumerate(around.ids[0])}
     return Sweep(_all_round()[0], distance, {name: rays for name, rays in hits.items() if len(rays)})
 
 
-def rays_on_vehicles(around: Surfaces) -> Ints:
-    """Return how many of its viewer's rays end on each surface that is a vehicle, (n,), as in a `Sweep`."""
-    _, met = _swept(around, around.vehicle)
-    return np.where(around.vehicle, np.bincount(met[met >= 0], minlength=len(met))[: len(around.vehicle)], 0)
-
-
-def _swept(around: Surfaces, of: Bools) -> tuple[Floats, Ints]:
-    """Cast the rays that may meet the surfaces `of` (n,); return `_first` of all rays of all viewers."""
+def cast(around: Surfaces, of: Bools) -> Rays:
+    """Cast the rays that may meet the surfaces `of` (n,), from all viewers."""
     begin, count = _towards(around)
     surface = np.repeat(np.arange(len(count)), count)
     ray = np.arange(len(surface)) + (begin - np.cumsum(count) + count)[surface]
     ray[ray >= RAYS] -= RAYS
     target = ray + (around.viewer * RAYS)[surface]
     if not of.all():
-        cast = np.zeros(len(around.ids) * RAYS, dtype=bool)
-        cast[target[of[surface]]] = True
-        needed = cast[target]
-        surface, ray, target = surface[needed], ray[needed], target[needed]
+        needed = np.zeros(len(around.ids) * RAYS, dtype=bool)
+        needed[target[of[surface]]] = True
+        taken = needed[target]
+        surface, ray, target = surface[taken], ray[taken], target[taken]
     walls = _walls(around.origins_m[around.viewer], around.corners_m)
     t, _ = _met(walls.take(surface, axis=2), *_all_round()[1].take(ray, axis=1))
-    return _first(surface, target, t.min(axis=0), len(around.ids) * RAYS)
+    return Rays(surface, target, t.min(axis=0))
+
+
+def rays_on(around: Surfaces, rays: Rays, solid: Bools) -> tuple[Ints, Ints]:
+    """Return how many rays of its viewer come to each surface, (n,), if only `solid` ones (n,) stop any.
+
+    Returned is also which surface stops the ray of each meeting, (m,); -1 if none does.
+    """
+    stops = solid[rays.surface]
+    ended = rays.of(stops)
+    least, met = _first(ended.surface, ended.target, ended.t, len(around.ids) * RAYS)
+    come = rays.surface[~stops & (rays.t < least[rays.target])]
+    return np.bincount(np.concatenate([met[met >= 0], come]), minlength=len(solid)), met[rays.target]
 
 
 def _towards(around: Surfaces) -> tuple[Ints, Ints]:

@@ -9,16 +9,17 @@ places it better. Noise is Gaussian with those standard deviations (declared for
 automotive data sheets, no particular product), keyed by episode, step, viewer and object.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import compress, product
 
 import numpy as np
 
 from harness.core import noise
-from harness.core.arrays import Bools, Floats
-from harness.world.ambient import AMBIENTS, DAY, Ambient, sun_rad
-from harness.world.perception.rays import Sweep, turned
+from harness.core.arrays import Bools, Floats, Ints
+from harness.world.ambient import Ambient, sun_rad
+from harness.world.parameters import Parameters
+from harness.world.perception.rays import Look, Surfaces, cast, rays_on, surfaces, turned
 from harness.world.state import Kind, VehicleState, WorldState
 
 LIDAR_RANGE_M, RADAR_RANGE_M = 80.0, 150.0
@@ -50,12 +51,60 @@ class Detection:
     braking: bool | None = None  # whether it is seen to brake, from the camera; None without one
 
 
-def detect(
-    state: WorldState, viewer: VehicleState, view: Sweep, ambient: Ambient = AMBIENTS[DAY]
-) -> list[Detection]:
+def detect(state: WorldState, viewer: VehicleState, parameters: Parameters) -> list[Detection]:
     """Return the detections of one vehicle's sensors, in the order of the state's vehicles."""
-    visible = [v for v in state.vehicles if v.id != viewer.id and len(view.hits.get(v.id, ())) >= LEAST_RAYS]
-    return [d for d in detections([(state, viewer, v) for v in visible], ambient) if d]
+    looks = [(state, viewer)]
+    return list(reports(looks, surfaces(looks), parameters).values())
+
+
+def reports(
+    looks: Sequence[Look], around: Surfaces, parameters: Parameters
+) -> dict[tuple[int, int], Detection]:
+    """Return what sensors report, by the number of the viewer and the vehicle's place among its surfaces.
+
+    Under `perception` 1 a vehicle of which nothing is reported, since too few rays end on it or no sensor
+    reaches so far, hides what is behind it. Under 2 it hides nothing: a vehicle is reported if enough rays
+    come to it past buildings and past vehicles that are reported.
+    """
+    nearby = [[v for v in state.vehicles if v.id != viewer.id] for state, viewer in looks]
+    known: dict[tuple[int, int], Detection | None] = {}
+
+    def reported(count: Ints) -> dict[tuple[int, int], Detection]:
+        in_sight = np.nonzero(around.by_viewer(np.where(around.vehicle, count, 0)) >= LEAST_RAYS)
+        pairs = list(zip(*(numbers.tolist() for numbers in in_sight), strict=True))
+        new = [pair for pair in pairs if pair not in known]
+        seen = detections([(*looks[n], nearby[n][place]) for n, place in new], parameters.light)
+        known.update(zip(new, seen, strict=True))
+        return {pair: d for pair in pairs if (d := known[pair])}
+
+    rays = cast(around, around.vehicle)
+    before = np.ones(len(around.place), dtype=bool)
+    count, first = rays_on(around, rays, before)
+    now = reported(count)
+    if parameters.perception == 1:
+        return now
+    solid = ~around.vehicle | among(around, now)
+    # What is reported although all hide each other stays so. The other rays end on what is not reported.
+    passing = (first >= 0) & ~solid[first]
+    rays, first, certain = rays.of(passing), first[passing], np.where(solid, count, 0)
+    if not (~solid[rays.surface] & (rays.t < np.inf) & (rays.surface != first)).any():
+        return now
+    while True:
+        then = reported(certain + rays_on(around, rays, solid)[0])
+        after = ~around.vehicle | among(around, then)
+        if np.array_equal(after, solid):
+            return then
+        if np.array_equal(after, before):
+            # Vehicles that run into each other may hide each other in turns: none of them is reported.
+            return {pair: d for pair, d in then.items() if pair in now}
+        before, solid, now = solid, after, then
+
+
+def among(around: Surfaces, pairs: Collection[tuple[int, int]]) -> Bools:
+    """Return which surfaces (n,) are among pairs of a viewer's number and a place among its surfaces."""
+    table = np.zeros((len(around.ids), max(map(len, around.ids), default=0)), dtype=bool)
+    table[tuple(np.array(list(pairs), dtype=int).reshape(-1, 2).T)] = True
+    return table[around.viewer, around.place]
 
 
 def detections(
