@@ -165,7 +165,7 @@ def record_type(scenario: Scenario) -> type[Record]:
     signal = _choice([*(r for _, r in road.paths if indicator(r) == r), "off"])
     section = Annotated[int, Meta(ge=0, le=max(len(path.lanes) for path in road.paths.values()) - 1)]
     vehicle = _narrowed(VehicleState, approach=approach, route=route)
-    sensors = Literal["camera", "lidar", "radar"]
+    sensors = Literal["camera", "lidar", "radar", "v2x"]
     graph = _narrowed(
         SceneGraph,
         nodes=_tuple(_narrowed(Node, indicator=signal | None, sensors=_tuple(sensors))),

@@ -86,13 +86,13 @@ def listed(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
                 8 * len(canonical_bytes(_message(graph))) for graph in graphs
             ]
         bits[n, : len(graphs)] = kept
-        counts[n, : len(graphs)] = [len(graph.nodes) for graph in graphs]
+        counts[n, : len(graphs)] = [len(graph.sensed) for graph in graphs]
     return counts, bits
 
 
 def _message(graph: SceneGraph) -> dict[str, object]:
     objects = [
-        [n.id, n.type, n.forward_m, n.left_m, n.heading_deg, n.speed_mps, n.indicator] for n in graph.nodes
+        [n.id, n.type, n.forward_m, n.left_m, n.heading_deg, n.speed_mps, n.indicator] for n in graph.sensed
     ]
     seen = [[sector.sector, sector.seen_share] for sector in graph.sectors]
     return {"from": graph.viewer, "objects": objects, "seen": seen, "speed_mps": graph.itself.speed_mps}

@@ -1,8 +1,9 @@
 """Beacons: how vehicles know of each other before anybody asks.
 
-The ego and the helpers broadcast their position, as with a CAM or a BSM; nobody else has a radio. A receiver
-knows a sender from the last beacon that it received, and extrapolates from there at constant speed along the
-heading, as real receivers do. The settings are the scenario's (`Parameters`):
+The ego and the helpers broadcast their position, as with a CAM or a BSM; they hear each other. With
+`radio_share` so does other traffic, the danger among it: the ego and all helpers hear it. A receiver knows a
+sender from the last beacon that it received, and extrapolates from there at constant speed along the heading,
+as real receivers do. The settings are the scenario's (`Parameters`):
 
     rule      `fixed`: 10 Hz, a BSM's. `cam` (ETSI EN 302 637-2, 6.1.3): a check, 10 times a second, finds the
               vehicle turned by 4°, 4 m farther or 0.5 m/s faster or slower than its last CAM says; or that
@@ -16,7 +17,8 @@ heading, as real receivers do. The settings are the scenario's (`Parameters`):
     noise     Gaussian, 0.2 m on each axis and 0.2°: the noisy setting of V2X-ViT (arXiv 2203.10638). That a
               speed has 0.1 m/s, and that errors are new in each beacon, is assumed. They are the sender's,
               so all receivers read the same, rounded to 1 cm, 1 cm/s and 1 mrad.
-    content   pose and speed, and the ego's target speed, which no CAM has: that is assumed.
+    content   pose, speed and class, and the ego's target speed, which no CAM has: that is assumed. A CAM may
+              have a turn indicator (EN 302 637-2, 7.1: in its low-frequency part); none is sent here.
 
 Before the start of an episode, its vehicles have driven at constant speed, and the first beacon, up to LEAD_S
 before the start, is received by everybody. Draws are keyed by layout seed, sender, receiver and number of the
@@ -89,21 +91,41 @@ def broadcast(
     of each in each frame, (F, V, 4), from `first_frame` on; 0 is the start. `loss` gives for one of these
     frames, counted from 0, the probability that a beacon is lost on the link to each helper, `(H,)`.
     """
-    if p.perfect_knowledge:
-        return ()
-    time_s = (first_frame + len(poses) - 1) / p.simulation_hz
     kept: list[Beacon] = []
     for place, sender in enumerate(radios):
         receivers = tuple(radios[:1] if place else radios[1:])
         target = None if place else target_mps
         links = slice(place - 1, place) if place else slice(None)
-        earlier = [b for b in before if b.sender == sender]
-        newest_first = chain(
-            _sent(p, seed, sender, receivers, target, poses[:, place], first_frame, earlier, loss, links),
-            reversed(earlier),
-        )
-        kept += reversed(_that_matter(newest_first, {*receivers}, time_s))
+        kept += _after(p, seed, before, sender, receivers, target, poses[:, place], first_frame, loss, links)
     return tuple(kept)
+
+
+def announced(
+    p: Parameters, seed: int, before: Sequence[Beacon], sender: str, receivers: Sequence[str], poses: Floats,
+    first_frame: int, loss: Callable[[int], Floats],
+) -> tuple[Beacon, ...]:  # fmt: skip
+    """Return the beacons that matter of one who does not help, with poses (F, 4): see `broadcast`.
+
+    `loss` gives the probability that a beacon is lost on the link to each receiver.
+    """
+    every = slice(None)
+    return tuple(_after(p, seed, before, sender, tuple(receivers), None, poses, first_frame, loss, every))
+
+
+def _after(
+    p: Parameters, seed: int, before: Sequence[Beacon], sender: str, receivers: tuple[str, ...],
+    target_mps: float | None, poses: Floats, first_frame: int, loss: Callable[[int], Floats], links: slice,
+) -> Sequence[Beacon]:  # fmt: skip
+    """Return the beacons of one sender that matter after some frames, by time."""
+    if p.perfect_knowledge:
+        return ()
+    earlier = [b for b in before if b.sender == sender]
+    newest_first = chain(
+        _sent(p, seed, sender, receivers, target_mps, poses, first_frame, earlier, loss, links),
+        reversed(earlier),
+    )
+    time_s = (first_frame + len(poses) - 1) / p.simulation_hz
+    return _that_matter(newest_first, {*receivers}, time_s)[::-1]
 
 
 def _that_matter(newest_first: Iterable[Beacon], receivers: set[str], time_s: float) -> list[Beacon]:
@@ -193,17 +215,19 @@ def _lead_frames(p: Parameters) -> int:
 def losses(
     p: Parameters, world: Callable[[], WorldState], radios: Sequence[str], poses: Floats
 ) -> Callable[[int], Floats]:
-    """Return a function that gives, for a frame, each helper's probability to lose a beacon, `(H,)`.
+    """Return a function that gives, for a frame, the probability to lose a beacon on each link, `(H,)`.
 
-    `world` returns the state; `radios` are the ego and the helpers; `poses` are x, y, heading and speed of
-    all vehicles in each frame, (F, V, 4).
+    `world` returns the state; a link is from the first of the `radios` to each other; `poses` are x, y,
+    heading and speed of all vehicles in each frame, (F, V, 4).
     """
     radio = beacon_radio(p.beacon_channel)
     if radio is None:
         declared = np.full(len(radios) - 1, p.beacon_loss)
         return lambda frame: declared
     state = world()
-    trips = Trips(np.array([NO_SEED]), np.array([state.episode_seed]), np.zeros(1, dtype=int), 1)
+    # The ego's links have one seed, and those of any other first radio another.
+    seed = NO_SEED if radios[0] == state.ego.id else NO_SEED - int(radios[0][1:])
+    trips = Trips(np.array([seed]), np.array([state.episode_seed]), np.zeros(1, dtype=int), 1)
 
     @cache
     def at(frame: int) -> Floats:

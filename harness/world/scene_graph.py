@@ -16,6 +16,7 @@ from harness.world.state import Closed, Count, Kind, Number, VehicleId
 WholeNumber = Annotated[int, Meta(ge=-1_000_000, le=1_000_000)]
 Role = Literal["ego", "helper"]
 Meeting = Literal["crossing", "merging", "ahead", "behind", "oncoming"]
+BY_BEACON = ("v2x",)  # the source of a vehicle that is known by its beacons alone
 
 
 class Viewer(Closed, frozen=True):
@@ -41,7 +42,7 @@ class Ego(Closed, frozen=True):
 
 
 class Node(Closed, frozen=True):
-    """A vehicle that the viewer's sensors report."""
+    """A vehicle that the viewer's sensors report, or that sends beacons out of their sight."""
 
     id: VehicleId
     type: Literal["vehicle", "car", "van", "truck"]
@@ -117,9 +118,14 @@ class SceneGraph(Closed, frozen=True):
     sectors: tuple[Sector, ...]
 
     @property
+    def sensed(self) -> tuple[Node, ...]:
+        """The vehicles that its sensors report."""
+        return tuple(node for node in self.nodes if node.sensors != BY_BEACON)
+
+    @property
     def seen(self) -> tuple[str, ...]:
         """Ids of the vehicles that its sensors report."""
-        return tuple(node.id for node in self.nodes)
+        return tuple(node.id for node in self.sensed)
 
     @property
     def occluded(self) -> tuple[str, ...]:

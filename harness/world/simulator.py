@@ -244,7 +244,7 @@ def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
     arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
     begun = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)
     plans = (begun.brakes_at_s, begun.brakes_mps2, begun.brakes_to_mps) if begun else ()
-    return Spawn(v.id, v.kind, v.part, v.approach, v.route, arc, v.speed_mps, *plans)
+    return Spawn(v.id, v.kind, v.part, v.approach, v.route, arc, v.speed_mps, *plans, radio=v.radio)
 
 
 def state_of(
@@ -255,4 +255,4 @@ def state_of(
     numbers = (*(v.position - origin_m), v.heading, v.speed)
     x_m, y_m, heading_rad, speed_mps = (round(float(number), DECIMALS) + 0.0 for number in numbers)
     pose, lit = (x_m, y_m, heading_rad, speed_mps), lamps and bool(v.braking)
-    return VehicleState(s.id, s.kind, s.part, *pose, s.approach, s.route, bool(v.crashed), lit)
+    return VehicleState(s.id, s.kind, s.part, *pose, s.approach, s.route, bool(v.crashed), lit, s.radio)

@@ -55,6 +55,7 @@ class VehicleState(Closed, frozen=True, omit_defaults=True):
     route: str  # what its path does, such as `straight` or `left`
     crashed: bool  # whether it has collided
     braking: bool = False  # whether its brake lamps are on; always false if the scenario has none
+    radio: bool = False  # whether one that does not help sends beacons
 
     @property
     def indicator(self) -> str:

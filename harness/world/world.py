@@ -202,14 +202,18 @@ class World:
         return moved
 
     def _broadcast(self, poses: Floats, first_frame: int) -> None:
-        """Add the beacons of the ego and the helpers in some frames, whose poses are (F, V, 4)."""
+        """Add the beacons of who has a radio in some frames, whose poses are (F, V, 4)."""
         p, target_mps = self.scenario.parameters, float(self.vehicles[0].target_speed)
         radios = [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"]
         ids = [self.vehicles[n].spawn.id for n in radios]
         loss = beacons.losses(p, self.state, ids, poses)
-        self.beacons = beacons.broadcast(
+        sent = beacons.broadcast(
             p, self.seed, self.beacons, ids, target_mps, poses[:, radios], first_frame, loss
         )
+        for n, sender in [(n, v.spawn.id) for n, v in enumerate(self.vehicles) if v.spawn.radio]:
+            loss = beacons.losses(p, self.state, [sender, *ids], poses)
+            sent += beacons.announced(p, self.seed, self.beacons, sender, ids, poses[:, n], first_frame, loss)
+        self.beacons = sent
 
     def _move(self) -> None:
         self.road.time_s = self.time_s

@@ -1,6 +1,6 @@
 """Make the scene graphs of viewers from the state of the world and what their sensors detect."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 from msgspec import UNSET
@@ -12,7 +12,7 @@ from harness.world.perception.rays import Look, Surfaces, hidden, surfaces
 from harness.world.perception.sensors import Detection, among, reports
 from harness.world.road import Road
 from harness.world.scenario import Scenario
-from harness.world.scene_graph import Conflict, Ego, Node, Role, SceneGraph, Sector, Viewer
+from harness.world.scene_graph import BY_BEACON, Conflict, Ego, Node, Role, SceneGraph, Sector, Viewer
 from harness.world.state import Part, VehicleState, WorldState
 
 OCCLUDED_BELOW = 0.5  # share of a sector in sight below which the sector counts as occluded
@@ -65,9 +65,24 @@ def _perceived(scenario: Scenario, looks: Sequence[Look], left_out: Collection[s
     listed = {place: d for place, d in reported.items() if d.id not in left_out}
     for (n, _), d in listed.items():
         detected[n].append(d)
+    for (state, viewer), seen in zip(looks, detected, strict=True):
+        seen += _announced(scenario, state, viewer, {*left_out, viewer.id, *(d.id for d in seen)})
     # An undetected vehicle must not reveal itself by what it hides.
     solid = ~around.vehicle | among(around, listed)
     return listed_graphs(scenario, looks, detected, _sectors(scenario.road(), around, solid))
+
+
+def _announced(
+    scenario: Scenario, state: WorldState, viewer: VehicleState, known: Collection[str]
+) -> Iterator[Detection]:
+    """Yield who else sends beacons, by the last one that the viewer has; nobody without a radio has any."""
+    for v in state.vehicles:
+        if v.radio and v.id not in known and viewer.part != "other":
+            beacon = last_heard(state, v.id, viewer.id)
+            if beacon or scenario.parameters.perfect_knowledge:
+                at = estimated(v, beacon, state.time_s)
+                place = at.x_m, at.y_m, at.heading_rad, at.speed_mps
+                yield Detection(v.id, BY_BEACON, v.kind, None, *place, None)
 
 
 def listed_graphs(

@@ -28,7 +28,7 @@ from harness.world.perception.sensors import (
     Detection,
 )
 from harness.world.scenario import Scenario
-from harness.world.scene_graph import Node, SceneGraph, Sector
+from harness.world.scene_graph import BY_BEACON, Node, SceneGraph, Sector
 from harness.world.state import VehicleState, WorldState
 
 # What a chi-squared value with three degrees of freedom (place and speed) exceeds once in 100 000.
@@ -86,7 +86,7 @@ def _reports(p: Parameters, case: Heard) -> list[Report]:
     senders = [own]
     for graph in case.helpers:
         sender = stated(p, case.state, graph.viewer)
-        senders.append([_itself(p, sender), *(_reported(p, sender, node) for node in graph.nodes)])
+        senders.append([_itself(p, sender), *(_reported(p, sender, node) for node in graph.sensed)])
     for reports in senders:
         accepted = _joined(accepted, reports)
     return accepted[1:]
@@ -193,12 +193,15 @@ def _reported(p: Parameters, sender: VehicleState, node: Node, exact: bool = Fal
     away_m = max(hypot(dx, dy), 0.1)
     seen = "lidar" in node.sensors
     along, across = (LIDAR_NOISE_M,) * 2 if seen else (RADAR_NOISE_M, BEARING_NOISE_RAD * away_m)
+    speed = SPEED_NOISE_MPS["radar" in node.sensors]
+    if node.sensors == BY_BEACON:
+        (along, across), speed = (p.beacon_noise_m,) * 2, p.beacon_noise_mps
     own_m, own_rad = (0.0, 0.0) if exact or p.perfect_knowledge else (p.beacon_noise_m, p.beacon_noise_rad)
     along, across = hypot(along, ROUNDED_M, own_m), hypot(across, ROUNDED_M, own_m, own_rad * away_m)
     turn = np.array([[dx, -dy], [dy, dx]]) / away_m
     return Report(
         detection, node if exact else None, turn @ np.diag([along**2, across**2]) @ turn.T,
-        SPEED_NOISE_MPS["radar" in node.sensors] ** 2,
+        speed**2,
     )  # fmt: skip
 
 
