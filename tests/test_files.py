@@ -1,12 +1,14 @@
-"""The canonical text of a value: digests and keys of stored records are made of these bytes."""
+"""The canonical text of a value, whose bytes digests and keys are made of; and files that are read once."""
 
 import math
+import os
 from datetime import date
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from harness.core.files import canonical_json, digest
+from harness.core.files import canonical_json, digest, read_once
 
 
 @pytest.mark.parametrize(
@@ -41,3 +43,24 @@ def test_a_number_that_is_not_finite_is_refused_however_deep_it_stands(number: f
 def test_a_type_that_json_lacks_is_refused(value: object) -> None:
     with pytest.raises(TypeError, match="not JSON serializable"):
         canonical_json({"in": [value]})
+
+
+def test_a_file_is_read_again_only_after_it_was_written_again(tmp_path: Path) -> None:
+    reads: list[Path] = []
+
+    @read_once
+    def text(path: Path) -> str:
+        reads.append(path)
+        return path.read_text()
+
+    file = tmp_path / "x.toml"
+    file.write_text("old")
+    assert [text(file), text(file), len(reads)] == ["old", "old", 1]
+    file.write_text("new")
+    os.utime(file, ns=(0, 1))
+    assert [text(file), text(file), len(reads)] == ["new", "new", 2]
+    file.unlink()
+    for _ in range(2):  # that it is not there is read every time
+        with pytest.raises(FileNotFoundError):
+            text(file)
+    assert len(reads) == 4

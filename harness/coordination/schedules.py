@@ -6,7 +6,6 @@ in the group `swarmdrive.schedules`.
 """
 
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,7 +14,7 @@ from harness.coordination.scheduling import FORMULAS, Schedule, ScheduleInputs
 from harness.core.arrays import Floats
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable
-from harness.core.files import sha256_file
+from harness.core.files import read_once, sha256_file
 from harness.core.plugins import FilesAndPlugins
 
 FAR_S, FAR_M = 6.0, 100.0  # scales of times and distances; a longer time counts as FAR_S
@@ -130,7 +129,7 @@ class Schedules(FilesAndPlugins[Schedule]):
         return sha256_file(file) if file else None
 
 
-@lru_cache(maxsize=64)
+@read_once
 def _read(path: Any) -> Learnt:
     where = f"schedule file {printable(path)}"
     return convert(toml(path, where), Stated, where).schedule(where)

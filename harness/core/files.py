@@ -10,8 +10,9 @@ import json
 import os
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache, wraps
 from glob import escape
 from io import BufferedReader
 from pathlib import Path
@@ -92,12 +93,22 @@ def text_of(path: str | Path, kind: Kind = "text") -> str:
     return bytes_of(path, kind).decode("utf-8-sig")
 
 
-def written_ns(path: Path) -> int:
-    """Return when a file was last written, in nanoseconds; 0 if nobody knows, as for a link to nowhere."""
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return 0
+def read_once(read: Callable[[Path], T]) -> Callable[[Path], T]:
+    """Decorate what reads a file, so that the file is read again only after it was written again."""
+
+    @lru_cache(maxsize=64)
+    def kept(path: Path, written_ns: int) -> T:
+        return read(path)
+
+    @wraps(read)
+    def of_now(path: Path) -> T:
+        try:
+            written_ns = path.stat().st_mtime_ns
+        except OSError:  # as for a link to nowhere
+            written_ns = 0
+        return kept(path, written_ns)
+
+    return of_now
 
 
 def neutral(cell: T) -> T | str:

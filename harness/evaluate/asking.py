@@ -376,14 +376,13 @@ class Asker:
     ) -> list[Request]:
         """Return the requests of the fusion calls with these sets of messages."""
         sets = list(_heard_sets(scenes, codes, rewrites))
-        missing = [each for each in sets if fusion_id(*each) not in self.answers]
-        graphs = dict(zip(map(id, missing), shared_graphs(self.spec.scenario, missing), strict=True))
+        lacks = [fusion_id(*each) not in self.answers for each in sets]
+        graphs = iter(shared_graphs(self.spec.scenario, list(compress(sets, lacks))))
         calls = []
-        for heard in sets:
-            scene, senders = heard
+        for (scene, senders), lacking in zip(sets, lacks, strict=True):
             keys = (key.partition(REWRITTEN)[0] for key in senders)
             sent = {key: a for key in keys if (a := self.answers.get(f"{scene.id}/{key}"))}
-            calls.append(fusion_request(self.spec, scene, sent, senders, graphs.get(id(heard))))
+            calls.append(fusion_request(self.spec, scene, sent, senders, next(graphs) if lacking else None))
         return calls
 
     def answer(self, requests: Sequence[Request]) -> None:

@@ -1,7 +1,6 @@
 """Measured distributions of round trips from a car to a cloud: files `networks/*.toml`."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +10,7 @@ from harness.core import resources
 from harness.core.arrays import Floats
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import written_ns
+from harness.core.files import read_once
 
 
 @dataclass(frozen=True)
@@ -38,12 +37,11 @@ def network(name: str) -> Network:
     """Load a network by name. Raises UserError if it is unknown or its file is wrong."""
     if name not in names():
         raise unknown("round_trip", name, names())
-    path = resources.find("networks", f"{name}.toml")
-    return _read(path, written_ns(path))
+    return _read(resources.find("networks", f"{name}.toml"))
 
 
-@lru_cache(maxsize=64)
-def _read(path: Path, mtime_ns: int) -> Network:
+@read_once
+def _read(path: Path) -> Network:
     where = f"network file {printable(path)}"
     network = convert(toml(path, where), Network, where)
     try:

@@ -7,7 +7,6 @@ in the group `swarmdrive.channels`.
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields
-from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +16,7 @@ import numpy as np
 
 from harness.core.config import convert, settable, toml
 from harness.core.errors import printable, unknown
-from harness.core.files import written_ns
+from harness.core.files import read_once
 from harness.core.plugins import FilesAndPlugins
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
@@ -53,12 +52,12 @@ class Profiles(FilesAndPlugins[Channel]):
     folder = "channels"
 
     def read(self, file: Path) -> Channel:
-        return _read(file, written_ns(file))[1]
+        return _read(file)[1]
 
     def profile(self, name: str) -> Profile:
         """Return the profile in the channel's file, or one made up for a package's channel."""
         if file := self.file(name):
-            return _read(file, written_ns(file))[0]
+            return _read(file)[0]
         kind = type(self[name])
         doc = (kind.__doc__ or "").strip().partition("\n")[0]
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
@@ -107,8 +106,8 @@ def _number(value: object) -> float:
         return np.nan
 
 
-@lru_cache(maxsize=64)
-def _read(path: Path, mtime_ns: int) -> tuple[Profile, Channel]:
+@read_once
+def _read(path: Path) -> tuple[Profile, Channel]:
     where = f"channel file {printable(path)}"
     profile = convert(toml(path, where), Profile, where)
     if profile.model not in MODELS:
