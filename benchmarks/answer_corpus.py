@@ -83,7 +83,7 @@ def questions(card: Card, count: int) -> Iterator[list[Request]]:
             source = LiveSource(FIRST_SEED + number, 1, scenario_name=scenario)
             agent = Agent(card, prompt, image="none" if prompt.image else "own")
             spec = Spec(agent, source, tuple(POINTS.values()), (0,))
-            asked = {one.role: one for one in requests(spec, source.trial(1, ego_alone=False))}
+            asked = {one.role: one for one in requests(spec, [*source.trial(1, ego_alone=False)])}
             for role, one in sorted(asked.items()):
                 name = f"{scenario}/{version}/{role}/{FIRST_SEED + number}"
                 yield [replace(one, id=name, temperature=t, sample=s) for t, s in DRAWS]

@@ -11,6 +11,7 @@ from evaluating import spec_of
 from harness.backends import cards
 from harness.backends.base import Request
 from harness.backends.vision import Vision
+from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, Scene, load
@@ -99,6 +100,21 @@ def test_image_alone_says_nothing_of_anybody_around(crossing: Dataset):
             _, user = prompts.load("v8").render(graph, crossing.actions, words=crossing.scenario.prompt_words)
             named = {node.id for node in graph.nodes} - {graph.ego.id, viewer}
             assert not named & set(user["content"].replace(":", " ").replace(",", " ").split())
+
+
+@pytest.mark.parametrize("image", ["own", "none"])
+@pytest.mark.parametrize("content", ["objects", "both", "oracle"])
+def test_a_prompt_that_shows_no_objects_is_not_asked_again_with_more_of_them(
+    crossing: Dataset, image: str, content: str
+):
+    """A picture is what the ego's own cameras see, whatever others list."""
+    point = named_point(f"6g:content={content}")
+    driven = replace(spec(crossing, image, "v8"), source=LiveSource(0, 2))
+    for of in (spec(crossing, image, "v8"), driven):
+        with pytest.raises(UserError, match="prompt v8 shows no objects in its text") as problem:
+            replace(of, points=(point,))
+        assert "\n" not in str(problem.value)
+    assert replace(spec(crossing, image, "v7"), points=(point,)).points == (point,)
 
 
 # -- twins ---------------------------------------------------------------------------------------------------

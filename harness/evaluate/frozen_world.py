@@ -1,6 +1,6 @@
 """Walk frozen scenes: an episode is a walk through the decision tree of its layout."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -53,6 +53,12 @@ class FrozenSource:
             delay_allowance_s=p.delay_allowance_s, decision_lag_s=p.decision_lag_s,
             path=str(self.dataset.path), selection=self.selection.given,
         )  # fmt: skip
+
+    def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
+        """Yield the first decision point of each of up to `most` episodes, of whatever vehicles."""
+        forest = self.dataset.forest
+        for root in forest.root[:most].tolist():
+            yield from self.dataset.scenes([forest.ids[root]])
 
     def settings(self) -> FrozenSettings:
         given: dict[str, Any] = self.selection.given

@@ -5,7 +5,7 @@ taken in the first frame that begins after the decision's latency; until then th
 decision that is still open when the next one is due continues, and the next one is skipped.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -84,14 +84,13 @@ class LiveSource:
             sample=self.sample, sample_seed=0 if self.sample is None else self.sample_seed,
         )  # fmt: skip
 
-    def trial(self, most: int, ego_alone: bool) -> list[Scene]:
-        """Return one decision point of each of up to `most` episodes, at different times."""
-        scenes, p = [], self.scenario.parameters
+    def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
+        """Yield one decision point of each of up to `most` episodes, at different times."""
+        p = self.scenario.parameters
         for number in self.numbers[:most]:
             trajectory = Trajectory(number, World.start(self.scenario, self.first_seed + number), [])
             trajectory.world.advance(round(number * p.decision_period_s * p.simulation_hz / 2))
-            scenes.append(look(trajectory, 0, ego_alone))
-        return scenes
+            yield look(trajectory, 0, ego_alone)
 
 
 class LiveWorld(SceneWorld):

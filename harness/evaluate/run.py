@@ -414,7 +414,7 @@ def _gather(
 def _identity_and_latency(spec: Spec, begun: RunStart | None) -> tuple[dict[str, Any], Latency]:
     """Open a closed-loop run's models; return their identity and the latency of their decisions."""
     models, source = _open_all(spec), cast("LiveSource", spec.source)
-    latency = _latency(spec, begun, models, lambda: source.trial(timing.SCENES, spec.ego_alone))
+    latency = _latency(spec, begun, models, lambda: [*source.trial(timing.SCENES, spec.ego_alone)])
     return together(spec.cards, models).identity(), latency
 
 

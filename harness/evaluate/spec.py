@@ -1,6 +1,6 @@
 """Hold and check the complete settings of an evaluation: enough to run it again."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
@@ -23,10 +23,12 @@ from harness.radio.profiles import CHANNELS
 from harness.runs.devices import Device
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes
+from harness.world.perception.graph import truth_graph
 from harness.world.scenario import Scenario
 
 TAG_CHARACTERS = 40
 HOTTEST = 2.0
+TRIED = 8  # scenes of which one must change the ego's prompt, where messages hold objects
 ASKS = ("used", "all")  # what --ask takes, the default first
 
 
@@ -60,6 +62,10 @@ class Source(Protocol):
 
     def settings(self) -> FrozenSettings | DriveSettings:
         """Return the settings that select this world."""
+        ...
+
+    def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
+        """Yield a decision point of each of up to `most` episodes; with `ego_alone`, no graph of a helper."""
         ...
 
 
@@ -230,6 +236,8 @@ class Spec:
         shown, ego = f"condition {printable(point.name)}", self.ego
         if point.ask.messages == "shuffled" and self.source.kind != "frozen":
             raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
+        if point.has_fusion_call and point.content.graph and ego.can.language_model:
+            self._check_shows_objects(shown)
         if not (point.has_fusion_call and point.rewrites.shows):
             return
         reason = self.fusion_obstacle
@@ -240,6 +248,21 @@ class Spec:
             reason = f"{printable(ego.card.name)} is no language model and cannot fuse messages"
         if reason:
             raise UserError(f"{shown}: {reason}")
+
+    def _check_shows_objects(self, shown: str) -> None:
+        """Raise UserError if the ego's prompt is the same whatever is around; it is tried on some scenes."""
+        for scene in self.source.trial(TRIED, ego_alone=True):
+            graph = truth_graph(self.scenario, scene.state)
+            full, empty = (
+                self.ego.rendered(each, self.actions, (), self.scenario.prompt_words)
+                for each in (graph, graph.blinded())
+            )
+            if full != empty:
+                return
+        raise UserError(
+            f"{shown}: prompt {self.ego.prompt.version} shows no objects in its text, so the ego would be "
+            "asked the same question again; give another --prompt"
+        )
 
     @property
     def fusion_obstacle(self) -> str | None:
