@@ -57,9 +57,13 @@ def command(
     extras.need("harness study contents", "matplotlib")
     with bar("points", quiet=as_json or quiet or dry_run, grows=True) as progress:
         own = options.cards(model)
-        replayed = [ReplayedRun(run, latency, progress, not no_model, None, own) for run in folders(runs)]
+        given = [
+            [ReplayedRun(run, latency, progress, not no_model, None, own) for run in folders(path)]
+            for path in runs
+        ]
+        replayed = [run for each in given for run in each]
         panels = panels_of(replayed, condition, over, grid)
-        swarms = models(replayed, [setting.point for panel in panels for setting in panel.settings])
+        swarms = models(given, panels)
         if dry_run:
             counts = {each.name: asked_at_most(each, panels) for each in swarms}
             if as_json:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from msgspec import structs
 
 from harness.coordination.contents import CONTENTS, INTENT, TRUTH
 from harness.coordination.operating_point import OperatingPoint
@@ -61,6 +62,9 @@ BESIDE = 3  # panels of a figure
 SPENDING = ("tau_nats", "max_helpers")  # axes that vary the bits
 # The paper's panels by axis, and what is added to their values: its N counts the ego.
 PAPER = {"loss": ("loss", 0.0), "tau_nats": ("tau", 0.0), "max_helpers": ("size", -1.0)}
+
+
+Place = tuple[OperatingPoint, int]  # of an outcome: the operating point, and the number of vehicles
 
 
 class Panel(NamedTuple):
@@ -118,11 +122,11 @@ class Result:
 
     model: Model
     panels: Sequence[Panel]
-    outcomes: Mapping[OperatingPoint, Outcome]
+    outcomes: Mapping[Place, Outcome]
 
     def at(self, setting: Setting, content: str) -> Outcome:
         """Return the outcome of a content at a grid point."""
-        return self.outcomes[holding(setting.point, content)]
+        return self.outcomes[place(setting, content)]
 
     @property
     def base(self) -> Setting:
@@ -130,9 +134,9 @@ class Result:
         return self.panels[0].settings[0]
 
     @property
-    def points(self) -> dict[OperatingPoint, Setting]:
+    def points(self) -> list[Setting]:
         """Each different grid point once."""
-        return {s.point: s for panel in reversed(self.panels) for s in reversed(panel.settings)}
+        return distinct(self.panels)
 
     @property
     def others(self) -> list[str]:
@@ -145,11 +149,14 @@ class Result:
         return [content for content in self.others if content != NOTHING and CONTENTS[content].graph != TRUTH]
 
     @cached_property
-    def p(self) -> dict[tuple[OperatingPoint, str], float | None]:
-        """The p of each content against intents at each point, by Holm's method for all of the model."""
-        keys = [(setting.point, content) for setting in self.points.values() for content in self.others]
-        raw = [self.outcomes[holding(point, content)].p_over(self.outcomes[point]) for point, content in keys]
-        return dict(zip(keys, corrected(raw), strict=True))
+    def _p(self) -> dict[Place, float | None]:
+        pairs = [(setting, content) for setting in self.points for content in self.others]
+        raw = [self.at(setting, content).p_over(self.at(setting, INTENT)) for setting, content in pairs]
+        return dict(zip([place(*pair) for pair in pairs], corrected(raw), strict=True))
+
+    def p(self, setting: Setting, content: str) -> float | None:
+        """Return the p of a content against intents, by Holm's method for all of the model; of these None."""
+        return self._p.get(place(setting, content))
 
     @property
     def families(self) -> list[str]:
@@ -161,47 +168,62 @@ class Result:
 def holding(point: OperatingPoint, content: str) -> OperatingPoint:
     """Return the operating point with this content."""
     if content == NOTHING:
-        return point.changed(schedule=NEVER, threshold=None)
+        return point.changed(content=INTENT, schedule=NEVER, threshold=None)
     return point.changed(content=content)
 
 
-def folders(paths: Sequence[Path]) -> list[Path]:
-    """Return the folders of runs, with all runs of a suite in place of its folder."""
-    found = list[Path]()
-    for path in paths:
-        suite = (path / SUITE).is_file()
-        found += [path / name for name in contents_of(path).families.values()] if suite else [path]
-    return found
+def place(setting: Setting, content: str) -> Place:
+    """Return what decides an outcome: the operating point with this content, and the number of vehicles."""
+    return holding(setting.point, content), setting.vehicles
 
 
-def models(runs: Sequence[ReplayedRun], points: Sequence[OperatingPoint]) -> list[Model]:
-    """Return the models of some runs, each with the contents that it can play at these points.
+def distinct(panels: Sequence[Panel]) -> list[Setting]:
+    """Return each different grid point once, in order."""
+    every = [setting for panel in panels for setting in panel.settings]
+    return list({place(setting, INTENT): setting for setting in reversed(every)}.values())[::-1]
+
+
+def folders(path: Path) -> list[Path]:
+    """Return the folders of a suite's runs, or a run's own."""
+    if (path / SUITE).is_file():
+        return [path / name for name in contents_of(path).families.values()]
+    return [path]
+
+
+def models(given: Sequence[Sequence[ReplayedRun]], panels: Sequence[Panel]) -> list[Model]:
+    """Return the models of some runs, each with the contents that it can play in these panels.
+
+    Args:
+        given: the runs of a suite together, which are of one model, or a run alone.
+        panels: what is played.
 
     Raises:
         UserError: two runs of a model are on the same family, or a model can play no intents.
     """
     by_model: dict[str, dict[str, ReplayedRun]] = {}
-    for run in runs:
-        of = run.run.manifest.variant
-        name = f"{of.model} · {of.answer}{of.mix}"
+    for runs in given:
+        variants = [run.run.manifest.variant for run in runs]
+        prompts = " and ".join(dict.fromkeys(variant.prompt for variant in variants))
+        name = str(structs.replace(variants[0], prompt=prompts))
         theirs = by_model.setdefault(name, {})
-        family = run.dataset.scenario.name
-        if family in theirs:
-            raise UserError(
-                f"{printable(run.run.path)} and {printable(theirs[family].run.path)} are both of {name} on "
-                f"{printable(family)}; give one of them"
-            )
-        theirs[family] = run
+        for run in runs:
+            family = run.dataset.scenario.name
+            if family in theirs:
+                raise UserError(
+                    f"{printable(run.run.path)} and {printable(theirs[family].run.path)} are both "
+                    f"{printable(name)} on {printable(family)}; give one of them"
+                )
+            theirs[family] = run
     result = []
     for name, theirs in by_model.items():
-        left_out = dict(_unable(theirs.values(), points))
+        left_out = dict(_unable(list(theirs.values()), [setting.point for setting in distinct(panels)]))
         if INTENT in left_out:
             raise UserError(f"{printable(name)}: {left_out[INTENT]}")
         result.append(Model(name, theirs, left_out))
     return result
 
 
-def _unable(runs: Any, points: Sequence[OperatingPoint]) -> Iterator[tuple[str, str]]:
+def _unable(runs: Sequence[ReplayedRun], points: Sequence[OperatingPoint]) -> Iterator[tuple[str, str]]:
     """Yield the contents that some of these runs' agents cannot play, and why."""
     for content in PLAYED:
         try:
@@ -233,8 +255,8 @@ def panels_of(
     panels = [Panel(c, "", (Setting(c, point_of(runs, c), vehicles),)) for c in conditions]
     for condition, name, text in varied:
         axis = axis_of(name)
-        points = settings(runs, [axis], [grid(axis, text)], [condition])
-        panels.append(Panel(f"{condition} over {name}", name, points))
+        grid_points = settings(runs, [axis], [grid(axis, text)], [condition])
+        panels.append(Panel(f"{condition} over {name}", name, grid_points))
     return panels
 
 
@@ -273,9 +295,9 @@ def run_contents(
         "panels": described({panel.name: panel.settings for panel in panels}),
     }  # fmt: skip
     refuse_other(out, "contents", stated)
-    points = {setting.point: setting for panel in panels for setting in panel.settings}
+    points = distinct(panels)
     progress.more(sum(len(model.contents) * len(model.runs) * len(points) for model in swarms))
-    results = [_played(model, panels, list(points.values()), seeds, progress) for model in swarms]
+    results = [_played(model, panels, points, seeds, progress) for model in swarms]
     runs = [run for model in swarms for run in model.runs.values()]
     for run in runs:
         run.settle()
@@ -291,7 +313,7 @@ def _played(
         replace(setting, point=holding(setting.point, content))
         for content in model.contents for setting in points
     ]  # fmt: skip
-    by_family: dict[OperatingPoint, dict[str, Mapping[str, Floats]]] = {s.point: {} for s in every}
+    by_family: dict[Place, dict[str, Mapping[str, Floats]]] = {(s.point, s.vehicles): {} for s in every}
     for family, run in model.runs.items():
         p = run.dataset.scenario.parameters
 
@@ -303,9 +325,9 @@ def _played(
 
         for setting, [walk] in zip(every, run.walked(every, seeds, read), strict=True):
             metrics = {SUCCESS: walk.ends[SUCCESS], **by_episode(walk, METRICS)}
-            by_family[setting.point][family] = metrics
+            by_family[setting.point, setting.vehicles][family] = metrics
             progress(1)
-    return Result(model, panels, {point: Outcome(families) for point, families in by_family.items()})
+    return Result(model, panels, {key: Outcome(families) for key, families in by_family.items()})
 
 
 def witnesses(run: ReplayedRun) -> Ints:
@@ -388,13 +410,13 @@ def _clear(result: Result, better: bool) -> str:
     """Say where each content is clearly better than intents, or clearly worse."""
     texts = []
     for content in result.sent:
-        points, values = set[OperatingPoint](), dict[str, list[str]]()
+        points, values = set[Place](), dict[str, list[str]]()
         for panel in result.panels:
             for setting in panel.settings:
-                p = result.p[setting.point, content]
+                p = result.p(setting, content)
                 gain = result.at(setting, content).over(result.at(setting, INTENT)).value
                 if p is not None and p <= LEVEL and (gain > 0) == better:
-                    points.add(setting.point)
+                    points.add(place(setting, content))
                     if panel.axis:
                         values.setdefault(panel.axis, []).append(_value(setting))
         where = "; ".join(f"{axis} {', '.join(each)}" for axis, each in values.items())
@@ -446,7 +468,7 @@ def _over(result: Result, setting: Setting, content: str) -> str:
     if content == INTENT:
         return ""
     gain = result.at(setting, content).over(result.at(setting, INTENT))
-    p = result.p[setting.point, content]
+    p = result.p(setting, content)
     return strong(shown(gain, sign="+"), p is not None and p <= LEVEL)
 
 
@@ -455,7 +477,7 @@ def _at_base(result: Result) -> Table:
     for content in result.model.contents:
         outcome = result.at(result.base, content)
         late, off_lag = (f"{100 * outcome.estimate(name).value:.1f}" for name in (LATE, OFF_LAG))
-        p = "" if content == INTENT else p_cell(result.p[result.base.point, content])
+        p = "" if content == INTENT else p_cell(result.p(result.base, content))
         rows.append((
             content, shown(outcome.estimate(SUCCESS)), _over(result, result.base, content), p,
             f"{_kbit(outcome):.2f}", f"{_age(outcome):.1f}", late, off_lag,
@@ -472,22 +494,22 @@ def _at_base(result: Result) -> Table:
 def _at_equal(result: Result, title: str, cost: Callable[[Outcome], float]) -> Table:
     """Of settings in the first condition that cost no more than intents in it, show each content's best."""
     intent = result.at(result.base, INTENT)
-    places = {result.base.point: "as it is"}
-    for panel in result.panels:
-        for setting in panel.settings:
-            if setting.condition == result.base.condition and panel.axis in SPENDING:
-                places.setdefault(setting.point, f"{panel.axis} {_value(setting)}")
+    settings = {"as it is": result.base} | {
+        f"{panel.axis} {_value(setting)}": setting
+        for panel in result.panels for setting in panel.settings
+        if setting.condition == result.base.condition and panel.axis in SPENDING
+    }  # fmt: skip
     rows = []
     for content in result.model.contents:
-        outcomes = [(result.outcomes[holding(point, content)], place) for point, place in places.items()]
+        outcomes = [(result.at(setting, content), name) for name, setting in settings.items()]
         within = [each for each in outcomes if cost(each[0]) <= cost(intent) + 1e-9]
         if not within:
             rows.append((content, "none", "", "", "", ""))
             continue
-        best, place = max(within, key=lambda each: each[0].estimate(SUCCESS).value)
+        best, name = max(within, key=lambda each: each[0].estimate(SUCCESS).value)
         gain = "" if best is intent else shown(best.over(intent), sign="+")
         costs = (f"{_kbit(best):.2f}", f"{_age(best):.1f}")
-        rows.append((content, place, shown(best.estimate(SUCCESS)), gain, *costs))
+        rows.append((content, name, shown(best.estimate(SUCCESS)), gain, *costs))
     return Table(
         f"{result.model.name}, {result.base.condition}: at the {title} of intents",
         ("content", "setting", "success %", "over intents", "kbit", "age, ms"), rows,
@@ -560,7 +582,7 @@ def _costs(result: Result) -> Iterator[tuple[str, str, list[Steps]]]:
             look: dict[str, Any] = {"color": COLOURS[n % len(COLOURS)]}
             places = sorted(
                 (cost(outcome), -100 * outcome.estimate(SUCCESS).value)
-                for point in result.points if (outcome := result.outcomes[holding(point, content)])
+                for setting in result.points if (outcome := result.at(setting, content))
             )  # fmt: skip
             x, y = np.array(places).T * [[1], [-1]]
             best = y >= np.maximum.accumulate(y)
@@ -619,7 +641,7 @@ def points_table(results: Sequence[Result]) -> "pd.DataFrame":
             "model": result.model.name, "family": family, "condition": setting.condition,
             "variable": panel.axis, "value": setting.value, "content": content,
             **_success(outcome.estimate(SUCCESS, family), outcome.over(intent, family)),
-            "p_holm": result.p.get((setting.point, content)) if last else None,
+            "p_holm": result.p(setting, content) if last else None,
             **{
                 key: value
                 for name in METRICS for key, value in _ends(name, outcome.estimate(name, family)).items()

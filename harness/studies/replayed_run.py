@@ -378,7 +378,8 @@ class _Nearest:
     def _nearest(self, intents: Intents) -> Intents:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)
         near = chosen(np.zeros_like(reach), -1.0, np.isfinite(reach), reach, self._helpers)
-        return replace(intents, valid=intents.valid & near)
+        range_m = np.where(near, intents.range_m, np.nan)
+        return replace(intents, valid=intents.valid & near, range_m=range_m)
 
     def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         return self._stored.fusion_call(scenes, codes, rewrites)

@@ -35,14 +35,15 @@ def played(done: Path, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame
     from harness.studies.contents import models, panels_of, run_contents
 
     source = ReplayedRun(done)
-    panels = panels_of([source], ["6g"], ["loss"], ["0,1"])
-    swarms = models([source], [setting.point for panel in panels for setting in panel.settings])
+    panels = panels_of([source], ["6g"], ["loss", "size"], ["0,1", "1,4"])
     out = tmp_path_factory.mktemp("study")
-    return run_contents(swarms, panels, source.seeds, out, Progress()).data["points"]
+    return run_contents(models([[source]], panels), panels, source.seeds, out, Progress()).data["points"]
 
 
-def cell(points: pd.DataFrame, content: str, column: str, loss: float | None = None) -> float:
-    at = points.value == loss if loss is not None else points.variable == ""
+def cell(
+    points: pd.DataFrame, content: str, column: str, value: float | None = None, axis: str = "loss"
+) -> float:
+    at = points.variable == "" if value is None else (points.variable == axis) & (points.value == value)
     return float(points[(points.content == content) & at][column].item())
 
 
@@ -72,6 +73,10 @@ def test_where_nothing_arrives_every_content_is_worth_nothing(played: pd.DataFra
     contents = played.content.unique()
     alone = cell(played, NOTHING, "success")
     assert {cell(played, content, "success", 1) for content in contents} == {alone}
+    assert {cell(played, content, "success", 1, "size") for content in contents} == {alone}
+    assert {cell(played, content, "bits_per_episode", 1, "size") for content in contents} == {0}
+    for content in contents:
+        assert cell(played, content, "success", 4, "size") == cell(played, content, "success")
     assert cell(played, NOTHING, "bits_per_episode") == 0
     assert all(cell(played, content, "bits_per_episode", 1) > 0 for content in contents if content != NOTHING)
     assert cell(played, "objects", "off_lag_rate", 1) == 0  # nobody is heard, so it is not asked again
@@ -129,7 +134,7 @@ def test_it_is_counted_first_then_played_and_goes_on(harness: Callable[..., Said
     code, out, err = harness("study", "contents", here, *VARIED)
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
-    assert out.startswith("Intent or objects?\nproxy · json, 6g, points over intents: objects ")
+    assert out.startswith("Intent or objects?\nproxy · v2 · json, 6g, points over intents: objects ")
     page = (here / "contents" / "index.html").read_text()
     for text in ("at the bits of intents", "at the age of intents", "by who sees the danger", "6g over loss"):
         assert text in page
@@ -147,10 +152,10 @@ def test_it_is_counted_first_then_played_and_goes_on(harness: Callable[..., Said
 @pytest.mark.slow
 def test_what_cannot_be_played_is_refused_in_a_line(harness: Callable[..., Said], done: Path) -> None:
     for words, reason in (
-        ([done, done], f"{done} and {done} are both of proxy · json on occluded-intersection; give one of"),
+        ([done, done], f"{done} and {done} are both proxy · v2 · json on occluded-intersection; give one of"),
         ([done, "--grid", "1,2"], "--grid: 1 given for 0 of --over; give one for each, in order"),
         ([done, "--condition", "single-local"], "--condition single-local has no channel"),
-        ([done, "--condition", "6g:consensus=ego-prompt"], "proxy · json: "),
+        ([done, "--condition", "6g:consensus=ego-prompt"], "proxy · v2 · json: "),
     ):
         code, out, err = harness("study", "contents", *words)
         assert (code, out) == (2, "")
