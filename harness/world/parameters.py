@@ -69,7 +69,9 @@ class Parameters:
     # quarter of the layouts; or `any`, as many as the scene happens to give
     witnesses: str = "any"
     radio_share: float = 0.0  # probability that a vehicle which does not help sends beacons, too
-    limits: int = 1  # version of the rule that says which delay is a failure (`harness.world.outcome`)
+    # version of the rule that says which delay is a failure (`harness.world.outcome`), and of the reference
+    # planner, by whose time it is one
+    limits: int = 1
     # version of what sensors make of a vehicle that they do not report: it hides who is behind it (1), or
     # hides nothing (2), so that nothing tells of it
     perception: int = 1

@@ -4,6 +4,9 @@ It knows only the scene graph. It plays every sequence of meta-actions over the 
 against the conflicts of the graph at constant speed, and takes the first action of the sequence that passes
 the conflict zone soonest without meeting anyone. A vehicle that is seen to brake is assumed to brake until it
 stands. The planner does not guess what it cannot see, so occlusion has a cost.
+
+Under `limits` 1 it plays only changes to ways that lie beside its own now, so that a driver who overtakes
+never comes back in what it plays. Under 2 it plays the way back, too.
 """
 
 from collections.abc import Sequence
@@ -67,7 +70,8 @@ class Rollouts:
         return float(self.speed_mps.max())
 
 
-Start = tuple[float, float, int, tuple[int, int]]  # speed, its target, decisions left, ways on either side
+# Speed, its target, decisions left, ways on either side, and how many ways to the right the ego's own one is.
+Start = tuple[float, float, int, tuple[int, int], int]
 
 
 def plan(scenario: Scenario, graph: SceneGraph) -> str:
@@ -87,8 +91,9 @@ def plans(scenario: Scenario, graphs: Sequence[SceneGraph]) -> list[str]:
             graph.ego.target_speed_mps,
             p.decisions - graph.step,
             (int("left" in ways), int("right" in ways)),
+            road.ways.index(road.ego) - road.ways.index(own) if road.ways else 0,
         )
-        for graph, ways in zip(graphs, beside, strict=True)
+        for graph, ways, (own, _) in zip(graphs, beside, places, strict=True)
     ]
     tried = _rollouts(scenario.actions, starts, p)
     return [
@@ -134,11 +139,23 @@ def _way(road: Road, ego: Ego) -> PathKey:
 
 @lru_cache(maxsize=64)
 def _sequences(
-    actions: tuple[str, ...], left: int, sides: tuple[int, int], parameters: Parameters
+    actions: tuple[str, ...], left: int, sides: tuple[int, int], home: int, parameters: Parameters
 ) -> Sequences:
-    """Return every sequence that `left` decisions and the ways on either side allow; a shared value."""
-    known = [a for a in actions if a in CALM and (a not in SIDE or sides[SIDE[a] > 0])]
-    sequences = list(product(known, repeat=min(HORIZON, left)))
+    """Return every sequence that `left` decisions and the ways on either side allow; a shared value.
+
+    Under `limits` 2 a sequence that ends beside the ego's own way, `home` ways to the right of the present
+    one, may also come back by a decision after `HORIZON`: an overtaking takes longer.
+    """
+    returns = parameters.limits > 1 and any(sides)
+    known = [a for a in actions if a in CALM and (a not in SIDE or returns or sides[SIDE[a] > 0])]
+    back = {SIDE[a]: a for a in known if a in SIDE}
+    later = ("FASTER",) * (left - HORIZON if returns else 0)
+    sequences = []
+    for played in product(known, repeat=min(HORIZON, left)):
+        way = home - sum(SIDE.get(a, 0) for a in played)
+        sequences.append(played + later)
+        for n in range(len(later) if way in back else 0):
+            sequences.append((*played, *later[:n], back[way], *later[n + 1 :]))
     ends = np.cumsum([[SIDE.get(a, 0) for a in s] for s in sequences], axis=1)
     stays = (ends.min(axis=1) >= -sides[0]) & (ends.max(axis=1) <= sides[1])
     sequences, ends = [s for s, fits in zip(sequences, stays, strict=True) if fits], ends[stays]
@@ -161,12 +178,12 @@ def levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
 def _rollouts(
     actions: tuple[str, ...], starts: Sequence[Start], parameters: Parameters
 ) -> dict[Start, Rollouts]:
-    alike: dict[tuple[int, tuple[int, int]], list[Start]] = {}
+    alike: dict[tuple[int, tuple[int, int], int], list[Start]] = {}
     for start in dict.fromkeys(starts):
         alike.setdefault(start[2:], []).append(start)
     rollouts = {}
-    for (left, sides), some in alike.items():
-        tried = _sequences(actions, left, sides, parameters)
+    for (left, sides, home), some in alike.items():
+        tried = _sequences(actions, left, sides, home, parameters)
         speeds, targets = np.array([start[:2] for start in some]).T
         for start, travelled in zip(
             some, travelled_m(tried.levels, speeds, targets, left, parameters), strict=True

@@ -20,6 +20,7 @@ from harness.world.planner import (
     plans,
     predicted,
 )
+from harness.world.reference import drive
 from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import SIZES_M, VehicleState, WorldState
 from harness.world.world import World
@@ -110,6 +111,15 @@ def test_an_ego_on_top_of_another_has_a_gap_below_zero():
     scene = graph(from_left(2.0, speed_mps=0.0))
     travelled = np.full((1, 90), scene.conflicts[0].ego.arc_m)
     assert gap(travelled, scene) == pytest.approx([-TOUCHING_M], abs=0.1)
+
+
+@pytest.mark.slow
+def test_who_overtakes_plans_the_way_back_under_limits_2():
+    """What comes late hinders one who does not: in all that it plays it stays on the wrong lane for good."""
+    seeds = 200006, 201020, 202134  # no danger, and a car that comes long after
+    for limits, results in ((1, ["time_out", "time_out", "collision"]), (2, ["cleared"] * 3)):
+        scenario = scenarios.get(f"do-not-pass:limits={limits}")
+        assert [drive(scenario, "full-view", seed).result for seed in seeds] == results
 
 
 def test_only_the_full_view_driver_reads_the_truth():
