@@ -32,6 +32,7 @@ from harness.evaluate.lifecycle import Evaluated
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
+from harness.prompts.decision import Question
 from harness.world.scenarios.occluded_intersection import SCENARIO
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
@@ -42,6 +43,7 @@ CHANGED: dict[str, Any] = {
     "role": "helper",
     "messages": ({"role": "user", "content": "Another scene"},),
     "actions": ("SLOWER", "IDLE"),
+    "question": Question("Scene", "What now?", {"SLOWER": None, "IDLE": None, "FASTER": None}),
     "orders": (({"role": "user", "content": "The same in another order"},),),
     "flips": (({"role": "user", "content": "The list reversed"},),),
     "max_tokens": 65,
@@ -60,7 +62,19 @@ CHANGED: dict[str, Any] = {
     "truth": {"nodes": []},
     "scenario": SCENARIO,
 }
-READ_BY_NO_MODEL = ("id", "flips", "timed", "agent", "sums", "reasons_first", "view", "truth", "scenario")
+# Nor is the question: who is asked it has it in the prompt.
+READ_BY_NO_MODEL = (
+    "id",
+    "question",
+    "flips",
+    "timed",
+    "agent",
+    "sums",
+    "reasons_first",
+    "view",
+    "truth",
+    "scenario",
+)
 
 
 class Talker(Scripted):

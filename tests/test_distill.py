@@ -229,7 +229,7 @@ def test_a_read_out_asks_for_a_letter_alone_as_an_evaluation_does(
     intents = {q.key: np.array([0.91, 0.06, 0.03, 0.0, 0.0])[: len(q.actions)] for q in asked}
     for short in excerpts(asked):
         assert short.read_out == in_mode(
-            "readout", short.prompt, short.messages, short.graph.role, short.actions
+            "readout", short.prompt, short.messages, short.graph, short.actions, short.scenario.prompt_words
         ), "where a question is no block, the letter follows it"
     told = next(with_messages(few[0], few[0].scenes, intents))
     assert "0.90" in told.read_out[-1]["content"], "the messages are there as well"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 from harness.core.files import canonical_json
 from harness.core.image import Image
 from harness.prompts.answer_schema import Shape
+from harness.prompts.decision import Question
 
 if TYPE_CHECKING:
     from harness.runs.records import Latency
@@ -18,10 +19,11 @@ if TYPE_CHECKING:
     from harness.world.scene_graph import SceneGraph
 
 Role = Literal["ego", "helper"]
-AnswerMode = Literal["json", "constrained", "readout"]
+AnswerMode = Literal["json", "constrained", "readout", "decision"]
+BARE: tuple[AnswerMode, ...] = ("readout", "decision")  # whose answer is a bare distribution
 Letters = Literal["raw", "cyclic"]
 Sums = Literal["refuse", "divide"]
-FinishReason = Literal["stop", "length", "error"]
+FinishReason = Literal["stop", "length", "refusal", "error"]
 AGAIN = "#2"  # suffix of the id of a repair turn's request
 
 
@@ -37,7 +39,9 @@ class Request:
     form: str = "distribution"  # what the prompt asks for (`Prompt.form`)
     # How the model answers. `json`: it writes freely. `constrained`: it fills in numbers and choices of a
     # fixed text. `readout`: it is asked for one letter, and the letters' probabilities are the answer.
+    # `decision`: it is asked the `question`, by a read-out unless it is a decision model.
     answer: AnswerMode = "json"
+    question: Question | None = None  # of a decision, what `messages` ask; its options are the actions
     # Of a read-out over cyclic orders, the chat with each further order of the actions behind the letters.
     orders: tuple[tuple[Mapping[str, str], ...], ...] = ()
     # Of a read-out, its chats with the list of actions reversed, `messages` and `orders`, which are asked as
@@ -60,10 +64,14 @@ class Request:
 
     @property
     def shape(self) -> Shape:
-        """What the JSON of its answer is to be; a read-out is a bare distribution, even a helper's."""
-        if self.answer == "readout":
+        """What the JSON of its answer is to be, even a helper's: a bare distribution if it is `bare`."""
+        if self.bare:
             return Shape("ego", self.actions, "distribution")
         return Shape(self.role, self.actions, self.form, self.extension)
+
+    @property
+    def bare(self) -> bool:
+        return self.answer in BARE
 
     @property
     def divides(self) -> bool:
@@ -96,13 +104,14 @@ class Completion:
     # as often as a server counts it.
     prompt_tokens: int | None
     completion_tokens: int | None  # tokens of the answer; None if the engine has no tokenizer
-    finish_reason: FinishReason  # `stop`, `length` (cut off by max_tokens) or `error`
+    # `stop`, `length` (cut off by max_tokens), `refusal` (of a question that was read) or `error`
+    finish_reason: FinishReason
     # Time of this answer if its request ran alone (batch_size 1), else None: the wall time of a batch is not
     # the latency of an answer.
     seconds: float | None
     batch_size: int  # number of requests that went through the engine together
     error: str | None = None  # the engine's message if finish_reason is `error`
-    label_mass: float | None = None  # total probability of the letters in a `readout`; None otherwise
+    label_mass: float | None = None  # total probability of the letters of a read-out; None otherwise
     retries: int = 0  # failed attempts before this one; their time is in `seconds`
     cached: bool = False  # whether it comes from the cache, in which case it has no seconds
     slow_s: float = 0.0  # declared seconds beyond its card's latency (the slow tail of a proxy)

@@ -27,6 +27,7 @@ T = TypeVar("T")
 NOT_IN_KEY = {
     "id": "names the place in a run; the model never reads it",
     "messages": "in the rendered prompt, with what the chat template adds to them (some write the date)",
+    "question": "in the rendered prompt",
     "flips": "asked as a request of their own",
     "agent": "which model is asked; what it is, is in the identity",
     "timed": "how the answer is sent; whoever measures asks past the cache",

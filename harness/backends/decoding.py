@@ -1,7 +1,7 @@
-"""The three answer modes, implemented once for all engines.
+"""The answer modes, implemented once for all engines.
 
-`json`: the model writes freely. `constrained`: it fills in the skeleton of the answer. `readout`: it is asked
-for one letter, and the letters' probabilities are the answer.
+`json`: the model writes freely. `constrained`: it fills in the skeleton of the answer. `readout` and
+`decision`: it is asked for one letter, and the letters' probabilities are the answer.
 """
 
 import math
@@ -74,7 +74,7 @@ class Decoding:
         """
         if request.answer == "constrained":
             return self._skeleton(request).most_tokens
-        if request.answer == "readout":
+        if request.bare:
             self._letter_tokens(request.actions)
             return 1
         return request.max_tokens
@@ -88,7 +88,7 @@ class Decoding:
         start_s = time.perf_counter()
         prompts = [prompt for prompt, *_ in orders]
         choice = Choice(requests, prompts)
-        if requests[0].answer == "readout":
+        if requests[0].bare:
             answers = self._read_out(requests, orders)
         else:
             mode = self._free if requests[0].answer == "json" else self._constrained

@@ -27,7 +27,7 @@ class Capabilities:
     """What an engine can do. Other code tests these capabilities, never an engine's name."""
 
     language_model: bool = True  # whose answers can be timed, and which can be asked to fuse messages
-    answer_modes: tuple[AnswerMode, ...] = ("json", "constrained", "readout")
+    answer_modes: tuple[AnswerMode, ...] = ("json", "constrained", "readout", "decision")
     thinks: Literal["always", "card", "never"] = "always"  # if its `card` says so
     renders: bool = True  # is `Rendering`: its answers can be cached, a check can show what its model reads
     has_weights: bool = False  # loads weights, which can be pulled, and has a device and a number format
@@ -35,7 +35,7 @@ class Capabilities:
     closed_loop: bool = True  # whether it answers for new scenes and not only for recorded ones
     own_latency: bool = False  # is `Timed`: its answers were timed earlier
     reference: bool = False  # whether it is a driver that a report compares models with
-    samples: bool = False  # whether it heeds a request's `temperature` and `sample` (never in a `readout`)
+    samples: bool = False  # whether it heeds a request's `temperature` and `sample` (never if it is `bare`)
 
 
 @dataclass(frozen=True)

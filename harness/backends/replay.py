@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import AGAIN, Backend, Completion, Request, failed, same_model
+from harness.backends.base import AGAIN, BARE, Backend, Completion, Request, failed, same_model
 from harness.backends.cache import cached, default_file
 from harness.backends.card import Card
 from harness.backends.cards import find_own
@@ -108,7 +108,7 @@ class Replay:
     def _as_run(self, request: Request) -> Request:
         """Return the request with the sampling settings of the run."""
         manifest = self._run.manifest
-        if request.answer == "readout":
+        if request.bare:
             return request
         return replace(request, temperature=manifest.temperature, sample=manifest.sampling_seed)
 
@@ -117,7 +117,7 @@ class Replay:
         # The prompt's digest cannot tell: free and constrained answers have the same prompt.
         if agent["answer"] != request.answer:
             raise UserError(f"{shown} was run with --answer {agent['answer']}; replay it with the same")
-        if bool(request.orders) != (agent["answer"] == "readout" and agent["letters"] == "cyclic"):
+        if bool(request.orders) != (agent["answer"] in BARE and agent["letters"] == "cyclic"):
             raise UserError(f"{shown} was run with --letters {agent['letters']}; replay it with the same")
         if request.flips and not agent["flip"]:
             raise UserError(f"{shown} was run without --flip; leave it out, or make the run again with it")

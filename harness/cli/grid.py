@@ -7,6 +7,7 @@ from typing import Any
 
 import typer
 
+from harness.backends.base import BARE
 from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.run import file_name, first_folder
@@ -20,7 +21,7 @@ HELPERS = ("helper_model", "helper_prompt", "helper_answer", "helper_thinking")
 HELP = {
     "model": "Models of the ego, separated by commas.",
     "prompt": "Prompt versions of the ego, such as v2,v3. Default: the scenario's usual one.",
-    "answer": "Answer modes of the ego, separated by commas: json, constrained, readout.",
+    "answer": "Answer modes of the ego, separated by commas: json, constrained, readout, decision.",
     "dataset": "Name of a shipped dataset, or a dataset's folder.",
     "helper_model": "Models of the helpers. Default: the ego's models.",
     "helper_prompt": "Prompt versions of the helpers. Default: the ego's versions.",
@@ -96,7 +97,7 @@ def _combinations(settings: Settings, flag: str, modes: Collection[str]) -> list
     combinations = []
     for model, prompt, answer in product(*lists):
         given = {**dict.fromkeys(HELPERS), "model": model, "prompt": prompt, "answer": answer}
-        if "readout" in modes and answer != "readout":
+        if any(mode in modes for mode in BARE) and answer not in BARE:
             given |= {"letters": None, "flip": False}
         if "json" in modes and answer != "json":
             given |= {"sums": "refuse"}

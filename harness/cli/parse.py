@@ -11,7 +11,7 @@ from harness.core import errors
 from harness.core.files import LARGEST, bytes_of, canonical_json
 
 HANDED_OVER = ("/dev/fd", "/proc/self/fd")  # folders of pipes that a shell opens for `<(command)`
-FINISH_REASONS = ("stop", "length", "error")
+FINISH_REASONS = ("stop", "length", "refusal", "error")
 
 
 def command(
@@ -28,7 +28,7 @@ def command(
         False, "--reasons-first", help="State that the prompt asked for reasons before the answer."
     ),
     finish_reason: str = typer.Option(
-        "stop", help="Why the engine stopped: stop (it was done), length (token limit) or error."
+        "stop", help="Why the engine stopped: stop (it was done), length (token limit), refusal or error."
     ),
     as_json: options.Json = False,
 ) -> None:

@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from harness.backends.base import AnswerMode, Letters, Request, Role, Sums
+from harness.backends.base import BARE, AnswerMode, Letters, Request, Role, Sums
 from harness.backends.card import Card
 from harness.backends.registry import Capabilities, capabilities
 from harness.core.errors import UserError, printable, unknown
 from harness.parsing.parse import Status, parse
-from harness.prompts import readout
+from harness.prompts import decision, readout
 from harness.prompts.versions import Prompt
 from harness.world.scene_graph import SceneGraph
 
@@ -22,7 +22,7 @@ class Agent:
 
     card: Card  # the model
     prompt: Prompt  # the prompt version
-    # how the model answers: free `json`, `constrained` to the schema, or a `readout` of letters
+    # how the model answers: free `json`, `constrained` to the schema, a `readout` of letters, or a `decision`
     answer: AnswerMode = "json"
     thinking: bool = False  # whether the model thinks before it answers
     # the picture that an image prompt shows: the viewer's `own`, a `blank` one, one of `another` scene,
@@ -30,7 +30,7 @@ class Agent:
     image: ImageMode = "own"
     # how a read-out's letters are read: `raw`, once, or `cyclic`, averaged over as many orders of the
     # list as there are actions; None takes the card's, or else cyclic. Always raw for what is no
-    # read-out of a language model.
+    # read-out of letters.
     letters: Letters | None = None
     # what becomes of an answer in `json` whose only fault is that its numbers do not sum to 1: `refuse`
     # counts it as failed, `divide` divides them by their sum
@@ -43,9 +43,12 @@ class Agent:
         name = printable(self.card.name)
         if self.letters not in (None, *get_args(Letters)):
             raise unknown("letters", str(self.letters), get_args(Letters))
-        if not (self.answer == "readout" and self.can.language_model):
-            if option := "--letters cyclic" if self.letters == "cyclic" else "--flip" if self.flip else "":
-                reason = "is no language model" if self.answer == "readout" else f"answers in {self.answer}"
+        lists = self.answer in BARE and self.can.language_model
+        if not (lists and "readout" in self.can.answer_modes):
+            cyclic = self.letters == "cyclic"
+            if option := "--letters cyclic" if cyclic else "--flip" if self.flip and not lists else "":
+                reason = "reads no letters" if lists else "is no language model"
+                reason = reason if self.answer in BARE else f"answers in {self.answer}"
                 raise UserError(
                     f"{option}: {name} {reason}; leave it out, or give a language model and --answer readout"
                 )
@@ -74,6 +77,11 @@ class Agent:
             reason = "cannot answer so" if self.can.language_model else "is no language model"
             modes = " or ".join(self.can.answer_modes)
             raise UserError(f"--answer {self.answer}: {name} {reason}; use {modes}")
+        if self.answer == "decision" and self.prompt.examples:
+            raise UserError(
+                f"--answer decision: prompt {self.prompt.version} has examples, and a decision is one "
+                "question; give a prompt without any"
+            )
         if self.sums not in get_args(Sums):
             raise unknown("sums", str(self.sums), get_args(Sums))
         if self.sums == "divide" and self.answer != "json":
@@ -97,8 +105,8 @@ class Agent:
 
     @property
     def samples(self) -> bool:
-        """Whether its answers are sampled at a temperature; a read-out is a distribution already."""
-        return self.can.samples and self.answer != "readout"
+        """Whether its answers are sampled at a temperature; a bare distribution is not."""
+        return self.can.samples and self.answer not in BARE
 
     @property
     def name(self) -> str:
@@ -122,12 +130,16 @@ class Agent:
     def chats(self, graph: SceneGraph, actions: tuple[str, ...], words: Mapping[str, str]) -> dict[str, Any]:
         """Return the chat about a scene graph in the agent's answer mode, as fields of a request.
 
-        They are the `messages`, and those of the further `orders` and the `flips` of a read-out's letters.
+        They are the `messages`, those of the further `orders` and the `flips` of a read-out's letters, and
+        the `question` of a decision.
         """
         rendered = self.rendered(graph, actions, (), words)
-        return self.in_orders(
-            actions, lambda order: in_mode(self.answer, self.prompt, rendered, graph.role, order)
+        chats = self.in_orders(
+            actions, lambda order: in_mode(self.answer, self.prompt, rendered, graph, order, words)
         )
+        if self.answer == "decision":
+            chats["question"] = decision.question(rendered, graph, actions, words)
+        return chats
 
     def in_orders(
         self, actions: tuple[str, ...],
@@ -151,8 +163,7 @@ class Agent:
         words: Mapping[str, str],
     ) -> tuple[Mapping[str, str], ...]:  # fmt: skip
         """Return the chat about a scene graph and the messages heard, before the answer mode changes it."""
-        letter = self.answer == "readout"
-        return shown(self.image, self.prompt.render(graph, actions, heard, words, letter))
+        return shown(self.image, self.prompt.render(graph, actions, heard, words, self.answer in BARE))
 
     def settings(self) -> dict[str, Any]:
         """Return everything that decides its answers, as plain values."""
@@ -173,12 +184,20 @@ def shown(image: str, messages: Sequence[Mapping[str, str]]) -> tuple[Mapping[st
 
 
 def in_mode(
-    answer: str, prompt: Prompt, messages: Sequence[Mapping[str, str]], role: str, actions: Sequence[str]
-) -> tuple[Mapping[str, str], ...]:
-    """Return a prompt's chat in an answer mode; in a read-out, the examples answer by a letter, too."""
+    answer: str, prompt: Prompt, messages: Sequence[Mapping[str, str]], graph: SceneGraph,
+    actions: Sequence[str], words: Mapping[str, str],
+) -> tuple[Mapping[str, str], ...]:  # fmt: skip
+    """Return a prompt's chat about a scene graph in an answer mode.
+
+    In a read-out, the examples answer by a letter, too. A decision keeps of the chat what it says of the
+    scene; the scenario's `words` ask.
+    """
+    if answer == "decision":
+        asked = decision.question(messages, graph, actions, words)
+        return decision.asked(asked, messages, actions)
     if answer != "readout":
         return tuple(messages)
-    return readout.asked(messages, actions, example_actions(prompt, role, actions))
+    return readout.asked(messages, actions, example_actions(prompt, graph.role, actions))
 
 
 def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[str]:

@@ -1,13 +1,13 @@
 """Check a model before a run: ask it in every answer mode, with and without pictures, and examine it."""
 
 from dataclasses import dataclass, replace
-from typing import cast, get_args
+from typing import cast
 
-from harness.backends.base import AnswerMode, Completion, Rendering, Request
+from harness.backends.base import Completion, Rendering, Request
 from harness.backends.card import Card
 from harness.backends.checkup import Checkup
 from harness.backends.checkup import check as ask
-from harness.backends.registry import open_backend
+from harness.backends.registry import capabilities, open_backend
 from harness.core.progress import Progress
 from harness.core.resources import DATASET
 from harness.dataset import load
@@ -50,10 +50,13 @@ def check(card: Card, thinking: bool, device: str | None, dtype: str | None, pro
     card's hold. `progress` counts answers.
     """
     data = load.load(load.find(DATASET), 1)
-    ego = Agent(card, versions.load(PROMPT), thinking=thinking)
-    sees = Agent(card, versions.load(IMAGE_PROMPT), thinking=thinking) if card.vision else None
+    can = capabilities(card.engine).answer_modes
+    if "readout" in can:  # which asks for letters, as a decision does
+        can = tuple(mode for mode in can if mode != "decision")
+    ego = Agent(card, versions.load(PROMPT), can[0], thinking=thinking)
+    sees = Agent(card, versions.load(IMAGE_PROMPT), can[0], thinking=thinking) if card.vision else None
     spec = Spec(ego, FrozenSource(data), (), (0,), batch_size=1, device=device, dtype=dtype)
-    modes = ("json",) if ego.thinking else get_args(AnswerMode)
+    modes = ("json",) if ego.thinking else can
     scenes = data.scenes(data.forest.ids[:1])
 
     def question(agent: Agent) -> Request:

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from harness.backends.base import Backend, Completion, Request
+from harness.backends.base import BARE, Backend, Completion, Request
 from harness.core import kept
 from harness.core.errors import UserError
 from harness.core.files import digest
@@ -84,7 +84,7 @@ def examine(
 
     Letters are read over cyclic orders to see what follows them, and in the pairs as the agent reads them.
     """
-    reader = replace(agent, answer="readout", letters=agent.letters if agent.answer == "readout" else None)
+    reader = replace(agent, answer="readout", letters=agent.letters if agent.answer in BARE else None)
     pairs = [*questions.scene_pairs(reader), *questions.plain_pairs(reader)]
     asked = [
         *questions.requests(replace(reader, letters="cyclic")),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.backends import cards
+from harness.backends.base import BARE
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.errors import UserError, in_range, unknown
@@ -97,8 +98,8 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
     with helper_options({"--answer": own.answer, "--thinking": own.thinking}):
         theirs = (
             prompt, mode, settings.thinking if own.thinking is None else own.thinking,
-            settings.image if prompt.image else "own", settings.letters if mode == "readout" else None,
-            settings.sums if mode == "json" else "refuse", settings.flip and mode == "readout",
+            settings.image if prompt.image else "own", settings.letters if mode in BARE else None,
+            settings.sums if mode == "json" else "refuse", settings.flip and mode in BARE,
         )  # fmt: skip
         return ego, tuple(Agent(helper_card, *theirs) for helper_card in helper_cards)  # type: ignore[arg-type]
 

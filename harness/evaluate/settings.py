@@ -44,7 +44,7 @@ class HelperSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     ] = None
     answer: Annotated[
         str | None,
-        option("How the helpers answer: json, constrained or readout. Default: like the ego.", HELPERS),
+        option("How the helpers answer, as --answer says. Default: like the ego.", HELPERS),
     ] = None
     thinking: Annotated[
         bool | None, option("Ask the helpers to think before they answer. Default: like the ego.", HELPERS)
@@ -169,7 +169,7 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         option(
             "How the model answers. json: free text with a JSON object. constrained: decoding allows only "
             "what fits the schema. readout: the intent is read from the probabilities of one letter per "
-            "action."
+            "action. decision: the same of a typed question, which decision models answer."
         ),
     ] = "json"
     thinking: Annotated[bool, option("Ask the model to think before it answers.")] = False
@@ -184,16 +184,17 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     letters: Annotated[
         str | None,
         option(
-            "How a readout's letters are read. raw: once. cyclic: averaged over as many orders of the list "
-            "as there are actions, so that no letter is preferred. Default: the card's, or cyclic.",
+            "How the letters of a readout or decision are read. raw: once. cyclic: averaged over as many "
+            "orders of the list as there are actions, so that none is preferred. Default: the card's, or "
+            "cyclic.",
             ANSWERS,
         ),
     ] = None
     flip: Annotated[
         bool,
         option(
-            "Ask each readout once more with the list of actions reversed, and count how often the "
-            "likeliest action changes. It changes no decision.",
+            "Ask each readout or decision once more with the list of actions reversed, and count how often "
+            "the likeliest action changes. It changes no decision.",
             ANSWERS,
         ),
     ] = False

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import msgspec
 
+from harness.backends.base import BARE
 from harness.backends.card import Card
 from harness.backends.cards import argument
 from harness.backends.registry import ENGINES
@@ -192,8 +193,8 @@ class Spec:
         if self.temperature and not any(agent.samples for agent in self.agents):
             name = printable(self.ego.card.name)
             reason = f"{name} has nothing to sample; leave it out, or give a model that writes its answers"
-            if self.ego.answer == "readout":
-                reason = "a readout is a distribution already; use --answer json or constrained"
+            if self.ego.answer in BARE:
+                reason = f"a {self.ego.answer} is a distribution already; use --answer json or constrained"
             raise UserError(f"{shown}: {reason}")
 
     def _check(self, agent: Agent) -> None:
@@ -267,8 +268,8 @@ class Spec:
     @property
     def fusion_obstacle(self) -> str | None:
         """Why the ego's prompt cannot hold the helpers' messages; None if it can."""
-        if "readout" in [agent.answer for agent in self.agents]:
-            return "a readout gives no messages to fuse; use --answer json or constrained"
+        if bare := [agent.answer for agent in self.agents if agent.answer in BARE]:
+            return f"a {bare[0]} gives no messages to fuse; use --answer json or constrained"
         version, form = self.ego.prompt.version, self.ego.prompt.helper_answer
         for prompt in (helper.prompt for helper in self.helpers):
             if prompt.helper_answer != form:

@@ -92,7 +92,8 @@ def parse(
             did not take the thought out of the text.
         reasons_first: whether the prompt asked for reasons before the answer; then prose there is no repair.
         divides: whether a sum that is off 1 by more than rounding is divided out, unless it is 0.
-        finish_reason: the engine's finish reason; `length` means that the token limit cut the text off.
+        finish_reason: the engine's finish reason; `length` means that the token limit cut the text off,
+            `refusal` that the model refused the question.
         error: the engine's message if it failed.
 
     Raises UserError for an unknown role.
@@ -102,6 +103,8 @@ def parse(
     if error is not None or finish_reason == "error":
         message = errors.printable(error or "no message", 80)
         return _failed(Failure(Status.ENGINE_ERROR, f"the engine failed: {message}"), None)
+    if finish_reason == "refusal":
+        return _failed(Failure(Status.REFUSED, "the model refused the question"), None)
     shape = Shape(role, tuple(actions), form, extension)
     thought: str | None = None
     try:

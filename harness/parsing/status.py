@@ -48,6 +48,7 @@ class Status(_Documented):
         "The probabilities differ from a sum of 1 by more than rounding (0.025), or all are zero.",
     )
     CONFLICTING_ANSWERS = "conflicting_answers", "Several answers stand in the text and they differ."
+    REFUSED = "refused", "The model refused the question, and the server said so."
     ENGINE_ERROR = "engine_error", "The engine failed; there is no completion to judge."
 
 

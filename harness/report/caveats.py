@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+from harness.backends.base import BARE
 from harness.backends.registry import ENGINES
 from harness.core.config import pairs
 from harness.core.errors import printable
@@ -137,7 +138,7 @@ def findings_of(manifest: Manifest) -> Iterator[str]:
     agents = [manifest.agent(0), *manifest.helpers]
     for agent, identity in zip(agents, identities, strict=False):
         if isinstance(identity, Mapping) and (findings := recall_findings(identity)):
-            for sentence in findings.sentences(agent["answer"] == "readout"):
+            for sentence in findings.sentences(agent["answer"] in BARE):
                 yield f"{printable(str(agent['model']['name']), 30)}: {sentence}"
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 from msgspec import UNSET
 
+from harness.backends.base import BARE
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.core.image import Image
@@ -71,10 +72,10 @@ def prompts_of(run: Run) -> Sent | None:
         if prompt.version in failed:  # it would take as long again
             return ()
         try:
-            letter = agent["answer"] == "readout"
+            letter = agent["answer"] in BARE
             rendered = prompt.render(graph, run.actions, heard, words, letter)
             messages = shown(agent["image"], rendered)
-            return in_mode(agent["answer"], prompt, messages, graph.role, run.actions)
+            return in_mode(agent["answer"], prompt, messages, graph, run.actions, words)
         except UserError:  # a stranger's, which no run can have used
             failed.add(prompt.version)
             return ()

@@ -26,7 +26,7 @@ from harness.runs.records import Answer, FrozenScenes
 from harness.runs.sources import lacking
 
 VALUES = {"strict": "C", "recovered": "P", "failed": "I"}  # as Inspect calls correct, partial and incorrect
-STOPS = {"stop": "stop", "length": "max_tokens"}
+STOPS = {"stop": "stop", "length": "max_tokens", "refusal": "content_filter"}
 SPOKEN = {
     "system": model.ChatMessageSystem, "user": model.ChatMessageUser, "assistant": model.ChatMessageAssistant,
 }  # fmt: skip

@@ -44,7 +44,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     heard: tuple[str, ...] = ()
     role: Role  # `ego`, `helper`, `merge` for the ego's fusion call, or `blind` for a helper shown nothing
     raw: str  # the completion as it came, except for lone surrogates, which no file can hold
-    finish_reason: str  # `stop`, `length` or `error`
+    finish_reason: str  # `stop`, `length`, `refusal` or `error`
     error: str | None  # the engine's message; None if it answered
     prompt_tokens: int | None  # tokens in; None if the engine has no tokenizer
     completion_tokens: int | None  # tokens out; None if the engine has no tokenizer

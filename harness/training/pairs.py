@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from harness.backends.base import BARE
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.seeds import FIRST, purpose, stated
@@ -94,9 +95,10 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
             asked_with = as_asked(dataset.scenario, scene, stored)
             q = question(lessons, asked_with, stored.viewer, prompt, messages)
             texts = shown(agent["image"], q.messages)
-            sent = in_mode(agent["answer"], prompt, texts, q.graph.role, q.actions)
+            words = dataset.scenario.prompt_words
+            sent = in_mode(agent["answer"], prompt, texts, q.graph, q.actions, words)
             completion = answer(prompt, q.graph, q.label, q.actions)
-            if agent["answer"] == "readout":
+            if agent["answer"] in BARE:
                 completion = readout.letters(q.actions)[int(q.label.argmax())]
             seed = int(scene.record.episode_seed)
             yield {

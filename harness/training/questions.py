@@ -51,7 +51,7 @@ class Question:
         """Return the chat messages that ask for a letter."""
         shown, words = self.excerpt or self.graph, self.scenario.prompt_words
         messages = self.prompt.render(shown, self.actions, self.heard, words, letter=True)
-        return in_mode("readout", self.prompt, messages, self.graph.role, self.actions)
+        return in_mode("readout", self.prompt, messages, self.graph, self.actions, words)
 
 
 def alone(lessons: Lessons) -> Iterator[Question]:

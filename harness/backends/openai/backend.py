@@ -135,7 +135,7 @@ class OpenAIBackend:
             answer = read(reply.payload, request, self._server.kind)
         self._note(request, reply, answer)
         first_at_s, tokens = reply.first_at_s, answer.completion_tokens
-        if request.answer == "readout":
+        if request.bare:
             first_at_s, tokens = end_s, 1
         first_s = None
         if seconds is not None and first_at_s is not None and not answer.error:
@@ -179,7 +179,7 @@ class OpenAIBackend:
         """Ask for a reply. If the server refuses to stream, ask again without, and stream no more."""
         json_body = partial(body, self._card, self._server, request)
         decision = request.id.partition("/")[0]
-        if not streamed or not self._streams or request.answer == "readout":
+        if not streamed or not self._streams or request.bare:
             return await self._pool.post(decision, json_body)
         reply = await self._pool.post(decision, lambda: {**json_body(), **ASKED})
         fault = (reply.fault or "").lower()

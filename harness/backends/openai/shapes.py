@@ -73,7 +73,7 @@ def body(
         json_body["chat_template_kwargs"] = {"enable_thinking": request.thinking}
     if request.answer == "constrained":
         json_body |= constraint(server.kind, request.shape)
-    if request.answer == "readout":
+    if request.bare:
         json_body |= {"max_tokens": 1, "logprobs": True, "top_logprobs": server.top_logprobs or MOST_LOGPROBS}
     if server.fields is None:
         return json_body
@@ -99,7 +99,7 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
         tokens = _count(usage.get("prompt_tokens")), _count(usage.get("completion_tokens"))
     except (LookupError, TypeError, AttributeError):
         return failed(request, "the answer is no chat completion")
-    if request.answer == "readout":
+    if request.bare:
         return _read_out(choice, request, *tokens)
     if not isinstance(content, str) and not (content is None and thought):
         if "content" not in message:

@@ -310,8 +310,9 @@ def _reworded(request: Request, reworded: Callable[[str], str]) -> Request:
         return tuple({**message, "content": reworded(message["content"])} for message in messages)
 
     return dataclasses.replace(
-        request, messages=chat(request.messages), orders=tuple(map(chat, request.orders))
-    )
+        request, messages=chat(request.messages), orders=tuple(map(chat, request.orders)),
+        question=request.question and request.question.reworded(reworded),
+    )  # fmt: skip
 
 
 _DECLARED = (
@@ -344,11 +345,11 @@ _DECLARED = (
         text=permuted_letters, modes=("readout",), constant=False,
     ),
     Twin(
-        "message-order", "the helpers' messages in another order", "fusion calls, not of a readout",
+        "message-order", "the helpers' messages in another order", "fusion calls in json or constrained",
         senders=lambda senders: senders[::-1], modes=("json", "constrained"),
     ),
     Twin(
-        "message-twice", "one helper's message twice", "fusion calls, not of a readout",
+        "message-twice", "one helper's message twice", "fusion calls in json or constrained",
         senders=lambda senders: [*senders, *senders[:1]], modes=("json", "constrained"),
     ),
 )  # fmt: skip

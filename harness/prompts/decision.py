@@ -1,0 +1,77 @@
+"""The decision answer mode: a typed question about a state, with what each option means.
+
+A decision model reads a state and a question, and gives each option a probability without writing text. Any
+chat model answers the same question by a read-out of letters (`harness.prompts.readout`).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from harness.prompts import readout
+from harness.world.scene_graph import SceneGraph
+
+# What actions mean; the words of a scenario go before it, under the action's name.
+MEANINGS = {
+    "SLOWER": "go one speed level down, of {speeds} m/s",
+    "IDLE": "keep the speed",
+    "FASTER": "go one speed level up, of {speeds} m/s",
+    "LANE_LEFT": "change to the lane on the left",
+    "LANE_RIGHT": "change to the lane on the right",
+}
+
+
+@dataclass(frozen=True)
+class Question:
+    """A choice between actions."""
+
+    state: str  # what the prompt says of the scene
+    instructions: str  # what is asked, in the scenario's words
+    meanings: Mapping[str, str | None]  # of each action; None where nobody says
+
+    def reworded(self, change: Callable[[str], str]) -> "Question":
+        """Return the question with all its texts changed."""
+        meanings = {action: text and change(text) for action, text in self.meanings.items()}
+        return replace(
+            self, state=change(self.state), instructions=change(self.instructions), meanings=meanings
+        )
+
+
+def question(
+    messages: Sequence[Mapping[str, str]], graph: SceneGraph, actions: Sequence[str], words: Mapping[str, str]
+) -> Question:
+    """Return what a scene graph's viewer is asked; the state is the last message of a prompt's chat about it.
+
+    `words` are the scenario's (`Scenario.prompt_words`).
+    """
+    ego, task, hiding = graph.ego.id, words.get("task", "drive on"), words.get("hiding")
+    if graph.role == "ego":
+        hidden = f" Other cars may be hidden by {hiding}." if hiding else ""
+        instructions = (
+            f"You drive car {ego}. Your task: {task}.{hidden} Never collide, and lose no time where nothing "
+            "is in your way. What do you do in the next second?"
+        )
+    else:
+        instructions = (
+            f"You help car {ego}, which does not see all that you see. Its task: {task}. It must never "
+            "collide, and should lose no time where nothing is in its way. "
+            f"What should {ego} do in the next second?"
+        )
+    return Question(messages[-1]["content"], instructions, {a: _meaning(a, words) for a in actions})
+
+
+def _meaning(action: str, words: Mapping[str, str]) -> str | None:
+    text = words.get(action, MEANINGS.get(action))
+    return text and text.replace("{speeds}", words.get("speeds", "those there are"))
+
+
+def asked(
+    question: Question, messages: Sequence[Mapping[str, str]], order: Sequence[str]
+) -> tuple[Mapping[str, str], ...]:
+    """Return the chat that asks a chat model for one letter; the actions are listed in an order.
+
+    The state comes first, since all orders share it. A picture stays with the last of the messages.
+    """
+    meant = (question.meanings[action] for action in order)
+    options = [f"{action}: {text}" if text else action for action, text in zip(order, meant, strict=True)]
+    user = {**messages[-1], "content": "\n".join([question.state, *options])}
+    return readout.asked(({"role": "system", "content": question.instructions}, user), order)
