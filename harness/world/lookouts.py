@@ -25,6 +25,7 @@ from harness.world.state import WorldState
 LOOKOUTS = ("v2", "v3", "v4")
 SEATS = ("first seat", "second seat", "third seat")
 MOST_ATTEMPTS = 2000
+DANGER = "danger"
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,13 @@ def placed(
         layout = _witnessed(scenario, draft, seed, parameters)
     if not parameters.radio_share:
         return layout
-    return replace(layout, spawns=tuple(_equipped(s, scenario, seed, parameters) for s in layout.spawns))
+
+    def equipped(spawn: Spawn) -> Spawn:
+        vehicle = DANGER if spawn.id == layout.danger_id else spawn.id
+        return replace(spawn, radio=has_radio(scenario.name, parameters, seed, vehicle))
+
+    spawns = (equipped(spawn) if spawn.part == "other" else spawn for spawn in layout.spawns)
+    return replace(layout, spawns=tuple(spawns))
 
 
 def witnesses(parameters: Parameters, seed: int) -> int | None:
@@ -60,6 +67,13 @@ def witnesses(parameters: Parameters, seed: int) -> int | None:
     if parameters.witnesses == "any":
         return None
     return seed % (len(LOOKOUTS) + 1) if parameters.witnesses == "each" else int(parameters.witnesses)
+
+
+def radios(scenario: Scenario, seed: int, danger: str | None) -> dict[str, Any]:
+    """Return a layout's `witnesses` and `danger_radio` for a row of a table; None where none is declared."""
+    p = scenario.parameters
+    radio = has_radio(scenario.name, p, seed) if danger and p.radio_share else None
+    return {"witnesses": witnesses(p, seed), "danger_radio": radio}
 
 
 def queue(
@@ -74,9 +88,10 @@ def queue(
     return tuple(cars)
 
 
-def _equipped(spawn: Spawn, scenario: Scenario, seed: int, p: Parameters) -> Spawn:
-    draw = noise.uniforms((1,), scenario.name, seed, "radio", spawn.id)[0]
-    return replace(spawn, radio=spawn.part == "other" and bool(draw < p.radio_share))
+def has_radio(scenario: str, parameters: Parameters, seed: int, vehicle: str = DANGER) -> bool:
+    """Return whether a vehicle that does not help sends beacons: the danger, or another by its id."""
+    draw = noise.uniforms((1,), scenario, seed, "radio", vehicle)[0]
+    return bool(draw < parameters.radio_share)
 
 
 @lru_cache(maxsize=256)  # a frozen scene asks again for each action that it follows

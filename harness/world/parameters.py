@@ -158,5 +158,6 @@ def beacon_radio(text: str) -> Physical | None:
 DIALS = tuple(
     field.name for field in fields(Parameters) if field.name.startswith(("beacon_", "perfect_", "ambient"))
 )
-# Further ones that a name may set: who is there, and what counts.
-SETTABLE = (*DIALS, "witnesses", "radio_share", "limits", "perception")
+# Further ones that a name may set: what counts, and where the scenario has lookouts, who has a radio.
+SETTABLE = (*DIALS, "limits", "perception")
+WITNESSED = (*SETTABLE, "witnesses", "radio_share")

@@ -4,6 +4,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
+import one_way_crossing
 import pytest
 
 from harness.core.errors import UserError
@@ -86,6 +87,10 @@ def test_a_world_of_witnesses_is_thawed_as_it_was(name: str) -> None:
         (v.id, v.part) for v in world.state().vehicles
     ]
     assert thawed.outcome.result == world.outcome.result
+
+
+def test_a_scenario_without_lookouts_has_no_such_settings() -> None:
+    assert not {"witnesses", "radio_share"} & {*one_way_crossing.SCENARIO.dials}
 
 
 def test_parameters_that_give_no_such_layout_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed, queue
+from harness.world.parameters import WITNESSED
 from harness.world.parameters import Parameters as Common
 from harness.world.road import Road, crossings, paths_along, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
@@ -170,6 +171,7 @@ SCENARIO = Scenario(
     road=road,
     layout=layout,
     cleared=cleared,
+    dials=WITNESSED,
     words={"task": "merge from a ramp into the right lane of a road", "hiding": "a wall beside the ramp"},
     one_sided="the ramp comes from the right",
 )

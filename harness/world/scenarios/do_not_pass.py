@@ -21,6 +21,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed, queue
+from harness.world.parameters import WITNESSED
 from harness.world.parameters import Parameters as Common
 from harness.world.road import Road, paths_along, straights
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
@@ -156,6 +157,7 @@ SCENARIO = Scenario(
     road=road,
     layout=layout,
     cleared=cleared,
+    dials=WITNESSED,
     words={"task": "pass a slow truck, or stay behind it", "hiding": "the truck"},
     brake_lamps=True,
     one_sided="traffic keeps to the right, and what comes towards it is on the left",

@@ -21,6 +21,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed, queue
+from harness.world.parameters import WITNESSED
 from harness.world.parameters import Parameters as Common
 from harness.world.road import Road, paths_along
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
@@ -141,6 +142,7 @@ SCENARIO = Scenario(
     road=road,
     layout=layout,
     cleared=cleared,
+    dials=WITNESSED,
     words={"task": "drive on along a motorway", "hiding": "the van ahead"},
     brake_lamps=True,
     one_sided="traffic keeps to the right lane and passes on the left",

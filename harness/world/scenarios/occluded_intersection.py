@@ -18,6 +18,7 @@ import numpy as np
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.crossroads import JUNCTION_M, SECTORS, road
 from harness.world.lookouts import Draft, placed, queue
+from harness.world.parameters import WITNESSED
 from harness.world.parameters import Parameters as Common
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, Building, Kind
@@ -172,6 +173,7 @@ SCENARIO = Scenario(
     road=road,
     layout=layout,
     cleared=cleared,
+    dials=WITNESSED,
     words={"task": "go straight over an intersection", "hiding": "buildings and trucks"},
     prompt="v2",
     one_sided=None,  # nobody has right of way, so that times decide and sides do not

@@ -20,6 +20,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed
+from harness.world.parameters import WITNESSED
 from harness.world.parameters import Parameters as Common
 from harness.world.road import Road, crossings, paths_along, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
@@ -182,6 +183,7 @@ SCENARIO = Scenario(
     road=road,
     layout=layout,
     cleared=cleared,
+    dials=WITNESSED,
     words={"task": "pull out of a kerbside space into the lane beside it", "hiding": "parked vans"},
     one_sided="the kerb is on the right",
 )

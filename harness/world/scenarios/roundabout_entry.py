@@ -22,6 +22,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed, queue
+from harness.world.parameters import WITNESSED
 from harness.world.parameters import Parameters as Common
 from harness.world.road import Lane, Path, PathKey, Road, crossings
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
@@ -242,6 +243,7 @@ SCENARIO = Scenario(
     road=road,
     layout=layout,
     cleared=cleared,
+    dials=WITNESSED,
     words={"task": "enter a roundabout and go straight on", "hiding": "a hedge and a planted island"},
     one_sided="traffic goes round one way and comes from the left",
 )
