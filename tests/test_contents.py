@@ -32,7 +32,7 @@ from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.dry_run import count
-from harness.evaluate.fusion import messages_of
+from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked, listed
 from harness.prompts import versions as prompts
 from harness.radio.channel import Draws
@@ -306,6 +306,50 @@ def test_helpers_that_see_nothing_add_but_themselves(small: Dataset) -> None:
         assert {*request.view.seen} <= {*own, "v2", "v3", "v4"}
 
 
+def test_shuffled_objects_are_those_of_another_layout_where_they_are_there(small: Dataset) -> None:
+    """Every question but the ego's own has the list of one other layout, in which the ego is left out."""
+    backend, scenes = Planner(small), {scene.id: scene for scene in all_scenes(small)}
+    walked(spec_of(small, points=(OBJECTS.changed(messages="shuffled"),), ask="used"), backend)
+    sets = [r for r in backend.asked if "!objects" in r.id]
+    assert len(sets) > 10
+    for request in sets:
+        name, _, key = request.id.partition("/")
+        senders = key.split("+")[1:]
+        source = scenes[source_of(name, senders)]
+        assert source.record.episode != scenes[name].record.episode
+        assert source.record.step == scenes[name].record.step
+        own, there = scenes[name].graphs["v1"], [source.graphs[s.partition("!")[0]] for s in senders]
+        assert request.view is not None
+        assert "v1" not in request.view.seen
+        for sender, graph in zip(senders, there, strict=True):
+            place = stated(small.scenario.parameters, source.state, sender.partition("!")[0])
+            new = {*request.view.nodes} - {*own.nodes}
+            assert place.id in {node.id for node in new} or place.id in own.seen
+            assert {node.id for node in new} <= {v.id for v in source.state.vehicles} | {*own.seen}, graph
+
+
+def test_with_shuffled_objects_and_words_nothing_is_won(small: Dataset) -> None:
+    """A planner hears of dangers that are not there, and of none that is."""
+    points = [OBJECTS, OBJECTS.changed(name="shuffled", messages="shuffled")]
+    rows = walked(spec_of(small, points=(POINTS["single-local"], *points)), Planner(small))
+    alone, own, shuffled = (
+        figure(rows, name, "success_rate").value for name in ("single-local", OBJECTS.name, "shuffled")
+    )
+    assert shuffled <= alone < own
+
+
+def test_a_shuffled_run_is_read_as_it_was_asked(small: Dataset, tmp_path: Path) -> None:
+    """A pair for training has the objects of the other layout; energy of them is not counted."""
+    point = OBJECTS.changed(messages="shuffled")
+    stored = folder.read(run(spec_of(small, points=(point,)), tmp_path / "run").out)
+    asked = {answer.prompt_sha256 for answers in stored.answers_by_scene.values() for answer in answers}
+    shuffled = [pair for pair in pairs(stored) if "&from:" in pair["viewer"]]
+    assert shuffled
+    assert {digest(pair["prompt"]) for pair in shuffled} <= asked
+    counted = count(spec_of(small, points=(point,), ask="used"), small, None)
+    assert counted["requests_by_role"]["fusion"] == 2 * 7 * counted["scenes"], "of two seeds"
+
+
 def test_bits_grow_with_what_is_listed(small: Dataset) -> None:
     scenes = all_scenes(small)
     counts, bits = listed(scenes)
@@ -453,7 +497,6 @@ def test_a_stranger_who_names_two_attacks_at_once_gets_both(small: Dataset, prox
         ("6g:content=objects,attack=liar", "some of ghost, hide, shift and absent"),
         ("6g:attack=ghost", "one on intents where content lists no objects"),
         ("6g:content=oracle,attack=hide", "one on intents where content lists no objects"),
-        ("6g:content=objects,messages=shuffled", "own or blind where content is objects"),
         ("6g:content=objects,attack=ghost:share=1/3+hide:share=1", "attacks of one share where content is"),
         ("6g:content=both,attack=liar+ghost:share=1", "attacks of one share where content is both"),
         ("mode2:content=both,edge=fusion", "none or relay where content is both: a unit sends a policy"),

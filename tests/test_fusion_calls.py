@@ -71,9 +71,8 @@ def heard(due: dict[OperatingPoint, Due], intents: Intents) -> Ints:
     """The sets of messages that are heard where nobody attacks."""
     nobody = np.zeros(intents.valid.shape, dtype=bool)
     sent = {point: exchange(point, intents, of.draws) for point, of in due.items()}
-    return heard_codes(
-        due, {point: SentIntents(intents, of.draws, nobody) for point, of in due.items()}, sent
-    )
+    broadcasts = {point: SentIntents(intents, of.draws, nobody) for point, of in due.items()}
+    return heard_codes(due, broadcasts, sent, len(intents.own))
 
 
 def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None:

@@ -146,8 +146,8 @@ def test_a_name_of_a_sweeps_axis_means_the_same_in_a_condition(name):
         ("6g:consensus=vote", "unknown consensus 'vote'"),
         ("6g:messages=none", "unknown messages 'none'"),
         (
-            "6g:consensus=ego-prompt,messages=shuffled",
-            "messages is 'shuffled'; it must be own or blind where consensus",
+            "6g:content=oracle,messages=shuffled",
+            "messages is 'shuffled'; it must be own or blind where content is oracle",
         ),
     ],
 )

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset
 from harness.evaluate.dry_run import count
-from harness.evaluate.fusion import messages_of
+from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
@@ -48,24 +48,27 @@ def told(words: object, action: str = "SLOWER") -> str:
 class Talkative(Scripted):
     """Helpers say what `words` has for them; an ego brakes if its prompt tells of a danger."""
 
-    def __init__(self, words: Mapping[str, str]) -> None:
+    def __init__(self, words: Mapping[str, str], speak: Callable[[str], str] = lambda scene: "") -> None:
         super().__init__({})
-        self.words, self.requests = words, list[Request]()
+        self.words, self.speak, self.requests = words, speak, list[Request]()
 
     def _say(self, request: Request) -> Completion:
         self.requests.append(request)
         name = request.id.partition("/")[2].removesuffix("~blind")
         if request.role == "helper":
-            text = told(self.words.get(name, ""), "IDLE")
+            text = told(self.words.get(name) or self.speak(request.id.partition("/")[0]), "IDLE")
         else:
             action = "SLOWER" if "danger" in request.messages[-1]["content"] else "IDLE"
             text = json.dumps({"maneuver": action, "confidence": 0.5})
         return Completion(request.id, text, None, None, "stop", None, 1)
 
 
-def asked(dataset: Dataset, words: Mapping[str, str], *points: OperatingPoint) -> dict[str, str]:
+def asked(
+    dataset: Dataset, words: Mapping[str, str], *points: OperatingPoint,
+    speak: Callable[[str], str] = lambda scene: "",
+) -> dict[str, str]:  # fmt: skip
     """Return the last turn of each question to the ego with words of helpers, by its senders."""
-    backend = Talkative(words)
+    backend = Talkative(words, speak)
     walked(spec(dataset, *points), backend)
     return {
         request.id.partition("/v1+")[2]: request.messages[-1]["content"]
@@ -129,6 +132,15 @@ def test_a_helper_that_sees_nothing_speaks_of_nothing(few: Dataset) -> None:
     walked(spec(few, TEXT.changed(messages="blind")), backend)
     assert {r.id.partition("/")[2] for r in backend.requests if "/v1+" in r.id} == {"v1+v2~blind!text"}
     assert [r for r in backend.requests if r.id.endswith("/v2~blind")]
+
+
+def test_shuffled_words_are_those_of_another_layout(few: Dataset) -> None:
+    """A helper speaks of its own scene; the ego hears of one that is not its own."""
+    texts = asked(few, {}, TEXT.changed(messages="shuffled"), speak=lambda scene: f"This is {scene}.")
+    assert texts
+    for senders, text in texts.items():
+        source = source_of("", senders.split("+"))
+        assert f'"This is {source}."' in text
 
 
 def test_injected_words_are_the_attackers(few: Dataset) -> None:

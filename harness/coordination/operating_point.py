@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_type_hints
 from msgspec import structs
 
 from harness.coordination.attacks import ATTACKS, Absent, attacks_of, in_question
-from harness.coordination.contents import CONTENTS, INTENT, OBJECTS, Content
+from harness.coordination.contents import CONTENTS, INTENT, OBJECTS, TRUTH, Content
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.parts import FUSION, RELAY, Ask, Cloud, Fusion, Guard, Part, Radio, wrong
 from harness.coordination.robust import Heads
@@ -48,6 +48,7 @@ class Rewrites(NamedTuple):
     graph: str = ""  # what the ego's graph is extended by (`contents.Content`)
     # what the prompt shows of messages: all of each, its words alone, or nothing
     shows: Literal["message", "words", ""] = "message"
+    shuffled: bool = False  # whether they come from another layout
 
 
 AS_SENT = Rewrites()
@@ -84,7 +85,7 @@ class OperatingPoint:
         if self.cloud.round_trip and self.has_fusion_call:
             twice = f"consensus is {EGO_PROMPT}" if self.content == CONTENTS[INTENT] else holds
             raise wrong("round_trip", self.cloud.round_trip, f"left out where {twice}, which asks twice")
-        if self.content.asks_again and self.ask.messages == "shuffled":
+        if self.content.graph == TRUTH and self.ask.messages == "shuffled":
             raise wrong("messages", "shuffled", f"own or blind where {holds}")
         if self.content.asks_again and self.radio.edge == FUSION:
             raise wrong(
@@ -117,8 +118,6 @@ class OperatingPoint:
             raise wrong("content", self.ask.content, allowed)
         if self.radio.edge == FUSION:
             raise wrong("edge", FUSION, f"none or relay {where}: a unit has no model")
-        if self.ask.messages == "shuffled":
-            raise wrong("messages", "shuffled", f"own or blind {where}")
 
     @classmethod
     def of(cls, name: str, profile: str | None = None, **settings: Any) -> "OperatingPoint":
@@ -319,7 +318,7 @@ class OperatingPoint:
         shows: Literal["message", "words", ""] = "words" if self.content.words else whole
         graph = self.content.graph
         attack = in_question(self.guard.attack, bool(shows), bool(graph))
-        return Rewrites(self.blind_helpers, attack, defences, graph, shows)
+        return Rewrites(self.blind_helpers, attack, defences, graph, shows, self.ask.messages == "shuffled")
 
     def _wrong(self, key: str, allowed: str) -> UserError:
         return _error_of(self.name, wrong(key, self.setting(key), allowed))

@@ -21,7 +21,7 @@ from harness.core.errors import Unanswered
 from harness.core.files import canonical_bytes, digest
 from harness.dataset.load import Scene
 from harness.evaluate import flip, repair, servers
-from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of
+from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of, source_of
 from harness.evaluate.kept_answers import KeptAnswers
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
@@ -377,11 +377,12 @@ class Asker:
         """Return the requests of the fusion calls with these sets of messages."""
         sets = list(_heard_sets(scenes, codes, rewrites))
         lacks = [fusion_id(*each) not in self.answers for each in sets]
-        graphs = iter(shared_graphs(self.spec.scenario, list(compress(sets, lacks))))
+        by_id = {scene.id: scene for scene in scenes}
+        graphs = iter(shared_graphs(self.spec.scenario, list(compress(sets, lacks)), by_id))
         calls = []
         for (scene, senders), lacking in zip(sets, lacks, strict=True):
-            keys = (key.partition(REWRITTEN)[0] for key in senders)
-            sent = {key: a for key in keys if (a := self.answers.get(f"{scene.id}/{key}"))}
+            source, keys = source_of(scene.id, senders), (key.partition(REWRITTEN)[0] for key in senders)
+            sent = {key: a for key in keys if (a := self.answers.get(f"{source}/{key}"))}
             calls.append(fusion_request(self.spec, scene, sent, senders, next(graphs) if lacking else None))
         return calls
 
@@ -414,8 +415,9 @@ def _heard_sets(
     helpers = max(len(scene.viewers) for scene in scenes) - 1
     for code in codes.tolist():
         at, heard, attacking = heard_in(code, helpers, bool(rewrites.attack))
-        scene = scenes[at]
-        yield scene, [key_of(scene.viewers[1 + h], rewrites, h in attacking) for h in heard]
+        at, source = divmod(at, len(scenes)) if rewrites.shuffled else (at, at)
+        name, viewers = scenes[source].id if rewrites.shuffled else "", scenes[source].viewers
+        yield scenes[at], [key_of(viewers[1 + h], rewrites, h in attacking, name) for h in heard]
 
 
 def _text(answer: Answer | None) -> str:

@@ -47,7 +47,7 @@ def lacking(spec: Spec, dataset: Dataset, scenes: Sequence[str], answers: Contai
 
     All are counted that may be asked there, whoever is heard.
     """
-    lacks, sends = Counter[str](), any(point.asks and point.content.intent for point in spec.points)
+    lacks, sends = Counter[str](), any(point.asks and point.content.asks_helpers for point in spec.points)
     for scene in dataset.scenes(scenes):
         viewers = spec.viewers(scene)
         own = {"ego": viewers[:1], "helper": viewers[1:] if sends else ()}
@@ -58,15 +58,22 @@ def lacking(spec: Spec, dataset: Dataset, scenes: Sequence[str], answers: Contai
 
 
 def _fusion_calls(spec: Spec, scene: Scene) -> Iterator[str]:
-    """Yield the ids of the fusion calls that a scene needs at most."""
-    most: dict[Rewrites, int] = {}
+    """Yield the ids of the fusion calls that a scene needs at most.
+
+    Where messages are shuffled, each condition and seed may hear another layout, whose id stands open.
+    """
+    most, sources = dict[Rewrites, int](), dict[Rewrites, list[str]]()
     for point in spec.points:
         if point.has_fusion_call and point.asks:
-            most[point.rewrites] = max(point.ask.max_helpers, most.get(point.rewrites, 0))
+            rewrites = point.rewrites
+            most[rewrites] = max(point.ask.max_helpers, most.get(rewrites, 0))
+            open_ids = [f"{point.name}-{seed}" for seed in spec.seeds]
+            sources[rewrites] = [*sources.get(rewrites, ()), *open_ids] if rewrites.shuffled else [""]
     helpers = scene.viewers[1:]
     for rewrites, others in most.items():
         for n in range(1, min(others, len(helpers)) + 1):
             for heard in combinations(helpers, n):
                 for attacks in product((False, True) if rewrites.attack else (False,), repeat=n):
-                    keys = [key_of(helper, rewrites, a) for helper, a in zip(heard, attacks, strict=True)]
-                    yield fusion_id(scene, keys)
+                    those = list(zip(heard, attacks, strict=True))
+                    for source in sources[rewrites]:
+                        yield fusion_id(scene, [key_of(helper, rewrites, a, source) for helper, a in those])

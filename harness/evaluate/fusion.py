@@ -21,6 +21,7 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.evaluate.repair import as_text
 from harness.runs.records import BLIND, REWRITTEN, Answer
 
+FROM = "from:"  # in a key, before the id of the scene that a shuffled message comes from
 WORDS = "words"  # in a key, after what the graph is extended by: the prompt shows the messages, too
 
 
@@ -66,29 +67,38 @@ def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list
     return code >> bits, heard, [h for h in heard if attacked and code >> (helpers + h) & 1]
 
 
-def key_of(helper: str, rewrites: Rewrites, attacks: bool) -> str:
+def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> str:
     """Return the key of a helper's message in a fusion call.
 
-    Such as `v2`, `v2~blind`, `v3!liar&schema`, `v2!text` where it holds words alone, or `v2!objects` where
-    the ego's graph has its objects.
+    Such as `v2`, `v2~blind`, `v3!liar&schema`, `v2!text` where it holds words alone, `v2!objects` where the
+    ego's graph has its objects, or `v2!objects&from:00012-3` where it comes from another scene, the `source`.
     """
     changed = [*([rewrites.attack] if attacks and rewrites.attack else []), *rewrites.defences]
     if rewrites.graph:
         changed += [rewrites.graph, *([WORDS] if rewrites.shows else [])]
     elif rewrites.shows == "words":
         changed.append(TEXT)
+    if source:
+        changed.append(FROM + source)
     return helper + BLIND * rewrites.blind + (REWRITTEN + "&".join(changed) if changed else "")
 
 
 def changes_of(key: str) -> list[str]:
     """Return how the message of a sender's key was changed, and what it holds if not an intent alone."""
-    return [change for change in key.partition(REWRITTEN)[2].split("&") if change]
+    changes = key.partition(REWRITTEN)[2].split("&")
+    return [change for change in changes if change and not change.startswith(FROM)]
+
+
+def source_of(scene: str, senders: Sequence[str]) -> str:
+    """Return the id of the scene whose helpers sent the messages that an ego heard in a scene."""
+    changes = (change for key in senders for change in key.partition(REWRITTEN)[2].split("&"))
+    return next((change.removeprefix(FROM) for change in changes if change.startswith(FROM)), scene)
 
 
 def messages_of(
     answers: Mapping[str, Answer], senders: Sequence[str], actions: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return these helpers' messages as a prompt takes them; `answers` are a point's, by key.
+    """Return these helpers' messages as a prompt takes them; `answers` are those of their scene, by key.
 
     One that holds words alone has a `sender` and `evidence`, in one line.
     """

@@ -1,8 +1,9 @@
 """Make the scene graphs that egos are asked with once helpers have shared what they see."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from msgspec import structs
 
 from harness.coordination.attacks import ATTACKS, attacks_of
 from harness.coordination.contents import OBJECTS, TRUTH
@@ -10,7 +11,7 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
 from harness.dataset.load import Scene
-from harness.evaluate.fusion import changes_of
+from harness.evaluate.fusion import changes_of, source_of
 from harness.runs.records import BLIND, REWRITTEN, Answer
 from harness.world.perception.graph import truth_graphs
 from harness.world.perception.shared import Heard, invented, merged
@@ -19,26 +20,31 @@ from harness.world.scene_graph import SceneGraph
 
 
 def shared_graphs(
-    scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]]
+    scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]], scenes: Mapping[str, Scene]
 ) -> Sequence[SceneGraph | None]:
     """Return the ego's graph for each scene and the keys of those who were heard in it (`fusion.key_of`).
 
-    None where their messages hold no objects. All sets have messages of one content.
+    None where their messages hold no objects. All sets have messages of one content; `scenes` has the scenes
+    that these come from, by id.
     """
     changes = {change for _, senders in sets for key in senders for change in changes_of(key)}
     if TRUTH in changes:
         return truth_graphs(scenario, [scene.state for scene, _ in sets])
     if OBJECTS not in changes:
         return [None] * len(sets)
-    cases = [
-        Heard(
-            scene.state,
-            scene.graphs[scene.viewers[0]],
-            [_sent(scenario, scene, key) for key in senders],
-        )
-        for scene, senders in sets
-    ]
+    cases = []
+    for scene, senders in sets:
+        source = scenes[source_of(scene.id, senders)]
+        graphs = [_sent(scenario, source, key) for key in senders]
+        if source.id != scene.id:
+            graphs = [_without_ego(graph) for graph in graphs]
+        cases.append(Heard(scene.state, scene.graphs[scene.viewers[0]], graphs, source.state))
     return merged(scenario, cases)
+
+
+def _without_ego(graph: SceneGraph) -> SceneGraph:
+    """Return a graph without the ego, which the ego that hears it would take for somebody else."""
+    return structs.replace(graph, nodes=tuple(node for node in graph.nodes if node.id != graph.ego.id))
 
 
 def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
@@ -52,10 +58,11 @@ def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
     return graph
 
 
-def as_asked(scenario: Scenario, scene: Scene, answer: Answer) -> Scene:
+def as_asked(scenario: Scenario, scene: Scene, answer: Answer, source: Scene | None = None) -> Scene:
     """Return a decision point as it was shown to who gave an answer.
 
-    A blind helper saw nothing; an ego that was asked again may have had the objects of others.
+    A blind helper saw nothing; an ego that was asked again may have had the objects of others, of the scene
+    `source` (`fusion.source_of`) if their messages were shuffled.
 
     Raises:
         UserError: the answer names a sender or an attack that there is not, as only a stranger's can.
@@ -63,7 +70,9 @@ def as_asked(scenario: Scenario, scene: Scene, answer: Answer) -> Scene:
     if answer.role == "blind":
         return scene.changed(graphs={viewer: graph.blinded() for viewer, graph in scene.graphs.items()})
     try:
-        [graph] = shared_graphs(scenario, [(scene, answer.heard)])
+        [graph] = shared_graphs(
+            scenario, [(scene, answer.heard)], {each.id: each for each in (source, scene) if each}
+        )
     except KeyError as error:
         raise UserError(
             f"answers.jsonl has an answer in scene {printable(scene.id)} that heard {printable(error)}, "

@@ -239,6 +239,11 @@ class Spec:
             raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
         if point.has_fusion_call and point.content.graph and ego.can.language_model:
             self._check_shows_objects(shown)
+        if point.has_fusion_call and point.rewrites.shuffled and self.device_profile:
+            raise UserError(
+                f"{shown}: energy is known of messages of the ego's own layout alone; leave "
+                "--device-profile out, or messages=shuffled"
+            )
         if not (point.has_fusion_call and point.rewrites.shows):
             return
         reason = self.fusion_obstacle

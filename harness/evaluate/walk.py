@@ -181,7 +181,11 @@ def walk(
         for point, due_here in due.items():
             broadcast = broadcasts[point]
             call = (
-                calls[point.rewrites](due_here.at, shown(point, broadcast)) if point.has_fusion_call else None
+                calls[point.rewrites](
+                    places_of(point, due_here, len(decision_points)), shown(point, broadcast)
+                )
+                if point.has_fusion_call
+                else None
             )
             fusion = FusionInputs(call, memories[point].recall(due_here), tie_draws(due_here.draws, ties))
             result = fuse(point, sent[point], broadcast.intents, fusion)
@@ -240,8 +244,9 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
 
 
 def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:
-    names = ("helpers", "payload_bits", "text_bytes", "unasked")
-    return replace(own, valid=valid, **{name: getattr(source, name) for name in names})
+    names = ("helpers", "payload_bits", "text_bytes", "unasked", "objects", "object_bits")
+    sent = {name: array for name in names if (array := getattr(source, name)) is not None}
+    return replace(own, valid=valid, **sent)
 
 
 def _able(point: OperatingPoint, intents: Intents) -> Intents:
@@ -300,21 +305,34 @@ def _fusion_calls(
     calls = {}
     for rewrites in dict.fromkeys(point.rewrites for point in due if point.has_fusion_call):
         alike = {point: due_here for point, due_here in due.items() if point.rewrites == rewrites}
-        calls[rewrites] = ask.fusion_call(decision_points, heard_codes(alike, broadcasts, sent), rewrites)
+        codes = heard_codes(alike, broadcasts, sent, len(decision_points))
+        calls[rewrites] = ask.fusion_call(decision_points, codes, rewrites)
     return calls
 
 
 def heard_codes(
     due: Mapping[OperatingPoint, Due], broadcasts: Mapping[OperatingPoint, SentIntents],
-    sent: Mapping[OperatingPoint, Exchange],
+    sent: Mapping[OperatingPoint, Exchange], n: int,
 ) -> Ints:  # fmt: skip
-    """Return the sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
+    """Return the sets of messages that the conditions with fusion calls hear (`codes_of`), ascending.
+
+    There are `n` decision points.
+    """
     codes = [np.empty(0, dtype=int)]
     for point, due_here in due.items():
         if point.has_fusion_call:
             on_time = sent[point].on_time
-            codes.append(codes_of(on_time, due_here.at, shown(point, broadcasts[point]))[on_time.any(axis=1)])
+            codes_here = codes_of(on_time, places_of(point, due_here, n), shown(point, broadcasts[point]))
+            codes.append(codes_here[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
+
+
+def places_of(point: OperatingPoint, due: Due, n: int) -> Ints:
+    """Return a number for each decision, (n,): of its point, and of that of its helpers if shuffled.
+
+    With `n` decision points, the number of a shuffled one is n times the first and the second.
+    """
+    return due.at * n + due.at[_sources(point, due)] if point.rewrites.shuffled else due.at
 
 
 def shown(point: OperatingPoint, broadcast: SentIntents) -> Bools | None:

@@ -19,7 +19,7 @@ from harness.dataset.forest import Forest
 from harness.dataset.load import Scene
 from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.device import answer_s
-from harness.evaluate.fusion import messages_of
+from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.parsing.parse import spans
 from harness.prompts.versions import Prompt
@@ -156,7 +156,8 @@ class Details:
             }
             shown |= {key: text(shown[key]) for key in ("error", "detail") if key in shown}
             asked = None
-            if scene and prompts:
+            # Shuffled messages are in the details of another scene.
+            if scene and prompts and source_of(name, answer.heard) == name:
                 heard = messages_of(by_viewer, answer.heard, run.actions)
                 messages = prompts(as_asked(self.runs.scenario, scene, answer), answer.viewer, heard)
                 key = digest(messages)

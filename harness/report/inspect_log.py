@@ -17,7 +17,7 @@ from harness.core.errors import UserError
 from harness.core.files import digest, replacing
 from harness.core.places import nameless, text
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.fusion import messages_of
+from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.report.details import prompts_of
 from harness.report.page import refuse_less
@@ -102,8 +102,11 @@ def _samples(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> 
         for answer in answers.values():
             asked: Sequence[Mapping[str, str]] = ()
             if sent and dataset and name in scenes:
-                heard = messages_of(answers, answer.heard, run.actions)
-                asked = sent(as_asked(dataset.scenario, scenes[name], answer), answer.viewer, heard)
+                source = source_of(name, answer.heard)
+                said = {each.key: each for each in run.answers_by_scene.get(source, ())}
+                heard = messages_of(said, answer.heard, run.actions)
+                shown = as_asked(dataset.scenario, scenes[name], answer, scenes.get(source))
+                asked = sent(shown, answer.viewer, heard)
             yield _sample(run, answer, asked, target, kept if answer.role in ("ego", "merge") else {}, facts)
 
 

@@ -27,7 +27,7 @@ from harness.dataset.load import Scene
 from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.fusion import codes_of
-from harness.evaluate.walk import Decided, Memory, shown, walk
+from harness.evaluate.walk import Decided, Memory, places_of, shown, walk
 from harness.prompts.versions import listed as listing
 from harness.report.document import Table
 from harness.runs.attribution import FILE, Attribution, LeftOut
@@ -169,12 +169,13 @@ def _messages(
     broadcast = part.said.take(decisions)
     taken = {field.name: getattr(part.result, field.name)[decisions] for field in fields(part.result)}
     whole, at = replace(part.result, **taken), due.at[decisions]
+    places = places_of(point, due, len(points))[decisions]
     rest = whole.on_time & (np.arange(whole.on_time.shape[1]) != helpers[:, None])
     call = None
     if point.has_fusion_call:
         attackers = shown(point, broadcast)
-        codes = np.unique(codes_of(rest, at, attackers)[rest.any(axis=1)])
-        call = stored.fusion_call(points, codes, point.rewrites)(at, attackers)
+        codes = np.unique(codes_of(rest, places, attackers)[rest.any(axis=1)])
+        call = stored.fusion_call(points, codes, point.rewrites)(places, attackers)
     fusion = FusionInputs(call, None if state is None else state[decisions])
     less = fuse(point, replace(whole, on_time=rest), broadcast.intents, fusion)
     for n, voice in enumerate(helpers.tolist()):

@@ -16,7 +16,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.seeds import FIRST, purpose, stated
 from harness.evaluate.agent import in_mode, shown
-from harness.evaluate.fusion import messages_of
+from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.prompts import readout
 from harness.runs.folder import Run, check_scenes, dataset_of
@@ -91,8 +91,12 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
                 )
             agent = run.agent(stored)
             prompt = prompts[agent["prompt"]["version"]]
-            messages = messages_of(answers, stored.heard, run.actions)
-            asked_with = as_asked(dataset.scenario, scene, stored)
+            said, source = answers, scene
+            if (other := source_of(scene.id, stored.heard)) != scene.id:
+                said = {each.key: each for each in run.answers_by_scene.get(other, ())}
+                [source] = dataset.scenes([other])
+            messages = messages_of(said, stored.heard, run.actions)
+            asked_with = as_asked(dataset.scenario, scene, stored, source)
             q = question(lessons, asked_with, stored.viewer, prompt, messages)
             texts = shown(agent["image"], q.messages)
             words = dataset.scenario.prompt_words

@@ -43,6 +43,7 @@ class Heard(NamedTuple):
     state: WorldState
     own: SceneGraph  # the ego's graph
     helpers: Sequence[SceneGraph]  # the graphs of the helpers that were heard
+    source: WorldState | None = None  # the state in which these helpers are; None for the ego's
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def _reports(p: Parameters, case: Heard) -> list[Report]:
     accepted = [_itself(p, ego, exact=True)]
     senders = [own]
     for graph in case.helpers:
-        sender = stated(p, case.state, graph.viewer)
+        sender = stated(p, case.source or case.state, graph.viewer)
         senders.append([_itself(p, sender), *(_reported(p, sender, node) for node in graph.sensed)])
     for reports in senders:
         accepted = _joined(accepted, reports)
