@@ -204,12 +204,15 @@ def test_what_a_run_lacks_has_an_entry(run: str) -> None:
     }
     for table, names in lacks.items():
         assert names <= getattr(formats, table).keys(), f"add an entry to formats.{table}"
-    assert {*records.Episode.__struct_fields__} <= {*head}
+    assert {*records.Episode.__struct_fields__} <= {*head, *formats.EPISODE}
     with (HERE / run / "answers.jsonl").open() as lines:
         assert {*records.Answer.__struct_fields__} <= {*json.loads(next(lines)), "heard", *formats.ANSWER}
 
 
-@pytest.mark.parametrize(("kind", "added"), [(records.Answer, formats.ANSWER), (RunStart, formats.START)])
+@pytest.mark.parametrize(
+    ("kind", "added"),
+    [(records.Answer, formats.ANSWER), (records.Episode, formats.EPISODE), (RunStart, formats.START)],
+)
 def test_a_struct_has_the_defaults_that_the_table_states(kind: type, added: dict) -> None:
     stated = {field.name: field for field in msgspec.structs.fields(kind)}
     for name, entry in added.items():

@@ -92,6 +92,13 @@ class Forest:
         )
 
     @cached_property
+    def harms(self) -> Bools:
+        """Whether each edge ends in a collision or off the road, (edges,)."""
+        return np.array(
+            [edge.end is not None and RATINGS[edge.end.result] == "unsafe" for edge in self.edges]
+        )
+
+    @cached_property
     def earliest_s(self) -> Floats:
         """The earliest time at which the goal can be reached after each action, (N, A); inf for never."""
         earliest_s = self.cleared_s[self.edge]
@@ -104,8 +111,7 @@ class Forest:
     @cached_property
     def avoids_harm(self) -> Bools:
         """Whether an end without a collision and on the road is still possible after each action, (N, A)."""
-        ratings = [edge.end and RATINGS[edge.end.result] for edge in self.edges]
-        avoids = np.array([rating in ("success", "late", "stuck") for rating in ratings])[self.edge]
+        avoids = ~self.harms[self.edge]
         for rows in self._levels_backwards():
             child = self.child[rows]
             avoids[rows] = np.where(child >= 0, avoids[child].any(axis=-1), avoids[rows])

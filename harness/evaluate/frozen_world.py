@@ -17,6 +17,7 @@ from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World
 from harness.runs.records import Episode, FrozenScenes
+from harness.world.outcome import rating
 from harness.world.parameters import frames
 from harness.world.scenario import Scenario
 
@@ -157,6 +158,7 @@ class FrozenWorld(SceneWorld):
             "value": forest.value[at], "safe": forest.safe[at, action],
             "regret": np.where(forest.value[at], ~forest.safe[at, action], np.nan),
             "delay_s": forest.delay_s[at, action],
+            "miss": forest.miss[at, action], "false_alarm": forest.false_alarm[at, action],
             "off_lag": np.where(np.isnan(latency_s), np.nan, off_lag),
             **by_action("safe", forest.safe[at], forest.actions),
             **by_action("delay_s", forest.delay_s[at], forest.actions),
@@ -172,7 +174,8 @@ class FrozenWorld(SceneWorld):
         walks, trees = self._walks[point], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])
         success = self._forest.succeeds(walks.last, trees)
-        ends = {"success_rate": success, "unsafe_rate": ~cleared, "late_rate": cleared & ~success}
+        unsafe = ~cleared if self.scenario.parameters.limits == 1 else self._forest.harms[walks.last]
+        ends = {"success_rate": success, "unsafe_rate": unsafe, "late_rate": cleared & ~success}
         return {name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()}
 
     def episodes(self) -> list[Episode]:
@@ -187,12 +190,15 @@ class FrozenWorld(SceneWorld):
         forest, last = self._forest, int(walks.last[index])
         edges = [forest.edges[taken[index]] for taken in walks.edges if taken[index] >= 0]
         end, reference_s = forest.end(last), float(forest.reference_s[tree])
+        earliest_s = float(forest.earliest_s[forest.root[tree]].min())
         cleared = end.result == "cleared"
         success = bool(forest.succeeds(np.array(last), np.array(tree)))
+        failure = "" if success else "late" if cleared else end.result
         return Episode(
             condition=condition, seed=int(self._seeds[seed]), episode=int(forest.episodes[tree]),
             layout_seed=int(forest.seeds[tree]), danger=forest.dangers[tree] or "none", success=success,
-            failure="" if success else "late" if cleared else end.result,
+            failure=failure, outcome=rating(failure, self.scenario.parameters),
+            time_lost_s=round(end.time_s - earliest_s, 3) if cleared else None,
             delay_s=round(end.time_s - reference_s, 3) if cleared and np.isfinite(reference_s) else None,
             time_s=end.time_s, partner=end.partner, striker=end.striker, fault=end.fault,
             least_gap_m=min(edge.least_gap_m for edge in edges),

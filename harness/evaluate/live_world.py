@@ -27,7 +27,7 @@ from harness.runs import metrics
 from harness.runs.records import ClosedLoop, Episode
 from harness.world import reference, scenarios
 from harness.world.drivers import PRIVILEGED
-from harness.world.outcome import Outcome
+from harness.world.outcome import Outcome, rating
 from harness.world.parameters import frames
 from harness.world.scenario import Scenario
 from harness.world.world import World
@@ -199,13 +199,14 @@ def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) 
     world = trajectory.world
     ended = world.outcome
     outcome = ended.judged(full_view, world.layout.danger, world.scenario.parameters) if full_view else ended
+    failure = "" if outcome.success else outcome.result
     delay_s = None
     if full_view and full_view.time_s is not None and full_view.success and ended.success:
         delay_s = round((ended.time_s or 0.0) - full_view.time_s, 3)
     return Episode(
         condition=course.point.name, seed=course.seed, episode=trajectory.number, layout_seed=world.seed,
-        danger=world.layout.danger or "none", success=outcome.success,
-        failure="" if outcome.success else outcome.result, delay_s=delay_s, time_s=outcome.time_s,
+        danger=world.layout.danger or "none", success=outcome.success, failure=failure,
+        outcome=rating(failure, world.scenario.parameters), delay_s=delay_s, time_s=outcome.time_s,
         partner=outcome.partner, striker=outcome.striker, fault=outcome.fault,
         least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=world.hard_brakings,
         other_crashes=outcome.other_crashes, skipped=course.skipped,

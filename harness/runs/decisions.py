@@ -32,10 +32,10 @@ COLUMNS = {
     "normalised_entropy": NUMBER, "own_weight": NUMBER, "latency_ms": NUMBER, "deadline_missed": FLAG,
     "fusion_ms": NUMBER, "fusion_failed": FLAG, "effective_loss": NUMBER, "observed_loss": NUMBER,
     "value": FLAG, "safe": FLAG, "regret": FLAG, "delay_s": NUMBER, "off_lag": FLAG, "acts_at_s": NUMBER,
-    "acted": FLAG,
+    "acted": FLAG, "miss": FLAG, "false_alarm": FLAG,
 }  # fmt: skip
 # A file has no such column if all its values are unknown.
-OPTIONAL = ("busy_ratio", "inference_j", "helpers_j", "radio_mj", "waiting_j")
+OPTIONAL = ("busy_ratio", "inference_j", "helpers_j", "radio_mj", "waiting_j", "miss", "false_alarm")
 NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # One column for each action: the policy, and the outcome of the action.
 OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}

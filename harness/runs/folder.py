@@ -454,13 +454,19 @@ def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | N
 def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     hints = dict(zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True))
     optional = {name for name, hint in hints.items() if type(None) in get_args(hint)}
+    parsed = pacsv.ParseOptions(newlines_in_values=True)
     with arrow_file(file) as lines:
+        there = pacsv.open_csv(lines, parse_options=parsed).schema.names
+        lines.seek(0)
+        if lacking := hints.keys() - {*there, *formats.EPISODE}:
+            raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
         table = pacsv.read_csv(
             lines,
-            parse_options=pacsv.ParseOptions(newlines_in_values=True),
+            parse_options=parsed,
             convert_options=pacsv.ConvertOptions(
                 column_types={name: _KINDS[(*get_args(hint), hint)[0]] for name, hint in hints.items()},
-                include_columns=list(hints), null_values=[""], true_values=["True"], false_values=["False"],
+                include_columns=list(hints), include_missing_columns=True, null_values=[""],
+                true_values=["True"], false_values=["False"],
             ),
         )  # fmt: skip
     columns = {}

@@ -98,7 +98,16 @@ COLUMNS: Mapping[str, Added] = {
     **dict.fromkeys(("inference_j", "helpers_j", "radio_mj", "waiting_j"),
                     Added("2026-11-23", None, "energy; also missing without a device profile")),
     "busy_ratio": Added("2026-11-23", None, "load of the channel; also missing where it is not known"),
+    **dict.fromkeys(("miss", "false_alarm"),
+                    Added("2026-11-27", None, "misses and false alarms; also missing in closed loop")),
 }  # fmt: skip
+# Columns of episodes.csv; `records.Episode` has the same defaults.
+EPISODE: Mapping[str, Added] = dict.fromkeys(
+    ("outcome", "time_lost_s", "miss", "false_alarm"),
+    Added(
+        "2026-11-27", None, "the price of caution; also empty in closed loop, and `outcome` under limits 1"
+    ),
+)
 
 
 def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,8 +4,8 @@ A package adds a metric by an entry point in the group `swarmdrive.metrics`.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal, Protocol, get_args
 
@@ -22,6 +22,7 @@ from harness.core.statistics import (
     brier,
     episode_interval,
     known_mean,
+    mean_of,
     negative_log_likelihood,
     rate_difference,
     rate_interval,
@@ -38,6 +39,8 @@ Better = Literal["higher", "lower", "neither"]
 Answers = Sequence[Answer | AnswerFacts]
 BASELINE = "single-local"  # the condition without V2V
 SUCCESS, LATENCY, GAIN = "success_rate", "latency_proxy_ms", f"success_gain_over_{BASELINE}"
+BALANCED = "balanced_success_rate"
+GAINS = {SUCCESS: GAIN, BALANCED: f"balanced_success_gain_over_{BASELINE}"}  # by what is gained
 PERCENTILES = (50, 95, 99)
 ALL = "all"  # the condition of a figure that is the same in all of them
 ROLES: tuple[Role, ...] = get_args(Role)
@@ -75,6 +78,9 @@ class Metric:
     total: bool = False  # whether an episode has the sum over its decisions instead of the mean
     world: World | None = None  # the world in which it is known; None for every world
     optional: bool = False  # whether a run in which it is nowhere known has no row of it
+    half: bool = False  # whether it is of the episodes with a danger alone, or of those without
+    # two metrics of a half of the episodes each, whose mean it is
+    halves: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.label:
@@ -83,7 +89,7 @@ class Metric:
     @property
     def compared(self) -> bool:
         """Whether two runs are compared in it, as in any that is known of an episode or of all decisions."""
-        return bool(self.decisions or self.episodes or self.percentile)
+        return bool(self.decisions or self.episodes or self.percentile or self.halves)
 
 
 class Metrics(Plugins[Metric]):
@@ -103,7 +109,7 @@ class Metrics(Plugins[Metric]):
 
 
 def _rate(
-    name: str, meaning: str, happened: Callable[[Episode], bool], better: Better = "lower", **more: Any
+    name: str, meaning: str, happened: Callable[[Episode], bool | None], better: Better = "lower", **more: Any
 ) -> Metric:
     return Metric(name, meaning, PERCENT, better, "rate", 1.0, episodes=happened, **more)
 
@@ -111,6 +117,19 @@ def _rate(
 def _share(name: str, meaning: str, column: str, better: Better = "lower", **more: Any) -> Metric:
     """Build the metric of a share of decisions, one column of their table."""
     return Metric(name, meaning, PERCENT, better, "rate", 1.0, decisions=_column(column), **more)
+
+
+def _halves(
+    stem: str, meaning: str, value: Callable[[Episode], bool | None], better: Better = "lower"
+) -> Iterator[Metric]:
+    """Yield the metrics of a share of the episodes with a danger, and of those without."""
+    for half, which in (("dangerous", "with a danger"), ("harmless", "without a danger")):
+
+        def of_half(e: Episode, harmless: bool = half == "harmless") -> bool | None:
+            return value(e) if (e.danger == "none") == harmless else None
+
+        text = meaning.format(f"episodes {which}")
+        yield _rate(f"{stem}_{half}_rate", text, of_half, better, optional=True, half=True)
 
 
 def _fails(*failures: str) -> Callable[[Episode], bool]:
@@ -207,8 +226,13 @@ def _of_answers() -> Iterator[Metric]:
 BUILT_IN = (
     _rate(SUCCESS, "share of episodes in which the ego clears the intersection within the allowed time",
           _field("success"), "higher", primary=True),
-    _rate("unsafe_rate", "share of episodes that end in a collision, by time-out or off the road",
-          lambda e: not e.success and e.failure != "late", primary=True),
+    Metric(BALANCED, "mean of the success rates with and without a danger", PERCENT, "higher", "rate", 1.0,
+           halves=("success_dangerous_rate", "success_harmless_rate"), primary=True),
+    *_halves("success", "share of {} that succeed", _field("success"), "higher"),
+    _rate("unsafe_rate", "share of episodes that end in a collision or off the road; where `limits` is 1, by "
+          "time-out, too",
+          lambda e: e.outcome == "unsafe" if e.outcome else not e.success and e.failure != "late",
+          primary=True),
     _rate("collision_rate", "share of episodes that end in a collision", _fails("collision")),
     _rate("at_fault_rate", "share of episodes that end in a collision in which the ego had to give way",
           lambda e: e.fault == "ego"),
@@ -216,6 +240,15 @@ BUILT_IN = (
           _fails("late")),
     _rate("time_out_rate", "share of episodes in which time runs out before the ego clears the intersection",
           _fails("time_out")),
+    _rate("stuck_rate", "share of episodes in which the ego never clears, without harm",
+          lambda e: e.outcome == "stuck" if e.outcome else None, optional=True),
+    *_halves("miss", "share of {} in which a decision made harm inevitable, which was not before",
+             _field("miss")),
+    *_halves("false_alarm", "share of {} in which a decision gave success away, and harm could still be "
+             "avoided", _field("false_alarm")),
+    Metric("time_lost_s", "time from the earliest possible clearing until the ego's; only episodes in which "
+           "it clears, late or not", SECONDS, "lower", label="time lost", episodes=_field("time_lost_s"),
+           world="frozen", optional=True),
     _rate("off_road_rate", "share of episodes in which the ego leaves the road", _fails("off_road")),
     _share("regret_rate", "share of decisions that gave success away, of those in which it was still "
            "possible", "regret", world="frozen"),
@@ -289,6 +322,8 @@ BUILT_IN = (
              label=f"latency p{p}", percentile=p) for p in PERCENTILES),
     Metric(GAIN, "success rate less that of the condition without V2V, in the same episodes", POINTS,
            "higher", "rate", 1.0),
+    Metric(GAINS[BALANCED], "balanced success rate less that of the condition without V2V, in the same "
+           "episodes", POINTS, "higher", "rate", 1.0),
     *_of_answers(),
     Metric("agreement_rate", "share of episodes that end alike, frozen and in closed loop", PERCENT,
            "higher", "rate", 1.0),
@@ -400,6 +435,35 @@ def difference(name: str, a: Floats, b: Floats, level: float = 0.95) -> Estimate
     """Return the interval over episodes of the difference a - b of a metric, both (E, S)."""
     rate = entry(name).interval == "rate"
     return rate_difference(a, b, level) if rate else episode_interval(a - b, level=level)
+
+
+def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False) -> Estimate:
+    """Return a metric's estimate, from that of each of its halves where it has them.
+
+    Halves have no episode in common, so that the intervals are independent. They have all seeds in common:
+    of `shared` units n is that of each half, and of others the sum.
+    """
+    halves = entry(name).halves
+    if not halves:
+        return estimate(name)
+    first, second = map(estimate, halves)
+    mean = mean_of([first, second])
+    n, n_excluded = (first.n, first.n_excluded) if shared else (mean.n, (mean.n_excluded - mean.n) // 2)
+    return replace(mean, n=n, n_excluded=max(n_excluded, 0))
+
+
+def known_in(values: Mapping[str, Floats]) -> list[str]:
+    """Return the metrics that a run states whose values by episode are these, in their order.
+
+    Those by danger are stated only if episodes are of both kinds: a run whose scenes do not know their
+    dangers has none.
+    """
+    known = {name for name, v in values.items() if not (entry(name).optional and np.isnan(v).all())}
+    both = known.issuperset(entry(BALANCED).halves)
+    return [
+        m.name for m in METRICS.values()
+        if (m.name in known or m.halves) and (both or not (m.half or m.halves))
+    ]  # fmt: skip
 
 
 def p_value(name: str, a: Floats, b: Floats) -> float | None:

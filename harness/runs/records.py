@@ -258,6 +258,13 @@ class Episode(Struct, frozen=True, kw_only=True):
     decisions: int | None = None  # decisions begun
     skipped: int | None = None  # decisions not begun, since one was still open
     never_acted: int | None = None  # decisions that were not ready before the end
+    # how it ended: `success`, `late`, `unsafe` (a collision, or off the road) or `stuck` (never there); None
+    # where `limits` is 1
+    outcome: str | None = None
+    # by how much the ego cleared later than was possible; frozen only, like the next two
+    time_lost_s: float | None = None
+    miss: bool | None = None  # whether a decision made harm inevitable, which was not before
+    false_alarm: bool | None = None  # whether a decision gave success away, and harm could still be avoided
 
 
 class Variant(Struct, frozen=True):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from msgspec import structs
 
 from harness.core.arrays import Floats
 from harness.core.statistics import (
+    Estimate,
     episode_interval,
     rate_difference,
     rate_interval,
@@ -19,8 +20,10 @@ from harness.core.statistics import (
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import (
     ALL,
+    BALANCED,
     BASELINE,
     GAIN,
+    GAINS,
     LATENCY,
     METRICS,
     PERCENTILES,
@@ -29,8 +32,9 @@ from harness.runs.metrics import (
     Grid,
     World,
     by_episode,
-    entry,
+    halved,
     in_range,
+    known_in,
     mean_by_place,
     metrics_of,
     over_episodes,
@@ -79,23 +83,28 @@ class Figures:
         )
 
     def scores(self) -> list[Score]:
-        values = {
-            name: v for name, v in self.values.items() if not (entry(name).optional and np.isnan(v).all())
-        }
+        names = known_in(self.values)
         return [
-            *of_conditions(self.grid.conditions, values),
+            *of_conditions(self.grid.conditions, self.values, names),
             *of_latencies(self.grid, self.latency_ms),
-            *_gains(self.grid.conditions, values[SUCCESS]),
+            *_gains(self.grid.conditions, self.values, GAINS if BALANCED in names else {SUCCESS: GAIN}),
             *_of_answers(self.answers),
         ]
 
 
-def of_conditions(conditions: Sequence[str], values: Mapping[str, Floats]) -> Iterator[Score]:
-    """Yield each metric's scores in each condition, over seeds and over episodes, from values (C, S, E)."""
+def of_conditions(
+    conditions: Sequence[str], values: Mapping[str, Floats], names: Sequence[str]
+) -> Iterator[Score]:
+    """Yield these metrics' scores in each condition, over seeds and over episodes, from values (C, S, E)."""
     for index, condition in enumerate(conditions):
-        for name, by_condition in values.items():
-            yield Score.of(condition, name, over_seeds(name, by_condition[index]), "seed means")
-            yield Score.of(condition, name, over_episodes(name, by_condition[index]), "episodes")
+
+        def scores(name: str, index: int = index, condition: str = condition) -> Iterator[Score]:
+            seeds = halved(name, lambda each: over_seeds(each, values[each][index]), shared=True)
+            yield Score.of(condition, name, seeds, "seed means")
+            episodes = halved(name, lambda each: over_episodes(each, values[each][index]))
+            yield Score.of(condition, name, episodes, "episodes")
+
+        yield from chain.from_iterable(map(scores, names))
         total = values["messages_per_episode"][index].sum(axis=1)
         yield Score.of(condition, "message_count", seed_interval(total), "seed means")
 
@@ -113,14 +122,24 @@ def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
             yield Score.of(condition, names[percent], in_range(LATENCY, seed_interval(values)), "seed means")
 
 
-def _gains(conditions: Sequence[str], success: Floats) -> Iterator[Score]:
-    """Yield each condition's gain over `BASELINE`, from success (C, S, E)."""
-    if BASELINE in conditions:
-        baseline = success[conditions.index(BASELINE)]
-        for condition, own in zip(conditions, success, strict=True):
-            if condition != BASELINE:
-                yield Score.of(condition, GAIN, seed_rate_interval(own - baseline), "seed means")
-                yield Score.of(condition, GAIN, rate_difference(own.T, baseline.T), "episodes")
+def _gains(
+    conditions: Sequence[str], values: Mapping[str, Floats], gains: Mapping[str, str]
+) -> Iterator[Score]:
+    """Yield each condition's gains over `BASELINE`, by the name of what is gained, from values (C, S, E)."""
+    if BASELINE not in conditions:
+        return
+    base = conditions.index(BASELINE)
+    for (n, condition), (name, gain) in product(enumerate(conditions), gains.items()):
+        if n != base:
+
+            def gain_by_seed(each: str, n: int = n) -> Estimate:
+                return seed_rate_interval(values[each][n] - values[each][base])
+
+            def gain_by_episode(each: str, n: int = n) -> Estimate:
+                return rate_difference(values[each][n].T, values[each][base].T)
+
+            yield Score.of(condition, gain, halved(name, gain_by_seed, shared=True), "seed means")
+            yield Score.of(condition, gain, halved(name, gain_by_episode), "episodes")
 
 
 def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator[Score]:
@@ -160,6 +179,8 @@ def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> li
         "deadline_misses": totals(decisions["deadline_missed"]),
         "decisions": totals(np.ones(len(places))),
     }
+    for name in ("miss", "false_alarm"):
+        columns[name] = [None if share is None else share > 0 for share in means(name)]
     if not np.isnan(decisions["acted"]).all():
         columns["never_acted"] = totals(1.0 - decisions["acted"])
     return [

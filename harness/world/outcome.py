@@ -46,11 +46,6 @@ class Outcome:
         """Whether the ego reached its goal without a collision and without a forced failure."""
         return self.result == "cleared"
 
-    @property
-    def rating(self) -> Rating | None:
-        """The outcome in one of four words; None while running."""
-        return RATINGS.get(self.result)
-
     def judged(self, reference: "Outcome", danger: str | None, parameters: Parameters) -> "Outcome":
         """Return this outcome, as `late` if the ego came too long after the full-view `reference`.
 
@@ -64,6 +59,11 @@ class Outcome:
     def ending(self, result: Result, time_s: float, **how: str) -> "Outcome":
         gap = 0.0 if result == "collision" else self.least_gap_m
         return replace(self, result=result, time_s=time_s, least_gap_m=gap, **how)  # type: ignore[arg-type]
+
+
+def rating(failure: str, parameters: Parameters) -> Rating | None:
+    """Return the word for an episode that failed like this, empty for a success; None where `limits` is 1."""
+    return None if parameters.limits == 1 else RATINGS[failure or "cleared"]
 
 
 def outline(v: VehicleState) -> Polygon:

@@ -183,10 +183,10 @@ def test_six_metrics_come_first_and_all_print_the_rest(worse: tuple[Path, Path],
     for form in ((), ("--markdown",)):
         few, every = (harness("compare", *worse, *form, *more)[1] for more in ((), ("--all",)))
         rows = [[name for name in metrics if re.search(rf"[ ?] {name} ", text)] for text in (few, every)]
-        primary = ["success_rate", "unsafe_rate", "latency_proxy_ms"]
+        primary = ["success_rate", "balanced_success_rate", "unsafe_rate", "latency_proxy_ms"]
         assert set(rows[0]) == {*primary, "bits_per_episode", "entropy_nats"}
         assert set(rows[1]) == set(metrics)
-        assert f"{len(metrics) - 5} more metrics: --all" in few
+        assert f"{len(metrics) - 6} more metrics: --all" in few
         assert re.search(r"\? entropy_nats ", few)
         assert "more metrics" not in every
     assert [name for name, d in metrics.items() if d["primary"]] == primary

@@ -21,12 +21,14 @@ from harness.dataset.load import Dataset, load
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
 from harness.report.compare.pair import pair
-from harness.runs.metrics import METRICS
+from harness.runs.metrics import BALANCED, METRICS
 from harness.world.scenarios.occluded_intersection import SCENARIO
 
 Said = tuple[int, str, str]
-SOME = {"time_to_clear_s", "regret_rate", "delay_s"}  # which not every episode has
-OPTIONAL = {name for name, metric in METRICS.items() if metric.optional}
+BY_DANGER = {name for name, metric in METRICS.items() if metric.half}
+# Which not every episode has.
+SOME = {"time_to_clear_s", "regret_rate", "delay_s", "time_lost_s", *BY_DANGER}
+OPTIONAL = {name for name, metric in METRICS.items() if metric.optional} - {"time_lost_s", *BY_DANGER}
 NAMES = {name for name, metric in METRICS.items() if metric.compared}
 LIVE = {name for name, metric in METRICS.items() if metric.world == "closed-loop"}
 
@@ -51,7 +53,9 @@ def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> Non
         assert {d.metric for d in of.differences} == always - silent
         for d in of.differences:
             assert d.change.value == 0
-            if d.metric.endswith(("_rate", "_reply_loss")):
+            if d.metric == BALANCED or (d.metric in BY_DANGER and d.change.n == 1):
+                assert d.change.low != d.change.low, "one of the four has no danger"
+            elif d.metric.endswith(("_rate", "_reply_loss")):
                 assert d.change.low == -d.change.high < 0, "what all episodes agree in, others may not"
             else:
                 assert d.change.low != d.change.low
@@ -270,7 +274,8 @@ def test_runs_of_other_lengths_and_conditions_are_compared_where_they_meet(
     c = found((runs[0], short.out))
     assert (c.pair.conditions, c.pair.episodes) == (("6g",), (0, 1, 2))
     assert c.settings == ()
-    assert all(d.change.n == 3 and d.change.value == 0 for d in c.conditions[0].differences)
+    assert all(d.change.n == 3 or d.metric in BY_DANGER for d in c.conditions[0].differences)
+    assert all(d.change.value == 0 for d in c.conditions[0].differences)
 
 
 def test_one_episode_has_differences_and_no_interval(small_path: Path, tmp_path: Path) -> None:

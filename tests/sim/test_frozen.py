@@ -132,6 +132,16 @@ def test_a_course_is_lost_by_one_decision_or_was_lost_from_the_start(small: Data
     assert lost > 200
 
 
+def test_one_needless_stop_of_a_real_harmless_layout_is_late_under_the_second_limits(small: Dataset) -> None:
+    harmless = [n for n, tree in enumerate(small.trees) if tree.danger.sector is None]
+    for limits in (1, 2):
+        f = Forest.of(tuple(small.trees), small.actions, replace(small.scenario.parameters, limits=limits))
+        late = f.false_alarm[f.root[harmless], f.actions.index("SLOWER")]
+        assert late.tolist() == [limits == 2] * len(harmless)
+        assert f.driver_success("cruise")[harmless].all()
+    assert harmless
+
+
 def test_harm_has_one_miss_and_lateness_one_false_alarm_unless_it_was_inevitable(small: Dataset) -> None:
     """Random walks, under both versions of the limits."""
     rng = np.random.default_rng(2)

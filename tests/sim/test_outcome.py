@@ -5,7 +5,7 @@ from typing import get_args
 
 import pytest
 
-from harness.world.outcome import Outcome, Result, fault, outline, striker
+from harness.world.outcome import RATINGS, Outcome, Result, fault, outline, rating, striker
 from harness.world.scenarios.occluded_intersection import SCENARIO, Parameters
 from harness.world.state import VehicleState
 
@@ -76,14 +76,14 @@ def test_a_failure_stays_what_it_is_and_makes_nobody_late(result):
 )
 def test_the_second_limits_forgive_less_where_there_is_no_danger(limits, danger, allowed_s):
     p = Parameters(limits=limits)
-    for over_s, rating in ((allowed_s, "success"), (allowed_s + 0.02, "late")):
+    for over_s, result in ((allowed_s, "cleared"), (allowed_s + 0.02, "late")):
         outcome = Outcome("cleared", 6.0 + over_s).judged(Outcome("cleared", 6.0), danger, p)
-        assert outcome.rating == rating
+        assert outcome.result == result
 
 
 def test_every_end_has_one_of_four_ratings():
-    ended = {result: Outcome(result).rating for result in get_args(Result)}
-    assert ended == {
-        "running": None, "cleared": "success", "late": "late", "collision": "unsafe", "off_road": "unsafe",
-        "time_out": "stuck",
-    }  # fmt: skip
+    assert RATINGS.keys() == {*get_args(Result)} - {"running"}
+    failures = ("", "late", "collision", "off_road", "time_out")
+    ratings = [rating(failure, Parameters(limits=2)) for failure in failures]
+    assert ratings == ["success", "late", "unsafe", "unsafe", "stuck"]
+    assert {rating(failure, Parameters()) for failure in failures} == {None}

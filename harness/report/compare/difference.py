@@ -8,12 +8,12 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import printable
-from harness.core.multiplicity import SuccessTest, holm, p_of_bootstrap, success_test
-from harness.core.statistics import Estimate, known_mean
+from harness.core.multiplicity import SuccessTest, holm, p_of_bootstrap, p_value, success_test
+from harness.core.statistics import LEVEL, Estimate, known_mean
 from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import Pair, Side
 from harness.runs import percentiles
-from harness.runs.metrics import METRICS, SUCCESS, difference, entry, metrics_of, p_value
+from harness.runs.metrics import METRICS, SUCCESS, difference, entry, halved, known_in
 from harness.runs.sources import prompt_of
 
 LOST_BY = ("B", "A", None)  # in the order of the list: what B gave away comes first, then what A did
@@ -162,10 +162,8 @@ def _settings(pair: Pair) -> Iterator[tuple[str, str | None, str | None]]:
 
 
 def _in_condition(pair: Pair, condition: str) -> InCondition:
-    differences = [
-        _difference(metric.name, *(pair.values(side, metric.name, condition) for side in (pair.a, pair.b)))
-        for metric in metrics_of(pair.a.run.world)
-    ]
+    shared = {name: pair.values(pair.a, name, condition) for name in pair.a.values}
+    differences = [_difference(pair, name, condition) for name in known_in(shared)]
     names = {metric.percentile: metric.name for metric in METRICS.values()}
     before, after = (pair.latencies(side, condition) for side in (pair.a, pair.b))
     differences += [
@@ -185,10 +183,26 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
     )
 
 
-def _difference(metric: str, a: Floats, b: Floats) -> Difference:
-    unknown = np.isnan(a) | np.isnan(b)
-    before, after = (float(known_mean(known_mean(np.where(unknown, np.nan, x), 1), 0)) for x in (a, b))
-    return Difference(metric, before, after, difference(metric, b, a), p_value(metric, b, a))
+def _difference(pair: Pair, metric: str, condition: str) -> Difference:
+    def values(name: str) -> tuple[Floats, Floats]:
+        a, b = (pair.values(side, name, condition) for side in (pair.a, pair.b))
+        unknown = np.isnan(a) | np.isnan(b)
+        return np.where(unknown, np.nan, a), np.where(unknown, np.nan, b)
+
+    halves = {name: values(name) for name in entry(metric).halves or (metric,)}
+    before, after = (
+        float(np.mean([known_mean(known_mean(half[side], 1), 0) for half in halves.values()]))
+        for side in (0, 1)
+    )
+
+    def change(level: float) -> Estimate:
+        def change_of(name: str) -> Estimate:
+            a, b = halves[name]
+            return difference(name, b, a, level)
+
+        return halved(metric, change_of)
+
+    return Difference(metric, before, after, change(LEVEL), p_value(change))
 
 
 def _flips(pair: Pair, condition: str, which: Bools) -> Iterator[Flip]:
