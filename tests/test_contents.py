@@ -294,6 +294,20 @@ def test_the_truth_is_no_worse_than_objects_and_these_no_worse_than_nothing(plan
     assert alone <= objects <= oracle
 
 
+def test_the_truth_has_every_sector_of_the_ego_in_sight(small: Dataset) -> None:
+    backend = Planner(small)
+    walked(spec_of(small, points=(ORACLE,), ask="used"), backend)
+    scenes = {scene.id: scene for scene in all_scenes(small)}
+    asked = [r for r in backend.asked if "!truth" in r.id and r.view]
+    assert asked
+    for request in asked:
+        assert request.view is not None
+        own = scenes[request.id.partition("/")[0]].graphs["v1"]
+        assert [s.sector for s in request.view.sectors] == [s.sector for s in own.sectors]
+        assert {(s.seen_share, s.occluded, s.by) for s in request.view.sectors} == {(1.0, False, ())}
+        assert "100% seen" in request.messages[-1]["content"]
+
+
 def test_helpers_that_see_nothing_add_but_themselves(small: Dataset) -> None:
     backend = Planner(small)
     walked(spec_of(small, points=(OBJECTS.changed(messages="blind"),), ask="used"), backend)

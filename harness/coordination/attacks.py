@@ -324,8 +324,7 @@ class Hide(_OfObjects):
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
         """Return the graph without nodes."""
-        seen = tuple(structs.replace(s, seen_share=1.0, occluded=False, by=()) for s in graph.sectors)
-        return structs.replace(graph, nodes=(), sectors=seen)
+        return structs.replace(graph, nodes=(), sectors=graph.all_in_sight)
 
 
 @dataclass(frozen=True)

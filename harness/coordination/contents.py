@@ -40,6 +40,7 @@ CONTENTS = {
     OBJECTS: Content(intent=False, graph=OBJECTS),
     # the ego's answer to the larger graph is fused with the helpers' intents
     "both": Content(intent=True, graph=OBJECTS),
-    # the ceiling: an ego that hears anybody sees everything, without noise
+    # perfect sharing: an ego that hears anybody sees everything, without noise. It is no bound, since a
+    # model may misread the truth, and plans on its own view again where it does not ask
     "oracle": Content(intent=False, graph=TRUTH),
 }

@@ -29,7 +29,9 @@ def shared_graphs(
     """
     changes = {change for _, senders in sets for key in senders for change in changes_of(key)}
     if TRUTH in changes:
-        return truth_graphs(scenario, [scene.state for scene, _ in sets])
+        truths = truth_graphs(scenario, [scene.state for scene, _ in sets])
+        own = [scene.graphs[scene.viewers[0]] for scene, _ in sets]
+        return [structs.replace(t, sectors=o.all_in_sight) for t, o in zip(truths, own, strict=True)]
     if OBJECTS not in changes:
         return [None] * len(sets)
     cases = []

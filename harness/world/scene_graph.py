@@ -132,6 +132,11 @@ class SceneGraph(Closed, frozen=True):
         """Names of the sectors that count as occluded."""
         return tuple(sector.sector for sector in self.sectors if sector.occluded)
 
+    @property
+    def all_in_sight(self) -> tuple[Sector, ...]:
+        """Its sectors as whoever sees all of each would list them."""
+        return tuple(Sector(sector.sector, 1.0, False, ()) for sector in self.sectors)
+
     def blinded(self) -> "SceneGraph":
         """Return the graph of a viewer without sensors, who knows only itself and the ego's beacon."""
         unseen = tuple(Sector(sector.sector, 0.0, True, ()) for sector in self.sectors)
