@@ -74,7 +74,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        if not self.path.endswith("/chat/completions"):  # Ollama is asked so for what it says of a model
+        # Ollama is asked by POST, too, for what it says of a model.
+        if not self.path.endswith(("/chat/completions", "/systemone", "/decisions")):
             self.server.listed(Asked(self.path, dict(self.headers), body, -1, self))
             return
         with self.server.lock:

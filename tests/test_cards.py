@@ -210,8 +210,8 @@ def test_what_was_said_of_one_engines_weights_says_nothing_of_anothers(shelf: Pa
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("llama-cpp", "proxy"), ["engine in", "'proxy'", "known: llama-cpp, openai"]),
-        (("llama-cpp", "transformers"), ["'transformers'", "known: llama-cpp, openai"]),
+        (("llama-cpp", "proxy"), ["engine in", "'proxy'", "known: decisions, llama-cpp, openai"]),
+        (("llama-cpp", "transformers"), ["'transformers'", "known: decisions, llama-cpp"]),
         (('file = "b.gguf"', 'dtype = "float32"'), ["[engines.llama-cpp]", "dtype", "transformers"]),
         (('file = "b.gguf"', "licence = 'MIT'"), ["[engines.llama-cpp]", "licence"]),
         (('weights = "a/b-GGUF"', ""), ["[engines.llama-cpp]", "weights", "goes with"]),

@@ -27,6 +27,7 @@ from harness.backends.card import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai import pool as openai_pool
 from harness.backends.openai.http import Client
+from harness.backends.openai.wire import CHAT
 from harness.backends.servers import Kind
 from harness.backends.servers import Server as Where
 from harness.core import resources
@@ -180,7 +181,7 @@ def test_a_server_that_is_gone_moves_no_decision_but_its_own(
 ) -> None:
     def ranked(urls: list[str]) -> list[str]:
         where = Where(tuple(urls))
-        pool = openai_pool.ServerPool(Client(where), where, "mine", "m", 4)
+        pool = openai_pool.ServerPool(Client(where), where, "mine", "m", 4, "/chat/completions")
         return [server.url for server in pool._rank(decision)]
 
     urls = [f"http://127.0.0.1:{port}/v1" for port in ports]
@@ -287,7 +288,7 @@ def test_a_bug_is_a_crash_and_no_wait_for_ever(monkeypatch: pytest.MonkeyPatch) 
 
     with serving(said_back) as there:
         backend = opened(there)
-        monkeypatch.setattr(openai_backend, "body", bug)
+        monkeypatch.setattr(backend, "_wire", CHAT._replace(body=bug))
         with pytest.raises(ZeroDivisionError):
             backend.complete(decisions(2))
 

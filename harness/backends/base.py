@@ -103,7 +103,7 @@ class Completion:
     # None if the engine has no tokenizer. Of several orders, what they begin with counts once in process, and
     # as often as a server counts it.
     prompt_tokens: int | None
-    completion_tokens: int | None  # tokens of the answer; None if the engine has no tokenizer
+    completion_tokens: int | None  # tokens of the answer, 0 if none is written; None if nobody counts them
     # `stop`, `length` (cut off by max_tokens), `refusal` (of a question that was read) or `error`
     finish_reason: FinishReason
     # Time of this answer if its request ran alone (batch_size 1), else None: the wall time of a batch is not

@@ -205,6 +205,11 @@ def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
     On llama-cpp the projector beside it goes with it, which has the same name behind its prefix.
     """
     stated = read_facts(file)
+    if stated.decision:
+        raise UserError(
+            f"model {printable(text)!r} is a decision model ({printable(stated.decision, 30)}), which no "
+            "engine opens here; serve it by llama-server, and copy models/systemone-example.toml"
+        )
     engine = "transformers" if engine == "transformers" else "llama-cpp"
     projector = file.with_name(f"{PROJECTOR}{file.name}")
     vision = _vision(text, file.parent) if engine == "llama-cpp" and projector.is_file() else None

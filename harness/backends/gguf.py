@@ -24,6 +24,7 @@ class ModelFacts:
     licence: str | None = None  # SPDX id of its licence, or its name, as the file writes it
     context_tokens: int | None = None  # the longest sequence that it was trained for
     template: str | None = None  # its chat template
+    decision: str | None = None  # the kind of decision model that it is, such as `kev`; None if it is none
 
 
 def read_facts(file: Path) -> ModelFacts:
@@ -40,7 +41,8 @@ def read_facts(file: Path) -> ModelFacts:
     context = values.get(f"{values.get('general.architecture')}.context_length")
     context_tokens = context if isinstance(context, int) else None
     template = text("tokenizer.chat_template")
-    return ModelFacts(text("general.name"), text("general.license"), context_tokens, template)
+    decision = text(f"{values.get('general.architecture')}.decision.type")
+    return ModelFacts(text("general.name"), text("general.license"), context_tokens, template, decision)
 
 
 def read_metadata(file: Path, arrays: bool = False) -> Mapping[str, Any]:

@@ -62,6 +62,7 @@ class Registration:
 
 
 _RULE = Capabilities(language_model=False, answer_modes=("json",), thinks="never", renders=False)
+_DECIDES = Capabilities(answer_modes=("decision",), thinks="never")
 _WEIGHTS = ("revision", "sha256", "gated")
 BUILT_IN: Mapping[str, Registration] = {
     "proxy": Registration("harness.backends.proxy:open", _RULE, card_keys=("failures",)),
@@ -98,6 +99,23 @@ BUILT_IN: Mapping[str, Registration] = {
         Capabilities(thinks="card", samples=True),
         card_keys=("vision", "system"),
         required_keys=("weights", "server"),
+    ),
+    **{
+        wire: Registration(
+            f"harness.backends.decisions.wires:open_{wire}",
+            _DECIDES,
+            card_keys=("vision",),
+            required_keys=("weights", "server"),
+        )
+        for wire in ("systemone", "decisions")
+    },
+    "sparrow": Registration(
+        "harness.backends.decisions.sparrow:open",
+        _DECIDES,
+        required_keys=("weights",),
+        packages={"sparrow_decider": "sparrow-decider"},
+        install=extras.install("sparrow"),
+        finds="harness.backends.decisions.sparrow:find",
     ),
 }
 

@@ -19,6 +19,7 @@ OPTIONAL = {
     "ray": ("ray", "ray"),
     "numba": ("numba", "fast"),
     "llama_cpp": ("llama-cpp-python", "llama-cpp"),
+    "sparrow_decider": ("sparrow-decider", "sparrow"),
     "torch": ("torch", "transformers"),
     "transformers": ("transformers", "transformers"),
 }

@@ -43,6 +43,10 @@ CARDS = {
     "proxy-faulty": ("proxy", ("json",)),
     **{name: ("driver", ("json",)) for name in cards.names() if cards.load(name).engine == "driver"},
     "openai-example": ("openai", get_args(AnswerMode)),
+    "systemone-example": ("systemone", ("decision",)),
+    "decisions-example": ("decisions", ("decision",)),
+    "sparrow-general": ("sparrow", ("decision",)),
+    "sparrow-robot": ("sparrow", ("decision",)),
     "swarm-tiny": ("llama-cpp", get_args(AnswerMode)),
     "swarm-tiny:transformers": ("transformers", get_args(AnswerMode)),
 }

@@ -1,7 +1,7 @@
 """What holds for every backend that can run here: the contract of `harness.backends.base.Backend`."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -37,6 +37,7 @@ WITH_WEIGHTS = [engine for engine in BUILT_IN if capabilities(engine).has_weight
 ENGINES = [
     *((name, "json") for name in (*model_free(), "replay")),
     *((engine, answer) for engine in ("openai", *WITH_WEIGHTS) for answer in get_args(AnswerMode)),
+    *((engine, "decision") for engine in ("systemone", "decisions", "sparrow")),
 ]
 
 
@@ -58,14 +59,17 @@ def case(
         tiny_qwen3.build(folder / "tiny", context_tokens=2048)
     if model == "transformers":
         model = str(folder / "tiny")
-    if model == "openai":
+    if model == "sparrow":
+        pytest.importorskip("sparrow_decider", reason="needs the sparrow extra")
+        model = "sparrow-general"
+    if model in ("openai", "systemone", "decisions"):
         with serving(answered) as there:
-            card = cards.load("openai-example")
+            card = cards.load(f"{model}-example")
             assert card.server is not None
             card = replace(card, server=replace(card.server, base_url=there.url))
             yield Case(
                 open_backend(card, batch_size=3),
-                tuple(requests(spec_of(data, "openai-example", answer=answer), scenes_of(data)[:5]))[:5],
+                tuple(requests(spec_of(data, card.name, answer=answer), scenes_of(data)[:5]))[:5],
             )
         return
     if model == "llama-cpp":
@@ -82,7 +86,9 @@ def case(
 
 
 def test_every_engine_that_a_card_may_name_is_tried_here() -> None:
-    tried = {cards.load(name).engine for name in model_free()} | {"replay", "openai", *WITH_WEIGHTS}
+    tried = {cards.load(name).engine for name in model_free()} | {
+        engine for engine, _ in ENGINES if engine in BUILT_IN
+    }
     assert tried == set(BUILT_IN)
     assert all(missing(cards.load(name)) is None for name in model_free())
 
@@ -90,17 +96,33 @@ def test_every_engine_that_a_card_may_name_is_tried_here() -> None:
 def answered(asked: Asked) -> None:
     """A decent llama-server, whose answers depend on the question alone."""
     said = digest(asked.body)
-    if asked.body.get("logprobs"):
+    if asked.path == "/v1/systemone":
+        [(name, question)] = asked.body["questions"].items()
+        asked.reply(
+            {"answers": {name: {"type": "choice", "probabilities": shares(question["criteria"], said)}}}
+        )
+    elif asked.path == "/v1/decisions":
+        [question] = asked.body["questions"]
+        p = shares([choice["value"] for choice in question["choices"]], said)
+        listed = [{"value": value, "probability": share} for value, share in p.items()]
+        asked.reply({"answers": [{"type": "choice", "name": question["name"], "probabilities": listed}]})
+    elif asked.body.get("logprobs"):
         asked.reply(read_out(("A", -0.5), (" B", -1.5 - int(said[0], 16)), ("C", -4.0)))
     elif "grammar" in asked.body:
         helper = '"evidence":"","risk":"low",' if "evidence" in asked.body["grammar"] else ""
-        p = f'"SLOWER":0.{said[:2].translate(DIGITS)},"IDLE":0.10,"FASTER":1.00'
-        asked.reply(completion(f'{{{helper}"action_distribution":{{{p}}}}}'))
+        digits = f'"SLOWER":0.{said[:2].translate(DIGITS)},"IDLE":0.10,"FASTER":1.00'
+        asked.reply(completion(f'{{{helper}"action_distribution":{{{digits}}}}}'))
     else:
         asked.reply(completion(said))
 
 
 DIGITS = str.maketrans("abcdef", "012345")
+
+
+def shares(options: Collection[str], said: str) -> dict[str, float]:
+    """Shares of options that depend on the question alone."""
+    weights = [1 + int(said[n], 16) for n in range(len(options))]
+    return {option: weight / sum(weights) for option, weight in zip(options, weights, strict=True)}
 
 
 def test_a_constrained_answer_keeps_to_the_schema(case: Case) -> None:
@@ -124,7 +146,8 @@ def same(one: list[Completion], other: list[Completion]) -> None:
 
 def test_a_read_out_and_only_a_read_out_says_how_much_was_on_its_letters(case: Case) -> None:
     for r, c in zip(case.asked, case.backend.complete(case.asked), strict=True):
-        assert (c.label_mass is not None) == r.bare
+        letters = "readout" in capabilities(case.backend.identity()["engine"]).answer_modes
+        assert (c.label_mass is not None) == (r.bare and letters)
         assert c.label_mass is None or 0 < c.label_mass <= 1
 
 
@@ -146,8 +169,9 @@ def test_each_completion_keeps_the_contract(case: Case) -> None:
         assert c.seconds is None or (c.batch_size == 1 and c.seconds > 0)
         assert c.first_token_s is None or (c.seconds is not None and 0 < c.first_token_s <= c.seconds)
         assert c.token_s is None or (c.first_token_s is not None and c.token_s > 0)
-        for tokens in (c.prompt_tokens, c.completion_tokens):
-            assert tokens is None or tokens > 0
+        assert c.prompt_tokens is None or c.prompt_tokens > 0
+        least = 0 if capabilities(case.backend.identity()["engine"]).answer_modes == ("decision",) else 1
+        assert c.completion_tokens is None or c.completion_tokens >= least, "who only decides writes none"
 
 
 def test_an_engine_that_has_tokens_keeps_to_the_most_that_is_allowed(case: Case) -> None:

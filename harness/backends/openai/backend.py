@@ -1,4 +1,4 @@
-"""The backend of a model behind any server that speaks OpenAI's chat completions."""
+"""The backend of a model behind any server that speaks OpenAI's chat completions, or another `Wire`."""
 
 import asyncio
 import json
@@ -7,7 +7,7 @@ import weakref
 from collections import deque
 from collections.abc import Coroutine, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from functools import partial
 from threading import Thread, current_thread
 from typing import Any, TypeVar
@@ -17,12 +17,12 @@ from harness.backends.card import Card
 from harness.backends.openai.http import Client, Reply
 from harness.backends.openai.pool import ServerPool
 from harness.backends.openai.prompt_check import PromptCheck
-from harness.backends.openai.shapes import answering_model, body, digest_url, read
+from harness.backends.openai.shapes import answering_model, data_url, digest_url
 from harness.backends.openai.stream import ASKED, BROKE_OFF
+from harness.backends.openai.wire import CHAT, Wire
 from harness.backends.orders import average_orders
 from harness.backends.registry import BUILT_IN
-from harness.backends.servers import Fields, Server
-from harness.core.errors import printable
+from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json
 
 T = TypeVar("T")
@@ -32,9 +32,7 @@ _CLOSED_S = 5.0  # longest wait for connections to close
 
 def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
     """Connect to a card's servers. Raises UserError if none answers or takes the key, or models differ."""
-    if card.server is None:
-        raise ValueError(f"card {card.name} has no server")
-    return OpenAIBackend(card, card.server, batch_size)
+    return OpenAIBackend(card, batch_size)
 
 
 class OpenAIBackend:
@@ -44,9 +42,13 @@ class OpenAIBackend:
     during another call. Connections stay open between calls.
     """
 
-    def __init__(self, card: Card, server: Server, batch_size: int) -> None:
+    def __init__(self, card: Card, batch_size: int, wire: Wire = CHAT) -> None:
+        """Connect to a card's servers. Raises what `open` raises, and ValueError without a server."""
+        if (server := card.server) is None:
+            raise ValueError(f"card {card.name} has no server")
         self._card = card
         self._server = server
+        self._wire = wire
         self._batch_size = batch_size
         self.window = batch_size * len(server.urls)
         self._streams = True  # until a server refuses to stream
@@ -54,11 +56,13 @@ class OpenAIBackend:
         self._named_other = False  # whether a server was said to name another model
         self._cuts = False  # whether a server was said to cut prompts
         client = Client(server)
-        self._pool = ServerPool(client, server, card.name, card.weights or "", batch_size)
+        self._pool = ServerPool(client, server, card.name, card.weights or "", batch_size, wire.path)
         self._prompts = PromptCheck(client, card, server)
         self._loop = _Loop(client)
         weakref.finalize(self, self._loop.end)
         self._loop.run(self._pool.open())
+        if misfit := wire.misfit(self._pool.model.states):
+            raise UserError(f"{card.shown}: its server says that it {misfit}")
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """Return one completion per request, in the same order.
@@ -73,7 +77,7 @@ class OpenAIBackend:
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         """Return the JSON that the server is sent for each request, with its picture as a digest."""
-        return [canonical_json(body(self._card, self._server, r, digest_url)) for r in requests]
+        return [canonical_json(self._wire.body(self._card, self._server, r, digest_url)) for r in requests]
 
     def identity(self) -> dict[str, Any]:
         """Return the model's identity as its servers state it; what none of them states goes undetected.
@@ -85,7 +89,8 @@ class OpenAIBackend:
         where = {} if self._server.any_may_answer else {"base_url": self._server.base_url}
         states = {"states": dict(model.states)} if model.states else {}
         named = {"model": self._card.weights, "listed": model.listed}
-        ours = {"engine": "openai", "answers": BUILT_IN["openai"].answers, "server": self._server.kind}
+        engine = self._wire.engine
+        ours = {"engine": engine, "answers": BUILT_IN[engine].answers, "server": self._server.kind}
         return {**ours, **where, **named, **version, **states}
 
     @property
@@ -106,7 +111,8 @@ class OpenAIBackend:
         return taken
 
     async def _all(self, requests: Sequence[Request]) -> list[Completion]:
-        await self._prompts.check(requests)
+        if not self._wire.decides:
+            await self._prompts.check(requests)
         together = min(self._batch_size, len(requests))
         # One at a time: if a server refuses to stream, the next request must know.
         if together == 1 and any(request.timed for request in requests):
@@ -132,7 +138,7 @@ class OpenAIBackend:
         if reply.fault:
             answer = failed(request, self._hinted(reply))
         else:
-            answer = read(reply.payload, request, self._server.kind)
+            answer = self._wire.read(reply.payload, request, self._server.kind)
         self._note(request, reply, answer)
         first_at_s, tokens = reply.first_at_s, answer.completion_tokens
         if request.bare:
@@ -166,18 +172,12 @@ class OpenAIBackend:
             self._pool.say(f"server {printable(reply.url)} {fault}")
 
     def _hinted(self, reply: Reply) -> str:
-        """Return a reply's fault; if it names a field that a card can change, say so."""
-        fault = reply.fault or ""
-        named = [f.name for f in fields(Fields) if f.name in fault]
-        if reply.status in (400, 422) and "top_logprobs" in fault:
-            return f"{fault}; set top_logprobs under [server] in its card"
-        if reply.status in (400, 422) and named:
-            return f"{fault}; its card can leave {named[0]} out or rename it: fields under [server]"
-        return fault
+        """Return a reply's fault, and what to do about it."""
+        return "; ".join(filter(None, (reply.fault, self._wire.remedy(reply))))
 
     async def _reply(self, request: Request, streamed: bool) -> Reply:
         """Ask for a reply. If the server refuses to stream, ask again without, and stream no more."""
-        json_body = partial(body, self._card, self._server, request)
+        json_body = partial(self._wire.body, self._card, self._server, request, data_url)
         decision = request.id.partition("/")[0]
         if not streamed or not self._streams or request.bare:
             return await self._pool.post(decision, json_body)

@@ -20,8 +20,11 @@ class Fault(NamedTuple):
 
 
 def may_pass(status: int) -> bool:
-    """Return whether another attempt may succeed after an HTTP status: a server is busy or broke down."""
-    return status == 429 or status >= 500
+    """Return whether another attempt may succeed after an HTTP status: a server is busy or broke down.
+
+    What it never learnt to do (501) it does not do the next time.
+    """
+    return status == 429 or (status >= 500 and status != 501)
 
 
 def error_words(payload: Any) -> str:

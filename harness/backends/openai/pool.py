@@ -16,7 +16,7 @@ from hashlib import blake2b
 from time import perf_counter
 from typing import Any
 
-from harness.backends.openai.http import COMPLETIONS, Client, Reply
+from harness.backends.openai.http import Client, Reply
 from harness.backends.openai.statements import Model, read_statement
 from harness.backends.servers import Server
 from harness.core.errors import Unanswered, UserError, printable
@@ -62,10 +62,15 @@ class ServerPool:
     It runs in one event loop, inside `async with` of the client.
     """
 
-    def __init__(self, client: Client, settings: Server, name: str, weights: str, at_once: int) -> None:
-        """Prepare a pool, which `open` connects. One server gets `at_once` requests at most."""
+    def __init__(
+        self, client: Client, settings: Server, name: str, weights: str, at_once: int, path: str
+    ) -> None:
+        """Prepare a pool, which `open` connects.
+
+        One server gets `at_once` requests at most, each at the `path` behind its base URL.
+        """
         self._client, self._settings, self._name, self._weights = client, settings, printable(name), weights
-        self._at_once = at_once
+        self._at_once, self._path = at_once, path
         self._servers = [_ServerState(url) for url in settings.urls]
         self._pending: set[_Pending] = set()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -173,7 +178,7 @@ class ServerPool:
             server.sent += 1
             nth, first = server.sent, server.busy == 1
             pending.begun_s = perf_counter() if pending.begun_s is None else pending.begun_s
-            reply = await self._client.post(server.url, COMPLETIONS, json.dumps(pending.body()).encode())
+            reply = await self._client.post(server.url, self._path, json.dumps(pending.body()).encode())
             alone = first and server.sent == nth
             reply = replace(
                 reply, retries=pending.failed[server], begun_s=pending.begun_s, alone=alone, url=server.url

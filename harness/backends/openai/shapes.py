@@ -96,7 +96,7 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
         message = choice["message"]
         content, thought = message.get("content"), _thought(message)
         finish, usage = choice.get("finish_reason"), payload.get("usage") or {}
-        tokens = _count(usage.get("prompt_tokens")), _count(usage.get("completion_tokens"))
+        tokens = tokens_in(usage.get("prompt_tokens")), tokens_in(usage.get("completion_tokens"))
     except (LookupError, TypeError, AttributeError):
         return failed(request, "the answer is no chat completion")
     if request.bare:
@@ -169,5 +169,6 @@ def answering_model(payload: Any) -> str | None:
     return model if isinstance(model, str) else None
 
 
-def _count(value: Any) -> int | None:
+def tokens_in(value: Any) -> int | None:
+    """Return a count of tokens as a server states it; None if it is none."""
     return value if type(value) is int and 0 <= value <= MOST_TOKENS else None

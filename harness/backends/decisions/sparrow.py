@@ -1,0 +1,83 @@
+"""The backend of sparrow-decider: decision models of a few megabytes, in this process, on numpy alone."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from harness.backends.base import Completion, Request, failed
+from harness.backends.card import Card
+from harness.backends.decisions.wires import asked_of, questions, read_systemone
+from harness.backends.registry import BUILT_IN
+from harness.core.errors import UserError, one_line, printable, unknown
+from harness.core.files import canonical_json, sha256_file
+
+SUFFIX = ".sparrow"
+
+
+def find(card: Card) -> Path:
+    """Return the file of a card's weights: a path, or the name of a model that the package has.
+
+    Raises UserError if there is none.
+    """
+    import sparrow_decider
+
+    weights = card.weights or ""
+    if (own := Path(weights).expanduser()).suffix == SUFFIX:
+        if not own.is_file():
+            raise UserError(f"{card.shown}: weights {printable(weights)} is no file; give one that is there")
+        return own
+    folder = Path(sparrow_decider.__file__).parent / "models"
+    shipped = {file.stem: file for file in sorted(folder.glob(f"*{SUFFIX}"))}
+    if weights not in shipped:
+        raise unknown(f"weights of {card.shown}", weights, shipped, f"; or the path of a {SUFFIX} file")
+    return shipped[weights]
+
+
+def open(card: Card, **_: Any) -> "Sparrow":
+    """Load a card's model. Raises UserError if it is not found or is no model."""
+    from sparrow_decider import Decider
+
+    file = find(card)
+    try:
+        model = Decider.load(str(file))
+    except Exception as error:  # the file may be anything
+        raise UserError(
+            f"{card.shown}: {printable(file)} is no model of sparrow-decider ({one_line(error)}); give "
+            "another"
+        ) from None
+    return Sparrow(model, file)
+
+
+class Sparrow:
+    """Answers the questions of decisions, one after the other."""
+
+    def __init__(self, model: Any, file: Path) -> None:
+        self._model, self._file = model, file
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        """Return one completion per request, as the package's own server would answer it."""
+        return [self._answer(request) for request in requests]
+
+    def _answer(self, request: Request) -> Completion:
+        start_s = time.perf_counter()
+        try:
+            answers = self._model.ask(asked_of(request).state, questions(request))
+        except (ValueError, ArithmeticError) as error:
+            return failed(request, one_line(error))
+        seconds = time.perf_counter() - start_s
+        completion = read_systemone({"answers": answers}, request)
+        return replace(completion, seconds=seconds, first_token_s=seconds)
+
+    def rendered(self, requests: Sequence[Request]) -> list[str]:
+        """Return what each request asks, as JSON."""
+        return [canonical_json({"state": asked_of(r).state, "questions": questions(r)}) for r in requests]
+
+    def identity(self) -> dict[str, Any]:
+        """Return the package's version, and the model by its name and digest."""
+        ours = {"engine": "sparrow", "answers": BUILT_IN["sparrow"].answers}
+        package = version("sparrow-decider")
+        return {**ours, "package": package, "model": self._model.name,
+                "sha256": sha256_file(self._file, "weights")}  # fmt: skip

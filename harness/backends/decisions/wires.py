@@ -1,0 +1,115 @@
+"""The two ways to ask a server of decision models: System One's, and that of OpenAI's decisions.
+
+`POST /v1/systemone` is that of llama.cpp (tools/server/README.md) and of Ollama 0.35 and later; `POST
+/v1/decisions` that of OpenAI (openai-python, types/decision_create_params.py and types/decision.py). Whatever
+a server promises, `harness.parsing.parse` judges the probabilities, which are kept as they are stated.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from harness.backends.base import Completion, Request, failed
+from harness.backends.card import Card
+from harness.backends.openai.backend import OpenAIBackend
+from harness.backends.openai.http import Reply
+from harness.backends.openai.shapes import tokens_in
+from harness.backends.openai.wire import Wire
+from harness.backends.servers import Kind, Server
+from harness.core.image import Image
+from harness.prompts.decision import Question
+
+NAME = "action"  # of the one question of a request
+
+
+def asked_of(request: Request) -> Question:
+    """Return the question of a decision. Raises ValueError if a request has none."""
+    if request.question is None:
+        raise ValueError(f"request {request.id} asks no question; only --answer decision does")
+    return request.question
+
+
+def questions(request: Request) -> dict[str, Any]:
+    """Return the question as System One has it, its options in the order of the actions."""
+    question = asked_of(request)
+    criteria = {action: question.meanings[action] for action in request.actions}
+    return {NAME: {"type": "choice", "instructions": question.instructions, "criteria": criteria}}
+
+
+def _systemone(card: Card, server: Server, request: Request, url: Callable[[Image], str]) -> dict[str, Any]:
+    body = {"model": card.weights, "state": asked_of(request).state, "questions": questions(request)}
+    return {**body, "images": [url(request.image)]} if request.image else body
+
+
+def _decisions(card: Card, server: Server, request: Request, url: Callable[[Image], str]) -> dict[str, Any]:
+    question = asked_of(request)
+    content: Any = question.state
+    if request.image:
+        picture = {"type": "input_image", "image_url": url(request.image)}
+        parts = [picture, {"type": "input_text", "text": question.state}]
+        content = [{"role": "user", "content": parts}]
+    meant = {action: question.meanings[action] for action in request.actions}
+    choices = [{"value": a, "description": m} if m else {"value": a} for a, m in meant.items()]
+    asked = {"type": "choice", "name": NAME, "instructions": question.instructions, "choices": choices}
+    return {"model": card.weights, "input": content, "questions": [asked]}
+
+
+def read_systemone(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
+    """Read an answer to `POST /v1/systemone`, without its time; a malformed one is an error."""
+    try:
+        answer = payload["answers"][NAME]
+        shares = [] if answer["type"] == "refusal" else answer["probabilities"].items()
+    except (LookupError, TypeError, AttributeError):
+        return failed(request, "the answer is no decision: it has no probabilities of the question")
+    return _completion(payload, request, answer["type"] == "refusal", shares)
+
+
+def read_decisions(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
+    """Read an answer to `POST /v1/decisions`, without its time; a malformed one is an error."""
+    try:
+        [answer] = payload["answers"]
+        listed = [] if answer["type"] == "refusal" else answer["probabilities"]
+        shares = [(each["value"], each["probability"]) for each in listed]
+    except (LookupError, TypeError, AttributeError, ValueError):
+        return failed(request, "the answer is no decision: it has no probabilities of the question")
+    return _completion(payload, request, answer["type"] == "refusal", shares)
+
+
+def _completion(
+    payload: Mapping[str, Any], request: Request, refused: bool, shares: Iterable[tuple[Any, Any]]
+) -> Completion:
+    usage = payload.get("usage")
+    usage = usage if isinstance(usage, dict) else {}
+    read = tokens_in(usage.get("input_tokens")) or None  # some count none
+    if refused:
+        return Completion(request.id, "", read, 0, "refusal", None, 1)
+    # Written out, so that the parser sees an option that stands there twice.
+    members = ",".join(f"{json.dumps(str(option))}:{json.dumps(share)}" for option, share in shares)
+    return Completion(request.id, f'{{"action_distribution":{{{members}}}}}', read, 0, "stop", None, 1)
+
+
+def _remedy(reply: Reply) -> str:
+    if reply.status == 501:
+        return (
+            "its model is no decision model, or takes no pictures: serve another one, or give a card with "
+            'engine = "openai", whose model decides by letters'
+        )
+    if reply.status == 404:
+        return 'a card has engine = "systemone" for /v1/systemone and "decisions" for /v1/decisions'
+    if reply.status in (400, 422):
+        return "it does not take this question, such as so many options, or options that are no single token"
+    return ""
+
+
+SYSTEMONE = Wire("systemone", "/systemone", _systemone, read_systemone, _remedy, decides=True)
+DECISIONS = Wire("decisions", "/decisions", _decisions, read_decisions, _remedy, decides=True)
+
+
+def open_systemone(card: Card, *, batch_size: int = 8, **_: Any) -> OpenAIBackend:
+    """Connect to servers that answer `POST /v1/systemone`, as `OpenAIBackend` does."""
+    return OpenAIBackend(card, batch_size, SYSTEMONE)
+
+
+def open_decisions(card: Card, *, batch_size: int = 8, **_: Any) -> OpenAIBackend:
+    """Connect to servers that answer `POST /v1/decisions`, as `OpenAIBackend` does."""
+    return OpenAIBackend(card, batch_size, DECISIONS)
