@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from harness.dataset.load import Scene
 
 HEADLINE = {  # metrics of a run's own table, by their heads
+    "balanced success": "balanced_success_rate",
     "success": "success_rate",
     "unsafe": "unsafe_rate",
     "latency": "latency_proxy_ms",

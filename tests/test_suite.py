@@ -208,7 +208,7 @@ def test_the_page_has_families_by_conditions_and_leads_to_each(evaluated: Harnes
     for family, folder in (("occluded-intersection", "small"), ("parking-exit", "exits")):
         assert f'<a href="{folder}/report.html">{family}</a>' in page
         assert (DONE / folder / "report.html").is_file()
-    for score in (read(DONE).score(c, "success_rate") for c in ("single-local", "v2x", "6g")):
+    for score in (read(DONE).score(c, "balanced_success_rate") for c in ("single-local", "v2x", "6g")):
         assert f"<dd>{100 * score.value:.1f} %" in page
     code, out, err = evaluated("report", DONE, "--out", "again.html")
     assert (code, err, out) == (0, "", "wrote again.html\n")
@@ -219,7 +219,7 @@ def test_the_page_has_families_by_conditions_and_leads_to_each(evaluated: Harnes
 def test_a_loss_has_one_minus_on_the_page(project: Harness) -> None:
     code, _, err = project(*EVAL, "--control", "shuffled-messages")
     assert (code, err) == (0, "")
-    gains = [s.value for s in read(DONE).scores if s.metric == "success_gain_over_single-local"]
+    gains = [s.value for s in read(DONE).scores if s.metric == "balanced_success_gain_over_single-local"]
     assert min(gains) < 0, "messages of other layouts lose episodes"
     page = (DONE / "report.html").read_text()
     shown = re.findall(r'<span class="gain \w*">(?:[✓✗] )?([^<]*)<', page)

@@ -119,7 +119,7 @@ def command(
         "95 % intervals over episodes; msgs: per episode; gain: over single-local, paired",
         *map(meaning, beside),
     )
-    rows = {label(name, frozen[0].scenario): score for name, score in beside.items()}
+    rows = {label(name, frozen[0].scenario): scores for name, scores in beside.items()}
     show(done, frozen[0].name, COLUMNS, notes, rows)
     typer.echo(f"wrote {page}")
 

@@ -41,6 +41,13 @@ class Column:
         return written(score) if self.interval else entry(score.metric).unit.text(score.value)
 
 
+BALANCED = (
+    Column("balanced success % [95 % CI]", "balanced_success_rate", interval=True),
+    Column("with a danger", "success_dangerous_rate", interval=True),
+    Column("without", "success_harmless_rate", interval=True),
+)
+
+
 def file_name(model: str) -> str:
     """Return a model's name as part of a folder's."""
     return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
@@ -160,11 +167,12 @@ def as_mapping(done: "Evaluated") -> dict[str, Any]:
 
 def show(
     done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str],
-    beside: "Mapping[str, Score] | None" = None,
+    beside: "Mapping[str, Mapping[str, Score]] | None" = None,
 ) -> None:  # fmt: skip
     """Print a run's table, a row a condition, with what it was run on and what to know about it.
 
-    Rows `beside` it are of what needs no model: a score by name.
+    Rows `beside` it are of what needs no model: scores by name and metric. A run whose scenes know their
+    dangers has a table of balanced success before it.
     """
     from harness.report.caveats import causes, caveats, lost_at_once
     from harness.report.constancy import ignores_input, in_a_line
@@ -180,16 +188,21 @@ def show(
     run = read(done.out)
     for caveat in (*caveats(m, done.scores), *ignores_input(run), *causes(run), *lost_at_once(run)):
         text.print(caveat)
-    table(
-        ("condition", *(column.head for column in columns)),
-        [
-            *((name, *(c.cell(figures.get((name, c.metric))) for c in columns)) for name in names),
-            *(
-                (name, *(c.cell(score if c.metric == score.metric else None) for c in columns))
-                for name, score in (beside or {}).items()
-            ),
-        ],
-    )
+    every = (*BALANCED, *columns)
+    rows: dict[str, Mapping[str, Score | None]] = {
+        name: {c.metric: figures.get((name, c.metric)) for c in every} for name in names
+    }
+    rows |= beside or {}
+    halves = [rows[names[0]][column.metric] for column in BALANCED[1:]]
+    tables = (BALANCED, columns) if all(halves) else (columns,)
+    for shown in tables:
+        table(
+            ("condition", *(column.head for column in shown)),
+            [(name, *(c.cell(scores.get(c.metric)) for c in shown)) for name, scores in rows.items()],
+        )
+        if shown is not columns:
+            of_each = " and ".join(str(half.n) for half in halves if half)
+            text.print(f"balanced: mean of both, of {of_each} episodes\n")
     for note in (*notes, *in_a_line(run), *origins(m, figures)):
         text.print(note)
 

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from msgspec import structs
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import text_of
 from harness.core.memory import uncollected
@@ -140,6 +140,11 @@ class Dataset:
     @cached_property
     def forest(self) -> Forest:
         return Forest.of(tuple(self.trees), self.actions, self.scenario.parameters)
+
+    @property
+    def dangerous(self) -> Bools:
+        """Whether each episode has a danger, (E,)."""
+        return np.array([tree.danger.sector is not None for tree in self.trees])
 
     @property
     def lost(self) -> int:

@@ -144,7 +144,8 @@ def _references(runs: Runs) -> dict[str, Score]:
     """Return success of the references: from the trees, in closed loop from their own runs."""
     if runs.dataset is None:
         return driven(runs.runs)
-    return in_trees(runs.dataset.of_episodes({number for run in runs.runs for number in run.grid.episodes}))
+    episodes = {number for run in runs.runs for number in run.grid.episodes}
+    return {name: of[SUCCESS] for name, of in in_trees(runs.dataset.of_episodes(episodes)).items()}
 
 
 def success(run: Run) -> Table:

@@ -17,7 +17,7 @@ from harness.report.drawing import colours
 from harness.report.page import save
 from harness.report.references import in_trees
 from harness.runs.folder import Run, dataset_of
-from harness.runs.metrics import BASELINE, GAIN, SUCCESS, entry
+from harness.runs.metrics import BASELINE, GAINS, entry
 from harness.runs.records import Score
 from harness.runs.suite import SuiteRun, mean
 
@@ -29,7 +29,7 @@ MEAN = "mean over families"
 class Cell:
     """One family under one condition."""
 
-    success: Score | None  # success rate
+    success: Score | None  # success rate, balanced where dangers are known
     gain: Score | None  # over `BASELINE`, paired; None where there is none
     verdict: str  # `better` or `worse` where the gain is not chance, its p at most 0.05 by Holm's method
 
@@ -51,11 +51,12 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
         suite: what was run.
         datasets: by family, those that were read already; others are read.
     """
-    datasets, gains = datasets or {}, BASELINE in suite.conditions
-    drivers = {
+    datasets, gains, lead = datasets or {}, BASELINE in suite.conditions, words.leading(suite)
+    of_trees = {
         family: in_trees((datasets.get(family) or dataset_of(run)).of_episodes(run.grid.episodes))
         for family, run in suite.runs.items()
     }
+    drivers = {family: {name: scores[lead] for name, scores in of.items()} for family, of in of_trees.items()}
     p_values = {
         (family, condition): p
         for family, run in suite.runs.items() if gains
@@ -69,9 +70,9 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
     def cells(name: str, of: Run | SuiteRun) -> dict[str, Cell]:
         by_condition = {}
         for c in suite.conditions:
-            gain, p = of.score(c, GAIN), corrected.get((name, c), 1.0)
+            gain, p = of.score(c, GAINS[lead]), corrected.get((name, c), 1.0)
             better = "better" if gain and (gain.value or 0.0) > 0 else "worse"
-            by_condition[c] = Cell(of.score(c, SUCCESS), gain, better if p <= LEVEL else "")
+            by_condition[c] = Cell(of.score(c, lead), gain, better if p <= LEVEL else "")
         return by_condition
 
     names = [name for name in next(iter(drivers.values())) if all(name in of for of in drivers.values())]
@@ -107,7 +108,7 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
             f"{suite.description}. {len(suite.runs)} families × {len(suite.manifest.seeds)} channel seeds; "
             "figures are means over families, with 95 % intervals over episodes."
         ],
-        [_families(lines, place), _metrics(suite)],
+        [_families(lines, place, words.leading(suite)), _metrics(suite)],
         warnings=caveats.merged(suite.runs, caveats.void),
         caveats=[
             *caveats.no_prompt(run.manifest for run in suite.runs.values()),
@@ -120,12 +121,14 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
 def _numbers(suite: SuiteRun) -> list[dict[str, str]]:
     """Return success under each condition, and the gain of the best."""
     best, base = words.compared(suite)
-    scores = {f"success with {c}": suite.score(c, SUCCESS) for c in suite.conditions}
-    scores[f"more with {best} than with {base}"] = suite.score(best, GAIN) if base == BASELINE else None
+    lead = words.leading(suite)
+    scores = {f"{words.LEADS[lead]} with {c}": suite.score(c, lead) for c in suite.conditions}
+    gain = suite.score(best, GAINS[lead]) if base == BASELINE else None
+    scores[f"more with {best} than with {base}"] = gain
     return [{"what": what, **words.shown(score)} for what, score in scores.items() if score]
 
 
-def _families(lines: Sequence[Line], place: Place) -> Table:
+def _families(lines: Sequence[Line], place: Place, lead: str) -> Table:
     mean = lines[-1]
     of_conditions = colours.conditions(mean.cells)
     key = Markup('<span class="key-colour" style="background:{}"></span>{}')
@@ -143,7 +146,8 @@ def _families(lines: Sequence[Line], place: Place) -> Table:
         "families and conditions of this table, and for the means for all conditions"
     )
     note = (
-        f"Success rate with its 95 % interval{gains * any(cell.gain for cell in mean.cells.values())}. The "
+        f"{words.LEADS[lead].capitalize()} with its 95 % interval"
+        f"{gains * any(cell.gain for cell in mean.cells.values())}. The "
         "mean gives each family the same weight, however many episodes it has. Its interval is combined from "
         "the intervals of the families (Zou and Donner 2008). It is about other episodes of these families, "
         "not about other families. Dashed lines and the last columns: references, which need no model, in "

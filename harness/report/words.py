@@ -3,19 +3,21 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-import numpy as np
 from markupsafe import Markup
 
 from harness.core import multiplicity
+from harness.core.arrays import Floats
 from harness.core.errors import printable
 from harness.core.figures import PLAIN, Unit
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import mean_of
+from harness.core.statistics import Estimate, mean_of
 from harness.runs import metrics
 from harness.runs.folder import Run
-from harness.runs.metrics import BASELINE, GAIN, LATENCY, SUCCESS, entry
+from harness.runs.metrics import BALANCED, BASELINE, GAINS, LATENCY, METRICS, SUCCESS, entry, halved, of_ends
 from harness.runs.records import Latency, Manifest, Score, Times, role_word
 from harness.runs.suite import SuiteRun
+
+LEADS = {SUCCESS: "success", BALANCED: "balanced success"}  # what a run is read by, in words
 
 
 def shown(score: Score) -> dict[str, str]:
@@ -42,14 +44,21 @@ def headline(run: Run | SuiteRun) -> str:
     best, base = compared(run)
     if not best:
         return f"{model} on {run.source}: the run has no success rate."
-    text = f"Under {best}, {model} clears {_success(run, best)} of the episodes"
+    lead = leading(run)
+    if lead == SUCCESS:
+        text = f"Under {best}, {model} clears {_shown(run, best, lead)} of the episodes"
+    else:
+        text = f"Under {best}, {model} has {_shown(run, best, lead)} balanced success"
     if isinstance(run, SuiteRun):
         text += f" (mean over {len(run.runs)} families)"
+    if halves := entry(lead).halves:
+        parts = (_shown(run, best, half) for half in halves)
+        text += ": {} with a danger, {} without".format(*parts)
     if not base:
         several = len(run.conditions) > 1
         return text + (", and no other condition does better." if several else ".")
-    text += f"; under {base}, {_success(run, base)}"
-    gain = run.score(best, GAIN) if base == BASELINE else None
+    text += f"; under {base}, {_shown(run, base, lead)}"
+    gain = run.score(best, GAINS[lead]) if base == BASELINE else None
     if gain is not None and gain.low is not None:
         p = p_values(run, base)
         corrected = dict(zip(p, holm(list(p.values())), strict=True))[best]
@@ -58,12 +67,18 @@ def headline(run: Run | SuiteRun) -> str:
     return text + "."
 
 
+def leading(run: Run | SuiteRun) -> str:
+    """Return the metric by which a run is read: balanced success, or success where no danger is known."""
+    return BALANCED if any(run.score(c, BALANCED) for c in run.conditions) else SUCCESS
+
+
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
     """Return the best condition, and the one that it is held against: the one without V2V, or the worst.
 
     Empty where there is none.
     """
-    scores = {c: s.value or 0.0 for c in run.conditions if (s := run.score(c, SUCCESS)) is not None}
+    lead = leading(run)
+    scores = {c: s.value or 0.0 for c in run.conditions if (s := run.score(c, lead)) is not None}
     best = max(scores, key=lambda c: scores[c], default="")
     alone = [c["name"] for c in run.manifest.conditions if c.get("profile") is None and c["name"] in scores]
     base = alone[0] if alone else min(scores, key=lambda c: scores[c], default="")
@@ -73,9 +88,14 @@ def compared(run: Run | SuiteRun) -> tuple[str, str]:
 def figures(run: Run) -> list[dict[str, str]]:
     """Return the few numbers of a run that are read first, each with what it is and its interval."""
     best, base = compared(run)
+    lead = leading(run)
     wanted = [
-        (f"success under {best}", run.score(best, SUCCESS)),
-        (f"gain over {base}", run.score(best, GAIN) if base == BASELINE else None),
+        (f"{LEADS[lead]} under {best}", run.score(best, lead)),
+        *(
+            (what, run.score(best, half))
+            for what, half in zip(("with a danger", "without a danger"), entry(lead).halves, strict=False)
+        ),
+        (f"gain over {base}", run.score(best, GAINS[lead]) if base == BASELINE else None),
         (f"unsafe episodes under {best}", run.score(best, "unsafe_rate")),
         (f"latency of a decision under {best}", run.score(best, LATENCY)),
         ("ego's answers that could not be read", run.score(metrics.ALL, "failed_rate_ego")),
@@ -84,17 +104,18 @@ def figures(run: Run) -> list[dict[str, str]]:
 
 
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
-    """Return p of each other condition's gain in success over `base`; of a suite the mean gain's."""
-    runs = run.runs.values() if isinstance(run, SuiteRun) else (run,)
-    successes = [
-        np.array([e.success for e in each.episodes], dtype=float).reshape(each.grid.shape) for each in runs
-    ]
+    """Return p of each other condition's gain over `base`, in what leads; of a suite the mean gain's."""
+    runs, lead = run.runs.values() if isinstance(run, SuiteRun) else (run,), leading(run)
+    parts = entry(lead).halves or (lead,)
+    successes = [{name: of_ends(METRICS[name], of.grid, of.episodes) for name in parts} for of in runs]
 
     def p_of(condition: str) -> float:
         a, b = (run.conditions.index(name) for name in (condition, base))
-        p = multiplicity.p_value(lambda level: mean_of([
-            metrics.difference(SUCCESS, success[a].T, success[b].T, level) for success in successes
-        ]))  # fmt: skip
+
+        def gain(success: Mapping[str, Floats], level: float) -> Estimate:
+            return halved(lead, lambda n: metrics.difference(n, success[n][a].T, success[n][b].T, level))
+
+        p = multiplicity.p_value(lambda level: mean_of([gain(success, level) for success in successes]))
         return 1.0 if p is None else p
 
     return {condition: p_of(condition) for condition in run.conditions if condition != base}
@@ -105,10 +126,9 @@ def p_value(p: float) -> str:
     return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 
-def _success(run: Run | SuiteRun, condition: str) -> str:
-    score = run.score(condition, SUCCESS)
-    assert score is not None
-    return shown(score)["value"]
+def _shown(run: Run | SuiteRun, condition: str, metric: str) -> str:
+    score = run.score(condition, metric)
+    return shown(score)["value"] if score else "–"
 
 
 def latency_source(latency: Latency) -> str:

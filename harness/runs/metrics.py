@@ -386,12 +386,18 @@ def by_episode(
     places = grid.places(decisions)
 
     def values(metric: Metric) -> Floats:
-        if not metric.episodes:
-            return of_decisions(metric, decisions, places, len(episodes))
-        numbers = [metric.episodes(episode) for episode in episodes]
-        return np.array([np.nan if v is None else float(v) for v in numbers])
+        if metric.episodes:
+            return of_ends(metric, grid, episodes)
+        return of_decisions(metric, decisions, places, len(episodes)).reshape(grid.shape)
 
-    return {metric.name: values(metric).reshape(grid.shape) for metric in metrics}
+    return {metric.name: values(metric) for metric in metrics}
+
+
+def of_ends(metric: Metric, grid: Grid, episodes: Sequence[Episode]) -> Floats:
+    """Return a metric of how episodes ended, (C, S, E); the episodes are in the order of the grid."""
+    assert metric.episodes
+    numbers = [metric.episodes(episode) for episode in episodes]
+    return np.array([np.nan if v is None else float(v) for v in numbers]).reshape(grid.shape)
 
 
 def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Floats:

@@ -93,7 +93,11 @@ def test_a_driver_may_be_an_action() -> None:
 
 
 def test_references_have_intervals_and_n_as_a_model_has(small: Dataset) -> None:
-    for name, score in in_trees(small).items():
+    for name, scores in in_trees(small).items():
+        score, balanced = scores["success_rate"], scores["balanced_success_rate"]
+        with_danger, without = scores["success_dangerous_rate"], scores["success_harmless_rate"]
+        assert (balanced.n, with_danger.n, without.n) == (4, 3, 1)
+        assert balanced.value == fmean([with_danger.value or 0.0, without.value or 0.0])
         assert (score.metric, score.n, score.interval) == ("success_rate", 4, "episodes"), name
         assert score.low is not None
         assert score.high is not None
