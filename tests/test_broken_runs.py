@@ -133,7 +133,7 @@ def test_a_wrong_answer_says_what_is_wrong(old: bytes, new: bytes, said: str, ru
         (lambda text: text.replace("True", "perhaps"), "'perhaps'"),
         (lambda text: text.replace(",True,", ",,"), "success is unknown in some rows"),
         (lambda text: text.replace("6g", "7g"), "not every episode is there once"),
-        (lambda text: text.replace("failure", "fail"), "Column 'failure'"),
+        (lambda text: text.replace("failure", "fail"), "it lacks failure"),
     ],
 )
 def test_wrong_episodes_say_what_is_wrong(wrong: Callable[[str], str], said: str, run: Path) -> None:

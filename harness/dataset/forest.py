@@ -18,9 +18,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.schema import Edge, End, Tree
+from harness.world.conflict_measures import columns
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import RATINGS, ROUNDING_S
 from harness.world.parameters import Parameters
@@ -97,6 +99,16 @@ class Forest:
         return np.array(
             [edge.end is not None and RATINGS[edge.end.result] == "unsafe" for edge in self.edges]
         )
+
+    @cached_property
+    def conflicts(self) -> Mapping[str, Floats]:
+        """How near others come to the ego in time on each edge, (edges,), as columns of decisions."""
+
+        def known(measure_s: float | UnsetType | None) -> float:
+            return np.nan if measure_s is UNSET else np.inf if measure_s is None else measure_s
+
+        ttc_s, pet_s = zip(*((known(edge.ttc_s), known(edge.pet_s)) for edge in self.edges), strict=True)
+        return columns(np.array(ttc_s), np.array(pet_s))
 
     @cached_property
     def earliest_s(self) -> Floats:

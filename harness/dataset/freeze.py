@@ -16,6 +16,7 @@ from harness.core.files import digest
 from harness.dataset.schema import Branching, Danger, Edge, End, Record
 from harness.world import lockstep
 from harness.world.beacons import known
+from harness.world.conflict_measures import rounded
 from harness.world.drivers import DRIVERS, choices
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graphs, truth_graphs
@@ -56,6 +57,7 @@ def edges(worlds: Sequence[World], episode: int) -> tuple[list[list[Edge]], list
     p = worlds[0].scenario.parameters
     for world in waiting:
         world.outcome, world.hard_brakings = Outcome(), 0  # count only what happens from here on
+        world.conflicts = world.conflicts.anew()
     lockstep.advance(waiting, [p.due_frame(world.step) + p.lag_frames for world in waiting])
     parts_of_world = [list(_branches(world)) for world in waiting]
     branches = [branch for parts in parts_of_world for _, branch in parts]
@@ -86,7 +88,8 @@ def _edge(actions: list[str], branch: World, episode: int, following: dict[str, 
     else:
         child, _ = following.setdefault(scene_id(episode, branch.state()), (len(following), branch))
     gap_m = round(outcome.least_gap_m, 3)
-    return Edge(actions, child, end, gap_m, branch.hard_brakings, outcome.other_crashes)
+    conflicts_s = rounded(branch.conflicts.ttc_s), rounded(branch.conflicts.pet_s)
+    return Edge(actions, child, end, gap_m, branch.hard_brakings, outcome.other_crashes, *conflicts_s)
 
 
 def _drivers(

@@ -14,6 +14,7 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, Purpose
+from harness.world.conflict_measures import HORIZON_S
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import Conflict, Node, SceneGraph, Sector
 from harness.world.state import (
@@ -36,6 +37,7 @@ Episode = Annotated[int, Meta(ge=0, le=LAST_EPISODE)]
 Text = Annotated[str, Meta(max_length=200)]
 FileName = Annotated[str, Meta(pattern=FILE_NAME)]
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+Seconds = Annotated[float, Meta(ge=0, le=HORIZON_S)]
 SceneId = Annotated[str, Meta(pattern="^[0-9]{5}-[0-9]-[0-9a-f]{12}$")]
 
 
@@ -93,6 +95,8 @@ class Edge(Closed, frozen=True):
         least_gap_m: smallest distance to another vehicle's outline on the way.
         hard_brakings: times the ego begins to brake harder than 4 m/s² on the way.
         other_crashes: vehicles that crash without the ego on the way.
+        ttc_s: least time to collision on the way; None where none was near, unset in older datasets.
+        pet_s: least post-encroachment time of arrivals on the way; as `ttc_s`.
     """
 
     actions: Annotated[list[Text], Meta(min_length=1)]
@@ -101,6 +105,8 @@ class Edge(Closed, frozen=True):
     least_gap_m: Number
     hard_brakings: Count
     other_crashes: Count
+    ttc_s: Seconds | UnsetType | None = UNSET
+    pet_s: Seconds | UnsetType | None = UNSET
 
 
 class Branching(Closed, frozen=True):

@@ -232,6 +232,13 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
             (edge.to is None) != (edge.end is None) for edge in edges
         ),
         "an edge leads to a decision point that is not there": all(to < n for to, n in continuing),
+        "some edges have measures of conflicts, and some have not": len(
+            {each is msgspec.UNSET for edge in edges for each in (edge.ttc_s, edge.pet_s)}
+        ) <= 1,
+        "a collision is no conflict": all(
+            edge.ttc_s is msgspec.UNSET or (edge.ttc_s, edge.pet_s) == (0.0, 0.0)
+            for edge in edges if edge.end and edge.end.result == "collision"
+        ),
     }  # fmt: skip
     return [problem for problem, holds in conditions.items() if not holds]
 

@@ -5,6 +5,7 @@ observed once, until one of them takes another action than the rest, or takes it
 world branches. A branch continues exactly as the undivided world would, to the last bit.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import itemgetter
@@ -21,6 +22,9 @@ class Decision:
     action: str  # the meta-action
     frame: int  # the frame in which it acts
     acted: bool = False  # whether it has acted
+    # least time to collision and post-encroachment time until the next decision begins; inf for none
+    ttc_s: float = math.inf
+    pet_s: float = math.inf
 
 
 @dataclass
@@ -31,6 +35,7 @@ class Course:
     seed: int  # seed of the channel's draws
     # the decision that has not acted yet; until it does, the ego keeps to its last action
     open: Decision | None = None
+    last: Decision | None = None  # the decision that began last
     skipped: int = 0  # how many decisions did not begin, since one was still open when they were due
 
 
@@ -41,6 +46,14 @@ class Trajectory:
     number: int  # the episode's number
     world: World  # the world
     courses: list[Course]  # the episode under each condition and seed
+
+    def measure(self) -> None:
+        """Add the world's conflicts to the last decision of each course, and begin them anew."""
+        for decision in (course.last for course in self.courses):
+            if decision:
+                decision.ttc_s = min(decision.ttc_s, self.world.conflicts.ttc_s)
+                decision.pet_s = min(decision.pet_s, self.world.conflicts.pet_s)
+        self.world.conflicts = self.world.conflicts.anew()
 
     def act(self) -> list["Trajectory"]:
         """Let the decisions that are ready act; return one trajectory for each target the egos then have."""

@@ -160,6 +160,7 @@ class FrozenWorld(SceneWorld):
             "delay_s": forest.delay_s[at, action],
             "miss": forest.miss[at, action], "false_alarm": forest.false_alarm[at, action],
             "off_lag": np.where(np.isnan(latency_s), np.nan, off_lag),
+            **{name: values[forest.edge[at, action]] for name, values in forest.conflicts.items()},
             **by_action("safe", forest.safe[at], forest.actions),
             **by_action("delay_s", forest.delay_s[at], forest.actions),
         }  # fmt: skip

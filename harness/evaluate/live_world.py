@@ -25,7 +25,7 @@ from harness.evaluate.settings import DriveSettings
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.runs import metrics
 from harness.runs.records import ClosedLoop, Episode
-from harness.world import reference, scenarios
+from harness.world import conflict_measures, reference, scenarios
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import Outcome, rating
 from harness.world.parameters import frames
@@ -146,7 +146,7 @@ class LiveWorld(SceneWorld):
             for (_, course), latency_s, action in zip(
                 self._places(part.point), latencies_s, chosen, strict=True
             ):
-                course.open = Decision(actions[action], due_frame + frames(latency_s, hz))
+                course.open = course.last = Decision(actions[action], due_frame + frames(latency_s, hz))
                 self._decisions.append(course.open)
         self._advance()
 
@@ -159,14 +159,18 @@ class LiveWorld(SceneWorld):
     def _advance(self) -> None:
         self._step += 1
         parts = branches.advance(self._going, self._p.due_frame(self._step))
+        for part in parts:
+            part.measure()
         self._ended += [part for part in parts if part.world.outcome.ended]
         self._going = [part for part in parts if not part.world.outcome.ended]
 
     def columns(self) -> dict[str, Any]:
-        """Return when each decision acts and whether it did, in the order of decisions."""
+        """Return when each decision acts, whether it did, and conflicts, in the order of decisions."""
+        ttc_s, pet_s = (np.array([getattr(d, name) for d in self._decisions]) for name in ("ttc_s", "pet_s"))
         return {
             "acts_at_s": np.array([d.frame for d in self._decisions]) / self._p.simulation_hz,
             "acted": np.array([d.acted for d in self._decisions]),
+            **conflict_measures.columns(ttc_s, pet_s),
         }
 
     def episodes(self) -> list[Episode]:

@@ -129,6 +129,12 @@ def of_run(run: Run) -> Iterator[str]:
             f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
             "closed-loop success may differ. harness study fidelity compares the two."
         )
+    if all(e.short_ttc is None for e in run.episodes):
+        older = "dataset" if run.world == "frozen" else "run"
+        yield (
+            f"Time to collision and post-encroachment time are unknown: this {older} is older than these "
+            "measures."
+        )
 
 
 def findings_of(manifest: Manifest) -> Iterator[str]:

@@ -48,7 +48,7 @@ KEPT = (
 )  # fmt: skip
 ENDING = (
     "condition", "seed", "partner", "striker", "fault", "time_s", "delay_s", "least_gap_m", "hard_brakings",
-    "other_crashes",
+    "other_crashes", "least_ttc_s", "least_pet_s",
 )  # fmt: skip
 # The same for all decisions of a scene, or known from its outcomes.
 LEFT_OUT = ("scene", "episode", "step", "danger", "seed", "safe", "delay_s")

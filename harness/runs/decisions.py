@@ -32,10 +32,14 @@ COLUMNS = {
     "normalised_entropy": NUMBER, "own_weight": NUMBER, "latency_ms": NUMBER, "deadline_missed": FLAG,
     "fusion_ms": NUMBER, "fusion_failed": FLAG, "effective_loss": NUMBER, "observed_loss": NUMBER,
     "value": FLAG, "safe": FLAG, "regret": FLAG, "delay_s": NUMBER, "off_lag": FLAG, "acts_at_s": NUMBER,
-    "acted": FLAG, "miss": FLAG, "false_alarm": FLAG,
+    "acted": FLAG, "miss": FLAG, "false_alarm": FLAG, "ttc_s": NUMBER, "pet_s": NUMBER, "short_ttc": FLAG,
+    "short_pet": FLAG,
 }  # fmt: skip
 # A file has no such column if all its values are unknown.
-OPTIONAL = ("busy_ratio", "inference_j", "helpers_j", "radio_mj", "waiting_j", "miss", "false_alarm")
+OPTIONAL = (
+    "busy_ratio", "inference_j", "helpers_j", "radio_mj", "waiting_j", "miss", "false_alarm", "ttc_s",
+    "pet_s", "short_ttc", "short_pet",
+)  # fmt: skip
 NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # One column for each action: the policy, and the outcome of the action.
 OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}

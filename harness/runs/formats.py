@@ -100,14 +100,21 @@ COLUMNS: Mapping[str, Added] = {
     "busy_ratio": Added("2026-11-23", None, "load of the channel; also missing where it is not known"),
     **dict.fromkeys(("miss", "false_alarm"),
                     Added("2026-11-27", None, "misses and false alarms; also missing in closed loop")),
+    **dict.fromkeys(("ttc_s", "pet_s", "short_ttc", "short_pet"),
+                    Added("2026-11-27", None, "conflicts in time; also missing on trees of older datasets")),
 }  # fmt: skip
 # Columns of episodes.csv; `records.Episode` has the same defaults.
-EPISODE: Mapping[str, Added] = dict.fromkeys(
-    ("outcome", "time_lost_s", "miss", "false_alarm"),
-    Added(
-        "2026-11-27", None, "the price of caution; also empty in closed loop, and `outcome` under limits 1"
+EPISODE: Mapping[str, Added] = {
+    **dict.fromkeys(
+        ("outcome", "time_lost_s", "miss", "false_alarm"),
+        Added("2026-11-27", None,
+              "the price of caution; also empty in closed loop, and `outcome` under limits 1"),
     ),
-)
+    **dict.fromkeys(
+        ("least_ttc_s", "short_ttc", "least_pet_s", "short_pet"),
+        Added("2026-11-27", None, "conflicts in time; also empty on trees of older datasets"),
+    ),
+}  # fmt: skip
 
 
 def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:

@@ -263,6 +263,18 @@ BUILT_IN = (
            "higher", label="least gap", episodes=_field("least_gap_m")),
     Metric("hard_brakings_per_episode", "number of times that the ego begins to brake harder than 4 m/s²",
            MEAN_COUNT, "lower", episodes=_field("hard_brakings")),
+    Metric("least_ttc_s", "least time to collision with another vehicle at constant velocities, up to 5 s; "
+           "only episodes in which it is known", SECONDS, "higher", label="least TTC",
+           episodes=_field("least_ttc_s"), optional=True),
+    _rate("short_ttc_rate", "share of episodes with a time to collision below 1.5 s", _field("short_ttc"),
+          label="short TTC rate", optional=True),
+    _share("short_ttc_decision_rate", "share of decisions with a time to collision below 1.5 s before the "
+           "next one", "short_ttc", label="short TTC decision rate", optional=True),
+    Metric("least_pet_s", "least post-encroachment time: from one vehicle's leaving a place to the other's "
+           "arrival, the ego one of them, up to 5 s; only episodes in which it is known", SECONDS, "higher",
+           label="least PET", episodes=_field("least_pet_s"), optional=True),
+    _rate("short_pet_rate", "share of episodes with a post-encroachment time below 1.5 s",
+          _field("short_pet"), label="short PET rate", optional=True),
     Metric("other_crashes_per_episode", "number of vehicles that crash without the ego", MEAN_COUNT, "lower",
            episodes=_field("other_crashes")),
     Metric("decisions_per_episode", "number of decisions begun", MEAN_COUNT, "neither",
@@ -421,6 +433,13 @@ def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
     count = np.bincount(places[known], minlength=n)
     total = sum_by_place(values[known], places[known], n)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def least_by_place(values: Floats, places: Ints, n: int) -> Floats:
+    """Return the least of the known values at each of n places, (n,); NaN where there is none."""
+    least = np.full(n, np.nan)
+    np.fmin.at(least, places, values)
+    return least
 
 
 def over_seeds(name: str, values: Floats) -> Estimate:

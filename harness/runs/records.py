@@ -265,6 +265,10 @@ class Episode(Struct, frozen=True, kw_only=True):
     time_lost_s: float | None = None
     miss: bool | None = None  # whether a decision made harm inevitable, which was not before
     false_alarm: bool | None = None  # whether a decision gave success away, and harm could still be avoided
+    least_ttc_s: float | None = None  # least time to collision with another vehicle; None where none was near
+    short_ttc: bool | None = None  # whether it was below 1.5 s; None where it was not measured
+    least_pet_s: float | None = None  # least post-encroachment time
+    short_pet: bool | None = None  # whether it was below 1.5 s
 
 
 class Variant(Struct, frozen=True):

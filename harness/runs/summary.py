@@ -35,6 +35,7 @@ from harness.runs.metrics import (
     halved,
     in_range,
     known_in,
+    least_by_place,
     mean_by_place,
     metrics_of,
     over_episodes,
@@ -169,8 +170,11 @@ def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> li
     def totals(values: Floats) -> list[int]:
         return [int(total) for total in sum_by_place(values, places, n)]
 
+    def known(values: Floats) -> list[Any]:
+        return [None if v != v else v for v in values.tolist()]
+
     def means(name: str) -> list[Any]:
-        return [None if v != v else v for v in mean_by_place(decisions[name], places, n).tolist()]
+        return known(mean_by_place(decisions[name], places, n))
 
     columns = {
         "messages": totals(decisions["messages"]),
@@ -179,8 +183,10 @@ def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> li
         "deadline_misses": totals(decisions["deadline_missed"]),
         "decisions": totals(np.ones(len(places))),
     }
-    for name in ("miss", "false_alarm"):
+    for name in ("miss", "false_alarm", "short_ttc", "short_pet"):
         columns[name] = [None if share is None else share > 0 for share in means(name)]
+    for name in ("ttc_s", "pet_s"):
+        columns[f"least_{name}"] = known(least_by_place(decisions[name], places, n))
     if not np.isnan(decisions["acted"]).all():
         columns["never_acted"] = totals(1.0 - decisions["acted"])
     return [

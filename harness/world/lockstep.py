@@ -24,6 +24,7 @@ from highway_env.vehicle.controller import ControlledVehicle
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import printable
+from harness.world.conflict_measures import observe
 from harness.world.perception.rays import turned
 from harness.world.road import Lane, Road, lanes_of
 from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M, Traffic
@@ -84,13 +85,16 @@ def _together(lanes: "Lanes", worlds: Sequence[World], until_frames: Sequence[in
             going = going[~over]
             fleet.keep(~over)
     _frames[type(fleet)] += passed
+    poses = poses[:, :passed]
     poses[..., :2] -= worlds[0].scenario.road().origin_m
     np.copyto(poses, np.nan, where=~there[:, None, :, None])
     before_m = np.array([world.outcome.least_gap_m for world in worlds])
     gaps_m = least_gaps_m(poses, sizes_m, before_m).tolist()
-    rows = zip(worlds, poses, begun.tolist(), speeds_mps, gaps_m, strict=True)
-    for world, frames, first, speed_mps, gap_m in rows:
-        world.passed(frames[: world.frame - first, : len(world.vehicles)], speed_mps, gap_m)
+    hz = worlds[0].scenario.parameters.simulation_hz
+    conflicts = observe([world.conflicts for world in worlds], poses, sizes_m, begun + 1, hz)
+    rows = zip(worlds, poses, begun.tolist(), speeds_mps, gaps_m, conflicts, strict=True)
+    for world, frames, first, speed_mps, gap_m, so_far in rows:
+        world.passed(frames[: world.frame - first, : len(world.vehicles)], speed_mps, gap_m, so_far)
 
 
 def _form() -> "type[Fleet]":

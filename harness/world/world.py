@@ -15,6 +15,7 @@ import shapely
 
 from harness.core.arrays import Floats, Ints
 from harness.world import beacons
+from harness.world.conflict_measures import Conflicts, observe
 from harness.world.outcome import Outcome, fault, outline, striker
 from harness.world.scenario import Layout, Scenario
 from harness.world.simulator import copied, new_road, populated, spawn_of, state_of, vehicle_on
@@ -47,6 +48,7 @@ class World:
     outcome: Outcome = field(default_factory=Outcome)
     hard_brakings: int = 0  # how often the ego began to brake harder than HARD_BRAKING_MPS2
     braking_hard: bool = False  # whether it braked so hard in the last frame
+    conflicts: Conflicts = field(default_factory=Conflicts)  # how near others came to the ego in time
     beacons: tuple[Beacon, ...] = ()  # the beacons that still matter (`WorldState.beacons`)
 
     @classmethod
@@ -175,16 +177,19 @@ class World:
             poses = self._in_road_frame(frames)
             sizes_m = np.array([[(v.LENGTH, v.WIDTH) for v in self.vehicles]])
             [gap_m] = least_gaps_m(poses[None], sizes_m, np.array([self.outcome.least_gap_m])).tolist()
-            self.passed(poses, speed_mps, gap_m)
+            first, hz = np.array([self.frame + 1 - len(frames)]), self.scenario.parameters.simulation_hz
+            [conflicts] = observe([self.conflicts], poses[None], sizes_m, first, hz)
+            self.passed(poses, speed_mps, gap_m, conflicts)
 
-    def passed(self, poses: Floats, speed_mps: float, gap_m: float) -> None:
-        """Record the last frames: beacons, the least gap so far and hard braking.
+    def passed(self, poses: Floats, speed_mps: float, gap_m: float, conflicts: Conflicts) -> None:
+        """Record the last frames: beacons, the least gap so far, conflicts and hard braking.
 
         `poses` are x, y, heading and speed of each vehicle in each frame, (F, V, 4), from the origin of the
         scenario's road; `speed_mps` is the ego's before these frames.
         """
         self._broadcast(poses, self.frame + 1 - len(poses))
         self.outcome = replace(self.outcome, least_gap_m=gap_m)
+        self.conflicts = conflicts.collided() if self.outcome.result == "collision" else conflicts
         speeds_mps = np.concatenate([[speed_mps], poses[:, 0, 3]])
         slows_mps2 = (speeds_mps[:-1] - speeds_mps[1:]) * self.scenario.parameters.simulation_hz
         hard = [self.braking_hard, *(slows_mps2 > HARD_BRAKING_MPS2).tolist()]

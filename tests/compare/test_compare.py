@@ -26,9 +26,14 @@ from harness.world.scenarios.occluded_intersection import SCENARIO
 
 Said = tuple[int, str, str]
 BY_DANGER = {name for name, metric in METRICS.items() if metric.half}
+CONFLICTS = {"least_ttc_s", "short_ttc_rate", "short_ttc_decision_rate", "least_pet_s", "short_pet_rate"}
 # Which not every episode has.
-SOME = {"time_to_clear_s", "regret_rate", "delay_s", "time_lost_s", *BY_DANGER}
-OPTIONAL = {name for name, metric in METRICS.items() if metric.optional} - {"time_lost_s", *BY_DANGER}
+SOME = {
+    "time_to_clear_s", "regret_rate", "delay_s", "time_lost_s", "least_ttc_s", "least_pet_s", *BY_DANGER,
+}  # fmt: skip
+OPTIONAL = {name for name, metric in METRICS.items() if metric.optional} - {
+    "time_lost_s", *BY_DANGER, *CONFLICTS,
+}  # fmt: skip
 NAMES = {name for name, metric in METRICS.items() if metric.compared}
 LIVE = {name for name, metric in METRICS.items() if metric.world == "closed-loop"}
 

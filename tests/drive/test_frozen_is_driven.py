@@ -11,13 +11,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from evaluating import live_spec_of, run, spec_of
 
 from harness.coordination.contents import CONTENTS, TEXT
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.resources import DATASET
-from harness.dataset.load import find, load
+from harness.dataset.load import Dataset, find, load
+from harness.report.caveats import of_run
 from harness.runs import folder
 from harness.runs.folder import Run
 from harness.world.drivers import DRIVERS
@@ -82,3 +84,36 @@ def test_what_the_tree_says_is_what_driving_gives(
     assert len(left_out) <= (1 - least) * len(found)
     for place in found.keys() - left_out:
         assert found[place] == expected[place], place
+
+
+CONFLICTS = ("least_ttc_s", "short_ttc", "least_pet_s", "short_pet")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [*DRIVERS, "proxy"])
+def test_conflicts_in_a_tree_are_those_of_driving(tmp_path: Path, small: Dataset, model: str) -> None:
+    """Of each decision and episode, on a tree that is built today; the shipped ones are older."""
+    how: dict[str, Any] = {"points": (ALONE,), "seeds": (0,)}
+    driven = live_spec_of(model, len(small.episodes), small.manifest.seed, **how)
+    walked, drove = (
+        folder.read(run(spec, tmp_path / name).out)
+        for spec, name in ((spec_of(small, model, **how), "walked"), (driven, "drove"))
+    )
+    assert not off_lag(walked)
+    for e, expected in zip(walked.episodes, drove.episodes, strict=True):
+        assert [getattr(e, name) for name in CONFLICTS] == [getattr(expected, name) for name in CONFLICTS]
+        assert e.failure != "collision" or (e.least_ttc_s, e.least_pet_s) == (0.0, 0.0)
+    for name in ("ttc_s", "pet_s", "short_ttc", "short_pet"):
+        np.testing.assert_array_equal(walked.decisions[name], drove.decisions[name])
+    assert walked.score(ALONE.name, "short_ttc_rate") == drove.score(ALONE.name, "short_ttc_rate")
+    if model != "brake":
+        assert any(e.least_ttc_s for e in walked.episodes)
+        assert any(e.least_pet_s is not None for e in walked.episodes)
+
+
+def test_what_an_older_tree_does_not_hold_is_unknown_and_said(tmp_path: Path) -> None:
+    older = folder.read(run(spec_of(load(find(DATASET), 2), "cruise"), tmp_path / "older").out)
+    assert {getattr(e, name) for e in older.episodes for name in CONFLICTS} == {None}
+    assert np.isnan(older.decisions["short_ttc"]).all()
+    assert not {s.metric for s in older.scores} & {"least_ttc_s", "short_ttc_rate", "short_ttc_decision_rate"}
+    assert [s for s in of_run(older) if "Time to collision" in s and "dataset is older" in s]

@@ -421,6 +421,9 @@ HOSTILE_TREES = {
     "an unknown end": at("levels", 5, 0, "edges", 0, "end", "result", value="won"),
     "a time out of this world": at("levels", 5, 0, "edges", 0, "end", "time_s", value=1e300),
     "an unknown field": at("more", value=1),
+    "a time to collision in the past": at("levels", 0, 0, "edges", 0, "ttc_s", value=-1.0),
+    "an edge without the measures of the others": lambda tree: tree["levels"][0][0]["edges"][0].pop("pet_s"),
+    "a collision that is no conflict": at("levels", 5, 0, "edges", 0, "end", "result", value="collision"),
 }
 
 

@@ -43,6 +43,7 @@ def everything(world):
         world.outcome,
         world.hard_brakings,
         world.braking_hard,
+        (world.conflicts.ttc_s, world.conflicts.pet_s),
         world.beacons,
         vehicles,
     )

@@ -28,10 +28,12 @@ function endings(ends) {
     ],
     number(e.time_s, 2, "s"),
     number(e.least_gap_m, 1, "m"),
+    number(e.least_ttc_s, 2, "s"),
+    number(e.least_pet_s, 2, "s"),
   ]);
   return [
     h("h3", {}, "How the episode ended"),
-    table("ends", ["condition", "result", "at", "least gap"], rows),
+    table("ends", ["condition", "result", "at", "least gap", "least TTC", "least PET"], rows),
   ];
 }
 

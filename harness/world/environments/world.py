@@ -148,7 +148,10 @@ class EnvironmentWorld(World):
 
     def _recast(self) -> None:
         """Remove vehicles that have left, and add new ones."""
-        present = {id(v) for v in self.road.vehicles}
+        present, places = (
+            {id(v) for v in self.road.vehicles},
+            {id(v): n for n, v in enumerate(self.everybody)},
+        )
         self.everybody = [v for v in self.everybody if id(v) in present]
         known = {id(v) for v in self.everybody}
         for v in self.everybody:
@@ -156,6 +159,9 @@ class EnvironmentWorld(World):
         for v in self.road.vehicles:
             if id(v) not in known:
                 self._enter(v, "other")
+        now = [places.get(id(v), -1) for v in self.everybody]
+        if now != list(range(len(places))):
+            self.conflicts = self.conflicts.recast(now)
 
     def _move(self) -> None:
         self.constants.restore()
