@@ -86,6 +86,8 @@ def _edge(actions: list[str], branch: World, episode: int, following: dict[str, 
         contact = outcome.partner, outcome.striker, outcome.fault
         end = End(outcome.result, outcome.time_s, *contact)  # type: ignore[arg-type]
     else:
+        # Where several edges lead to one state, the post-encroachment times after it are by the past of the
+        # first. No tree that ships has such edges.
         child, _ = following.setdefault(scene_id(episode, branch.state()), (len(following), branch))
     gap_m = round(outcome.least_gap_m, 3)
     conflicts_s = rounded(branch.conflicts.ttc_s), rounded(branch.conflicts.pet_s)

@@ -53,7 +53,10 @@ class Conflicts:
         return replace(self, ttc_s=0.0, pet_s=0.0)
 
     def recast(self, places: Sequence[int]) -> "Conflicts":
-        """Return the same for other vehicles: each one's place among those before, or -1 for a new one."""
+        """Return the same for other vehicles: each one's place among those before, or -1 for a new one.
+
+        Where a vehicle was that has left is forgotten.
+        """
         at = np.array(places)
         trail = np.where((at < 0)[:, None], np.nan, self.trail[:, at]) if self.trail.size else self.trail
         box = np.where(at < 0, np.inf, self.box[:, at]) if self.box.size else self.box
