@@ -15,7 +15,7 @@ from harness.evaluate.settings import FrozenSettings
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
-from harness.runs.metrics import World
+from harness.runs.metrics import BALANCED, World, entry
 from harness.runs.records import Episode, FrozenScenes
 from harness.world.outcome import rating
 from harness.world.parameters import frames
@@ -171,13 +171,20 @@ class FrozenWorld(SceneWorld):
         return self._forest.episodes
 
     def ends(self, point: OperatingPoint) -> dict[str, Floats]:
-        """Return success, failure and lateness under a condition, (S, E); NaN where a walk was left out."""
+        """Return success, failure and lateness under a condition, (S, E); NaN where a walk was left out.
+
+        Success with a danger and without is NaN in the other episodes as well.
+        """
         walks, trees = self._walks[point], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])
         success = self._forest.succeeds(walks.last, trees)
         unsafe = ~cleared if self.scenario.parameters.limits == 1 else self._forest.harms[walks.last]
         ends = {"success_rate": success, "unsafe_rate": unsafe, "late_rate": cleared & ~success}
-        return {name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()}
+        known = {name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()}
+        dangerous = np.array([danger is not None for danger in self._forest.dangers])
+        for name, of_half in zip(entry(BALANCED).halves, (dangerous, ~dangerous), strict=True):
+            known[name] = np.where(of_half, known["success_rate"], np.nan)
+        return known
 
     def episodes(self) -> list[Episode]:
         return [

@@ -13,11 +13,12 @@ from harness.core.statistics import Estimate
 from harness.report.runs import Runs
 from harness.report.words import shown
 from harness.runs.folder import Run
-from harness.runs.metrics import LATENCY, SUCCESS, difference, p_value
+from harness.runs.metrics import BALANCED, LATENCY, SUCCESS, difference, entry, p_value
 from harness.runs.records import Score
 
 Successes = Mapping[tuple[int, int], float]  # 0 or 1, by episode and seed
 
+LEADING = (BALANCED, *entry(BALANCED).halves)
 BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 
 
@@ -59,7 +60,7 @@ class Grid:
 
 
 METRICS = (
-    SUCCESS, "strict_rate", "recovered_rate", "failed_rate", LATENCY, "latency_p95_ms", "brier",
+    *LEADING, SUCCESS, "strict_rate", "recovered_rate", "failed_rate", LATENCY, "latency_p95_ms", "brier",
 )  # fmt: skip
 
 

@@ -14,9 +14,12 @@ from harness.evaluate.table import columns
 from harness.evaluate.walk import Ask, Decided, World, walk
 from harness.runs.decisions import DECIMALS
 from harness.runs.metrics import (
+    BALANCED,
     METRICS,
     PERCENTILES,
+    halved,
     in_range,
+    known_in,
     of_decisions,
     over_episodes,
     over_seeds,
@@ -49,7 +52,8 @@ class WalkResult:
     """What a walk at one operating point came to, for some seeds and episodes of each."""
 
     episodes: Ints  # their numbers, (E,)
-    ends: Mapping[str, Floats]  # each of `ENDS`, (S, E); NaN where an episode was left out
+    # each of `ENDS`, and success by danger where that is known, (S, E); NaN where an episode was left out
+    ends: Mapping[str, Floats]
     columns: Mapping[str, Floats]  # what was read of the decisions by name, (n, ...)
     places: Ints  # the episode of each decision, counted row by row in (S, E), (n,)
 
@@ -167,7 +171,7 @@ class _Part(NamedTuple):
 def _part(walked: WalkResult, seeds: int) -> _Part:
     n = len(walked.episodes)
     seed, latency_ms = walked.places // n, walked.columns["latency_ms"]
-    metrics = {**{name: walked.ends[name] for name in ENDS}, **by_episode(walked, PER_DECISION)}
+    metrics = {**walked.ends, **by_episode(walked, PER_DECISION)}
     return _Part(walked.episodes, metrics, [latency_ms[seed == place] for place in range(seeds)])
 
 
@@ -186,10 +190,11 @@ def _estimates(
     source: Source, metrics: Mapping[str, Floats], latency_ms: Floats
 ) -> Iterator[tuple[str, Estimate, str]]:
     over = over_seeds if source.same_episodes else over_own_episodes
-    for name, values in metrics.items():
-        yield name, over(name, values), "seed means"
+    known = known_in(metrics)
+    for name in (name for name in (*metrics, BALANCED) if name in known):
+        yield name, halved(name, lambda each: over(each, metrics[each]), shared=True), "seed means"
         if source.same_episodes:
-            yield name, over_episodes(name, values), "episodes"
+            yield name, halved(name, lambda each: over_episodes(each, metrics[each])), "episodes"
     for percent, values in zip(PERCENTILES, latency_ms.T, strict=True):
         yield f"latency_p{percent}_ms", seed_interval(values), "seed means"
 
