@@ -93,6 +93,7 @@ def test_a_twin_changes_the_question_with_the_chat(data: Dataset, twin: str) -> 
     change = TWINS[twin].text
     assert change is not None
     changed = [(r, change(spec, r)) for r in requests(spec, scenes_of(data)[:3])]
+    assert any(old.question != new.question for old, new in changed)
     for old, new in changed:
         assert old.question is not None
         assert new.question is not None

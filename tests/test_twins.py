@@ -23,6 +23,7 @@ from harness.dataset.load import Dataset, Scene, load
 from harness.evaluate.asking import requests
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
+from harness.prompts.decision import CARE
 from harness.report.compare.gate import gate
 from harness.studies.twins import asking, declared, scoring
 from harness.studies.twins import study as twins_page
@@ -305,7 +306,8 @@ def test_every_prompt_that_ships_has_twins_of_its_text(crossing: Dataset, versio
 
 
 def test_every_paraphrase_is_of_a_sentence_that_ships() -> None:
-    shipped = "\n".join(file.read_text() for file in folder("prompts").glob("*/*.j2"))
+    prompts = (file.read_text() for file in folder("prompts").glob("*/*.j2"))
+    shipped = "\n".join([*prompts, *CARE.values()])
     for sentence, other in declared.paraphrases().items():
         assert sentence in shipped
         assert sentence not in other

@@ -228,7 +228,8 @@ def _show(spec: "Spec", seen: "Checkup") -> None:
         for difference in contradictions(card):
             typer.echo(f"warning      {difference}")
     if seen.tokens is None:
-        typer.echo("tokens       not known here: the server renders the prompt and counts them")
+        why = "the server renders the prompt and counts them" if card.server else "it counts none"
+        typer.echo(f"tokens       not known here: {why}")
     else:
         typer.echo(
             f"tokens       {len(seen.tokens)} in the prompt, {seen.bos_tokens} of them BOS at its beginning"

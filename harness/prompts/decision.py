@@ -19,6 +19,12 @@ MEANINGS = {
     "LANE_RIGHT": "change to the lane on the right",
 }
 
+# What counts, by who is asked.
+CARE = {
+    "ego": "Never collide, and lose no time where nothing is in your way.",
+    "helper": "It must never collide, and should lose no time where nothing is in its way.",
+}
+
 
 @dataclass(frozen=True)
 class Question:
@@ -44,19 +50,16 @@ def question(
     `words` are the scenario's (`Scenario.prompt_words`).
     """
     ego, task, hiding = graph.ego.id, words.get("task", "drive on"), words.get("hiding")
+    care = CARE[graph.role]
     if graph.role == "ego":
         hidden = f" Other cars may be hidden by {hiding}." if hiding else ""
-        instructions = (
-            f"You drive car {ego}. Your task: {task}.{hidden} Never collide, and lose no time where nothing "
-            "is in your way. What do you do in the next second?"
-        )
+        asked = f"You drive car {ego}. Your task: {task}.{hidden} {care} What do you do in the next second?"
     else:
-        instructions = (
-            f"You help car {ego}, which does not see all that you see. Its task: {task}. It must never "
-            "collide, and should lose no time where nothing is in its way. "
+        asked = (
+            f"You help car {ego}, which does not see all that you see. Its task: {task}. {care} "
             f"What should {ego} do in the next second?"
         )
-    return Question(messages[-1]["content"], instructions, {a: _meaning(a, words) for a in actions})
+    return Question(messages[-1]["content"], asked, {a: _meaning(a, words) for a in actions})
 
 
 def _meaning(action: str, words: Mapping[str, str]) -> str | None:
