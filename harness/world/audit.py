@@ -174,10 +174,15 @@ def judge(points: HiddenPoints, sectors: tuple[str, ...]) -> tuple[dict[str, Est
     from sklearn.model_selection import StratifiedGroupKFold
 
     layout, step, danger = points.layout, points.step, points.danger
-    varies = [k for k, column in enumerate(points.numbers.T) if len(np.unique(column[~np.isnan(column)])) > 1]
+    known, classes = ~np.isnan(points.numbers), np.unique(danger)
+    folds = list(StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(known, danger, layout))
+    # Learning fails on a number that is unknown wherever a model learns.
+    varies = [
+        k
+        for k, column in enumerate(points.numbers.T)
+        if len(np.unique(column[known[:, k]])) > 1 and all(known[learnt, k].any() for learnt, _ in folds)
+    ]
     table, names = points.numbers[:, varies], [points.names[k] for k in varies]
-    classes = np.unique(danger)
-    folds = list(StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(table, danger, layout))
     trees = partial(HistGradientBoostingClassifier, max_leaf_nodes=8, early_stopping=False, random_state=0)
     models = [trees(max_iter=40).fit(table[learnt], danger[learnt]) for learnt, _ in folds]
 

@@ -9,7 +9,7 @@ import one_way_crossing
 import pytest
 
 from harness.core.errors import UserError
-from harness.world.audit import HiddenPoints, Ranks, audit, judge, numbers
+from harness.world.audit import FOLDS, HiddenPoints, Ranks, audit, judge, numbers
 from harness.world.perception.graph import scene_graph
 from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, Parameters, layout
 from harness.world.world import World
@@ -94,6 +94,19 @@ def test_what_is_known_only_where_there_is_danger_tells_too(known):
     auc, told_by = judge(moments(table, danger), ("left", "right"))
     assert auc["danger"].value == 1.0
     assert list(told_by) == ["number 2"]
+
+
+@pytest.mark.slow
+def test_a_number_of_which_one_fold_alone_knows_anything_is_left_out(known):
+    """Where that fold's model learns, scikit-learn would have nothing to bin."""
+    from sklearn.model_selection import StratifiedGroupKFold
+
+    table, danger = known
+    splits = StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(table, danger, np.arange(200))
+    learnt, _ = next(iter(splits))
+    table[learnt, 2] = np.nan
+    auc, _ = judge(moments(table, danger), ("left", "right"))
+    assert auc == judge(moments(np.delete(table, 2, axis=1), danger), ("left", "right"))[0]
 
 
 # -- scenarios --------------------------------------------------------------------------------------
