@@ -14,7 +14,8 @@ import argparse
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,6 +55,11 @@ class Row(NamedTuple):
         return f"{self.model}-{self.prompt}-{self.answer}"
 
     @property
+    def who(self) -> Sequence[str]:
+        """The options that name it."""
+        return "--model", self.model, "--prompt", self.prompt, "--answer", self.answer
+
+    @property
     def datasets(self) -> Sequence[str]:
         """The datasets of its families."""
         named = suites.named(self.dataset)
@@ -76,16 +82,14 @@ def main() -> None:
     arguments.add_argument("--out", type=Path, default=Path("reports/contents"))
     arguments.add_argument("--page", type=Path)
     given = arguments.parse_args()
-    parts = []
     for row in ROWS:
         if given.only in row.name:
-            here = given.out / row.name
             limit = None if row.rule else given.limit
-            evaluate(row, here / "frozen", limit)
-            study = play(row, here)
-            driven = drive(row, here, limit) if row.drives else {}
-            parts.append(written(row, study, driven))
-    text = "\n\n".join(parts)
+            evaluate(row, given.out / row.name, limit)
+            drive(row, given.out / row.name, limit, play(row, given.out / row.name))
+    done = [row for row in ROWS if finished(given.out / row.name / "frozen")]
+    studies = [(row, play(row, given.out / row.name), driven(row, given.out / row.name)) for row in done]
+    text = "\n\n".join(written(*each) for each in studies)
     print(text)
     if given.page:
         page = given.page.read_text("utf-8")
@@ -101,15 +105,21 @@ def harness(*words: str) -> None:
     subprocess.run([sys.executable, "-m", "harness", *words, "--quiet"], check=True, stdout=sys.stderr)
 
 
-def evaluate(row: Row, out: Path, limit: int | None) -> None:
+def finished(out: Path) -> bool:
+    """Return whether a folder has a finished run or suite."""
+    return any((out / name).exists() for name in ("suite.json", "run.json"))
+
+
+def evaluate(row: Row, here: Path, limit: int | None) -> None:
     """Evaluate a model on frozen scenes, alone and with intents, unless it is done."""
-    if not any((out / name).exists() for name in ("suite.json", "run.json")):
+    out = here / "frozen"
+    if not finished(out):
         few = () if limit is None else ("--limit", str(limit))
-        who = ("--model", row.model, "--prompt", row.prompt, "--answer", row.answer)
         points = ("--condition", "single-local", "--condition", BASE)
-        harness("eval", *who, "--dataset", row.dataset, *points, *few, "--out", str(out))
+        harness("eval", *row.who, "--dataset", row.dataset, *points, *few, "--out", str(out))
 
 
+@cache
 def play(row: Row, here: Path) -> Study:
     """Play every content on a model's runs, and write the study's page."""
     print(f"harness study contents {here / 'frozen'} --out {here / 'contents'}", file=sys.stderr, flush=True)
@@ -120,26 +130,36 @@ def play(row: Row, here: Path) -> Study:
     return study
 
 
-def drive(row: Row, here: Path, limit: int | None) -> dict[str, Outcome]:
-    """Drive the layouts of a model's datasets with each content, and return the outcomes by content."""
-    families: dict[str, dict[str, dict[str, Floats]]] = {content: {} for content in PLAYED}
-    for name in row.datasets:
-        dataset = load(find(name))
-        scenario, out = dataset.scenario.name, here / "driven" / name
+def drive(row: Row, here: Path, limit: int | None, study: Study) -> None:
+    """Drive the layouts of a model's datasets with each content that it can play, unless it is done."""
+    conditions = [PLAYED[content] for content, *_ in study.tables[0].rows]
+    for name in row.datasets if row.drives else ():
+        dataset, out = load(find(name)), here / "driven" / name
         layouts = min(limit or len(dataset.episodes), len(dataset.episodes))
         if not (out / "run.json").exists():
-            who = ("--model", row.model, "--prompt", row.prompt, "--answer", row.answer)
-            points = [word for point in PLAYED.values() for word in ("--condition", point)]
+            points = [word for point in conditions for word in ("--condition", point)]
             where = ("--episodes", str(layouts), "--first-seed", str(dataset.seeds[0]))
-            harness("drive", *who, "--scenario", scenario, *where, *points, "--out", str(out))
+            scenario = ("--scenario", dataset.scenario.name)
+            harness("drive", *row.who, *scenario, *where, *points, "--out", str(out))
+
+
+def driven(row: Row, here: Path) -> dict[str, Outcome]:
+    """Return what a model comes to driven, by content; nothing unless all is done."""
+    families: dict[str, dict[str, dict[str, Floats]]] = {}
+    outs = {name: here / "driven" / name for name in row.datasets}
+    if not all((out / "run.json").exists() for out in outs.values()):
+        return {}
+    for name, out in outs.items():
         run = read(out)
         [success] = by_episode([METRICS[SUCCESS]], run.grid, run.decisions, run.episodes).values()
         for content, point in PLAYED.items():
-            families[content][scenario] = {SUCCESS: success[run.conditions.index(point)]}
+            if point in run.conditions:
+                at = run.conditions.index(point)
+                families.setdefault(content, {})[name] = {SUCCESS: success[at]}
     return {content: Outcome(of) for content, of in families.items()}
 
 
-def written(row: Row, study: Study, driven: dict[str, Outcome]) -> str:
+def written(row: Row, study: Study, driven: Mapping[str, Outcome]) -> str:
     """Return what the page says of a model: sentences and tables, and what it comes to driven."""
     tables = [table for table in study.tables if not table.folded]
     first = tables[0]
