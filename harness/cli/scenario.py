@@ -119,6 +119,14 @@ def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episod
 
 
 def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
+    halves = ("balanced", "dangerous", "harmless")
+    if all("balanced" in rates for rates in outcomes.values()):
+        table(
+            ("driver", "balanced success % [95 % CI]", "with a danger", "without"),
+            [(driver, *(shown(rates[half]) for half in halves)) for driver, rates in outcomes.items()],
+        )
+        n_dangerous, n_harmless = (next(iter(outcomes.values()))[half].n for half in halves[1:])
+        console().print(f"balanced: mean of both, of {n_dangerous} and {n_harmless} episodes\n")
     heads = ("driver", "success % [95 % CI]", "collision %", "late %", "time-out %", "other crashes")
     rows = []
     for driver, rates in outcomes.items():

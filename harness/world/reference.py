@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.parallel import Workers, spread
-from harness.core.statistics import rate_interval
+from harness.core.statistics import Estimate, mean_of, rate_interval
 from harness.world import lockstep
 from harness.world.drivers import DRIVERS, PRIVILEGED, choices
 from harness.world.outcome import Outcome
@@ -17,6 +17,7 @@ from harness.world.state import WorldState
 from harness.world.world import World
 
 TOGETHER = 16  # episodes that are simulated together
+BY_DANGER = ("balanced", "dangerous", "harmless")  # success by danger, in a `summary`
 
 
 def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[str]:
@@ -84,12 +85,22 @@ def check(
     scenario: Scenario, episodes: int, seed: int, workers: Workers, progress: Callable[[int], None]
 ) -> dict[str, Any]:
     """Drive every reference driver through the same episodes; return the `summary` of each."""
-    outcomes = drive_apart(scenario, range(seed, seed + episodes), workers, progress)
-    return {driver: summary([o[driver] for o in outcomes]) for driver in DRIVERS}
+    seeds = range(seed, seed + episodes)
+    outcomes = drive_apart(scenario, seeds, workers, progress)
+    dangerous = [scenario.layout(each, scenario.parameters).danger is not None for each in seeds]
+    return {driver: summary([o[driver] for o in outcomes], dangerous) for driver in DRIVERS}
 
 
-def summary(outcomes: list[Outcome]) -> dict[str, Any]:
-    """Return rates of results (Wilson, n is episodes), collisions by fault, and crashes of others."""
+def summary(outcomes: list[Outcome], dangerous: Sequence[bool] = ()) -> dict[str, Any]:
+    """Return rates of results (Wilson, n is episodes), collisions by fault, and crashes of others.
+
+    Where some episodes are `dangerous` and some are not, also success in either, and the mean of both.
+    """
+    by_danger: dict[str, Estimate] = {}
+    if any(dangerous) and not all(dangerous):
+        success, has_danger = np.array([float(outcome.success) for outcome in outcomes]), np.array(dangerous)
+        halves = [rate_interval(success[of_half]) for of_half in (has_danger, ~has_danger)]
+        by_danger = dict(zip(BY_DANGER, (mean_of(halves), *halves), strict=True))
     rates = {
         result: rate_interval(np.array([float(outcome.result == result) for outcome in outcomes]))
         for result in ("cleared", "collision", "late", "time_out", "off_road")
@@ -97,6 +108,7 @@ def summary(outcomes: list[Outcome]) -> dict[str, Any]:
     return {
         "success": rates.pop("cleared"),
         **rates,
+        **by_danger,
         "ego_at_fault": sum(outcome.fault == "ego" for outcome in outcomes),
         "other_at_fault": sum(outcome.fault == "other" for outcome in outcomes),
         "other_crashes": sum(outcome.other_crashes for outcome in outcomes),

@@ -21,6 +21,15 @@ def test_who_clears_too_long_after_the_full_view_driver_is_late():
     assert outcomes["local-view"].time_s - outcomes["full-view"].time_s > 1.01
 
 
+def test_a_summary_balances_success_over_danger_and_none():
+    outcomes = [Outcome("cleared", 6.0), Outcome("collision", 3.0), Outcome("cleared", 5.0)]
+    found = summary(outcomes, [True, True, False])
+    rates = [found[half] for half in ("balanced", "dangerous", "harmless")]
+    assert [(e.value, e.n) for e in rates] == [(0.75, 3), (0.5, 2), (1.0, 1)]
+    for known in ((), [True] * 3, [False] * 3):
+        assert {"balanced", "dangerous", "harmless"}.isdisjoint(summary(outcomes, known))
+
+
 @pytest.mark.slow
 def test_a_check_counts_every_episode_once_for_any_number_of_workers():
     done = []
