@@ -29,6 +29,7 @@ from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.dataset.load import Dataset, find, load
+from harness.evaluate import flip
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import answer_of, requests
 from harness.evaluate.spec import Spec
@@ -111,6 +112,23 @@ def test_a_server_is_asked_as_its_document_says(wire: str, asked: list[Request])
                 }
             ]  # fmt: skip
     assert backend.identity()["engine"] == wire
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_a_flipped_question_lists_its_options_in_reverse(wire: str, data: Dataset) -> None:
+    spec = with_ego(spec_of(data, f"{wire}-example", "v9", answer="decision"), flip=True)
+    question = next(requests(spec, scenes_of(data)[:1]))
+    with opened(wire, lambda got: got.reply(answer(wire))) as (there, backend):
+        [done] = backend.complete([question])
+        [mirror] = backend.complete([flip.asked(question)])
+    listed = [
+        list(got.body["questions"]["action"]["criteria"])
+        if wire == "systemone"
+        else [choice["value"] for choice in got.body["questions"][0]["choices"]]
+        for got in there.asked
+    ]
+    assert listed == [list(question.actions), list(question.actions[::-1])]
+    assert flip.compared(answer_of(question, done), answer_of(flip.asked(question), mirror)).flipped is False
 
 
 @pytest.mark.parametrize("wire", WIRES)
