@@ -15,7 +15,7 @@ from pathlib import Path
 
 from evaluating import run, spec_of
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.operating_point import POINTS, named_point
 from harness.dataset.load import Dataset, load
 from harness.evaluate import run as evaluation
 from harness.evaluate.spec import Spec
@@ -23,11 +23,12 @@ from harness.evaluate.spec import Spec
 CHANGES = ("fsync", "mkdir", "replace", "rmdir", "unlink")
 TREES_AT_ONCE = 1  # so that some die between two parts of a run
 WALKS_AT_ONCE = 1  # and some between the walks of two seeds
+CONTENTS = ("6g:content=objects", "6g:content=both")
 
 
 def spec_to_kill(dataset: Dataset) -> Spec:
-    """Two layouts, alone and together."""
-    return spec_of(dataset, limit=2, points=(POINTS["single-local"], POINTS["6g"]))
+    """Two layouts, alone and together, where helpers send objects, or intents as well."""
+    return spec_of(dataset, limit=2, points=(POINTS["single-local"], *map(named_point, CONTENTS)))
 
 
 def die_before(n: int) -> None:
