@@ -17,6 +17,7 @@ from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import BALANCED, World, entry
 from harness.runs.records import Episode, FrozenScenes
+from harness.world.lookouts import radios
 from harness.world.outcome import rating
 from harness.world.parameters import frames
 from harness.world.scenario import Scenario
@@ -212,4 +213,5 @@ class FrozenWorld(SceneWorld):
             least_gap_m=min(edge.least_gap_m for edge in edges),
             hard_brakings=sum(edge.hard_brakings for edge in edges),
             other_crashes=sum(edge.other_crashes for edge in edges),
+            **radios(self.scenario, int(forest.seeds[tree]), forest.dangers[tree]),
         )  # fmt: skip

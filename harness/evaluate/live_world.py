@@ -27,6 +27,7 @@ from harness.runs import metrics
 from harness.runs.records import ClosedLoop, Episode
 from harness.world import conflict_measures, reference, scenarios
 from harness.world.drivers import PRIVILEGED
+from harness.world.lookouts import radios
 from harness.world.outcome import Outcome, rating
 from harness.world.parameters import frames
 from harness.world.scenario import Scenario
@@ -214,4 +215,5 @@ def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) 
         partner=outcome.partner, striker=outcome.striker, fault=outcome.fault,
         least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=world.hard_brakings,
         other_crashes=outcome.other_crashes, skipped=course.skipped,
+        **radios(world.scenario, world.seed, world.layout.danger),
     )  # fmt: skip

@@ -114,6 +114,10 @@ EPISODE: Mapping[str, Added] = {
         ("least_ttc_s", "short_ttc", "least_pet_s", "short_pet"),
         Added("2026-11-27", None, "conflicts in time; also empty on trees of older datasets"),
     ),
+    **dict.fromkeys(
+        ("witnesses", "danger_radio"),
+        Added("2026-11-27", None, "who sees the danger; also empty where none is declared"),
+    ),
 }  # fmt: skip
 
 

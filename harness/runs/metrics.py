@@ -140,6 +140,10 @@ def _field(name: str) -> Callable[[Episode], Any]:
     return lambda e: getattr(e, name)
 
 
+def _witnessed(count: int) -> Callable[[Episode], bool | None]:
+    return lambda e: e.success if e.witnesses == count else None
+
+
 def _column(name: str) -> Callable[[Columns], Floats]:
     return lambda d: d[name]
 
@@ -259,6 +263,9 @@ BUILT_IN = (
     Metric("time_to_clear_s", "time until the ego has cleared the intersection; only episodes in which it "
            "does, late or not", SECONDS, "lower", label="time to clear",
            episodes=lambda e: e.time_s if e.failure in ("", "late") else None),
+    *(_rate(f"success_rate_{k}_witness{'' if k == 1 else 'es'}", "success rate in the layouts in which so "
+            "many helpers have, or would have, the danger in sight at the first decision",
+            _witnessed(k), "higher", optional=True) for k in range(4)),
     Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision", METRES,
            "higher", label="least gap", episodes=_field("least_gap_m")),
     Metric("hard_brakings_per_episode", "number of times that the ego begins to brake harder than 4 m/s²",

@@ -269,6 +269,9 @@ class Episode(Struct, frozen=True, kw_only=True):
     short_ttc: bool | None = None  # whether it was below 1.5 s; None where it was not measured
     least_pet_s: float | None = None  # least post-encroachment time
     short_pet: bool | None = None  # whether it was below 1.5 s
+    # how many helpers have, or would have, the danger in sight at the first decision; None if not declared
+    witnesses: int | None = None
+    danger_radio: bool | None = None  # whether the danger sends beacons; None without one, or undeclared
 
 
 class Variant(Struct, frozen=True):
