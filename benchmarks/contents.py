@@ -25,7 +25,6 @@ from harness.coordination.contents import CONTENTS
 from harness.core.arrays import Floats
 from harness.core.figures import shown
 from harness.core.progress import Progress
-from harness.core.resources import DATASET
 from harness.dataset import suites
 from harness.dataset.load import find, load
 from harness.report.document import Table
@@ -34,8 +33,10 @@ from harness.runs.metrics import METRICS, SUCCESS, by_episode
 from harness.studies.contents import BASE, NOTHING, Outcome, folders, models, panels_of, run_contents
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, write_study
+from harness.world import scenarios
+from harness.world.scenario import Scenario
 
-SUITE = "suite:v2v-safety"
+SUITE = "suite:v2v-safety-2"
 PLAYED = {NOTHING: "single-local", **{name: f"{BASE},content={name}" for name in CONTENTS}}
 
 
@@ -48,6 +49,7 @@ class Row(NamedTuple):
     dataset: str = SUITE
     rule: bool = False  # whether it costs nothing to ask, so that no limit applies
     drives: bool = True  # whether it drives as well
+    panels: Sequence[str] = ()  # the conditions that are played as they are, instead of the usual points
 
     @property
     def name(self) -> str:
@@ -68,9 +70,9 @@ class Row(NamedTuple):
 
 ROWS = (
     Row("proxy", "v4", rule=True),
-    Row("swarm-tiny", "v2", "readout", DATASET),
+    Row("swarm-tiny", "v2", "readout", "occluded-intersection-v3"),
     Row("swarm-tiny-six", "v4", "readout"),
-    Row("smollm2-135m", "v10", "json", DATASET, drives=False),
+    Row("smollm2-135m", "v10", "readout", "occluded-intersection-v3", drives=False, panels=(BASE,)),
 )
 
 
@@ -124,7 +126,7 @@ def play(row: Row, here: Path) -> Study:
     """Play every content on a model's runs, and write the study's page."""
     print(f"harness study contents {here / 'frozen'} --out {here / 'contents'}", file=sys.stderr, flush=True)
     runs = [ReplayedRun(run) for run in folders(here / "frozen")]
-    panels = panels_of(runs, (), (), ())
+    panels = panels_of(runs, row.panels, (), ())
     study = run_contents(models([runs], panels), panels, runs[0].seeds, here / "contents", Progress())
     write_study(study, here / "contents")
     return study
@@ -139,8 +141,19 @@ def drive(row: Row, here: Path, limit: int | None, study: Study) -> None:
         if not (out / "run.json").exists():
             points = [word for point in conditions for word in ("--condition", point)]
             where = ("--episodes", str(layouts), "--first-seed", str(dataset.seeds[0]))
-            scenario = ("--scenario", dataset.scenario.name)
-            harness("drive", *row.who, *scenario, *where, *points, "--out", str(out))
+            harness(
+                "drive", *row.who, "--scenario", named(dataset.scenario), *where, *points, "--out", str(out)
+            )
+
+
+def named(scenario: Scenario) -> str:
+    """Return what names a scenario with the parameters that a dataset states."""
+    usual = scenarios.get(scenario.name).parameters
+    dials = [
+        f"{key}={value}" for key in scenario.dials
+        if (value := getattr(scenario.parameters, key)) != getattr(usual, key)
+    ]  # fmt: skip
+    return ":".join(filter(None, (scenario.name, ",".join(dials))))
 
 
 def driven(row: Row, here: Path) -> dict[str, Outcome]:

@@ -3,11 +3,15 @@
 import json
 import tomllib
 from pathlib import Path
+from shutil import copyfile
 
 import pytest
 
+from harness.core import resources
+from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.dataset import suites
+from harness.dataset.load import find
 from harness.dataset.verify import check
 from harness.prompts import versions as prompts
 
@@ -36,3 +40,21 @@ def test_a_shipped_suite_has_one_released_dataset_of_each_family(name: str) -> N
 @pytest.mark.parametrize("version", prompts.names())
 def test_a_shipped_prompt_is_released(version: str) -> None:
     assert prompts.load(version).released
+
+
+def test_a_wheel_holds_the_newest_of_each_family_and_the_usual_one() -> None:
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    held = {Path(source).name for source in wheel["force-include"] if source.startswith("datasets/")}
+    suite = suites.named("suite:v2v-safety-2")
+    assert suite
+    assert held & {*DATASETS} == {*suite.datasets, resources.DATASET}
+
+
+def test_a_released_dataset_that_an_installation_lacks_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "datasets").mkdir()
+    copyfile(ROOT / "datasets/released.toml", tmp_path / "datasets/released.toml")
+    monkeypatch.setattr(resources, "root", lambda: tmp_path)
+    with pytest.raises(UserError, match="dataset blind-merge-v1 is not in this installation"):
+        find("blind-merge-v1")

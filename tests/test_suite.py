@@ -149,7 +149,7 @@ def test_other_settings_do_not_go_on(evaluated: Harness) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--dataset", "suite:tow"), "unknown suite 'tow'; did you mean 'two'? known: two, v2v-safety\n"),
+        (("--dataset", "suite:tow"), "unknown suite 'tow'; did you mean 'two'? known: two, v2v-safety, v2v"),
         (("--prompt", "v2"), "--prompt v2 speaks of a crossing, which parking-exit is not; "),
         (("--latency", "measured"), "--latency measured: "),
         (("--only", "3"), "--only 3: give episodes from 0 to 1, "),

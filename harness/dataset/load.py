@@ -249,6 +249,11 @@ def find(name: str) -> Path:
     names = {manifest.parent.name for manifest in entries("datasets", "*/manifest.json")}
     if name in names:
         return beside("datasets", name)
+    if name in released():
+        raise UserError(
+            f"dataset {printable(name)} is not in this installation, which has the newest of each family; "
+            "clone the repository, which has all"
+        )
     raise unknown("dataset", name, names, "; or give a folder made by `harness dataset build`")
 
 
@@ -263,10 +268,10 @@ def argument(path: Path) -> str:
     return str(target.relative_to(here) if target.is_relative_to(here) else target)
 
 
-def released_digests() -> set[str]:
-    """Return the manifests' digests of released datasets, from `datasets/released.toml`."""
+def released() -> dict[str, str]:
+    """Return the digest of each released dataset's manifest by name, from `datasets/released.toml`."""
     pins = folder("datasets") / "released.toml"
-    return set(tomllib.loads(text_of(pins)).values()) if pins.is_file() else set()
+    return tomllib.loads(text_of(pins)) if pins.is_file() else {}
 
 
 @uncollected()
@@ -280,7 +285,7 @@ def load(path: Path, limit: int | None = None) -> Dataset:
     manifest, digest = read_manifest(path)
     for problem in file_problems(path, manifest):
         raise unusable(path, problem)
-    trusted = digest in released_digests()
+    trusted = digest in released().values()
     trees = Trees(range(manifest.episodes)[:limit], _Folder(path, manifest, trusted))
     for number in trees.numbers:
         trees.read(number)

@@ -5,10 +5,13 @@ whether there is a danger and where it comes from. A layout is never on both sid
 Only decision points of one step are compared, since fewer dangers are still hidden at later steps, and only
 answers of one fold's model. If the classifier does better than chance, any model can: then an ego alone is
 not blind.
+
+Beacons of traffic (`radio_share`) are left out: who hears the car that would be the danger, and hears that it
+is none, knows that and has not guessed it.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -82,7 +85,8 @@ def audit(
     """
     extras.need("an audit", "sklearn")
     seeds = range(seed, seed + layouts)
-    points = _selected(spread(partial(_hidden, scenario), seeds, workers, progress), scenario)
+    silent = replace(scenario, parameters=replace(scenario.parameters, radio_share=0.0))
+    points = _selected(spread(partial(_hidden, silent), seeds, workers, progress), scenario)
     auc, told_by = judge(points, tuple(scenario.road().sectors))
     return Audit(scenario.name, layouts, seed, tuple(np.unique(points.step).tolist()), auc, told_by)
 

@@ -9,6 +9,7 @@ import one_way_crossing
 import pytest
 
 from harness.core.errors import UserError
+from harness.world import scenarios
 from harness.world.audit import FOLDS, HiddenPoints, Ranks, audit, judge, numbers
 from harness.world.perception.graph import scene_graph
 from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, Parameters, layout
@@ -139,6 +140,13 @@ def test_every_graph_gives_the_same_names():
             names.add(tuple(dict(numbers(scene_graph(SCENARIO, state, viewer), road))))
     assert len(names) == 1
     assert len(set(*names)) == len(*names)
+
+
+def test_a_car_that_is_heard_to_be_harmless_is_no_tell():
+    silent, loud = (
+        audit(scenarios.get(f"hard-brake-ahead:radio_share={share}"), 40, 0, quiet) for share in (0, 1)
+    )
+    assert loud == silent
 
 
 def test_a_scenario_that_hides_nothing_has_nothing_to_audit():
