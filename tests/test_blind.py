@@ -246,5 +246,5 @@ def test_a_fusion_call_has_the_blind_helpers_messages(
 
 def test_only_a_point_with_a_channel_asks_the_blind() -> None:
     assert not named_point("single-local:messages=blind").blind_helpers
-    with pytest.raises(UserError, match="messages is 'shuffled'; it must be own or blind where consensus is"):
-        points(["6g:consensus=ego-prompt"], ["shuffled-messages"])
+    with pytest.raises(UserError, match="messages is 'shuffled'; it must be own or blind where"):
+        named_point("6g:content=oracle,messages=shuffled")

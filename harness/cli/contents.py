@@ -45,7 +45,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Compare what messages may hold: nothing, intents, objects or both.
+    """Compare contents of messages: intents, objects, both.
 
     Each is played at every point from stored answers. The model is asked only where the runs have no answer.
     If the study is stopped, the same command continues it.

@@ -49,12 +49,17 @@ def test_people_read_it_in_eighty_columns(harness: Callable[..., Said]) -> None:
 
 
 def test_what_is_not_installed_is_named_with_the_command_that_installs_it() -> None:
-    told = json.loads(apart("sys.modules['torch'] = sys.modules['llama_cpp'] = None", "--json"))
+    absent = "sys.modules['torch'] = sys.modules['llama_cpp'] = sys.modules['sparrow_decider'] = None"
+    told = json.loads(apart(absent, "--json"))
     lacks = {m["name"]: (m["missing"], m["remedy"]) for m in told["models"]}
     assert lacks["qwen3-4b"] == ("torch", "pip install 'swarmdrive-harness[transformers]'")
     assert lacks["swarm-tiny"] == ("llama-cpp-python", "pip install 'swarmdrive-harness[llama-cpp]'")
     assert lacks["proxy"] == (None, None)
-    assert {engine for engine, lack in told["engines"].items() if lack} == {"transformers", "llama-cpp"}
+    assert {engine for engine, lack in told["engines"].items() if lack} == {
+        "transformers",
+        "llama-cpp",
+        "sparrow",
+    }
 
 
 @pytest.mark.slow
