@@ -40,6 +40,7 @@ from harness.studies.play import by_episode, metric_columns
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, corrected, p_cell, percent, refuse_other
 from harness.studies.sweep import point_of, settings
+from harness.world.lookouts import radios
 from harness.world.parameters import frames
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ USUAL = (
     (RADIO, "density_per_km", "50,100,200,400"),
 )
 BESIDE = 3  # panels of a figure
+SAFE, HEARD = -1, -2  # in place of a number of witnesses
 SPENDING = ("tau_nats", "max_helpers")  # axes that vary the bits
 # The paper's panels by axis, and what is added to their values: its N counts the ego.
 PAPER = {"loss": ("loss", 0.0), "tau_nats": ("tau", 0.0), "max_helpers": ("size", -1.0)}
@@ -333,14 +335,15 @@ def _played(
 def witnesses(run: ReplayedRun) -> Ints:
     """Return how many helpers have the danger in sight at the first decision of each episode, (E,).
 
-    -1 without a danger.
+    `SAFE` without a danger, `HEARD` where it has a radio: its beacons tell of it, whoever sees it.
     """
-    forest = run.dataset.forest
+    forest, scenario = run.dataset.forest, run.dataset.scenario
     counts = []
     for scene in run.dataset.scenes([forest.ids[n] for n in forest.root.tolist()]):
-        danger = scene.record.danger.vehicle
-        seen = [any(node.id == danger for node in scene.graphs[v].nodes) for v in scene.viewers[1:]]
-        counts.append(-1 if danger is None else sum(seen))
+        danger = scene.record.danger
+        seen = [any(node.id == danger.vehicle for node in scene.graphs[v].nodes) for v in scene.viewers[1:]]
+        heard = radios(scenario, scene.state.episode_seed, danger.sector)["danger_radio"]
+        counts.append(SAFE if danger.vehicle is None else HEARD if heard else sum(seen))
     return np.array(counts)
 
 
@@ -348,10 +351,11 @@ def groups(model: Model) -> dict[str, dict[str, Bools]]:
     """Return by name which episodes of each family, (E,), are in each group: by who sees the danger."""
     counts = {family: witnesses(run) for family, run in model.runs.items()}
     most = max(int(each.max()) for each in counts.values())
-    numbers = {"no danger": -1, **{f"a danger, seen by {n}": n for n in range(most + 1)}}
+    numbers = {"no danger": SAFE, **{f"a danger, seen by {n}": n for n in range(most + 1)}}
+    numbers["a danger with a radio"] = HEARD
     named = {
         name: {family: each == n for family, each in counts.items()} for name, n in numbers.items()
-    } | {"any danger": {family: each >= 0 for family, each in counts.items()}}  # fmt: skip
+    } | {"any danger": {family: each != SAFE for family, each in counts.items()}}  # fmt: skip
     return {name: within for name, within in named.items() if any(map(np.any, within.values()))}
 
 
