@@ -129,8 +129,8 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     cause = "24 of the ego's 24 answers could not be read. The commonest cause, 24 of 24: a probability"
     assert said.index(cause) < said.index("condition")
     page = unescape(Path("reports/mute/report.html").read_text())
-    assert page.index(cause) < page.index("Under 6g, mute clears")
-    assert page.index(UNREAD) < page.index("Under 6g, mute clears")
+    assert page.index(cause) < page.index("Under 6g, mute")
+    assert page.index(UNREAD) < page.index("Under 6g, mute")
     assert "none of the ego's answers could be read: it drives by the fallback" in harness("run", "ls")[1]
     sound = ("--prompt", "v1", "--json", "--out", "reports/sound")
     code, out, err = harness("eval", "--model", "proxy", *options, *sound)
