@@ -11,8 +11,6 @@ asked on fewer layouts of each family, and each table says on how many.
 """
 
 import argparse
-import re
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -20,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from markupsafe import Markup
+from pages import harness, write_tables
 
 from harness.coordination.contents import CONTENTS
 from harness.core.arrays import Floats
@@ -34,7 +33,6 @@ from harness.studies.contents import BASE, NOTHING, Outcome, folders, models, pa
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, write_study
 from harness.world import scenarios
-from harness.world.scenario import Scenario
 
 SUITE = "suite:v2v-safety-2"
 PLAYED = {NOTHING: "single-local", **{name: f"{BASE},content={name}" for name in CONTENTS}}
@@ -94,17 +92,7 @@ def main() -> None:
     text = "\n\n".join(written(*each) for each in studies)
     print(text)
     if given.page:
-        page = given.page.read_text("utf-8")
-        page = re.sub(
-            r"(<!-- tables -->\n).*(<!-- end -->)", lambda m: f"{m[1]}{text}\n{m[2]}", page, flags=re.S
-        )
-        given.page.write_text(page, "utf-8")
-
-
-def harness(*words: str) -> None:
-    """Run a command of the harness, and say which."""
-    print(f"harness {' '.join(words)}", file=sys.stderr, flush=True)
-    subprocess.run([sys.executable, "-m", "harness", *words, "--quiet"], check=True, stdout=sys.stderr)
+        write_tables(given.page, text)
 
 
 def finished(out: Path) -> bool:
@@ -118,7 +106,7 @@ def evaluate(row: Row, here: Path, limit: int | None) -> None:
     if not finished(out):
         few = () if limit is None else ("--limit", str(limit))
         points = ("--condition", "single-local", "--condition", BASE)
-        harness("eval", *row.who, "--dataset", row.dataset, *points, *few, "--out", str(out))
+        harness("eval", *row.who, "--dataset", row.dataset, *points, *few, "--out", str(out), "--quiet")
 
 
 @cache
@@ -141,19 +129,8 @@ def drive(row: Row, here: Path, limit: int | None, study: Study) -> None:
         if not (out / "run.json").exists():
             points = [word for point in conditions for word in ("--condition", point)]
             where = ("--episodes", str(layouts), "--first-seed", str(dataset.seeds[0]))
-            harness(
-                "drive", *row.who, "--scenario", named(dataset.scenario), *where, *points, "--out", str(out)
-            )
-
-
-def named(scenario: Scenario) -> str:
-    """Return what names a scenario with the parameters that a dataset states."""
-    usual = scenarios.get(scenario.name).parameters
-    dials = [
-        f"{key}={value}" for key in scenario.dials
-        if (value := getattr(scenario.parameters, key)) != getattr(usual, key)
-    ]  # fmt: skip
-    return ":".join(filter(None, (scenario.name, ",".join(dials))))
+            scenario = ("--scenario", scenarios.argument(dataset.scenario))
+            harness("drive", *row.who, *scenario, *where, *points, "--out", str(out), "--quiet")
 
 
 def driven(row: Row, here: Path) -> dict[str, Outcome]:

@@ -10,15 +10,13 @@ asked on fewer layouts, and each row says on how many.
 """
 
 import argparse
-import re
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 from matplotlib.figure import Figure
+from pages import harness, write_tables
 
 from harness.core.figures import shown
 from harness.evaluate.trial import ROLES, Answers, described
@@ -90,11 +88,7 @@ def main() -> None:
     tables = "\n\n".join([success(runs), answers(runs, said), sentences(said)])
     print(tables)
     if given.page:
-        text = given.page.read_text("utf-8")
-        text = re.sub(
-            r"(<!-- tables -->\n).*(<!-- end -->)", lambda m: f"{m[1]}{tables}\n{m[2]}", text, flags=re.S
-        )
-        given.page.write_text(text, "utf-8")
+        write_tables(given.page, tables)
     if given.picture:
         save(drawn(runs), given.picture, "svg")
 
@@ -113,8 +107,7 @@ def make(row: Row, given: argparse.Namespace) -> None:
         for option in ("limit", "device", "batch_size"):
             if value := getattr(given, option):
                 words += [f"--{option.replace('_', '-')}", str(value)]
-    print(f"harness {' '.join(words)}", file=sys.stderr, flush=True)
-    subprocess.run([sys.executable, "-m", "harness", *words, *ARGUMENTS], check=True, stdout=sys.stderr)
+    harness(*words, *ARGUMENTS)
 
 
 def success(runs: dict[Row, Run]) -> str:

@@ -241,11 +241,7 @@ def _pretty(value: Any) -> bytes:
 
 def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
     default, p = scenarios.get(scenario.name).parameters, scenario.parameters
-    changed = {
-        dial: getattr(p, dial) for dial in scenario.dials if getattr(p, dial) != getattr(default, dial)
-    }
-    dials = [f"{k}={v if isinstance(v, str) else canonical_json(v)}" for k, v in changed.items()]
-    name = shlex.quote(environment.joined(scenario.name, dials))
+    name = shlex.quote(scenarios.argument(scenario))
     lag = f" --lag {p.decision_lag_s:g}" if p.decision_lag_s != default.decision_lag_s else ""
     unaudited = "" if audits or episodes < LEAST_AUDITED else " --no-audit"
     return f"harness dataset build {name} --episodes {episodes} --seed {seed}{lag}{unaudited}"

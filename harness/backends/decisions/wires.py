@@ -1,8 +1,9 @@
 """The two ways to ask a server of decision models: System One's, and that of OpenAI's decisions.
 
-`POST /v1/systemone` is that of llama.cpp (tools/server/README.md) and of Ollama 0.35 and later; `POST
-/v1/decisions` that of OpenAI (openai-python, types/decision_create_params.py and types/decision.py). Whatever
-a server promises, `harness.parsing.parse` judges the probabilities, which are kept as they are stated.
+`POST /v1/systemone` is what others say of llama.cpp and of Ollama 0.35 and later, and what the server of
+sparrow-decider answers; `POST /v1/decisions` is OpenAI's (openai-python, types/decision_create_params.py and
+types/decision.py). Whatever a server promises, `harness.parsing.parse` judges the probabilities, which are
+kept as they are stated.
 """
 
 import json

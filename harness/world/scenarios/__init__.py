@@ -13,6 +13,7 @@ from typing import Any
 
 from harness.core.config import convert, value_of
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import canonical_json
 from harness.core.plugins import Plugins
 from harness.world.environments import environment
 from harness.world.parameters import LATER, Parameters
@@ -42,6 +43,14 @@ def get(text: str) -> Scenario:
         return scenario
     changed: dict[str, Any] = dict(_setting(scenario, part) for part in settings.split(","))
     return replace(scenario, parameters=replace(scenario.parameters, **changed))
+
+
+def argument(scenario: Scenario) -> str:
+    """Return the text by which `get` finds a scenario again, with the settings that differ from its usual."""
+    usual, p = get(scenario.name).parameters, scenario.parameters
+    changed = {dial: getattr(p, dial) for dial in scenario.dials if getattr(p, dial) != getattr(usual, dial)}
+    settings = [f"{k}={v if isinstance(v, str) else canonical_json(v)}" for k, v in changed.items()]
+    return environment.joined(scenario.name, settings)
 
 
 def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
