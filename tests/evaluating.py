@@ -1,7 +1,7 @@
 """Evaluations as tests make them: the real parts, or the real parts around answers from a script."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -20,13 +20,16 @@ from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import Asker, requests
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.fusion import messages_of
 from harness.evaluate.lifecycle import Evaluated
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.run import evaluate
+from harness.evaluate.sharing import as_asked
 from harness.evaluate.spec import Spec
 from harness.evaluate.table import table
 from harness.evaluate.walk import Decided, walk
 from harness.prompts import versions as prompts
+from harness.report.details import prompts_of
 from harness.runs import folder
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
@@ -137,6 +140,19 @@ def asker_of(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Pat
 def all_scenes(dataset: Dataset) -> list[Scene]:
     """Every scene of a dataset's trees, in their order."""
     return dataset.scenes(dataset.forest.ids)
+
+
+def as_read(stored: folder.Run, dataset: Dataset) -> Iterator[tuple[Answer, Sequence[Any], Sequence[Any]]]:
+    """Each answer of a run, the messages that it heard, and the chat that a reader is shown for it."""
+    sent = prompts_of(stored)
+    assert sent is not None
+    scenes = {scene.id: scene for scene in all_scenes(dataset)}
+    for name, answers in stored.answers_by_scene.items():
+        by_key = {answer.key: answer for answer in answers}
+        for answer in answers:
+            heard = messages_of(by_key, answer.heard, dataset.actions)
+            shown = as_asked(dataset.scenario, scenes[name], answer)
+            yield answer, heard, sent(shown, answer.viewer, heard)
 
 
 def scenes_of(dataset: Dataset) -> list[Scene]:

@@ -11,6 +11,7 @@ import pytest
 from evaluating import (
     Walked,
     all_scenes,
+    as_read,
     figure,
     run,
     same_files,
@@ -32,12 +33,11 @@ from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.dry_run import count
-from harness.evaluate.fusion import messages_of, source_of
+from harness.evaluate.fusion import source_of
 from harness.evaluate.sharing import as_asked, listed
 from harness.prompts import versions as prompts
 from harness.radio.channel import Draws
 from harness.radio.messages import Counts, size
-from harness.report.details import prompts_of
 from harness.runs import folder
 from harness.training.pairs import pairs
 from harness.world import scenarios
@@ -469,17 +469,10 @@ def test_whoever_reads_a_run_sees_what_the_ego_was_asked(small: Dataset, tmp_pat
     """The prompt of every answer can be shown as it was sent, and a pair for training has it."""
     spec = spec_of(small, points=(OBJECTS, BOTH, OBJECTS.changed(attack="ghost:share=1/3", name="lied to")))
     stored = folder.read(run(spec, tmp_path / "run").out)
-    sent = prompts_of(stored)
-    assert sent is not None
-    scenes = {scene.id: scene for scene in all_scenes(small)}
     shared = 0
-    for name, answers in stored.answers_by_scene.items():
-        by_key = {answer.key: answer for answer in answers}
-        for answer in answers:
-            heard = messages_of(by_key, answer.heard, small.actions)
-            messages = sent(as_asked(small.scenario, scenes[name], answer), answer.viewer, heard)
-            assert digest(messages) == answer.prompt_sha256
-            shared += any("objects" in key for key in answer.heard)
+    for answer, _, messages in as_read(stored, small):
+        assert digest(messages) == answer.prompt_sha256
+        shared += any("objects" in key for key in answer.heard)
     assert shared > 10
     asked = {answer.prompt_sha256 for answers in stored.answers_by_scene.values() for answer in answers}
     assert {digest(pair["prompt"]) for pair in pairs(stored)} <= asked

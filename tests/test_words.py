@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluating import Scripted, all_scenes, asker_of, run, scenes_of, spec_of, walked
+from evaluating import Scripted, as_read, asker_of, run, scenes_of, spec_of, walked
 from graphs import MESSAGES
 
 from harness.backends.base import Completion, Request
@@ -20,12 +20,10 @@ from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset
 from harness.evaluate.dry_run import count
-from harness.evaluate.fusion import messages_of, source_of
-from harness.evaluate.sharing import as_asked
+from harness.evaluate.fusion import source_of
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.radio.messages import Counts, size
-from harness.report.details import prompts_of
 from harness.runs import folder
 
 TEXT = named_point("6g:loss=0,content=text,schedule=always")
@@ -160,18 +158,11 @@ def test_a_run_is_read_as_it_was_asked(few: Dataset, tmp_path: Path) -> None:
     """With the words of a model that ships."""
     six = spec_of(few, "swarm-tiny-six", "v12", points=(TEXT,), seeds=(0,))
     stored = folder.read(run(six, tmp_path / "run").out)
-    sent = prompts_of(stored)
-    assert sent is not None
-    scenes = {scene.id: scene for scene in all_scenes(few)}
     fused = 0
-    for name, answers in stored.answers_by_scene.items():
-        by_key = {answer.key: answer for answer in answers}
-        for answer in answers:
-            heard = messages_of(by_key, answer.heard, few.actions)
-            messages = sent(as_asked(few.scenario, scenes[name], answer), answer.viewer, heard)
-            assert digest(messages) == answer.prompt_sha256
-            fused += answer.heard != ()
-            assert all(message.keys() == {"sender", "evidence"} for message in heard)
+    for answer, heard, messages in as_read(stored, few):
+        assert digest(messages) == answer.prompt_sha256
+        fused += answer.heard != ()
+        assert all(message.keys() == {"sender", "evidence"} for message in heard)
     assert fused > 2
 
 
