@@ -67,9 +67,20 @@ def test_every_shipped_card_loads_under_its_file_name() -> None:
 def test_language_models_declare_no_latency_that_was_not_measured() -> None:
     for card in cards.load_all():
         if capabilities(card.engine).renders:
-            assert (card.latency.source, card.latency.inference_s) == ("paper", None), card.name
+            assert card.latency.source in ("paper", "cited"), card.name
+            assert (card.latency.source == "cited") == card.latency.basis.startswith("cited: "), card.name
             from_hub = capabilities(card.engine).has_weights and "/" in str(card.weights)
             assert card.licence or not from_hub, card.name
+
+
+@pytest.mark.parametrize("name", ["kev-4b", "lev-4b", "laya", "julia-1", "clef", "d1-3b"])
+def test_a_published_decision_model_says_whose_it_is_and_that_it_never_ran_here(name: str) -> None:
+    card = cards.load(name)
+    assert (card.engine, bool(card.licence)) == ("systemone", True)
+    assert re.fullmatch(r"[\w-]+/[\w.-]+", card.weights or "")
+    if card.latency.source == "cited":
+        assert card.latency.basis.endswith("never run here")
+        assert re.search(r"\b20\d\d\b", card.latency.basis)
 
 
 @pytest.mark.parametrize(

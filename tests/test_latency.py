@@ -51,6 +51,10 @@ def test_the_paper_counts_unless_a_card_or_the_user_declares_a_time() -> None:
     assert known(None, silent, nobody) == known("paper", silent, nobody) == PAPER
     assert (PAPER.ego_s, PAPER.helper_s, PAPER.fusion_s) == (0.145, 0.145, 0.145)
     assert known(None, fast, nobody) == known("card", fast, nobody) == of_card
+    cited = CardLatency("cited", 0.012, "cited: its makers, their computer; never run here")
+    elsewhere = [Agent(replace(resolve(LANGUAGE_MODEL), latency=cited), prompt)]
+    assert known(None, elsewhere, nobody) == PAPER  # another computer's time counts by name alone
+    assert known("card", elsewhere, nobody) == Latency("card", cited.basis, 0.012, 0.012, 0.012)
     assert known("paper", fast, nobody) == PAPER
     assert known("measured", fast, nobody) is None
     told = known("ego=0.2,helper=0.1", fast, nobody)

@@ -39,6 +39,7 @@ def test_the_list_has_every_card_in_eighty_columns(
     assert "card 145 ms" in listed["proxy"]
     assert "yes" in listed["proxy"]
     assert listed["qwen3-4b"].split()[3] == "paper"
+    assert "cited 12 ms" in listed["kev-4b"]
     assert "\n  Deterministic rule on what its viewer sees\n" in out
     lines = out.splitlines()
     other = lines[lines.index(next(line for line in lines if line.startswith("qwen3-4b"))) + 1 :]

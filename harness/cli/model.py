@@ -43,7 +43,7 @@ def list_models(as_json: options.Json = False) -> None:
 
     def show(name: str, card: "Card") -> None:
         seconds, lack = card.latency.inference_s, missing(card)
-        latency = "paper" if seconds is None else f"card {seconds * 1000:g} ms"
+        latency = "paper" if seconds is None else f"{card.latency.source} {seconds * 1000:g} ms"
         here = f"no: {lack}" if lack else "yes"
         stem, _, engine = name.partition(":")
         # A card's other engines stand below it.

@@ -43,7 +43,7 @@ def known(choice: str | None, agents: Sequence[Agent], backends: Sequence[Backen
 def _of_agent(choice: str | None, agent: Agent, backend: Backend) -> Latency:
     if choice is None and agent.can.own_latency:
         return cast("Timed", backend).latency()
-    if (choice or agent.card.latency.source) == "paper":
+    if (choice or agent.card.latency.source) in ("cited", "paper"):
         return PAPER
     seconds = cast("float", agent.card.latency.inference_s)
     return Latency("card", agent.card.latency.basis, seconds, seconds, seconds)
