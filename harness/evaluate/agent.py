@@ -134,12 +134,13 @@ class Agent:
         the `question` of a decision.
         """
         rendered = self.rendered(graph, actions, (), words)
-        chats = self.in_orders(
-            actions, lambda order: in_mode(self.answer, self.prompt, rendered, graph, order, words)
-        )
-        if self.answer == "decision":
-            chats["question"] = decision.question(rendered, graph, actions, words)
-        return chats
+        if self.answer != "decision":
+            return self.in_orders(
+                actions, lambda order: in_mode(self.answer, self.prompt, rendered, graph, order, words)
+            )
+        question = decision.question(rendered, graph, actions, words)
+        chats = self.in_orders(actions, lambda order: decision.asked(question, rendered, order))
+        return {**chats, "question": question}
 
     def in_orders(
         self, actions: tuple[str, ...],
