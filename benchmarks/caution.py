@@ -1,6 +1,7 @@
 """What one needless SLOWER costs in layouts without a danger, from which `harmless_allowance_s` follows.
 
-`python benchmarks/caution.py [LAYOUTS]` drives full-view through those of 200 tune layouts of each scenario.
+`python benchmarks/caution.py [LAYOUTS [SCENES]]` drives full-view through those of 200 tune layouts of each
+scenario, as SCENES has them drawn and judged.
 At each decision at which it does not slow down, an ego takes SLOWER instead and then drives as full-view
 does. The table has by how much later it reaches the goal, and how often that is more than is allowed.
 """
@@ -20,6 +21,7 @@ from harness.world.scenario import Scenario
 from harness.world.world import World
 
 LAYOUTS = 200
+SCENES = "limits=2,witnesses=any,radio_share=0,perception=1"
 SLOWER = ALWAYS["brake"]
 
 
@@ -60,10 +62,11 @@ def _goal_s(outcome: Outcome) -> float:
 def main() -> None:
     """Measure and print."""
     layouts = int(sys.argv[1]) if len(sys.argv) > 1 else LAYOUTS
-    print(f"harmless layouts of {layouts} each, {stated(FIRST['tune'], layouts)}, limits=2; seconds later")
+    scenes = sys.argv[2] if len(sys.argv) > 2 else SCENES
+    print(f"harmless layouts of {layouts} each, {stated(FIRST['tune'], layouts)}, {scenes}; seconds later")
     print(f"{'scenario':22} decision    n   0 %    5 %   50 %  100 %   late, % [95 % interval]")
     for name in sorted(scenarios.names()):
-        scenario = scenarios.get(f"{name}:limits=2")
+        scenario = scenarios.get(f"{name}:{scenes}")
         seeds = range(FIRST["tune"], FIRST["tune"] + layouts)
         harmless = [s for s in seeds if scenario.layout(s, scenario.parameters).danger is None]
         parts = [

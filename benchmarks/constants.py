@@ -21,7 +21,10 @@ from harness.world.world import World
 
 LAYOUTS = 240
 # How layouts are drawn that are judged by each version.
-VERSIONS = {1: "limits=1,witnesses=any,radio_share=0,perception=1", 2: "limits=2,witnesses=each"}
+VERSIONS = {
+    1: "limits=1,witnesses=any,radio_share=0,perception=1",
+    2: "limits=2,witnesses=each,radio_share=0.25,perception=2",
+}
 HEADS = ("scenario", "limits", "action", "cleared", "layouts", "harmless_cleared", "harmless", "first_seed")
 
 
