@@ -17,8 +17,14 @@ from harness.evaluate.live_world import LiveSource
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
+from harness.report.history import history
+from harness.report.matrix import BEST, WORSE, headline, lines
+from harness.report.runs import Runs
 from harness.runs.folder import Run, read
-from harness.runs.metrics import BALANCED, GAINS, METRICS
+from harness.runs.leading import SUCCESS, lead_of
+from harness.runs.listing import runs
+from harness.runs.metrics import BALANCED, GAINS, METRICS, of_ends
+from harness.runs.success import Success, alike
 
 HALVES = METRICS[BALANCED].halves
 BY_DANGER = {name for name, metric in METRICS.items() if metric.half or metric.halves}
@@ -99,6 +105,50 @@ def test_two_runs_are_compared_in_it_and_a_gate_takes_it(tmp_path: Path) -> None
     assert of.p_value is not None
     assert 0 < of.p_value <= 1
     assert judge(gate(f"6g:{BALANCED} < -0.1"), comparison).failed == (("6g", pytest.approx(-0.2)),)
+
+
+def test_what_counts_by_single_episodes_is_what_a_summary_states(tmp_path: Path) -> None:
+    done = made(tmp_path / "run", 0, 1, 7)
+    how = Success.of(done.episodes[:8], lead_of(done))
+    alone, best = of_ends(METRICS[SUCCESS], done.grid, done.episodes)
+    for e, metric in ((how.estimate(best), BALANCED), (how.difference(best, alone), GAINS[BALANCED])):
+        stated = done.score("6g", metric)
+        assert stated is not None
+        assert (e.value, e.low, e.high, e.n) == (stated.value, stated.low, stated.high, stated.n)
+    assert how.mean(best) == how.estimate(best).value
+    counts = how.resampled(np.random.default_rng(0), 50)
+    assert (counts[:, :3].sum(axis=1) == 3).all(), "each half is drawn for itself"
+    assert np.allclose(how.weights(counts).sum(axis=1), 1)
+    assert (how.weights(counts) @ best.mean(axis=0))[0] == pytest.approx(how.mean(best))
+    only = Success(np.ones(8, dtype=bool))
+    assert [each.metric for each in alike([how, only])] == [SUCCESS] * 2
+    assert alike([how, how])[0].metric == BALANCED
+    assert how.plain.estimate(best).value == 5 / 8
+
+
+def test_the_best_of_several_runs_has_the_most_balanced_success(tmp_path: Path) -> None:
+    """One loses all 8 dangers and the other 10 of 32 harmless ones: by plain success 80 and 75 %."""
+
+    def change(*lost: int) -> Callable[[Row], None]:
+        def end(row: Row) -> None:
+            row["danger"] = "left" if row["episode"] < 8 else "none"
+            if row["episode"] in lost:
+                row |= {"success": False, "failure": "late"}
+
+        return end
+
+    for name, failed in (("plain", range(8)), ("fair", range(8, 18))):
+        made_up(tmp_path / name, episode=change(*failed), episodes=40)
+    both = [read(tmp_path / name) for name in ("plain", "fair")]
+    found = lines(Runs(tuple(both), ("plain", "fair"), None))
+    marks = {(line.name, line.mark) for line in found}
+    assert marks == {("fair", BEST), ("plain", WORSE)}
+    assert headline(found).startswith("Best by balanced success under ")
+    [worse] = [line.behind for line in found if line.behind and line.condition == "6g"]
+    assert worse.change.value == pytest.approx(1 / 2 - 27 / 32)
+    [group] = history(tmp_path, None)
+    assert {line.score.metric for line in group.lines if line.score} == {BALANCED}
+    assert [listed.success for listed in runs(tmp_path) if listed.name == "fair"] == [pytest.approx(27 / 32)]
 
 
 def test_who_is_stuck_is_unsafe_in_older_runs_only(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from harness.cli.terminal import WIDTH, echo_json, echo_wrong
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
 from harness.core.figures import DASH, PERCENT
-from harness.runs.listing import SUCCESS
+from harness.runs.leading import BALANCED
 
 if TYPE_CHECKING:
     from harness.report.history import Line
@@ -24,7 +24,7 @@ VARIANT = 32  # columns of model, prompt and answer mode
 def ls(folder: options.Reports = Path("reports"), as_json: options.Json = False) -> None:
     """List runs and studies, newest first.
 
-    Each has the success of its best condition.
+    Each has the success of its best condition, balanced over danger and none where that leads.
     """
     from harness.runs.listing import UNREAD, runs
 
@@ -54,12 +54,15 @@ def _outcome(run: "Listed") -> str:
         return f"{run.state}: {run.why}"
     if run.success is None:
         return ""
-    return f"{printable(run.condition, 24)} {PERCENT.interval(run.success, run.low, run.high)} %"
+    what = " balanced" if run.metric == BALANCED else ""
+    return f"{printable(run.condition, 24)}{what} {PERCENT.interval(run.success, run.low, run.high)} %"
 
 
 def history(
     folder: options.Reports = Path("reports"),
-    metric: str = typer.Option(SUCCESS, help="Metric to show, by its name in summary.csv."),
+    metric: str | None = typer.Option(
+        None, help="Metric to show, by its name in summary.csv. Default: the success that leads."
+    ),
     condition: str | None = typer.Option(
         None, help="Condition to show. Default: the last of those that most runs have."
     ),
@@ -79,18 +82,19 @@ def history(
     wrong: dict[str, UserError] = {}
     groups = history.history(folder, metric, condition, dataset, wrong.__setitem__)
     if html:
-        history.write(groups, metric, html)
+        history.write(groups, html)
     if as_json:
         echo_json([
-            {"scenes": group.of, "condition": group.condition, "metric": metric,
+            {"scenes": group.of, "condition": group.condition, "metric": group.metric,
              "runs": [_mapping(line) for line in group.lines]}
             for group in groups
         ] + [{"run": name, "error": str(error)} for name, error in wrong.items()])  # fmt: skip
         return
-    percent = " %" if entry(metric).unit.name == "%" else ""
-    typer.echo(f"{metric}{percent} with its 95 % interval")
+    names = {g.metric: f"{g.metric}{' %' * (entry(g.metric).unit.name == '%')}" for g in groups}
+    typer.echo(f"{' or '.join(names.values())} with its 95 % interval")
     for group in groups:
-        typer.echo(f"\n{printable(f'{group.of}, {group.condition}', WIDTH)}")
+        of = f": {names[group.metric]}" if len(names) > 1 else ""
+        typer.echo(f"\n{printable(f'{group.of}, {group.condition}', WIDTH - len(of))}{of}")
         for line in group.lines:
             value = n = DASH
             if score := line.score:

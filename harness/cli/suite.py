@@ -100,7 +100,7 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     from harness.report import caveats
     from harness.report.constancy import ignores_input
     from harness.report.suite import seeds_of
-    from harness.report.words import LEADS, leading
+    from harness.runs.leading import IN_WORDS, lead_of
     from harness.runs.metrics import BASELINE
     from harness.world.drivers import ALWAYS
 
@@ -113,7 +113,7 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     ):
         text.print(sentence)
     gaining = [c for c in done.conditions if c != BASELINE] if BASELINE in done.conditions else []
-    _matrix(f"{LEADS[leading(done)]}, % [95 % CI]", "success", done.conditions, lines)
+    _matrix(f"{IN_WORDS[lead_of(done)]}, % [95 % CI]", "success", done.conditions, lines)
     _matrix(f"gain over {BASELINE}, points", "gain", gaining, lines)
     # `constant` stands for the two that always take one action: a line has no room for all.
     drivers = [name for name in lines[-1].drivers if name not in ALWAYS]

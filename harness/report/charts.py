@@ -40,12 +40,17 @@ APART = 0.05  # of success between two names of lines, the height of one
 PAPER = {"single-local": (145.0, 0.689), "v2x": (218.9, 0.835), "6g": (151.4, 0.941)}
 
 
-def success_latency(rows: Rows, references: Mapping[str, float], window_ms: Sequence[float]) -> Spec:
-    """Draw success over latency, a point a run and condition, and the paper's; references are lines."""
+def success_latency(
+    rows: Rows, references: Mapping[str, float], window_ms: Sequence[float], label: str
+) -> Spec:
+    """Draw success over latency, a point a run and condition, and the paper's; references are lines.
+
+    `label` is what leads, in words.
+    """
     untitled = {"legend": {"orient": "top", "title": None}}
     condition = condition_colours(rows) | untitled
     shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition") | untitled
-    x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", "success rate")
+    x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", f"{label} rate")
     present = {key for row in rows for key, value in row.items() if value is not None}
     along_x = {"x": {**x, "field": "latency_low"}, "x2": {"field": "latency_high"}, "y": y}
     along_y = {"x": x, "y": {**y, "field": "low"}, "y2": {"field": "high"}}

@@ -13,6 +13,7 @@ from harness.report.document import Section, Table, document, forest, linked, re
 from harness.report.page import save
 from harness.report.words import cell
 from harness.runs.folder import Run, read
+from harness.runs.leading import lead_of
 from harness.runs.listing import runs as listed
 from harness.runs.metrics import ALL, entry
 from harness.runs.records import Score
@@ -36,18 +37,19 @@ class Group:
     # of the values: the one that was asked for, or the last of those that most of the runs have; `all` of a
     # metric that depends on none
     condition: str
+    metric: str  # of the values
     lines: tuple[Line, ...]  # by date, the oldest first
 
 
 def history(
-    folder: Path, metric: str, condition: str | None = None, dataset: str | None = None,
+    folder: Path, metric: str | None, condition: str | None = None, dataset: str | None = None,
     wrong: Callable[[str, UserError], object] = lambda name, error: None,
 ) -> list[Group]:  # fmt: skip
     """Return the finished runs in a folder, the group whose last run is the newest first.
 
     Args:
         folder: is looked through as `harness run ls` does.
-        metric: a metric of `summary.csv`.
+        metric: a metric of `summary.csv`; None for the success that leads in a group.
         condition: of the values; None for the last of those that most of a group's runs have.
         dataset: name of the dataset, or of the scenario of driven runs; None for all.
         wrong: called with the name of a run that is left out since a file of it is broken, and the error.
@@ -83,34 +85,37 @@ def _scenes(run: Run) -> str:
     return run.source.partition(" (")[0]
 
 
-def _group(lines: Sequence[Line], metric: str, condition: str | None) -> Group:
+def _group(lines: Sequence[Line], metric: str | None, condition: str | None) -> Group:
     if condition is None:
         count = Counter(name for line in lines for name in line.run.conditions)
         most = max(count.values())
         condition = next(name for name in reversed(list(count)) if count[name] == most)
 
+    metric = metric or lead_of(*(line.run for line in lines))
     scored = tuple(
         replace(line, score=line.run.score(condition, metric) or line.run.score(ALL, metric))
         for line in lines
     )
     if {line.score.condition for line in scored if line.score} == {ALL}:
         condition = ALL
-    return Group(where(lines[-1].run), condition, scored)
+    return Group(where(lines[-1].run), condition, metric, scored)
 
 
-def write(groups: Sequence[Group], metric: str, out: Path) -> None:
+def write(groups: Sequence[Group], out: Path) -> None:
     """Write the page. Raises UserError if `out` cannot be written."""
-    place, label = beside(out), entry(metric).label
+    place, labels = beside(out), dict.fromkeys(entry(group.metric).label for group in groups)
     about = (
         "Runs by date, the oldest first, with 95 % intervals; n is the number of episodes or answers that a "
         "value is the mean of. Only runs in one table compare, since they have the same scenes; a run with "
         "fewer episodes has other scenes."
     )
-    tables = [_table(group, label, place) for group in groups]
-    save([document([Section(f"{label} over runs", about=[about], tables=tables)])], out, "--html")
+    tables = [_table(group, place) for group in groups]
+    title = f"{' or '.join(labels)} over runs"
+    save([document([Section(title, about=[about], tables=tables)])], out, "--html")
 
 
-def _table(group: Group, label: str, place: Place) -> Table:
+def _table(group: Group, place: Place) -> Table:
+    label = entry(group.metric).label
     scale = reach(line.score for line in group.lines if line.score)
     heads = ("run", "started", "model", "prompt", "answer", label, "interval, on one scale", "n")
     rows = []

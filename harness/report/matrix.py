@@ -1,6 +1,6 @@
 """Prompts and models side by side: what each run scored, and which cannot be told from the best."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from statistics import median
@@ -13,8 +13,10 @@ from harness.core.statistics import Estimate
 from harness.report.runs import Runs
 from harness.report.words import shown
 from harness.runs.folder import Run
-from harness.runs.metrics import BALANCED, LATENCY, SUCCESS, difference, entry, p_value
+from harness.runs.leading import IN_WORDS, lead_of
+from harness.runs.metrics import BALANCED, LATENCY, SUCCESS, entry
 from harness.runs.records import Score
+from harness.runs.success import Success
 
 Successes = Mapping[tuple[int, int], float]  # 0 or 1, by episode and seed
 
@@ -26,7 +28,7 @@ BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 class Behind:
     """A run against the best one, over the episodes that both have."""
 
-    change: Estimate  # of its success minus the best one's, with a 95 % interval over these episodes
+    change: Estimate  # of its success minus the best one's, as it leads, with a 95 % interval over these
     p_value: float  # of no difference, by that interval, corrected by Holm's method for all pairs of runs
 
     @property
@@ -47,6 +49,12 @@ class Line:
     tokens: tuple[float | None, float | None]  # medians of a prompt and an answer; None where not counted
     mark: str  # `BEST` under its condition, `CLOSE` or `WORSE`; empty where no run is the best
     behind: Behind | None  # how it stands to the best; None for the best
+    lead: str  # the metric by which the runs are read together
+
+    @property
+    def success(self) -> Score | None:
+        """What leads."""
+        return self.scores[self.lead]
 
 
 @dataclass(frozen=True)
@@ -68,7 +76,10 @@ def lines(runs: Runs) -> list[Line]:
     """Return every run under each of its conditions, by condition and then in the runs' order."""
     ended = [_successes(run) if len(runs.runs) > 1 else {} for run in runs.runs]
     lengths = [_tokens(run) for run in runs.runs]
-    all_marks = marked([[of.get(condition, {}) for of in ended] for condition in runs.conditions])
+    lead = lead_of(*runs.runs)
+    dangerous = {e.episode for run in runs.runs for e in run.episodes if e.danger != "none"}
+    by_condition = [[of.get(condition, {}) for of in ended] for condition in runs.conditions]
+    all_marks = marked(by_condition, dangerous if lead == BALANCED else ())
     rows = []
     for condition, marks in zip(runs.conditions, all_marks, strict=True):
         for n, run in enumerate(runs.runs):
@@ -76,7 +87,7 @@ def lines(runs: Runs) -> list[Line]:
                 scores = {metric: _score(run, condition, metric) for metric in METRICS}
                 who = run.manifest.variant
                 of_line = runs.names[n], f"{who.model}{who.mix}", who.prompt, who.answer, condition
-                rows.append(Line(*of_line, scores, lengths[n], *marks[n]))
+                rows.append(Line(*of_line, scores, lengths[n], *marks[n], lead))
     return rows
 
 
@@ -117,13 +128,16 @@ def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
     return by_condition
 
 
-def marked(conditions: Sequence[Sequence[Successes]]) -> list[list[tuple[str, Behind | None]]]:
+def marked(
+    conditions: Sequence[Sequence[Successes]], dangerous: Container[int] = ()
+) -> list[list[tuple[str, Behind | None]]]:
     """Return the mark of each run under each condition, and how it stands to the best one there.
 
     Args:
         conditions: of each, the successes of every run; empty for one that was not made under it.
+        dangerous: the episodes with a danger, where balanced success leads.
     """
-    results = [_behind_best(ended) for ended in conditions]
+    results = [_behind_best(ended, dangerous) for ended in conditions]
     every = [(n, run) for n, (_, behind) in enumerate(results) for run in behind]
     p_values = [results[n][1][run].p_value for n, run in every]
     pairs = sum(len(list(combinations(filter(None, ended), 2))) for ended in conditions)
@@ -140,7 +154,9 @@ def marked(conditions: Sequence[Sequence[Successes]]) -> list[list[tuple[str, Be
     return marks
 
 
-def _behind_best(ended: Sequence[Successes]) -> tuple[int | None, dict[int, Behind]]:
+def _behind_best(
+    ended: Sequence[Successes], dangerous: Container[int]
+) -> tuple[int | None, dict[int, Behind]]:
     """Return the best run and the others against it, p not yet corrected; None where there is no such run.
 
     The best is not behind any other on the episodes and seeds that the two share: a run of other episodes is
@@ -148,25 +164,27 @@ def _behind_best(ended: Sequence[Successes]) -> tuple[int | None, dict[int, Behi
     """
     scored = [n for n, of in enumerate(ended) if of]
     for best in scored:
-        pairs = {n: _shared(ended[n], ended[best]) for n in scored if n != best}
-        if pairs and all(len(a) and a.mean() <= b.mean() for a, b in pairs.values()):
-            return best, {n: _behind(a, b) for n, (a, b) in pairs.items()}
+        pairs = {n: _shared(ended[n], ended[best], dangerous) for n in scored if n != best}
+        if pairs and all(a.size and how.mean(a) <= how.mean(b) for how, a, b in pairs.values()):
+            return best, {n: _behind(*pair) for n, pair in pairs.items()}
     return None, {}
 
 
-def _shared(first: Successes, second: Successes) -> tuple[Floats, Floats]:
-    """Successes of the episodes and seeds that both have, each (E, S); empty where there are none."""
+def _shared(first: Successes, second: Successes, dangerous: Container[int]) -> tuple[Success, Floats, Floats]:
+    """Successes of the episodes and seeds that both have, each (S, E), and how they count."""
     both = sorted(first.keys() & second.keys())
-    episodes = {episode for episode, _ in both}
-    a, b = (np.array([of[key] for key in both]).reshape(len(episodes), -1) if both else np.empty((0, 0))
-            for of in (first, second))  # fmt: skip
-    return a, b
+    episodes = sorted({episode for episode, _ in both})
+    a, b = (
+        np.array([of[key] for key in both]).reshape(len(episodes), -1).T if both else np.empty((0, 0))
+        for of in (first, second)
+    )
+    return Success(np.array([episode in dangerous for episode in episodes], dtype=bool)), a, b
 
 
-def _behind(a: Floats, b: Floats) -> Behind:
-    p = p_value(SUCCESS, a, b)
+def _behind(how: Success, a: Floats, b: Floats) -> Behind:
+    p = how.p_value(a, b)
     # One episode has no interval: nothing says that it is more than chance.
-    return Behind(difference(SUCCESS, a, b), 1.0 if p is None else p)
+    return Behind(how.difference(a, b), 1.0 if p is None else p)
 
 
 def uneven(runs: Runs) -> str | None:
@@ -184,11 +202,11 @@ def uneven(runs: Runs) -> str | None:
 
 
 def figures(results: Sequence[Line]) -> list[dict[str, str]]:
-    """Return the best run's success under each condition, with what it is and its interval."""
+    """Return the best run's leading success under each condition, with what it is and its interval."""
     return [
-        {"what": f"success with {line.condition}, best: {line.name}", **shown(success)}
+        {"what": f"{IN_WORDS[line.lead]} with {line.condition}, best: {line.name}", **shown(line.success)}
         for line in results
-        if line.mark == BEST and (success := line.scores[SUCCESS])
+        if line.mark == BEST and line.success
     ]
 
 
@@ -198,7 +216,7 @@ def headline(results: Sequence[Line]) -> str:
     for condition in dict.fromkeys(line.condition for line in results):
         of_condition = [line for line in results if line.condition == condition]
         best = next((line for line in of_condition if line.mark == BEST), None)
-        if best is not None and (success := best.scores[SUCCESS]):
+        if best is not None and (success := best.success):
             close = [line.name for line in of_condition if line.mark == CLOSE]
             rivals = f"{len(close)} others" if len(close) > 1 else "".join(close)
             rest = f", which cannot be told from {rivals}" if close else ""
@@ -207,4 +225,5 @@ def headline(results: Sequence[Line]) -> str:
             outcomes.append(
                 f"{condition}: no run, since each is behind another or shares no episodes with it"
             )
-    return f"Best under {'; '.join(outcomes)}." if outcomes else "No two runs have a condition in common."
+    by = " by balanced success" if results[0].lead == BALANCED else ""
+    return f"Best{by} under {'; '.join(outcomes)}." if outcomes else "No two runs have a condition in common."

@@ -31,6 +31,7 @@ from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
 from harness.report.panels import panels
 from harness.report.runs import Runs
+from harness.runs.leading import IN_WORDS
 
 TEMPLATES = Path(__file__).parent / "templates"
 HEAD = 1 << 14  # bytes of a page within which it states what it lacks
@@ -134,6 +135,7 @@ def _pieces(
         key_figures=[*words.figures(runs.runs[0]), *tile(runs.runs[0])] if alone else matrix.figures(lines),
         actions=_actions(runs),
         lines=lines,
+        lead=IN_WORDS[lines[0].lead],
         grids=matrix.grids(lines),
         uneven=matrix.uneven(runs),
         summaries=[contents.summary(run) for run in runs.runs],

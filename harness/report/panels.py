@@ -17,7 +17,8 @@ from harness.report import charts
 from harness.report.references import driven, in_trees, label, sentences
 from harness.report.runs import Runs
 from harness.runs.folder import Run
-from harness.runs.metrics import LATENCY, SUCCESS
+from harness.runs.leading import IN_WORDS, lead_of
+from harness.runs.metrics import LATENCY
 from harness.runs.records import Score, role_word
 
 Table = list[dict[str, Any]]
@@ -53,15 +54,16 @@ def panels(runs: Runs) -> Iterator[Panel]:
     tau_nats = sorted({c["tau_nats"] for c in points})
     windows_ms = sorted({c["window_s"] * 1000 for c in points})
 
-    if rows := joined(success):
-        references, scenario = _references(runs), runs.scenario
+    lead = lead_of(*runs.runs)
+    if rows := joined(lambda run: success(run, lead)):
+        references, scenario = _references(runs, lead), runs.scenario
         rates = {label(name, scenario): s.value for name, s in references.items() if s.value is not None}
         yield Panel(
-            "success-latency", "overview", "Success and latency",
+            "success-latency", "overview", f"{IN_WORDS[lead].capitalize()} and latency",
             "Each point is a condition; the lines through it are 95 % intervals over episodes. Rings: what "
             "the paper reports, with other scenes and another model. A reply that arrives after the "
             "decision window is not fused." + sentences(references, scenario),
-            charts.success_latency(rows, rates, windows_ms),
+            charts.success_latency(rows, rates, windows_ms, IN_WORDS[lead]),
         )  # fmt: skip
     if rows := joined(statuses):
         yield Panel(
@@ -140,19 +142,19 @@ def panels(runs: Runs) -> Iterator[Panel]:
         )  # fmt: skip
 
 
-def _references(runs: Runs) -> dict[str, Score]:
-    """Return success of the references: from the trees, in closed loop from their own runs."""
+def _references(runs: Runs, lead: str) -> dict[str, Score]:
+    """Return what leads of the references: from the trees, in closed loop from their own runs."""
     if runs.dataset is None:
-        return driven(runs.runs)
+        return driven(runs.runs, lead)
     episodes = {number for run in runs.runs for number in run.grid.episodes}
-    return {name: of[SUCCESS] for name, of in in_trees(runs.dataset.of_episodes(episodes)).items()}
+    return {name: of[lead] for name, of in in_trees(runs.dataset.of_episodes(episodes)).items()}
 
 
-def success(run: Run) -> Table:
-    """Return success and latency of each condition, of which both are known."""
+def success(run: Run, lead: str) -> Table:
+    """Return what leads and latency of each condition, of which both are known."""
     rows = []
     for condition in run.conditions:
-        latency, rate = run.score(condition, LATENCY), run.score(condition, SUCCESS)
+        latency, rate = run.score(condition, LATENCY), run.score(condition, lead)
         if latency and rate:
             rows.append({
                 "condition": condition, "latency_ms": latency.value, "latency_low": latency.low,

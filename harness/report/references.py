@@ -31,13 +31,13 @@ def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
     return {name: scores(name, success) for name, success in dataset.reference_success().items()}
 
 
-def driven(runs: Iterable[Run]) -> dict[str, Score]:
-    """Return the success of each reference that some of these runs are of."""
+def driven(runs: Iterable[Run], metric: str) -> dict[str, Score]:
+    """Return a metric of each reference that some of these runs are of."""
     scores = {}
     for run in runs:
         engine = ENGINES.get(str(run.manifest.model.get("engine")))
         if engine and engine.capabilities.reference:
-            scores[str(run.manifest.model["name"])] = run.score(run.conditions[0], SUCCESS)
+            scores[str(run.manifest.model["name"])] = run.score(run.conditions[0], metric)
     return {name: score for name, score in scores.items() if score and score.value is not None}
 
 

@@ -17,6 +17,7 @@ from harness.report.drawing import colours
 from harness.report.page import save
 from harness.report.references import in_trees
 from harness.runs.folder import Run, dataset_of
+from harness.runs.leading import IN_WORDS, lead_of
 from harness.runs.metrics import BASELINE, GAINS, entry
 from harness.runs.records import Score
 from harness.runs.suite import SuiteRun, mean
@@ -51,7 +52,7 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
         suite: what was run.
         datasets: by family, those that were read already; others are read.
     """
-    datasets, gains, lead = datasets or {}, BASELINE in suite.conditions, words.leading(suite)
+    datasets, gains, lead = datasets or {}, BASELINE in suite.conditions, lead_of(suite)
     of_trees = {
         family: in_trees((datasets.get(family) or dataset_of(run)).of_episodes(run.grid.episodes))
         for family, run in suite.runs.items()
@@ -108,7 +109,7 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
             f"{suite.description}. {len(suite.runs)} families × {len(suite.manifest.seeds)} channel seeds; "
             "figures are means over families, with 95 % intervals over episodes."
         ],
-        [_families(lines, place, words.leading(suite)), _metrics(suite)],
+        [_families(lines, place, lead_of(suite)), _metrics(suite)],
         warnings=caveats.merged(suite.runs, caveats.void),
         caveats=[
             *caveats.no_prompt(run.manifest for run in suite.runs.values()),
@@ -121,8 +122,8 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
 def _numbers(suite: SuiteRun) -> list[dict[str, str]]:
     """Return success under each condition, and the gain of the best."""
     best, base = words.compared(suite)
-    lead = words.leading(suite)
-    scores = {f"{words.LEADS[lead]} with {c}": suite.score(c, lead) for c in suite.conditions}
+    lead = lead_of(suite)
+    scores = {f"{IN_WORDS[lead]} with {c}": suite.score(c, lead) for c in suite.conditions}
     gain = suite.score(best, GAINS[lead]) if base == BASELINE else None
     scores[f"more with {best} than with {base}"] = gain
     return [{"what": what, **words.shown(score)} for what, score in scores.items() if score]
@@ -146,7 +147,7 @@ def _families(lines: Sequence[Line], place: Place, lead: str) -> Table:
         "families and conditions of this table, and for the means for all conditions"
     )
     note = (
-        f"{words.LEADS[lead].capitalize()} with its 95 % interval"
+        f"{IN_WORDS[lead].capitalize()} with its 95 % interval"
         f"{gains * any(cell.gain for cell in mean.cells.values())}. The "
         "mean gives each family the same weight, however many episodes it has. Its interval is combined from "
         "the intervals of the families (Zou and Donner 2008). It is about other episodes of these families, "

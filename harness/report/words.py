@@ -6,18 +6,17 @@ from typing import Any
 from markupsafe import Markup
 
 from harness.core import multiplicity
-from harness.core.arrays import Floats
 from harness.core.errors import printable
 from harness.core.figures import PLAIN, Unit
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import Estimate, mean_of
+from harness.core.statistics import mean_of
 from harness.runs import metrics
 from harness.runs.folder import Run
-from harness.runs.metrics import BALANCED, BASELINE, GAINS, LATENCY, METRICS, SUCCESS, entry, halved, of_ends
+from harness.runs.leading import IN_WORDS, lead_of
+from harness.runs.metrics import BASELINE, GAINS, LATENCY, METRICS, SUCCESS, entry, of_ends
 from harness.runs.records import Latency, Manifest, Score, Times, role_word
+from harness.runs.success import Success
 from harness.runs.suite import SuiteRun
-
-LEADS = {SUCCESS: "success", BALANCED: "balanced success"}  # what a run is read by, in words
 
 
 def shown(score: Score) -> dict[str, str]:
@@ -44,7 +43,7 @@ def headline(run: Run | SuiteRun) -> str:
     best, base = compared(run)
     if not best:
         return f"{model} on {run.source}: the run has no success rate."
-    lead = leading(run)
+    lead = lead_of(run)
     if lead == SUCCESS:
         text = f"Under {best}, {model} clears {_shown(run, best, lead)} of the episodes"
     else:
@@ -67,17 +66,12 @@ def headline(run: Run | SuiteRun) -> str:
     return text + "."
 
 
-def leading(run: Run | SuiteRun) -> str:
-    """Return the metric by which a run is read: balanced success, or success where no danger is known."""
-    return BALANCED if any(run.score(c, BALANCED) for c in run.conditions) else SUCCESS
-
-
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
     """Return the best condition, and the one that it is held against: the one without V2V, or the worst.
 
     Empty where there is none.
     """
-    lead = leading(run)
+    lead = lead_of(run)
     scores = {c: s.value or 0.0 for c in run.conditions if (s := run.score(c, lead)) is not None}
     best = max(scores, key=lambda c: scores[c], default="")
     alone = [c["name"] for c in run.manifest.conditions if c.get("profile") is None and c["name"] in scores]
@@ -88,9 +82,9 @@ def compared(run: Run | SuiteRun) -> tuple[str, str]:
 def figures(run: Run) -> list[dict[str, str]]:
     """Return the few numbers of a run that are read first, each with what it is and its interval."""
     best, base = compared(run)
-    lead = leading(run)
+    lead = lead_of(run)
     wanted = [
-        (f"{LEADS[lead]} under {best}", run.score(best, lead)),
+        (f"{IN_WORDS[lead]} under {best}", run.score(best, lead)),
         *(
             (what, run.score(best, half))
             for what, half in zip(("with a danger", "without a danger"), entry(lead).halves, strict=False)
@@ -105,17 +99,21 @@ def figures(run: Run) -> list[dict[str, str]]:
 
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
     """Return p of each other condition's gain over `base`, in what leads; of a suite the mean gain's."""
-    runs, lead = run.runs.values() if isinstance(run, SuiteRun) else (run,), leading(run)
-    parts = entry(lead).halves or (lead,)
-    successes = [{name: of_ends(METRICS[name], of.grid, of.episodes) for name in parts} for of in runs]
+    runs = [*run.runs.values()] if isinstance(run, SuiteRun) else [run]
+    lead = lead_of(run)
+    counting = [Success.of(of.episodes[: len(of.grid.episodes)], lead) for of in runs]
+    successes = [of_ends(METRICS[SUCCESS], of.grid, of.episodes) for of in runs]
 
     def p_of(condition: str) -> float:
         a, b = (run.conditions.index(name) for name in (condition, base))
-
-        def gain(success: Mapping[str, Floats], level: float) -> Estimate:
-            return halved(lead, lambda n: metrics.difference(n, success[n][a].T, success[n][b].T, level))
-
-        p = multiplicity.p_value(lambda level: mean_of([gain(success, level) for success in successes]))
+        p = multiplicity.p_value(
+            lambda level: mean_of(
+                [
+                    how.difference(success[a], success[b], level)
+                    for how, success in zip(counting, successes, strict=True)
+                ]
+            )
+        )
         return 1.0 if p is None else p
 
     return {condition: p_of(condition) for condition in run.conditions if condition != base}

@@ -15,6 +15,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import opened, text_of
 from harness.core.formats import CONFIG, SOURCES, SUITE, WORK
 from harness.runs import formats
+from harness.runs.leading import BALANCED, SUCCESS, leading
 
 DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
@@ -29,7 +30,7 @@ STUDIES = {
     "closed-loop.json": "study",
     "fidelity.csv": "study",
 }
-SUCCESS, FAILED = "success_rate", "failed_rate_ego"
+FAILED = "failed_rate_ego"
 UNREAD = 0.5  # share of failed answers from which a run's headline mentions them
 _BROKEN = (
     OSError,
@@ -60,11 +61,12 @@ class Listed:
     prompt: str | None = None  # the prompt version; those of all families for a suite
     answer: str | None = None  # the answer mode
     tags: tuple[str, ...] = ()  # words by which to find it
-    condition: str | None = None  # the condition with the highest success rate; the first of several
-    success: float | None = None  # that rate, 0 to 1, over episodes; for a suite, the mean over families
+    condition: str | None = None  # the condition with the highest success; the first of several
+    success: float | None = None  # that, 0 to 1, over episodes; for a suite, the mean over families
     low: float | None = None  # lower end of its 95 % interval; None if the data cannot bound it
     high: float | None = None  # its upper end
     unread: float | None = None  # share of the ego's answers that could not be parsed
+    metric: str | None = None  # what success is: the metric that leads
 
 
 def runs(folder: Path) -> list[Listed]:
@@ -177,18 +179,19 @@ def _with_summary(path: str, listed: Listed) -> Listed:
     """Return an entry as finished, with the best condition of its summary."""
     with opened(os.path.join(path, "summary.csv"), "rows") as data, TextIOWrapper(data, "utf-8-sig") as file:
         # Parse only the rows needed: a folder may hold a thousand summaries of a thousand rows.
-        markers = (f",{SUCCESS},", f",{FAILED},")
+        markers = [f",{metric}," for metric in (BALANCED, SUCCESS, FAILED)]
         head, *lines = [
             line for n, line in enumerate(file) if n == 0 or any(metric in line for metric in markers)
         ]
     table = list(csv.DictReader([head, *lines]))
-    rows = [row for row in table if (row["metric"], row["interval"]) == (SUCCESS, "episodes")]
+    metric = leading({row["metric"] for row in table})
+    rows = [row for row in table if (row["metric"], row["interval"]) == (metric, "episodes")]
     best = max(rows, key=lambda row: _number(row["value"]) or 0.0)
     value, low, high = (_number(best[key]) for key in ("value", "ci_low", "ci_high"))
     unread = next((_number(row["value"]) for row in table if row["metric"] == FAILED), None)
     return replace(
         listed, state="finished", why=None, condition=best["condition"], success=value, low=low,
-        high=high, unread=unread,
+        high=high, unread=unread, metric=metric,
     )  # fmt: skip
 
 

@@ -31,6 +31,7 @@ from harness.core.statistics import (
     seed_rate_interval,
 )
 from harness.parsing.status import Repair
+from harness.runs import leading
 from harness.runs.decisions import Decisions
 from harness.runs.records import Answer, AnswerFacts, Episode, Role, Score, role_word
 
@@ -38,8 +39,8 @@ World = Literal["frozen", "closed-loop"]
 Better = Literal["higher", "lower", "neither"]
 Answers = Sequence[Answer | AnswerFacts]
 BASELINE = "single-local"  # the condition without V2V
-SUCCESS, LATENCY, GAIN = "success_rate", "latency_proxy_ms", f"success_gain_over_{BASELINE}"
-BALANCED = "balanced_success_rate"
+SUCCESS, BALANCED = leading.SUCCESS, leading.BALANCED
+LATENCY, GAIN = "latency_proxy_ms", f"success_gain_over_{BASELINE}"
 GAINS = {SUCCESS: GAIN, BALANCED: f"balanced_success_gain_over_{BASELINE}"}  # by what is gained
 PERCENTILES = (50, 95, 99)
 ALL = "all"  # the condition of a figure that is the same in all of them

@@ -65,7 +65,9 @@ def test_it_lists_frozen_live_and_sweep_newest_first(folder: Path) -> None:
 def test_success_is_that_of_the_best_condition_over_episodes(folder: Path) -> None:
     [frozen] = [one for one in runs(folder) if one.name == "frozen"]
     lines = (folder / "frozen/summary.csv").read_text().splitlines()
-    rates = [line.split(",") for line in lines if ",success_rate," in line and line.endswith(",episodes")]
+    rates = [
+        line.split(",") for line in lines if ",balanced_success_rate," in line and line.endswith(",episodes")
+    ]
     best = max(rates, key=lambda row: float(row[6]))
     assert len(rates) == 3
     assert (frozen.condition, frozen.success, frozen.low, frozen.high) == (best[4], *map(float, best[6:9]))
@@ -88,7 +90,7 @@ def test_json_has_every_field_whole(harness: Callable[..., Said], folder: Path) 
     assert code == 0
     assert list(told["live"]) == [
         "name", "kind", "state", "date", "why", "model", "prompt", "answer", "tags", "condition", "success",
-        "low", "high", "unread",
+        "low", "high", "unread", "metric",
     ]  # fmt: skip
     assert told["live"]["date"] == json.loads((folder / "live/run.json").read_text())["created"]
 

@@ -107,7 +107,7 @@ def test_references_have_intervals_and_n_as_a_model_has(small: Dataset) -> None:
 def test_names_of_near_lines_stand_together() -> None:
     rows = [{"run": "a", "condition": "6g", "latency_ms": 150.0, "success": 0.5, "low": 0.4, "high": 0.6}]
     heights = {"brake": 0.0, "full-view": 0.97, "constant IDLE": 0.52, "cruise": 0.55, "local-view": 0.93}
-    spec = success_latency(rows, heights, [])
+    spec = success_latency(rows, heights, [], "success")
     [layer] = [x for x in spec["layer"] if "layer" in x and "data" in x["layer"][0]]
     lines, names = (part["data"]["values"] for part in layer["layer"])
     assert {line["reference"]: line["success"] for line in lines} == heights

@@ -13,7 +13,8 @@ from harness.report.compare.difference import LOST_BY, Comparison, DecisionFlip,
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.words import p_value, pace
-from harness.runs.metrics import SUCCESS, entry
+from harness.runs.leading import IN_WORDS, leading
+from harness.runs.metrics import entry
 from harness.runs.records import role_word
 
 BETTER, WORSE, HINT = "better", "worse", "hint"
@@ -94,13 +95,14 @@ def rest(c: InCondition) -> list[Difference]:
 
 
 def findings(comparison: Comparison) -> list[tuple[str, str]]:
-    """Return how success changed in each condition: a sentence and its verdict."""
+    """Return how what leads changed in each condition: a sentence and its verdict."""
     findings = []
     for c in comparison.conditions:
-        for d in [d for d in c.differences if d.metric == SUCCESS]:
+        lead = leading({d.metric for d in c.differences})
+        for d in [d for d in c.differences if d.metric == lead]:
             row = line(d)
             p = "" if d.p_corrected is None else f", Holm's p {row.p}"
-            change = f"success {row.change} points {row.interval}: {row.verdict or 'may be chance'}"
+            change = f"{IN_WORDS[lead]} {row.change} points {row.interval}: {row.verdict or 'may be chance'}"
             findings.append((f"{c.condition}: {change}{p}", row.verdict))
     return findings
 

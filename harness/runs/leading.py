@@ -1,0 +1,31 @@
+"""The metric by which runs are read: success balanced over layouts with and without a danger, or plain.
+
+It is balanced where layouts are of both kinds, as a run's rows of `BALANCED` say.
+"""
+
+from collections.abc import Container, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from harness.runs.records import Score
+
+SUCCESS, BALANCED = "success_rate", "balanced_success_rate"
+IN_WORDS = {SUCCESS: "success", BALANCED: "balanced success"}
+
+
+class Scored(Protocol):
+    """A run, or a suite's."""
+
+    @property
+    def scores(self) -> "Sequence[Score]": ...
+
+
+def leading(names: Container[str]) -> str:
+    """Return the metric by which what has metrics of these names is read."""
+    return BALANCED if BALANCED in names else SUCCESS
+
+
+def lead_of(*runs: Scored) -> str:
+    """Return the metric by which runs are read together: balanced success where all of them state it."""
+    stated = [{score.metric for score in run.scores if score.value is not None} for run in runs]
+    return leading(set.intersection(*stated))

@@ -1,0 +1,88 @@
+"""How success of episodes counts: balanced over layouts with and without a danger, or plain.
+
+All that picks, orders or tests by success of single episodes does so here.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.core import multiplicity
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of, resampled
+from harness.runs import metrics
+from harness.runs.leading import BALANCED, IN_WORDS, SUCCESS
+from harness.runs.metrics import over_episodes
+from harness.runs.records import Episode
+
+
+@dataclass(frozen=True)
+class Success:
+    """How success of episodes E counts."""
+
+    dangerous: Bools  # which of them have a danger, (E,)
+
+    @classmethod
+    def of(cls, episodes: Sequence[Episode], lead: str) -> "Success":
+        """Return that of some episodes, one row of each, in runs that are read by `lead`."""
+        return cls(np.array([lead == BALANCED and episode.danger != "none" for episode in episodes]))
+
+    @property
+    def metric(self) -> str:
+        """What leads."""
+        return BALANCED if 0 < self.dangerous.sum() < len(self.dangerous) else SUCCESS
+
+    @property
+    def words(self) -> str:
+        """The same for people."""
+        return IN_WORDS[self.metric]
+
+    @property
+    def plain(self) -> "Success":
+        """The same episodes, read by plain success."""
+        return Success(np.zeros_like(self.dangerous))
+
+    def mean(self, success: Floats) -> float:
+        """Return the mean of success, (S, E)."""
+        return float(np.mean([known_mean(known_mean(success[:, part], 0), 0) for part in self._parts]))
+
+    def estimate(self, success: Floats) -> Estimate:
+        """Return the same with its interval over episodes."""
+        return self._mean(lambda part: over_episodes(SUCCESS, success[:, part]))
+
+    def difference(self, a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
+        """Return success a - b, both (S, E), paired by episode."""
+        return self._mean(lambda part: metrics.difference(SUCCESS, a[:, part].T, b[:, part].T, level))
+
+    def p_value(self, a: Floats, b: Floats) -> float | None:
+        """Return the p-value of no such difference; None without an interval."""
+        return multiplicity.p_value(lambda level: self.difference(a, b, level))
+
+    def resampled(self, draws: np.random.Generator, times: int) -> Ints:
+        """Return how often each episode counts, as in `statistics.resampled`, (1 + times, E), by halves."""
+        counts = np.empty((1 + times, len(self.dangerous)), dtype=np.int64)
+        for part in self._parts:
+            counts[:, part] = resampled(draws, int(part.sum()), times)
+        return counts
+
+    def weights(self, counts: Ints) -> Floats:
+        """Return the weight of each episode in the mean where they count so often, (..., E)."""
+        shares = sum(part / (len(self._parts) * part.sum()) for part in self._parts)
+        return np.asarray(counts * shares)
+
+    @property
+    def _parts(self) -> list[Bools]:
+        """Which episodes are averaged first, (E,) each; the mean is of these means."""
+        halves = [self.dangerous, ~self.dangerous]
+        return halves if self.metric == BALANCED else [np.ones_like(self.dangerous)]
+
+    def _mean(self, estimate: Callable[[Bools], Estimate]) -> Estimate:
+        parts = self._parts
+        return mean_of([*map(estimate, parts)]) if len(parts) > 1 else estimate(parts[0])
+
+
+def alike(successes: Sequence[Success]) -> list[Success]:
+    """Return what is averaged over families: balanced only where it is in all of them."""
+    balanced = all(success.metric == BALANCED for success in successes)
+    return [success if balanced else success.plain for success in successes]
