@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from harness.core.errors import UserError
 
 if TYPE_CHECKING:
-    from harness.api import compare, load, ls, run, sweep
+    from harness.api import compare, environment, load, ls, run, sweep
 
-__all__ = ["UserError", "compare", "load", "ls", "run", "sweep"]
+__all__ = ["UserError", "compare", "environment", "load", "ls", "run", "sweep"]
 __version__ = "0.3.0"
 
 

@@ -26,7 +26,16 @@ def folder(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_there_are_few_names_and_importing_loads_nothing_else() -> None:
-    assert dir(harness) == ["UserError", "__version__", "compare", "load", "ls", "run", "sweep"]
+    assert dir(harness) == [
+        "UserError",
+        "__version__",
+        "compare",
+        "environment",
+        "load",
+        "ls",
+        "run",
+        "sweep",
+    ]
     code = "import sys, harness; assert not {'numpy', 'pandas', 'msgspec'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(AttributeError, match="no attribute 'evaluation'; it has UserError, compare"):

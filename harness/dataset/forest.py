@@ -220,12 +220,18 @@ class Forest:
         return self.succeeds(self.last_edge(chosen), np.arange(len(self.root)))
 
     def uniform_success(self) -> Floats:
-        """Return with what probability each episode succeeds, (E,), if every action is equally likely.
+        """Return with what probability each episode succeeds, (E,), if every action is equally likely."""
+        return np.asarray(self.chance(np.ones(self.child.shape))[self.root].mean(axis=-1))
 
-        A pass from the leaves backwards gives it exactly: no action is drawn.
+    def chance(self, policy: Floats) -> Floats:
+        """Return with what probability an episode succeeds after each action, (N, A).
+
+        What follows is drawn by a policy's weights of the actions at each decision point, (N, A). A pass
+        from the leaves backwards gives that exactly: no action is drawn.
         """
         chance = self.succeeds(self.edge, self.tree[:, None]).astype(float)
         for rows in self._levels_backwards():
             child = self.child[rows]
-            chance[rows] = np.where(child >= 0, chance[child].mean(axis=-1), chance[rows])
-        return np.asarray(chance[self.root].mean(axis=-1))
+            after = np.average(chance[child], axis=-1, weights=policy[child])
+            chance[rows] = np.where(child >= 0, after, chance[rows])
+        return chance

@@ -1,0 +1,161 @@
+"""Driving as a Gymnasium environment: one decision a step, with the worth of every action known.
+
+An action is an index, or a distribution over the actions: then the reward is its expected worth, and the
+action that is taken is drawn from it by the environment's own generator.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Literal, get_args
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable, unknown
+from harness.core.files import digest
+from harness.core.seeds import purpose
+from harness.learning import asking
+from harness.learning.trips import Roads, Trees, Trip
+from harness.learning.values import Values, optimal
+from harness.world.audit import numbers
+
+Observation = Literal["text", "arrays"]
+Reward = Literal["value", "success"]
+MOST_CHARS = 100_000  # of a chat message
+MOST = 1e6  # as great as a number of a scene graph may be
+# What messages are written in: line breaks, and letters and signs up to those of East Asia.
+CHARACTERS = frozenset({"\n", "\t", *map(chr, range(0x20, 0x3000))})
+
+
+class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untyped
+    """Decides for the ego, a decision a step, on layouts that may be learnt from.
+
+    An observation is a chat that asks the viewer (`text`), or the numbers of its scene graph (`arrays`):
+    `numbers`, named by `self.numbers`, 0 where `known` is 0. The last of an episode repeats the one before.
+
+    `info` has what no driver knows: `values` and `optimal` of every action, (A,), `lost` if success is out of
+    reach, `scene`, `layout_seed`, `danger` (its sector, "" without one) and `viewer`; after a step the index
+    `taken`, and at the end `success`.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 # as gymnasium declares it
+    expected_value = staticmethod(asking.expected_value)
+
+    def __init__(
+        self, source: Trees | Roads, ask: asking.Asking, *, observation: Observation = "text",
+        viewer: str | None = None, reward: Reward = "value", distributions: bool = False,
+    ) -> None:  # fmt: skip
+        for name, given, allowed in (("observation", observation, Observation), ("reward", reward, Reward)):
+            if given not in get_args(allowed):
+                raise unknown(name, str(given), get_args(allowed))
+        if reward == "value" and isinstance(source, Roads) and not source.then:
+            raise UserError('reward="value" needs values; give then="local-view", or reward="success"')
+        self.source, self.ask, self.actions = source, ask, source.scenario.actions
+        self.viewer, self.reward, self._text = viewer, reward, observation == "text"
+        scene = source.begin(source.seeds[0]).scene
+        graph = scene.graphs[asking.viewer_of(scene, viewer, 0.0)]
+        self.numbers = tuple(name for name, _ in numbers(graph, source.scenario.road()))
+        of_actions = (len(self.actions),)
+        self.action_space = (
+            spaces.Box(0.0, 1.0, of_actions) if distributions else spaces.Discrete(len(self.actions))
+        )
+        text = spaces.Text(MOST_CHARS, charset=CHARACTERS)
+        each = (len(self.numbers),)
+        self.observation_space = (
+            spaces.Sequence(spaces.Dict({"role": text, "content": text}))
+            if self._text
+            else spaces.Dict(numbers=spaces.Box(-MOST, MOST, each), known=spaces.MultiBinary(each))
+        )
+        self.trip: Trip | None = None
+
+    @property
+    def values(self) -> Values:
+        """The worth of every action at every decision point, as arrays. Raises UserError without trees."""
+        return self._trees("values").values
+
+    def rows(self, per_level: int = 6) -> list[dict[str, Any]]:
+        """Return the questions of all layouts, for trainers of text models; see `asking.rows`.
+
+        Raises UserError without trees.
+        """
+        trees = self._trees("rows()")
+        return [*asking.rows(trees.dataset, trees.values, self.ask, self.viewer, per_level)]
+
+    def learnt(self) -> dict[str, Any]:
+        """Return what a model's card should state of what it learnt from here, as plain values."""
+        scenario, seeds = self.source.scenario, self.source.seeds
+        prompt = self.ask.prompt
+        return {
+            "scenarios": {scenario.name: digest(scenario.parameters.stated())}, "layouts": len(seeds),
+            "first_seed": seeds[0], "purpose": purpose(seeds[0], len(seeds)), "then": self.source.then,
+            "reward": self.reward, "prompts": {prompt.version: prompt.sha256} if self._text else {},
+        }  # fmt: skip
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode on a layout that is drawn, or on that of `options={"layout_seed": ...}`.
+
+        Raises UserError for a layout that may not be learnt from, or has no tree here.
+        """
+        super().reset(seed=seed)
+        seeds = self.source.seeds
+        drawn = seeds[int(self.np_random.integers(len(seeds)))]
+        self.trip = self.source.begin((options or {}).get("layout_seed", drawn))
+        return self._look()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take an action, given as an index or as a distribution (A,), which is normalised.
+
+        Raises UserError before `reset`, after the end, or for what is no action.
+        """
+        if self.trip is None or self.trip.success is not None:
+            raise UserError("no episode is under way; call reset() first")
+        p = self._distribution(action)
+        index = np.ndim(action) == 0
+        taken = int(action) if index else int(self.np_random.choice(len(p), p=p))
+        worth = float(p @ self.trip.values)
+        self.trip.take(taken)
+        success = self.trip.success
+        reward = worth if self.reward == "value" else float(success or 0)
+        observation, info = self._look()
+        info |= {"taken": taken} if success is None else {"taken": taken, "success": success}
+        return observation, reward, success is not None, False, info
+
+    def _distribution(self, action: Any) -> Floats:
+        try:
+            given = np.asarray(action)
+            if given.ndim == 0 and given.dtype.kind in "iu" and 0 <= given < len(self.actions):
+                return np.asarray(np.eye(len(self.actions))[int(given)])
+            p = given.astype(float)
+            total = p.sum()
+            if p.shape == (len(self.actions),) and (p >= 0).all() and 0 < total < np.inf:
+                return np.asarray(p / total)
+        except (TypeError, ValueError):
+            pass
+        raise UserError(
+            f"action {printable(str(action), 40)}: give 0 to {len(self.actions) - 1}, one of "
+            f"{', '.join(self.actions)}, or {len(self.actions)} probabilities"
+        )
+
+    def _look(self) -> tuple[Any, dict[str, Any]]:
+        assert self.trip
+        scene, values = self.trip.scene, self.trip.values
+        viewer = asking.viewer_of(scene, self.viewer, float(self.np_random.random()))
+        record, graph = scene.record, scene.graphs[viewer]
+        info = {
+            "values": values.copy(), "optimal": optimal(values), "lost": bool((values == 0).all()),
+            "scene": scene.id, "layout_seed": record.episode_seed, "danger": record.danger.sector or "",
+            "viewer": viewer,
+        }  # fmt: skip
+        if self._text:
+            return tuple(self.ask.chat(graph)), info
+        read = [number for _, number in numbers(graph, self.source.scenario.road())]
+        known = np.array([number is not None for number in read], np.int8)
+        return {"numbers": np.array([number or 0.0 for number in read], np.float32), "known": known}, info
+
+    def _trees(self, what: str) -> Trees:
+        if isinstance(self.source, Trees):
+            return self.source
+        raise UserError(f"{what} of driven episodes are not known in advance; leave out driven=True")

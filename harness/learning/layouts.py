@@ -1,0 +1,60 @@
+"""Layouts that may be learnt from, and their trees: built once, kept on disk, never of report seeds."""
+
+import re
+from collections.abc import Callable
+
+from harness.core import kept
+from harness.core.errors import UserError, printable, unknown
+from harness.core.files import digest
+from harness.core.formats import WORK
+from harness.core.parallel import Workers
+from harness.core.seeds import FIRST, LAST_SEED, Purpose, purpose
+from harness.dataset.build import build
+from harness.dataset.load import Dataset, find, load
+from harness.world.scenario import Scenario
+
+# What a tree depends on; numbers of it that are kept are of this code alone.
+CODE = ("world/**/*.py", "world/**/*.csv", "dataset/*.py")
+
+
+def seeds(which: str | int, layouts: int) -> range:
+    """Return the layout seeds of a purpose, or from a first one on.
+
+    Raises UserError for seeds that numbers are reported of, of two purposes, or none at all.
+    """
+    if isinstance(which, str) and which not in FIRST:
+        raise unknown("seeds", which, [name for name in FIRST if name != "report"], "; or the first seed")
+    first = FIRST[which] if isinstance(which, str) else which
+    if not 0 <= first <= LAST_SEED - layouts or layouts < 1:
+        raise UserError(f"seeds {first}, layouts {layouts}: give a seed from 0 on, and 1 layout or more")
+    refuse(purpose(first, layouts), f"seeds={which!r}")
+    return range(first, first + layouts)
+
+
+def refuse(kind: Purpose, what: str) -> None:
+    """Raise UserError if layouts are those that numbers are reported of."""
+    if kind == "report":
+        raise UserError(
+            f"{what}: numbers are reported of layout seeds from {FIRST['report']} on, and nothing may learn "
+            f'from them; give seeds="train" ({FIRST["train"]} to {FIRST["report"] - 1}) or seeds="tune"'
+        )
+
+
+def stored(dataset: str) -> Dataset:
+    """Read a dataset, by its folder or name. Raises UserError for none, or one of report seeds."""
+    data = load(find(dataset))
+    refuse(data.manifest.purpose, f"dataset {printable(dataset)}")
+    return data
+
+
+def trees(scenario: Scenario, of: range, workers: Workers, progress: Callable[[int], None]) -> Dataset:
+    """Return the trees of a scenario's layouts; what is not in the user's cache folder is built.
+
+    A build that was stopped goes on. Raises UserError if another process is building them.
+    """
+    key = digest([scenario.name, scenario.parameters.stated(), kept.code_sha256(*CODE)])[:12]
+    name = re.sub(r"[^A-Za-z0-9]+", "-", scenario.name)[:60]
+    folder = kept.folder() / "trees" / f"{name}-{of.start}-{len(of)}-{key}"
+    if not (folder / "manifest.json").is_file() or (folder / WORK).is_dir():
+        build(scenario, folder, len(of), of.start, workers, progress, audits=False)
+    return load(folder)

@@ -1,0 +1,176 @@
+"""One episode, decision by decision: a walk through its tree, or a drive in the simulator."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.core.errors import UserError, unknown
+from harness.core.seeds import purpose
+from harness.dataset.freeze import edges, record_of
+from harness.dataset.load import Dataset, Scene
+from harness.learning.layouts import refuse
+from harness.learning.values import BEST, Values
+from harness.world.drivers import DRIVERS, PRIVILEGED
+from harness.world.outcome import Outcome
+from harness.world.reference import drive, finish
+from harness.world.scenario import Scenario
+from harness.world.world import World
+
+
+class Trip(Protocol):
+    """An episode that is under way at a decision point, or over."""
+
+    @property
+    def scene(self) -> Scene:
+        """The present decision point; the last one once the episode is over."""
+        ...
+
+    @property
+    def values(self) -> Floats:
+        """What each action is worth there, (A,)."""
+        ...
+
+    @property
+    def success(self) -> bool | None:
+        """Whether the episode succeeded; None while it is under way."""
+        ...
+
+    def take(self, action: int) -> None:
+        """Take an action, and go on to the next decision point or to the end."""
+        ...
+
+
+class Source(Protocol):
+    """Begins episodes on layouts that may be learnt from."""
+
+    @property
+    def scenario(self) -> Scenario: ...
+
+    @property
+    def seeds(self) -> Sequence[int]:
+        """The layout seeds among which episodes are drawn."""
+        ...
+
+    def begin(self, seed: int) -> Trip:
+        """Begin an episode. Raises UserError for a layout that this source has not."""
+        ...
+
+
+@dataclass(frozen=True)
+class Trees:
+    """Episodes that are walked through trees."""
+
+    dataset: Dataset  # the trees, and the scenes of their decision points
+    then: str = BEST  # who decides after an action that is judged
+
+    @property
+    def scenario(self) -> Scenario:
+        return self.dataset.scenario
+
+    @property
+    def seeds(self) -> Sequence[int]:
+        return self.dataset.seeds
+
+    @cached_property
+    def values(self) -> Values:
+        return Values.of(self.dataset.forest, self.then)
+
+    def begin(self, seed: int) -> "TreeTrip":
+        if seed not in self.seeds:
+            raise UserError(f"layout seed {seed} has no tree here; give one of {_range(self.seeds)}")
+        return TreeTrip(self, int(self.dataset.forest.root[self.seeds.index(seed)]))
+
+
+@dataclass
+class TreeTrip:
+    """A walk through a tree."""
+
+    of: Trees
+    at: int  # place of the decision point in the forest
+    success: bool | None = None
+
+    @property
+    def scene(self) -> Scene:
+        [scene] = self.of.dataset.scenes([self.of.values.ids[self.at]])
+        return scene
+
+    @property
+    def values(self) -> Floats:
+        return np.asarray(self.of.values.table[self.at])
+
+    def take(self, action: int) -> None:
+        forest = self.of.dataset.forest
+        if (child := int(forest.child[self.at, action])) >= 0:
+            self.at = child
+        else:
+            self.success = bool(forest.succeeds(forest.edge[self.at, action], forest.tree[self.at]))
+
+
+@dataclass(frozen=True)
+class Roads:
+    """Episodes that are driven in the simulator, so that no tree is built."""
+
+    scenario: Scenario
+    seeds: Sequence[int]
+    then: str | None = None  # a reference driver; None where values are not asked for
+
+    def __post_init__(self) -> None:
+        if self.then not in (None, *DRIVERS):
+            raise unknown("then", str(self.then), DRIVERS, "; only trees know more than drivers do")
+
+    def begin(self, seed: int) -> "RoadTrip":
+        refuse(purpose(seed, 1), f"layout seed {seed}")
+        return RoadTrip(self, World.start(self.scenario, seed))
+
+
+@dataclass
+class RoadTrip:
+    """An episode in the simulator."""
+
+    of: Roads
+    world: World
+    success: bool | None = None
+
+    def __post_init__(self) -> None:
+        self._look()
+
+    @cached_property
+    def reference(self) -> Outcome:
+        """How the full-view driver ends on this layout, which says how late is too late."""
+        return drive(self.of.scenario, PRIVILEGED, self.world.seed)
+
+    def _look(self) -> None:
+        state = self.world.state()
+        record = record_of(self.world, state, 0, (state.ego, *state.helpers))
+        self.scene, self.values = Scene(record), self._values()
+
+    def _values(self) -> Floats:
+        actions = self.of.scenario.actions
+        values = np.full(len(actions), np.nan)
+        if self.of.then:
+            [branches], worlds = edges([self.world], 0)
+            ends = finish(worlds, [self.of.then] * len(worlds))
+            for edge in branches:
+                end = Outcome(edge.end.result, edge.end.time_s) if edge.end else ends[edge.to or 0]
+                values[[actions.index(action) for action in edge.actions]] = self._succeeded(end)
+        return values
+
+    def _succeeded(self, end: Outcome) -> bool:
+        return end.judged(self.reference, self.world.layout.danger, self.of.scenario.parameters).success
+
+    def take(self, action: int) -> None:
+        self.world.act(self.of.scenario.actions[action])
+        if self.world.outcome.ended:
+            self.success = self._succeeded(self.world.outcome)
+        elif self.world.step < self.of.scenario.parameters.decisions:
+            self._look()
+        else:
+            raise RuntimeError("an undecided episode after its last decision")
+
+
+def _range(seeds: Sequence[int]) -> str:
+    return f"{min(seeds)} to {max(seeds)}"

@@ -1,0 +1,76 @@
+"""What every action is worth at the decision points of trees, as arrays: rewards without a simulator.
+
+The worth of an action is the probability that the episode succeeds after it. Trees give it exactly, whoever
+decides from there on:
+
+- `best`: whoever decides best and sees everything. It is 1 or 0: whether success is still possible.
+- a reference driver, such as `local-view`, which sees no more than the ego. It is 1 or 0 as well.
+- `uniform`: every action is drawn with the same probability.
+
+The worth of a distribution at a decision point is `sum_a p(a) v(a)`, and its gradient in p is v. Where
+success is out of reach after every action, nothing can be learnt: the point is `lost`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import unknown
+from harness.dataset.forest import Forest
+from harness.world.drivers import UNIFORM
+
+BEST = "best"
+
+
+@dataclass(frozen=True)
+class Values:
+    """The worth of A actions at N decision points."""
+
+    ids: tuple[str, ...]  # ids of the decision points
+    actions: tuple[str, ...]  # the meta-actions
+    then: str  # who decides after the action
+    table: Floats  # worth of each action, (N, A)
+
+    @classmethod
+    def of(cls, forest: Forest, then: str = BEST) -> "Values":
+        """Raises UserError if there is no such driver."""
+        if then == BEST:
+            table = forest.safe.astype(float)
+        elif then == UNIFORM:
+            table = forest.chance(np.ones(forest.child.shape))
+        elif then in forest.drivers:
+            table = forest.chance(np.eye(len(forest.actions))[forest.drivers[then]])
+        else:
+            raise unknown("then", then, [BEST, UNIFORM, *forest.drivers])
+        return cls(forest.ids, forest.actions, then, table)
+
+    def __call__(self, points: Sequence[str] | Ints, p: Floats | None = None) -> Floats:
+        """Return the worth of each action at n decision points, (n, A); given distributions p (n, A), theirs.
+
+        The points are ids, or places among `ids`, which is faster. Raises KeyError for an unknown id.
+        """
+        places = points if isinstance(points, np.ndarray) else self.at(points)
+        values = self.table[places]
+        return values if p is None else np.einsum("na,na->n", p, values)
+
+    def at(self, ids: Sequence[str]) -> Ints:
+        """Return the places of decision points among `ids`, (n,). Raises KeyError for an unknown one."""
+        return np.fromiter(map(self.place.__getitem__, ids), np.intp, len(ids))
+
+    @cached_property
+    def place(self) -> Mapping[str, int]:
+        return {name: n for n, name in enumerate(self.ids)}
+
+    @cached_property
+    def lost(self) -> Bools:
+        """Whether every action is worth nothing, (N,)."""
+        return np.asarray(~self.table.any(axis=-1))
+
+
+def optimal(values: Floats) -> Bools:
+    """Return which actions are worth most, (..., A); none where all are worth nothing, or it is not known."""
+    most = values.max(axis=-1, keepdims=True)
+    return np.asarray((values == most) & (most > 0))

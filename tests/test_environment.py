@@ -1,0 +1,277 @@
+"""`harness.environment`: exact rewards on trees and in the simulator, on layouts that may be learnt from."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harness as package
+from harness import UserError
+from harness.core.seeds import FIRST
+from harness.dataset.load import Dataset
+from harness.learning.values import BEST, Values, optimal
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs the sim extra")
+
+Make = Callable[..., Any]
+
+
+@pytest.fixture
+def make(small_path: Path) -> Make:
+    """An environment on the four trees of the small dataset, whose layouts are of tune seeds."""
+    return lambda **options: package.environment(dataset=small_path, **options)
+
+
+def after(data: Dataset, point: int, action: int, driver: str) -> bool:
+    """Whether an episode succeeds after an action if a driver takes the rest, walked edge by edge."""
+    forest = data.forest
+    edge, point = forest.edge[point, action], forest.child[point, action]
+    while point >= 0:
+        action = forest.drivers[driver][point]
+        edge, point = forest.edge[point, action], forest.child[point, action]
+    end, limit_s = forest.edges[edge].end, forest.limit_s
+    return end.result == "cleared" and end.time_s <= limit_s[int(edge_tree(data, edge))]
+
+
+def edge_tree(data: Dataset, edge: int) -> int:
+    [at] = np.unique(data.forest.tree[(data.forest.edge == edge).any(axis=1)])
+    return int(at)
+
+
+@pytest.mark.parametrize("driver", ["cruise", "local-view", "full-view"])
+def test_worth_is_what_a_walk_of_the_driver_comes_to(driver: str, small: Dataset) -> None:
+    values = Values.of(small.forest, driver)
+    for point in range(0, len(values.ids), 9):
+        for action in range(len(values.actions)):
+            assert values.table[point, action] == after(small, point, action, driver)
+
+
+def test_the_best_is_at_least_as_good_as_everyone(small: Dataset) -> None:
+    best = Values.of(small.forest, BEST)
+    assert set(np.unique(best.table)) == {0, 1}
+    for then in ("uniform", "cruise", "brake", "local-view", "full-view"):
+        others = Values.of(small.forest, then).table
+        assert (best.table >= others).all()
+        assert (best.table > others).any() == (then != "full-view"), "which sees everything too"
+    assert np.array_equal(optimal(best.table).any(axis=1), ~best.lost)
+    with pytest.raises(UserError, match="unknown then 'nobody'"):
+        Values.of(small.forest, "nobody")
+
+
+def test_a_batch_is_one_at_a_time_and_ids_are_places(small: Dataset) -> None:
+    values, rng = Values.of(small.forest, "uniform"), np.random.default_rng(3)
+    places = rng.integers(len(values.ids), size=50)
+    p = rng.dirichlet(np.ones(len(values.actions)), 50)
+    batch = values(places, p)
+    for n, place in enumerate(places.tolist()):
+        [alone] = values([values.ids[place]], p[n : n + 1])
+        assert alone == batch[n] == pytest.approx(sum(p[n] * values.table[place]))
+    assert np.array_equal(values(places), values.table[places])
+    with pytest.raises(KeyError, match="00000-9-nowhere"):
+        values(["00000-9-nowhere"])
+
+
+@pytest.mark.filterwarnings("ignore:.*not within the observation space")
+@pytest.mark.filterwarnings("ignore:.*spec")
+@pytest.mark.parametrize(
+    "options", [{}, {"observation": "arrays"}, {"distributions": True, "viewer": "any", "reward": "success"}]
+)
+def test_gymnasium_finds_nothing_wrong(options: dict[str, Any], make: Make) -> None:
+    from gymnasium.utils.env_checker import check_env
+
+    check_env(make(**options), skip_render_check=True)
+
+
+@pytest.mark.parametrize("driver", ["cruise", "full-view"])
+def test_whoever_drives_as_a_driver_ends_as_it_does(driver: str, make: Make, small: Dataset) -> None:
+    env, forest = make(then=driver), small.forest
+    for tree, seed in enumerate(small.seeds):
+        _, info = env.reset(options={"layout_seed": seed})
+        assert (info["layout_seed"], info["danger"]) == (seed, forest.dangers[tree] or "")
+        over, visited = False, []
+        while not over:
+            visited.append(info["scene"])
+            action = forest.drivers[driver][forest.place[info["scene"]]]
+            worth = info["values"][action]
+            _, reward, over, cut, info = env.step(action)
+            assert (reward, cut) == (worth, False)
+            assert reward == forest.driver_success(driver)[tree], "its own worth stays the same to the end"
+        assert info["success"] == forest.driver_success(driver)[tree]
+        assert set(visited) <= {forest.ids[n] for n in forest.visited(forest.drivers[driver])}
+
+
+def test_a_distribution_is_worth_its_mean_and_one_of_its_actions_is_taken(make: Make) -> None:
+    env, p, taken = make(then="uniform"), np.array([0.25, 0.5, 0.25]), []
+    for seed in range(40):
+        _, info = env.reset(seed=seed)
+        _, reward, *_, then = env.step(p * 8)  # is normalised
+        assert reward == pytest.approx(p @ info["values"])
+        taken.append(then["taken"])
+        assert env.reset(seed=seed)[1]["scene"] == info["scene"]
+        assert env.step(p)[-1]["taken"] == taken[-1]
+    assert set(taken) == {0, 1, 2}
+
+
+def test_success_is_paid_once_at_the_end(make: Make, small: Dataset) -> None:
+    env, paid = make(reward="success"), []
+    for seed in small.seeds:
+        _, info = env.reset(options={"layout_seed": seed})
+        rewards, over = [], False
+        while not over:
+            _, reward, over, _, info = env.step(int(info["values"].argmax()))
+            rewards.append(reward)
+        assert rewards[:-1] == [0] * (len(rewards) - 1)
+        assert (
+            rewards[-1] == info["success"] == small.forest.value[small.forest.root[small.seeds.index(seed)]]
+        )
+        paid.append(rewards[-1])
+    assert 1 in paid
+
+
+@pytest.mark.slow
+def test_driving_is_the_walk_through_the_tree(make: Make, small: Dataset) -> None:
+    """The same actions lead to the same states, are worth the same and end the same, with no tree built."""
+    seed = small.seeds[1]
+    walked = make(then="local-view")
+    driven = package.environment(
+        "occluded-intersection", seeds=seed, layouts=1, driven=True, then="local-view"
+    )
+    assert small.scenario.parameters == driven.source.scenario.parameters
+    (seen, a), (shown, b) = (env.reset(options={"layout_seed": seed}) for env in (walked, driven))
+    over: Any = False
+    for action in (1, 0, 2, 2, 2, 2, 2, 2):
+        assert seen == shown
+        assert (a["scene"].split("-", 1)[1], a["values"].tolist()) == (
+            b["scene"].split("-", 1)[1], b["values"].tolist(),
+        )  # fmt: skip
+        if over:
+            break
+        (seen, *before, a), (shown, *after, b) = (env.step(action) for env in (walked, driven))
+        assert before == after
+        over = after[1]
+    assert over
+    assert a["success"] == b["success"]
+
+
+@pytest.mark.slow
+def test_trees_are_built_once_and_say_what_was_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = package.environment("hard-brake-ahead", layouts=1, quiet=True)
+    monkeypatch.setattr("harness.learning.layouts.build", None)
+    again = package.environment("hard-brake-ahead", layouts=1, quiet=True)
+    assert np.array_equal(env.values.table, again.values.table)
+    learnt = json.loads(json.dumps(env.learnt()))
+    first = {"layouts": 1, "first_seed": FIRST["train"], "purpose": "train", "then": "best"}
+    assert first.items() <= learnt.items()
+    assert set(learnt["scenarios"]) == {"hard-brake-ahead"}
+    assert learnt["prompts"] == {env.ask.prompt.version: env.ask.prompt.sha256}
+
+
+def test_arrays_are_of_the_viewers_own_graph(make: Make, small: Dataset) -> None:
+    env = make(observation="arrays")
+    seen, info = env.reset(seed=1)
+    graph = small.scene(info["scene"]).graphs[info["viewer"]]
+    by_name = dict(zip(env.numbers, seen["numbers"].tolist(), strict=True))
+    assert by_name["ego speed_mps"] == pytest.approx(graph.ego.speed_mps)
+    assert by_name["ego zone_m"] == pytest.approx(graph.ego.zone_m)
+    assert (seen["numbers"][seen["known"] == 0] == 0).all()
+    assert 0 < seen["known"].sum() < len(env.numbers)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (
+            {"seeds": "report"},
+            "seeds='report': numbers are reported of layout seeds from 200000 on, and noth",
+        ),
+        ({"seeds": 200_000}, 'nothing may learn from them; give seeds="train" (100000 to 199999)'),
+        ({"seeds": 99_999, "layouts": 2}, "are for tune and train; keep to one of"),
+        ({"seeds": "tain"}, "unknown seeds 'tain'"),
+        ({"seeds": -1}, "seeds -1, layouts 32: give a seed from 0 on"),
+        ({"layouts": 0}, "layouts 0: give a seed from 0 on, and 1 layout or more"),
+        ({"scenario": "moon"}, "unknown scenario 'moon'"),
+        ({"dataset": "occluded-intersection-v2"}, "numbers are reported of layout seeds from 200000 on"),
+        ({"dataset": "prompts"}, "prompts is no dataset (no manifest.json); build one with"),
+        ({"dataset": "nowhere"}, "unknown dataset 'nowhere'"),
+        ({"dataset": "SMALL", "driven": True}, "leave out scenario and driven"),
+        ({"dataset": "SMALL", "then": "nobody"}, "unknown then 'nobody'"),
+        ({"dataset": "SMALL", "prompt": "v0"}, "unknown prompt 'v0'"),
+        ({"dataset": "SMALL", "prompt": "v7"}, "prompt v7 shows pictures, and here are texts alone"),
+        ({"dataset": "SMALL", "answer": "song"}, "unknown answer 'song'"),
+        ({"dataset": "SMALL", "viewer": "v99"}, "unknown viewer of scene"),
+        ({"dataset": "SMALL", "observation": "smell"}, "unknown observation 'smell'"),
+        ({"dataset": "SMALL", "reward": "fame"}, "unknown reward 'fame'"),
+        ({"driven": True}, 'reward="value" needs values; give then="local-view", or reward="success"'),
+        ({"driven": True, "then": "best"}, "unknown then 'best'"),
+    ],
+)
+def test_bad_input_is_one_line(options: dict[str, Any], said: str, small_path: Path) -> None:
+    given: dict[str, Any] = {key: small_path if value == "SMALL" else value for key, value in options.items()}
+    with pytest.raises(UserError) as error:
+        package.environment(**given).values  # noqa: B018 # read when they are first asked for
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "action", [3, -1, 1.0, "IDLE", [0.5, 0.5], [0, 0, 0], [1, -1, 1], [1, np.nan, 1], [1, np.inf, 1], None]
+)
+def test_what_is_no_action_is_one_line_and_moves_nobody(action: Any, make: Make) -> None:
+    env = make()
+    with pytest.raises(UserError, match="no episode is under way; call reset"):
+        env.step(1)
+    _, info = env.reset(seed=1)
+    with pytest.raises(UserError, match="give 0 to 2, one of SLOWER, IDLE, FASTER, or 3 probabilities"):
+        env.step(action)
+    assert env.trip.scene.id == info["scene"]
+
+
+def test_a_layout_of_report_seeds_is_not_begun(make: Make) -> None:
+    driven = package.environment("occluded-intersection", driven=True, reward="success")
+    with pytest.raises(UserError, match="layout seed 200003: numbers are reported of"):
+        driven.reset(options={"layout_seed": 200_003})
+    with pytest.raises(UserError, match="layout seed 200003 has no tree here; give one of 100 to 103"):
+        make().reset(options={"layout_seed": 200_003})
+    with pytest.raises(UserError, match="rows\\(\\) of driven episodes are not known in advance"):
+        driven.rows()
+
+
+def test_rows_are_the_questions_of_points_where_something_can_be_won(make: Make, small: Dataset) -> None:
+    env = make(viewer="any")
+    rows, values = env.rows(per_level=2), env.values
+    assert rows == env.rows(per_level=2)
+    assert len({row["viewer"] for row in rows}) > 1
+    levels = [(row["layout_seed"], row["scene"].split("-")[1]) for row in rows]
+    assert max(map(levels.count, levels)) == 2
+    assert len(rows) < len(env.rows(per_level=99)) == (~values.lost).sum()
+    for row in rows:
+        assert row["values"] == values([row["scene"]])[0].tolist() != [0, 0, 0]
+        assert (row["purpose"], row["danger"]) == ("tune", bool(small.dangerous[row["layout_seed"] - 100]))
+        scene = small.scene(row["scene"])
+        assert row["prompt"] == env.ask.chat(scene.graphs[row["viewer"]])
+        assert row["role"] == scene.graphs[row["viewer"]].role
+    json.dumps(rows)
+
+
+def columns(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    return {key: [row[key] for row in rows] for key in rows[0] if key != "prompt"}
+
+
+def test_an_answer_is_worth_what_the_distribution_that_it_states_is(make: Make) -> None:
+    env = make()
+    row = next(row for row in env.rows() if row["values"] == [0, 1, 1])
+    stated = '{"action_distribution":{"SLOWER":0.4,"IDLE":0.5,"FASTER":0.1}}'
+    said = [stated, f"I think. {stated} ", [{"role": "assistant", "content": stated}], "brake!", ""]
+    worth = env.expected_value([row["prompt"]] * 5, said, **columns([row] * 5), trainer_state=None)
+    assert worth == [pytest.approx(0.6)] * 3 + [0, 0]
+
+
+def test_a_letter_is_worth_its_action(make: Make) -> None:
+    env = make(answer="readout")
+    row = next(row for row in env.rows() if row["values"] == [0, 1, 1])
+    assert row["prompt"][-1]["content"].endswith("Answer with one letter: A SLOWER, B IDLE, C FASTER.")
+    said = ["A", "B", " C\n", "B: it is clear", "BRAKE", "D", "b", ""]
+    assert env.expected_value([], said, **columns([row] * 8)) == [0, 1, 1, 1, 0, 0, 0, 0]
