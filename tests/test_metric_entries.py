@@ -59,7 +59,8 @@ def test_an_entry_says_all_that_is_shown(metric: Metric) -> None:
     assert not metric.meaning.endswith(".")
     assert metric.most == 1.0 or metric.interval == "mean"
     assert metric.compared or not metric.primary
-    assert sum(map(bool, (metric.decisions, metric.episodes, metric.answers, metric.percentile))) <= 1
+    ways = (metric.decisions, metric.episodes, metric.answers, metric.percentile, metric.pooled)
+    assert sum(map(bool, ways)) <= 1
     assert metric.unit.name != "%" or metric.most == 1.0
 
 

@@ -9,6 +9,9 @@ from harness.report.runs import Runs
 from harness.runs.folder import Run
 from harness.runs.metrics import entry
 
+HONEST = (
+    "optimal_action_rate", "optimal_brier", "optimal_nll_nats", "calibration_error", "coverage_at_5_risk",
+)  # fmt: skip
 EXAMPLES = 3  # of each status of answers
 MOVED = 5  # decision points whose answers moved most
 
@@ -32,7 +35,20 @@ def summary(run: Run) -> list[dict[str, Any]]:
             "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in run.conditions],
         }
         for metric in dict.fromkeys(s.metric for s in run.scores if s.condition != "all")
+        if not entry(metric).superseded
     ]
+
+
+def probabilities(runs: Runs) -> list[dict[str, Any]]:
+    """Return how honest the probabilities of each run's policies are: a condition a line, where known."""
+    lines = []
+    for name, run in zip(runs.names, runs.runs, strict=True):
+        flips = run.score("all", "flip_rate_ego")
+        for condition in run.conditions:
+            scores = [run.score(condition, metric) for metric in HONEST]
+            if any(scores):
+                lines.append({"run": name, "condition": condition, "cells": [*scores, flips]})
+    return lines
 
 
 def answers(runs: Runs) -> list[tuple[str, list[Any]]]:

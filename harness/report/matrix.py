@@ -21,6 +21,7 @@ from harness.runs.success import Success
 Successes = Mapping[tuple[int, int], float]  # 0 or 1, by episode and seed
 
 LEADING = (BALANCED, *entry(BALANCED).halves)
+OPTIMAL = "optimal_action_rate"
 BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 
 
@@ -68,7 +69,8 @@ class Grid:
 
 
 METRICS = (
-    *LEADING, SUCCESS, "strict_rate", "recovered_rate", "failed_rate", LATENCY, "latency_p95_ms", "brier",
+    *LEADING, SUCCESS, "strict_rate", "recovered_rate", "failed_rate", LATENCY, "latency_p95_ms", OPTIMAL,
+    "optimal_brier",
 )  # fmt: skip
 
 

@@ -140,6 +140,7 @@ def _pieces(
         uneven=matrix.uneven(runs),
         summaries=[contents.summary(run) for run in runs.runs],
         answers=contents.answers(runs),
+        probabilities=contents.probabilities(runs),
         charts=charts,
         examples=contents.examples(runs),
         attributions=contents.attributions(runs),

@@ -20,10 +20,11 @@ from harness.runs.folder import Run
 from harness.runs.leading import IN_WORDS, lead_of
 from harness.runs.metrics import LATENCY
 from harness.runs.records import Score, role_word
+from harness.runs.reliability import BINS
+from harness.runs.summary import judged_of
 
 Table = list[dict[str, Any]]
 ENTROPY_NATS, TOKENS, ARRIVAL_MS = 0.1, 25, 10.0  # widths of bins
-CERTAINTY = 0.1
 Part = Literal["overview", "answers", "communication"]
 ENTROPY = "entropy of the ego's own intent, nats"
 BUDGET = (200, 400)  # tokens of a prompt: the paper's
@@ -74,14 +75,15 @@ def panels(runs: Runs) -> Iterator[Panel]:
         )  # fmt: skip
     if rows := joined(reliability):
         yield Panel(
-            "reliability", "answers", "Is the policy as safe as it is sure?",
-            "Decisions are grouped by the probability of the chosen action in the fused policy, in steps of "
-            "a tenth; each point shows how often that action was safe. On the dashed line the two agree; "
-            "above it the policy is less sure than it could be. A probability spread over two safe actions "
-            "is no mistake, so this is not the calibration of a single label. All seeds; decisions without "
-            "a safe action are left out; 95 % intervals over episodes.",
+            "reliability", "answers", "Is the policy as often right as it is sure?",
+            "Decisions are grouped by the probability of the likeliest action in the fused policy, in "
+            f"{BINS} bins of equal mass; each point shows how often that action was optimal, so that success "
+            "was still possible after it. The mean distance from the dashed line is the ECE; above the line "
+            "the policy is less sure than it could be. A probability spread over two optimal actions is no "
+            "mistake, but lies above the line. All seeds; decisions in which nothing could succeed are left "
+            "out; 95 % intervals over episodes.",
             charts.shares(
-                rows, "certainty", "fused probability of the action taken", "share safe", diagonal=True
+                rows, "certainty", "fused probability of the likeliest action", "share optimal", diagonal=True
             ),
         )  # fmt: skip
     if rows := joined(entropies):
@@ -177,10 +179,19 @@ def statuses(run: Run) -> Table:
 
 
 def reliability(run: Run) -> Table:
-    """Return how often the action taken was safe, by how probable fusion held it."""
-    certainty = run.decisions.of_actions("fused").max(axis=1)
-    bins = np.minimum((certainty / CERTAINTY).astype(int), round(1 / CERTAINTY) - 1)
-    return list(_shares(run, bins, certainty, 1.0 - run.decisions["regret"], "certainty"))
+    """Return how often the likeliest action was optimal, by how probable fusion held it."""
+    rows: Table = []
+    judged_by_condition = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
+    for condition, judged in zip(run.conditions, judged_by_condition, strict=True):
+        bins = judged.bins()
+        for place in np.unique(bins):
+            here = bins == place
+            share = rate_interval(judged.right[here], judged.episode[here])
+            rows.append({
+                "condition": condition, "certainty": round(float(judged.sure[here].mean()), 4),
+                "share": share.value, "low": share.low, "high": share.high, "n": share.n,
+            })  # fmt: skip
+    return rows
 
 
 def errors(run: Run) -> Table:

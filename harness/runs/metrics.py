@@ -31,7 +31,7 @@ from harness.core.statistics import (
     seed_rate_interval,
 )
 from harness.parsing.status import Repair
-from harness.runs import leading
+from harness.runs import leading, reliability
 from harness.runs.decisions import Decisions
 from harness.runs.records import Answer, AnswerFacts, Episode, Role, Score, role_word
 
@@ -76,12 +76,15 @@ class Metric:
     answers: Callable[[Answers], Floats] | None = None
     role: Role | None = None  # whose answers
     percentile: int | None = None  # the percent of all decisions whose latency is at most so long
+    pooled: reliability.Figure | None = None  # returns its value for all decisions, which has no mean
     total: bool = False  # whether an episode has the sum over its decisions instead of the mean
     world: World | None = None  # the world in which it is known; None for every world
     optional: bool = False  # whether a run in which it is nowhere known has no row of it
     half: bool = False  # whether it is of the episodes with a danger alone, or of those without
     # two metrics of a half of the episodes each, whose mean it is
     halves: tuple[str, ...] = ()
+    # whether another has taken its place: tables and comparisons keep it, and pages leave it out
+    superseded: bool = False
 
     def __post_init__(self) -> None:
         if not self.label:
@@ -90,7 +93,7 @@ class Metric:
     @property
     def compared(self) -> bool:
         """Whether two runs are compared in it, as in any that is known of an episode or of all decisions."""
-        return bool(self.decisions or self.episodes or self.percentile or self.halves)
+        return bool(self.decisions or self.episodes or self.percentile or self.pooled or self.halves)
 
 
 class Metrics(Plugins[Metric]):
@@ -118,6 +121,16 @@ def _rate(
 def _share(name: str, meaning: str, column: str, better: Better = "lower", **more: Any) -> Metric:
     """Build the metric of a share of decisions, one column of their table."""
     return Metric(name, meaning, PERCENT, better, "rate", 1.0, decisions=_column(column), **more)
+
+
+def _judged(
+    name: str, meaning: str, unit: Unit, better: Better, score: Callable[[Floats, Any], Floats], **more: Any
+) -> Metric:
+    """Build the metric of a score of fused policies by their optimal actions."""
+    return Metric(
+        name, meaning, unit, better, world="frozen",
+        decisions=lambda d: score(d.of_actions("fused"), d.of_actions("safe") == 1.0), **more,
+    )  # fmt: skip
 
 
 def _halves(
@@ -324,11 +337,25 @@ BUILT_IN = (
            decisions=_column("entropy_nats")),
     Metric("normalised_entropy", "entropy of the ego's own intent from 0 (sure) to 1 (undecided)", SCORE,
            "neither", decisions=_column("normalised_entropy")),
-    Metric("brier", "Brier score of the fused policy against the safe actions; 0 best, 2 worst", SCORE,
-           "lower", world="frozen",
+    _judged("optimal_action_rate", "share of decisions whose likeliest action is optimal; only those in "
+            "which success was still possible", PERCENT, "higher", reliability.right, interval="rate",
+            most=1.0),
+    _judged("optimal_brier", "Brier score of the optimal actions, taken as one event; 0 best, 2 worst", SCORE,
+            "lower", reliability.brier, most=2.0, label="Brier"),
+    _judged("optimal_nll_nats", f"negative log-likelihood of the optimal actions together, whose probability "
+            f"counts as {reliability.LEAST_P} at least", NATS, "lower", reliability.likelihood_nats,
+            label="NLL"),
+    Metric("calibration_error", f"expected calibration error of the likeliest action, in {reliability.BINS} "
+           "bins of equal mass, over all decisions", PERCENT, "lower", most=1.0, label="ECE", world="frozen",
+           pooled=reliability.calibration_error),
+    Metric("coverage_at_5_risk", "greatest share of decisions, the surest first, of which 5 % at most are "
+           "not optimal, over all decisions", PERCENT, "higher", most=1.0, label="coverage at 5 % risk",
+           world="frozen", pooled=reliability.coverage),
+    Metric("brier", "distance of the fused policy from the uniform one over the safe actions; 0 best, 2 "
+           "worst", SCORE, "lower", world="frozen", superseded=True,
            decisions=lambda d: brier(d.of_actions("fused"), safe_target(d.of_actions("safe") == 1.0))),
-    Metric("negative_log_likelihood", "negative log-likelihood of the safe actions in the fused policy; "
-           "0 best", SCORE, "lower", world="frozen",
+    Metric("negative_log_likelihood", "optimal_nll_nats with a least probability of 0.0001", SCORE, "lower",
+           world="frozen", superseded=True,
            decisions=lambda d: negative_log_likelihood(d.of_actions("fused"), d.of_actions("safe") == 1.0)),
     _share("fallback_rate", "share of decisions in which the ego's own answer could not be read",
            "own_failed"),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 from harness.core.statistics import (
     Estimate,
     episode_interval,
@@ -44,6 +44,7 @@ from harness.runs.metrics import (
     sum_by_place,
 )
 from harness.runs.records import Answer, AnswerFacts, Episode, Score
+from harness.runs.reliability import Judged, estimate
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ class Figures:
     values: Mapping[str, Floats]  # each metric's values by episode, (C, S, E)
     # the decisions' latencies for each condition and seed, in the order of the grid
     latency_ms: Sequence[Floats]
+    judged: Sequence[Judged]  # the decisions whose optimal actions are known, for each condition
     answers: Sequence[tuple[Answer | AnswerFacts, int]]  # the answers, each with its episode
 
     @classmethod
@@ -62,14 +64,16 @@ class Figures:
         answers: Iterable[Answer | AnswerFacts],
     ) -> "Figures":  # fmt: skip
         """Compute the figures; `episodes` are in the order of the grid."""
-        latency_ms, places = decisions["latency_ms"], grid.places(decisions) // len(grid.episodes)
+        cells, latency_ms = grid.places(decisions), decisions["latency_ms"]
+        places = cells // len(grid.episodes)
         order = np.argsort(places, kind="stable")
         starts = np.searchsorted(places[order], np.arange(1, len(grid.conditions) * len(grid.seeds)))
         numbers = decisions.whole("episode")
         episode_of = {scene: int(numbers[rows.start]) for scene, rows in decisions.scenes.items()}
         return cls(
             grid, by_episode(metrics_of(world), grid, decisions, episodes),
-            np.split(latency_ms[order], starts), [(answer, episode_of[answer.scene]) for answer in answers],
+            np.split(latency_ms[order], starts), judged_of(grid, decisions, cells),
+            [(answer, episode_of[answer.scene]) for answer in answers],
         )  # fmt: skip
 
     @classmethod
@@ -80,6 +84,10 @@ class Figures:
             replace(parts[0].grid, episodes=episodes),
             {name: np.concatenate([part.values[name] for part in parts], axis=2) for name in parts[0].values},
             [np.concatenate(each) for each in zip(*(part.latency_ms for part in parts), strict=True)],
+            [
+                Judged.joined(each, [len(part.grid.episodes) for part in parts])
+                for each in zip(*(part.judged for part in parts), strict=True)
+            ],
             list(chain.from_iterable(part.answers for part in parts)),
         )
 
@@ -88,6 +96,7 @@ class Figures:
         return [
             *of_conditions(self.grid.conditions, self.values, names),
             *of_latencies(self.grid, self.latency_ms),
+            *_of_judged(self.grid, self.judged),
             *_gains(self.grid.conditions, self.values, GAINS if BALANCED in names else {SUCCESS: GAIN}),
             *_of_answers(self.answers),
         ]
@@ -121,6 +130,23 @@ def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
         own = all_percentiles[index * len(grid.seeds) : (index + 1) * len(grid.seeds)]
         for percent, values in zip(PERCENTILES, own.T, strict=True):
             yield Score.of(condition, names[percent], in_range(LATENCY, seed_interval(values)), "seed means")
+
+
+def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
+    """Return each condition's decisions whose optimal actions are known; `cells` (n,) are `Grid.places`."""
+    fused, optimal = decisions.of_actions("fused"), decisions.of_actions("safe") == 1.0
+    condition, _, episode = np.unravel_index(cells, grid.shape)
+    rows = [np.flatnonzero(condition == place) for place in range(len(grid.conditions))]
+    return [Judged.of(fused[here], optimal[here], episode[here]) for here in rows]
+
+
+def _of_judged(grid: Grid, judged: Sequence[Judged]) -> Iterator[Score]:
+    """Yield each condition's figures of all decisions, where any is known."""
+    for condition, decisions in zip(grid.conditions, judged, strict=True):
+        for metric in METRICS.values():
+            if metric.pooled and len(decisions.sure):
+                figure = in_range(metric.name, estimate(decisions, metric.pooled, len(grid.episodes)))
+                yield Score.of(condition, metric.name, figure, "episodes")
 
 
 def _gains(

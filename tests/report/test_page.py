@@ -31,11 +31,11 @@ from harness.core.files import digest
 from harness.evaluate.asking import answer_of, requests
 from harness.prompts import readout
 from harness.prompts import versions as prompts
-from harness.report import library
+from harness.report import contents, library
 from harness.report.details import prompts_of
 from harness.report.page import render, visible
 from harness.report.runs import gather
-from harness.report.words import answer_times, figures, headline, latency_source, pace
+from harness.report.words import answer_times, figures, headline, latency_source, pace, shown
 from harness.runs.folder import csv_text, read
 from harness.runs.records import Episode, Latency, Score, Times
 
@@ -198,6 +198,17 @@ def test_the_summary_has_every_condition_and_metric_with_interval_and_n(run, pag
     assert "2 episodes × 3 channel seeds of two; 95 % intervals over episodes" in page.text
     for metric in ("latency proxy", "trigger rate", "entropy"):
         assert metric in page.text
+
+
+def test_the_page_says_how_honest_the_probabilities_are(run, page):
+    """A line a condition, beside the picture; figures that others have replaced stay off the page."""
+    table = page.text.split("How honest the probabilities are")[1].split("Layouts are resampled")[0]
+    for condition in ("single-local", "v2x", "6g"):
+        line = table.split(condition)[1]
+        for metric in contents.HONEST:
+            cell = shown(read(run).score(condition, metric))
+            assert f"{cell['value']} {cell['interval']}" in line
+    assert "negative log likelihood" not in page.text
 
 
 def test_the_page_names_model_prompt_dataset_versions_and_where_latency_comes_from(run, page, dataset):

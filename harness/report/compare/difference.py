@@ -12,7 +12,7 @@ from harness.core.multiplicity import SuccessTest, holm, p_of_bootstrap, p_value
 from harness.core.statistics import LEVEL, Estimate, known_mean
 from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import Pair, Side
-from harness.runs import percentiles
+from harness.runs import percentiles, reliability
 from harness.runs.metrics import METRICS, SUCCESS, difference, entry, halved, known_in
 from harness.runs.sources import prompt_of
 
@@ -170,6 +170,14 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
         Difference(names[percent], a, b, change, p_of_bootstrap(change.value, change.low, change.high))
         for percent, a, b, change in percentiles.differences(before, after, len(pair.episodes))
     ]
+    judged_a, judged_b = (pair.judged(side, condition) for side in (pair.a, pair.b))
+    for metric in METRICS.values():
+        if metric.pooled:
+            first, second, change = reliability.difference(
+                judged_a, judged_b, metric.pooled, len(pair.episodes)
+            )
+            p = p_of_bootstrap(change.value, change.low, change.high)
+            differences.append(Difference(metric.name, first, second, change, p))
     a, b = (pair.values(side, SUCCESS, condition) for side in (pair.a, pair.b))
     decisions, flipped = _decision_flips(pair, condition)
     return InCondition(

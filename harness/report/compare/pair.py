@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.core.places import nameless
@@ -19,6 +19,7 @@ from harness.runs.folder import Run, read
 from harness.runs.metrics import by_episode, metrics_of
 from harness.runs.percentiles import Decided
 from harness.runs.records import Episode, FrozenScenes
+from harness.runs.reliability import Judged
 from harness.world.parameters import DIALS
 
 SETTINGS = (
@@ -76,15 +77,25 @@ class Pair:
         of_condition = side.values[metric][grid.conditions.index(condition)]
         return np.asarray(of_condition[np.ix_(list(seeds), list(episodes))].T)
 
+    def judged(self, side: Side, condition: str) -> Judged:
+        """Return the decisions in `episodes` whose optimal actions are known, by their place there."""
+        rows, place = self._rows(side, condition)
+        p, safe = (side.run.decisions.of_actions(name)[rows] for name in ("fused", "safe"))
+        return Judged.of(p, safe == 1.0, place)
+
     def latencies(self, side: Side, condition: str) -> list[Decided]:
         """Of each seed, the episodes' places in `episodes` and the latencies in ms of their decisions."""
+        rows, place = self._rows(side, condition)
+        seed, latency_ms = (side.run.decisions[name][rows] for name in ("seed", "latency_ms"))
+        return [(place[seed == s], latency_ms[seed == s]) for s in self.seeds]
+
+    def _rows(self, side: Side, condition: str) -> tuple[Ints, Ints]:
+        """Return the rows of a condition's decisions in `episodes`, and the place of each there, (n,)."""
         decisions = side.run.decisions
         names, episode = side.run.conditions, decisions.whole("episode")
         of_condition = decisions.codes("condition", names) == names.index(condition)
-        kept = of_condition & np.isin(episode, self.episodes)
-        place = np.searchsorted(self.episodes, episode[kept]).astype(np.int64)
-        seed, latency_ms = decisions.whole("seed")[kept], decisions["latency_ms"][kept]
-        return [(place[seed == s], latency_ms[seed == s]) for s in self.seeds]
+        rows = np.flatnonzero(of_condition & np.isin(episode, self.episodes))
+        return rows, np.searchsorted(self.episodes, episode[rows]).astype(np.int64)
 
 
 @uncollected()

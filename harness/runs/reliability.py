@@ -1,0 +1,175 @@
+"""Judge the probabilities of policies by the actions that turned out optimal.
+
+The worth of an action is exact, from the decision tree: whether success is still possible after it. An action
+is *optimal* if it is of the greatest worth; of several all are. Where nothing can succeed any more all
+actions are alike, and the decision is not judged. A policy is right if its likeliest action is optimal, and
+as sure as that action is probable; of equally likely actions the share that is optimal counts.
+
+Each figure is over all decisions, and none is a mean over episodes. Its interval is a bootstrap (Efron and
+Tibshirani 1993, chapter 13) that resamples whole episodes, since decisions of one are not independent. The
+ends are percentiles of the resampled figures, moved by as much as these are off the figure on average: a
+resample is noisier than the sample, which lifts a calibration error.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.noise import generator
+from harness.core.statistics import Estimate, resampled
+
+LEAST_P = 0.005  # least probability of the optimal actions that is counted in a likelihood
+BINS = 15  # of equal mass
+RISK = 0.05  # greatest share of decisions acted on whose action is not optimal
+RESAMPLES = 399  # of episodes
+AT_ONCE = 4_000_000  # how many numbers are in memory at once
+
+
+def mass(p: Floats, optimal: Bools) -> Floats:
+    """Return the probability of the optimal actions in policies, both `(..., A)`; NaN where none is."""
+    total = np.minimum(np.sum(np.where(optimal, p, 0.0), axis=-1), 1.0)  # rounding may lift it above 1
+    return np.where(np.any(optimal, axis=-1), total, np.nan)
+
+
+def brier(p: Floats, optimal: Bools) -> Floats:
+    """Return the Brier score (Brier 1950) of two events, that an optimal action is taken or another.
+
+    With the probability m of the optimal actions it is (1 - m)² + (0 - (1 - m))²; 0 best, 2 worst. It does
+    not matter how m is spread over several optimal actions.
+    """
+    return np.asarray(2.0 * (1.0 - mass(p, optimal)) ** 2)
+
+
+def likelihood_nats(p: Floats, optimal: Bools) -> Floats:
+    """Return -ln of the probability of the optimal actions (Good 1952), at least `LEAST_P`: 5.3 nats."""
+    return np.asarray(-np.log(np.maximum(mass(p, optimal), LEAST_P)))
+
+
+def right(p: Floats, optimal: Bools) -> Floats:
+    """Return the share of the likeliest actions that is optimal, `(...)`; NaN where no action is."""
+    likeliest = p == p.max(axis=-1, keepdims=True)
+    share = np.sum(likeliest & optimal, axis=-1) / np.maximum(likeliest.sum(axis=-1), 1)
+    return np.where(np.any(optimal, axis=-1) & ~np.isnan(p).any(axis=-1), share, np.nan)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Decisions of which the optimal actions are known."""
+
+    sure: Floats  # the probability of the likeliest action, (n,)
+    right: Floats  # the share of the likeliest actions that is optimal, (n,)
+    episode: Ints  # the place of each decision's episode, from 0, (n,)
+
+    @classmethod
+    def of(cls, p: Floats, optimal: Bools, episode: Ints) -> "Judged":
+        """Judge policies `(n, A)`, and leave out the decisions without an optimal action."""
+        hits = right(p, optimal)
+        known = ~np.isnan(hits)
+        return cls(p.max(axis=-1)[known], hits[known], episode[known])
+
+    @classmethod
+    def joined(cls, parts: Sequence["Judged"], sizes: Sequence[int]) -> "Judged":
+        """Join parts of so many episodes each, one after the other."""
+        starts = np.cumsum([0, *sizes[:-1]])
+        episode = [part.episode + start for part, start in zip(parts, starts, strict=True)]
+        sure, hits = (np.concatenate([getattr(part, name) for part in parts]) for name in ("sure", "right"))
+        return cls(sure, hits, np.concatenate(episode))
+
+    def bins(self) -> Ints:
+        """Return the bin of each decision, (n,)."""
+        levels, level = np.unique(-self.sure, return_inverse=True)
+        return np.asarray(_bins(np.bincount(level, minlength=len(levels))[None])[0][level])
+
+
+Figure = Callable[[Floats, Floats, Floats], Floats]
+
+
+def calibration_error(count: Floats, hits: Floats, sure: Floats) -> Floats:
+    """Return the expected calibration error of the likeliest action (Naeini and others 2015), (R,).
+
+    `BINS` bins of equal mass (Nguyen and O'Connor 2015); decisions that are equally sure are in one bin. The
+    error is the mean over decisions of the distance between a bin's share of right policies and how sure they
+    are on average. It is above 0 even for calibrated policies, the more the fewer decisions there are.
+
+    Args:
+        count: how many decisions are at each level of how sure they are, from the surest, (R, L).
+        hits: how many of these are right, (R, L).
+        sure: how sure all of these are together, (R, L).
+    """
+    place = _bins(count) + BINS * np.arange(len(count))[:, None]
+    gaps = np.bincount(place.ravel(), weights=(hits - sure).ravel(), minlength=BINS * len(count))
+    return np.asarray(np.abs(gaps).reshape(-1, BINS).sum(axis=1) / count.sum(axis=1))
+
+
+def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
+    """Return the greatest share of decisions of which at most `RISK` are not right, (R,).
+
+    The surest decisions are acted on first, and those that are equally sure together (selective
+    classification: El-Yaniv and Wiener 2010). The bound is chosen on the decisions that it is stated of.
+    `calibration_error` says what the arguments are.
+    """
+    acted, correct = count.cumsum(axis=1), hits.cumsum(axis=1)
+    within = acted - correct <= RISK * acted + 1e-9
+    return np.asarray(np.where(within, acted, 0.0).max(axis=1) / acted[:, -1])
+
+
+def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
+    """Return a figure of decisions in so many episodes, with its interval over these."""
+    return _estimate([figure(*sums) for sums in _sums(judged, episodes)], judged, episodes)
+
+
+def difference(a: Judged, b: Judged, figure: Figure, episodes: int) -> tuple[float, float, Estimate]:
+    """Return a figure of A's and of B's decisions, and B's less A's, paired by episode.
+
+    Episodes in which either has no decision are left out.
+    """
+    both = np.intersect1d(a.episode, b.episode)
+    a, b = (_of(side, np.isin(side.episode, both)) for side in (a, b))
+    of_a, of_b = (
+        np.concatenate([figure(*sums) for sums in _sums(side, episodes)] or [np.full(1, np.nan)])
+        for side in (a, b)
+    )
+    return float(of_a[0]), float(of_b[0]), _estimate([of_b - of_a], a, episodes)
+
+
+def _of(judged: Judged, which: Bools) -> Judged:
+    return Judged(judged.sure[which], judged.right[which], judged.episode[which])
+
+
+def _estimate(values: Sequence[Floats], judged: Judged, episodes: int) -> Estimate:
+    n = len(np.unique(judged.episode))
+    if not n:
+        return Estimate(math.nan, math.nan, math.nan, 0, episodes)
+    value, *others = np.concatenate(values).tolist()
+    low, high = value + np.percentile(others, (2.5, 97.5)) - np.mean(others)
+    low, high = (low, high) if low < high else (math.nan, math.nan)
+    return Estimate(value, float(low), float(high), n, episodes - n)
+
+
+def _sums(judged: Judged, episodes: int) -> Iterator[tuple[Floats, Floats, Floats]]:
+    """Yield what a `Figure` is of, in parts of some resamples; the first is of the decisions as they are."""
+    if not len(judged.sure):
+        return
+    order = np.argsort(-judged.sure, kind="stable")
+    sure, hits, episode = judged.sure[order], judged.right[order], judged.episode[order]
+    starts = np.flatnonzero(np.diff(sure, prepend=np.inf))
+    weights = resampled(generator("reliability", episodes), episodes, RESAMPLES)
+    weights = weights[weights[:, np.unique(episode)].any(axis=1)]  # resamples that have any decision
+    parts = np.array_split(weights, math.ceil(len(weights) * len(sure) / AT_ONCE))
+
+    def by_level(values: Floats) -> Floats:
+        return np.asarray(np.add.reduceat(values, starts, axis=1))
+
+    for part in parts:
+        count = part[:, episode].astype(float)
+        yield by_level(count), by_level(count * hits), by_level(count * sure)
+
+
+def _bins(count: Floats | Ints) -> Ints:
+    """Return the bin of each level (R, L): the one of equal mass that the middle of the level is in."""
+    upto = count.cumsum(axis=1)
+    place = BINS * (upto - count / 2) / upto[:, -1:]
+    return np.asarray(np.minimum(place.astype(np.int64), BINS - 1))
