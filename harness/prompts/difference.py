@@ -20,7 +20,7 @@ CONTEXT = 8  # words shown before and after a change
 MARKS: Mapping[Kind, tuple[str, str]] = {"same": ("", ""), "removed": ("[-", "-]"), "added": ("{+", "+}")}
 SETTINGS = (
     "ego_answer", "helper_answer", "reasons_first", "max_answer_tokens", "max_objects", "max_conflicts",
-    "token_budget", "examples", "extension", "repair_turn",
+    "token_budget", "examples", "example_sets", "extension", "repair_turn",
 )  # fmt: skip
 
 

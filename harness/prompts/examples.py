@@ -4,6 +4,7 @@ They are in the version's `examples.json`. Their layouts have train seeds, so th
 layout that a model was shown.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -38,6 +39,13 @@ class Examples(Struct, frozen=True):
 
     def of(self, role: str) -> tuple[Example, ...]:
         return self.ego if role == "ego" else self.helper
+
+    def only(self, numbers: Sequence[int]) -> "Examples | None":
+        """Return each role's examples of these numbers, from 1, in this order; None without any."""
+        if not numbers:
+            return None
+        some = {role: tuple(self.of(role)[number - 1] for number in numbers) for role in ("ego", "helper")}
+        return msgspec.structs.replace(self, **some)
 
     @property
     def seeds(self) -> frozenset[int]:

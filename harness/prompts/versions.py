@@ -8,7 +8,7 @@ Released versions are pinned by digest in `prompts/released.toml`: a changed tex
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
@@ -22,6 +22,7 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, sha256_bytes, text_of, write_whole
 from harness.core.resources import entries, find
 from harness.core.templates import TooMuch
+from harness.prompts.alternatives import resolved
 from harness.prompts.answer_schema import ROLES as ROLES
 from harness.prompts.answer_schema import Shape, closed, longest
 from harness.prompts.examples import EXAMPLES, Examples
@@ -65,6 +66,8 @@ class Prompt:
     # most conflicts in the variable `conflicts`, the soonest first; None for all
     max_conflicts: Count | None = None
     examples: Examples | None = None  # earlier turns of the chat, from one scenario; None without any
+    # sets of examples that may be chosen, by their numbers from 1; the first is shown. Empty for all of them
+    example_sets: tuple[tuple[Count, ...], ...] = ()
     # further members of a role's answer, as `Shape` takes them; roles without any are not there
     extension: Mapping[str, str] = field(default_factory=dict)
     # whether the ego's template can show a message that holds words alone, a `sender` and `evidence`
@@ -92,7 +95,9 @@ class Prompt:
         compiled = {}
         for role, text in self.texts.items():
             try:
-                compiled[role] = _compiled(text)
+                compiled[role] = _compiled(resolved(text))
+            except ValueError as error:
+                raise UserError(f"prompt {self.version} {role}.j2: {printable(error)}") from None
             except TemplateSyntaxError as error:
                 raise UserError(
                     f"prompt {self.version} {role}.j2 line {error.lineno} is no Jinja: "
@@ -256,25 +261,32 @@ def load(version: str, where: Path | None = None) -> Prompt:
     base = _base(version, where)
     optional = [name for name in (EXAMPLES, ANSWER) if os.path.lexists(base / version / name)]
     texts = {name: _text(base / version / name) for name in (*FILES, *optional)}
-    what = f"prompt {version} prompt.toml"
-    table = loads(texts["prompt.toml"], what)
-    sha256 = digest(texts)
     released = _released(base)
-    if version in released and released[version] != sha256:
+    if version in released and released[version] != digest(texts):
         raise UserError(
             f"prompt {version} was released and its text has changed; restore it, or copy it to a new "
             f"version (its digest is pinned in {printable(base / 'released.toml')})"
         )
-    table = {"reasons_first": REASONS_FIRST.get(sha256, ()), **table}
-    examples, extension = (
-        reads(texts[name], f"prompt {version} {name}") if name in texts else None
-        for name, reads in ((EXAMPLES, read_examples), (ANSWER, read_extension))
-    )
-    return convert(
-        table, Prompt, what, version=version, sha256=sha256, released=version in released,
+    return made(version, texts, version in released)
+
+
+def made(version: str, texts: Mapping[str, str], released: bool = False) -> Prompt:
+    """Make a version of the texts of its files, in the order of `FILES`. Raises UserError if one is wrong."""
+    what, sha256 = f"prompt {version} prompt.toml", digest(texts)
+    table = {"reasons_first": REASONS_FIRST.get(sha256, ()), **loads(texts["prompt.toml"], what)}
+    examples = read_examples(texts[EXAMPLES], f"prompt {version} {EXAMPLES}") if EXAMPLES in texts else None
+    extension = read_extension(texts[ANSWER], f"prompt {version} {ANSWER}") if ANSWER in texts else None
+    prompt = convert(
+        table, Prompt, what, version=version, sha256=sha256, released=released,
         texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=examples,
         extension=extension or {}, files=texts,
     )  # fmt: skip
+    if not prompt.example_sets:
+        return prompt
+    n = min(len(examples.of(role)) for role in ROLES) if examples else 0
+    if wrong := [number for some in prompt.example_sets for number in some if not 0 < number <= n]:
+        raise UserError(f"{what}: example_sets has {wrong[0]}, and examples.json has {n} a role; fix one")
+    return replace(prompt, examples=examples and examples.only(prompt.example_sets[0]))
 
 
 def as_it_was(version: str, sha256: str, where: Path | None = None) -> Prompt | None:

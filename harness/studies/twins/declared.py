@@ -23,6 +23,7 @@ from harness.core.image import Image
 from harness.dataset.load import Scene
 from harness.evaluate.spec import Spec
 from harness.prompts import readout
+from harness.prompts.alternatives import resolved
 from harness.world.perception.sensors import LIDAR_NOISE_M, RADAR_NOISE_M
 from harness.world.scene_graph import Conflict, Node, SceneGraph
 
@@ -210,7 +211,9 @@ def _says_units(spec: Spec, role: str) -> bool:
     """
     if spec.ego.prompt.examples:
         return False
-    fixed = PLACEHOLDER.sub("", spec.ego.prompt.texts[role]).replace(f"{_speeds(spec, 1.0)} m/s", "m/s")
+    fixed = PLACEHOLDER.sub("", resolved(spec.ego.prompt.texts[role])).replace(
+        f"{_speeds(spec, 1.0)} m/s", "m/s"
+    )
     return all(re.search(unit, fixed) for unit in ("m/s", r"\bm\b(?!/)")) and not re.search(
         r"\d\s*m\b", fixed
     )
