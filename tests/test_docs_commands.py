@@ -60,6 +60,7 @@ CUT = {
     "harness dataset scenario audit": "--layouts 24 --workers 1",  # of 300
     "harness model distill": "--layouts 2 --samples 16,16,16,16 --workers 1",  # of 240 and 300 000
     "harness prompt check mine --tokenizer ../tokenizer.json": "--dataset ../few",  # 4 episodes of 240
+    "harness prompt optimize": "--tune ../few --limit 2",  # 4 layouts of 24, and 2 of 240
     "harness model parity": "--prompts 1",  # of 64, on two engines
 }
 
@@ -154,7 +155,7 @@ def test_a_page_can_be_followed(
                 # A page that shows `echo $?` says how the line before it ends.
                 says = int(shown.split()[0]) if then == "echo $?" else 0
                 assert code == CUT_ENDS.get(command, says), f"{line}\n{err}"
-            elif program in ("cp", "echo"):
+            elif program in ("cp", "echo", "sed"):
                 subprocess.run(line, shell=True, check=True)
             else:
                 assert program in OTHER_PROGRAMS, line

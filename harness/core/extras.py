@@ -22,6 +22,7 @@ OPTIONAL = {
     "sparrow_decider": ("sparrow-decider", "sparrow"),
     "torch": ("torch", "transformers"),
     "transformers": ("transformers", "transformers"),
+    "gepa": ("gepa", "gepa"),
 }
 
 

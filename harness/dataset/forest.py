@@ -221,7 +221,12 @@ class Forest:
 
     def uniform_success(self) -> Floats:
         """Return with what probability each episode succeeds, (E,), if every action is equally likely."""
-        return np.asarray(self.chance(np.ones(self.child.shape))[self.root].mean(axis=-1))
+        return np.asarray(self.worth[self.root].mean(axis=-1))
+
+    @cached_property
+    def worth(self) -> Floats:
+        """The `chance` of each action if all later ones are drawn evenly, (N, A); 0 if none saves it."""
+        return self.chance(np.ones(self.child.shape))
 
     def chance(self, policy: Floats) -> Floats:
         """Return with what probability an episode succeeds after each action, (N, A).

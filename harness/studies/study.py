@@ -28,7 +28,7 @@ SOURCE = ("name", "latency")  # of a source, what makes a study another one
 # What else may lie in a folder, each as `<name>.json`; some of their files have the names of a study's.
 MANIFESTS = (
     "run", "suite", "sweep", "grid", "repeats", "trust", "schedule", "fidelity", "twins", "study",
-    "closed-loop", "contents",
+    "closed-loop", "contents", "optimize",
 )  # fmt: skip
 
 

@@ -1,0 +1,288 @@
+"""`harness prompt optimize`: search the wording of a prompt on tune seeds, certify it on report seeds."""
+
+import re
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
+from math import prod
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import typer
+from msgspec import structs, to_builtins
+
+from harness.cli import options
+from harness.cli.progress import Bar, bar
+from harness.cli.show import finish
+from harness.cli.terminal import echo_json
+from harness.core import extras, resources, work
+from harness.core.errors import UserError, in_range, printable
+from harness.core.formats import WORK
+from harness.core.seeds import FIRST
+from harness.evaluate.settings import OUTPUT, FrozenSettings, Settings
+
+if TYPE_CHECKING:
+    from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.spec import Spec
+    from harness.prompts.versions import Prompt
+    from harness.studies.optimize.engines import Engine
+    from harness.world.scenario import Scenario
+
+CONDITION = "single-local"
+SAMPLE = 4  # layouts of a family that a dry run counts on
+HELP = {
+    "prompt": "Prompt version to start from. Default: the scenario's usual one.",
+    "dataset": "Dataset of report layouts to certify on, or suite:NAME for several families at once.",
+    "condition": "Operating point to search under, one. Default: single-local.",
+}
+
+
+@options.takes(FrozenSettings, help=HELP)
+def command(
+    settings: Settings,
+    budget: int = typer.Option(..., help="Most questions that the search may ask on tune layouts."),
+    out: str = typer.Option(..., help="Name of the version to make, in the project's prompts/."),
+    layouts: int = typer.Option(24, help="Number of tune layouts of each scenario."),
+    first_seed: int = typer.Option(
+        FIRST["tune"], help="Layout seed of the first tune layout; tune seeds are 0 to 99999."
+    ),
+    tune: list[str] | None = typer.Option(
+        None, help="Dataset of tune layouts to use instead, one for each of --dataset. Repeatable."
+    ),
+    reflect: str | None = typer.Option(
+        None,
+        help="Model that rewrites the system text by what went wrong (GEPA), such as a served one. Default: "
+        "the search chooses among the alternatives that the prompt marks.",
+    ),
+    folder: Path | None = typer.Option(None, help="Folder to write the search to. Default: reports/NAME."),
+    workers: options.Workers = "2",
+    no_cache: options.NoCache = False,
+    dry_run: bool = typer.Option(
+        False,
+        "--dry-run",
+        help="Only count requests and tokens; ask no model, and write nothing.",
+        rich_help_panel=OUTPUT,
+    ),
+    tokenizer: Path | None = typer.Option(
+        None,
+        help="With --dry-run: tokenizer to count with: a tokenizer.json, its folder, or a GGUF file. "
+        "Default: the model's.",
+        rich_help_panel=OUTPUT,
+    ),
+    as_json: options.Json = False,
+    quiet: options.QuietOutput = False,
+) -> None:
+    """Search the wording of a prompt, and certify the winner.
+
+    It searches on tune seeds, and asks once on report seeds whether the winner is better than what it came
+    from. If the search is stopped, the same command continues it.
+    """
+    from harness.backends.cache import default_file
+    from harness.backends.registry import open_backend
+    from harness.dataset import load
+    from harness.dataset.verify import read_manifest, scenario_of
+    from harness.evaluate import resolve
+    from harness.prompts import versions as prompts
+    from harness.studies.optimize import engines
+    from harness.studies.optimize.search import Search, choices, only_for, search
+
+    extras.need("harness prompt optimize", "matplotlib", *(() if tune else ("highway_env",)))
+    extras.need("--reflect", *(("gepa",) if reflect else ()))
+    settings = structs.replace(settings, condition=settings.condition or (CONDITION,))
+    names = _datasets(settings.world)
+    manifests = [read_manifest(load.find(name)) for name in names]  # their layouts stay unread
+    scenarios = [scenario_of(manifest) for manifest, _ in manifests]
+    for name, (manifest, _) in zip(names, manifests, strict=True):
+        only_for("report", "--dataset", name, manifest.seed, manifest.episodes)
+    base = _base(settings, scenarios, budget)
+    settings = structs.replace(settings, prompt=base.version)
+    sizes = {} if reflect else choices(base)
+    given = _given(tune or (), scenarios) if tune else []
+    in_range("--layouts", layouts, 2, FIRST["train"])
+    only_for("tune", "--first-seed", str(first_seed), first_seed, layouts)
+    silent, who = as_json or quiet, options.workers_of(workers)
+    engine_name = f"GEPA with {reflect}" if reflect else "alternatives"
+    if dry_run:
+        with TemporaryDirectory() as place, bar("freezing a few tune layouts", quiet=silent) as progress:
+            few = given or _built(scenarios, Path(place), min(SAMPLE, layouts), first_seed, who, progress)
+            specs = [resolve.spec(settings, source) for source in few]
+            episodes = [min(manifest.episodes, settings.world.limit or manifest.episodes)  # type: ignore[union-attr]
+                        for manifest, _ in manifests]  # fmt: skip
+            counted = _counted(specs, sizes, budget, 0 if given else layouts, episodes, tokenizer)
+        if as_json:
+            echo_json(counted)
+        elif not quiet:
+            _show_counted(counted, engine_name)
+        return
+    where = folder or Path("reports", out)
+    _check_name(out, (where / WORK).is_dir())
+    begins = work.WorkStart(
+        settings={
+            "version": out, "budget": budget, "engine": engine_name, "prompt_sha256": base.sha256,
+            "tune": [source.dataset.sha256 for source in given] or [layouts, first_seed],
+            "report": [sha256 for _, sha256 in manifests], "evaluation": to_builtins(settings),
+        }
+    )  # fmt: skip
+    if begun := work.begun(where, work.WorkStart):
+        work.same(where, begins.settings, begun.settings)
+    cache, label = None if no_cache else default_file(), f"asking {printable(settings.model, 30)}"
+    with (
+        work.working(where, begun or begins) as place,
+        bar(label, quiet=silent, grows=True) as progress,
+    ):
+        sources = given or _built(scenarios, place, layouts, first_seed, who, progress)
+        specs = [resolve.spec(settings, source) for source in sources]
+        of = Search(
+            base, specs, partial(_report, settings, names), budget, out, Path("prompts"), engine_name,
+            shlex.join(["harness", *sys.argv[1:]]),
+        )  # fmt: skip
+        engine = _reflecting(reflect, specs[0], place, begins.settings) if reflect else engines.alternatives
+        study = search(of, engine, where, place, open_backend, progress, cache)
+    finish(study, where, as_json, quiet)
+    if not silent and Path("prompts", out).is_dir():
+        typer.echo(f"wrote prompts/{printable(out)}, sha256 {prompts.load(out).sha256}; a draft")
+    work.tidy(where)
+
+
+def _datasets(world: Any) -> list[str]:
+    from harness.dataset import suites
+
+    named = suites.named(world.dataset)
+    return list(named.datasets) if named else [world.dataset]
+
+
+def _report(settings: Settings, names: Sequence[str]) -> "list[Spec]":
+    from harness.evaluate import resolve
+
+    return [resolve.spec(settings, resolve.frozen(settings.world, name)) for name in names]  # type: ignore[arg-type]
+
+
+def _base(settings: Settings, scenarios: "Sequence[Scenario]", budget: int) -> "Prompt":
+    """Return the version to start from. Raises UserError for what can be told to be wrong before any work."""
+    from harness.evaluate import resolve
+    from harness.evaluate.latency import MEASURED
+    from harness.prompts.versions import unfit
+
+    if budget < 1:
+        raise UserError(f"--budget {budget}: give the most questions that the search may ask, 1 or more")
+    if len(points := resolve.points(settings.condition, settings.control, settings.attack)) != 1:
+        names = " ".join(point.name for point in points)
+        raise UserError(f"--condition {printable(names)}: a prompt is searched under one; give one")
+    if settings.latency == MEASURED:
+        raise UserError(f"--latency {MEASURED}: a search keeps the machine busy; give seconds")
+    ego, _ = resolve.agents(settings, scenarios[0])
+    if not ego.can.language_model:
+        raise UserError(
+            f"--model {printable(ego.card.name)}: it reads the scene and no prompt, so that no wording "
+            "changes what it does; give a language model (`harness model list`)"
+        )
+    for scenario in scenarios:
+        if reason := unfit(ego.prompt, scenario):
+            raise UserError(f"--prompt {ego.prompt.version} {reason}; give one for every scenario")
+    return ego.prompt
+
+
+def _given(names: Sequence[str], scenarios: "Sequence[Scenario]") -> "list[FrozenSource]":
+    """Return the datasets of --tune, one for each scenario."""
+    from harness.evaluate import resolve
+    from harness.studies.optimize.search import only_for
+
+    if len(names) != len(scenarios):
+        raise UserError(f"--tune: {len(names)} given for {len(scenarios)} datasets; give one each, in order")
+    sources = [resolve.frozen(FrozenSettings(), name) for name in names]
+    for name, source, scenario in zip(names, sources, scenarios, strict=True):
+        manifest = source.dataset.manifest
+        only_for("tune", "--tune", name, manifest.seed, manifest.episodes)
+        if source.scenario.name != scenario.name:
+            raise UserError(
+                f"--tune {printable(name)}: it is of {source.scenario.name}, and not of {scenario.name} as "
+                "--dataset is; give one of the same scenario"
+            )
+    return sources
+
+
+def _check_name(name: str, goes_on: bool) -> None:
+    from harness.prompts import versions as prompts
+
+    if not Path(resources.MARKER).is_file():
+        raise UserError(f"--out {printable(name)}: no project is here, `harness init` makes one")
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,60}", name):
+        raise UserError(
+            f"--out {printable(name)} cannot name a prompt; give letters, digits, '.', '_' or '-', "
+            "a letter or digit first"
+        )
+    if not goes_on and (name in prompts.names() or Path("prompts", name).exists()):
+        raise UserError(f"--out {name}: a prompt of that name is there already; give a new name")
+
+
+def _built(
+    scenarios: "Sequence[Scenario]", place: Path, layouts: int, first_seed: int, who: Any, progress: Bar
+) -> "list[FrozenSource]":
+    """Return tune layouts of each scenario, which are frozen if they are not there."""
+    from harness.dataset import load
+    from harness.dataset.build import build
+    from harness.evaluate.frozen_world import FrozenSource
+
+    sources = []
+    for scenario in scenarios:
+        out = place / f"tune-{scenario.name}"
+        if not (out / "manifest.json").is_file() or (out / WORK).is_dir():
+            progress.more(layouts)
+            build(scenario, out, layouts, first_seed, who, progress, audits=False)
+        sources.append(FrozenSource(load.load(out)))
+    return sources
+
+
+def _reflecting(model: str, first: "Spec", place: Path, of: Mapping[str, Any]) -> "Engine":
+    from harness.backends.cards import resolve
+    from harness.backends.registry import open_backend
+    from harness.prompts.versions import ROLES
+    from harness.studies.optimize.engines import Reflecting, asked_of
+
+    backend = open_backend(resolve(model), device=first.device, dtype=first.dtype, batch_size=1)
+    roles = ROLES if first.points[0].asks and not first.ego_alone else ROLES[:1]
+    return Reflecting(asked_of(backend), place / "reflections.jsonl", of, roles)
+
+
+def _counted(
+    specs: "Sequence[Spec]", sizes: Mapping[str, int], budget: int, layouts: int, episodes: Sequence[int],
+    tokenizer: Path | None,
+) -> dict[str, Any]:  # fmt: skip
+    """Return how many requests are to be expected, and the tokens of their prompts, from tune layouts."""
+    from harness.evaluate.dry_run import count
+
+    counted = [count(spec, spec.source.dataset, tokenizer) for spec in specs]  # type: ignore[attr-defined]
+    here = [len(list(spec.source.layout_seeds)) for spec in specs]
+    each = [c["requests"] / n for c, n in zip(counted, here, strict=True)]
+    return {
+        "choices": dict(sizes), "wordings": prod(sizes.values()) if sizes else None,
+        "wordings_in_a_round": 1 + sum(n - 1 for n in sizes.values()) if sizes else None,
+        "budget": budget,
+        "questions_a_wording": round(sum(q * (layouts or n) for q, n in zip(each, here, strict=True))),
+        "certificate_questions": 2 * round(sum(q * n for q, n in zip(each, episodes, strict=True))),
+        "prompt_tokens": [c["prompt_tokens"] for c in counted],
+    }  # fmt: skip
+
+
+def _show_counted(counted: dict[str, Any], engine: str) -> None:
+    if counted["choices"]:
+        marks = ", ".join(f"{name} ({n})" for name, n in counted["choices"].items())
+        typer.echo(
+            f"{marks}: {counted['wordings']} wordings, {counted['wordings_in_a_round']} of them in a "
+            "round of the search"
+        )
+    typer.echo(
+        f"search ({printable(engine)}): at most {counted['budget']} questions; a wording takes about "
+        f"{counted['questions_a_wording']} on the tune layouts"
+    )
+    typer.echo(
+        f"certificate: about {counted['certificate_questions']} questions on report layouts, both prompts"
+    )
+    for each in counted["prompt_tokens"]:
+        for role, s in (each or {}).items():
+            typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
+        if not each:
+            typer.echo("prompt tokens not counted: no tokenizer here; give --tokenizer")
+    typer.echo("no model was called, and no report layout was read")

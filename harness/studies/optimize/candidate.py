@@ -1,0 +1,101 @@
+"""A prompt with something of its text chosen or rewritten, as a version that can be written to a folder."""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness.core.config import loads
+from harness.core.errors import UserError
+from harness.core.files import write_whole
+from harness.prompts.alternatives import EXAMPLES as SETS
+from harness.prompts.alternatives import FIRST, counts, resolved
+from harness.prompts.examples import EXAMPLES, text_of
+from harness.prompts.examples import read as read_examples
+from harness.prompts.versions import ROLES, Prompt, made
+
+PROMPT = "prompt.toml"
+SYSTEM = re.compile(r"(\{%-?\s*block\s+system\s*-?%\})(.*?)(\{%-?\s*endblock\b)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A prompt that is tried."""
+
+    prompt: Prompt  # of the base's name
+    what: str  # how it differs from the base, in a line
+
+    @property
+    def key(self) -> str:
+        """The digest of its files."""
+        return self.prompt.sha256
+
+
+def space(prompt: Prompt) -> dict[str, int]:
+    """Return the number of alternatives of each choice that the author of a prompt marked, by name.
+
+    Raises UserError if a mark cannot be chosen from.
+    """
+    try:
+        marks = counts(prompt.texts.values())
+    except ValueError as error:
+        raise UserError(f"--prompt {prompt.version}: {error}") from None
+    return marks | ({SETS: len(prompt.example_sets)} if len(prompt.example_sets) > 1 else {})
+
+
+def chosen(base: Prompt, choice: Mapping[str, int] = FIRST) -> Candidate:
+    """Return a prompt with alternatives chosen by number, from 0. Raises UserError if its files are wrong."""
+    sizes = space(base)
+    changes = ", ".join(f"{name} {n + 1} of {sizes[name]}" for name, n in choice.items() if n)
+    files = {**base.files, **{f"{role}.j2": resolved(base.texts[role], choice) for role in ROLES}}
+    if base.example_sets:
+        examples = read_examples(files.pop(EXAMPLES), EXAMPLES).only(base.example_sets[choice.get(SETS, 0)])
+        files |= {EXAMPLES: text_of(examples)} if examples else {}
+    return _candidate(base, files, changes or "first alternatives")
+
+
+def systems(base: Prompt) -> dict[str, str]:
+    """Return the text of each role's block `system`, with its first alternatives."""
+    return {role: match[2] for role in ROLES if (match := SYSTEM.search(resolved(base.texts[role])))}
+
+
+def rewritten(base: Prompt, texts: Mapping[str, str]) -> Candidate:
+    """Return a prompt with some roles' blocks `system` rewritten. Raises UserError if its files are wrong."""
+    first, own = chosen(base), systems(base)
+    files = dict(first.prompt.files)
+    for role, text in texts.items():
+        files[f"{role}.j2"] = SYSTEM.sub(
+            lambda match, text=text: match[1] + text + match[3],  # type: ignore[misc]
+            files[f"{role}.j2"],
+            count=1,
+        )
+    roles = [role for role, text in texts.items() if text != own[role]]
+    return (
+        _candidate(base, files, f"system text of the {' and the '.join(roles)} rewritten") if roles else first
+    )
+
+
+def _candidate(base: Prompt, files: Mapping[str, str], what: str) -> Candidate:
+    table = loads(files[PROMPT], PROMPT)
+    table.pop("example_sets", None)
+    reasons = {"reasons_first": list(base.reasons_first)} if base.reasons_first else {}
+    table |= {"changed": f"against {base.version}, by harness prompt optimize: {what}", **reasons}
+    text = "".join(f"{key} = {_toml(value)}\n" for key, value in table.items())
+    return Candidate(made(base.version, {**files, PROMPT: text}), what)
+
+
+def _toml(value: Any) -> str:
+    """Return a value of a prompt's settings as TOML, which writes all but tables as JSON does."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+    return json.dumps(value, ensure_ascii=False)
+
+
+def write(candidate: Candidate, folder: Path, more: Mapping[str, str]) -> None:
+    """Write a version's files, and beside them others that are not part of its digest."""
+    folder.mkdir(parents=True, exist_ok=True)
+    ordered: Sequence[str] = [*more, *(name for name in candidate.prompt.files if name != PROMPT), PROMPT]
+    for name in ordered:  # prompt.toml last: without it, there is no version
+        write_whole(folder / name, more.get(name) or candidate.prompt.files[name])

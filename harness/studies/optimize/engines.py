@@ -1,0 +1,184 @@
+"""The engines of a search: each plays candidates until it has tried all, or the budget is spent.
+
+An engine only explores. Which candidate is best is said by `Tuning.best`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.backends.base import Backend, Request
+from harness.core.errors import Unanswered, UserError, printable
+from harness.core.files import canonical_json, sha256_bytes
+from harness.prompts.versions import Prompt
+from harness.studies.optimize.candidate import Candidate, chosen, rewritten, space, systems
+from harness.studies.optimize.feedback import of_course
+from harness.studies.optimize.tuning import Played, Spent, Tuning
+from harness.studies.study import Cells
+
+if TYPE_CHECKING:
+    from gepa.core.adapter import EvaluationBatch
+
+Engine = Callable[[Tuning], None]
+BATCH = 3  # layouts of which GEPA reads what went wrong, each time
+REPLY_TOKENS = 2048  # most tokens of what the reflecting model writes
+GEPA_SEED = 0
+ASKED = """A driving program asks a small language model at every decision. This is the Jinja template of \
+its system message:
+```
+<curr_param>
+```
+These are some of its decisions, and what each action would have been worth:
+
+<side_info>
+
+Write a better template of the system message. Keep what stands in {{ }} and {% %} as it is, and leave the \
+form of the answer alone, which is asked for elsewhere. Write only the template, between ``` and ```."""
+
+
+def alternatives(tuning: Tuning) -> None:
+    """Search the marked alternatives by coordinate descent.
+
+    Each alternative of each choice is played with the best of the others, first on half of the layouts, and
+    on the rest if it is not worse there. The best stays; it ends when a round over all choices changes
+    nothing.
+    """
+    base = tuning.base
+    sizes = space(base)
+    best = dict.fromkeys(sizes, 0)
+    before: dict[str, int] = {}
+    while before != best:
+        before = dict(best)
+        for name, count in sizes.items():
+            for number in range(count):
+                tried = {**best, name: number}
+                if tried != best and _better(tuning, chosen(base, tried), chosen(base, best)):
+                    best = tried
+
+
+def _better(tuning: Tuning, new: Candidate, old: Candidate) -> bool:
+    half = tuning.first_half
+    now = tuning.rank(old)
+    return tuning.score(new, half) >= tuning.score(old, half) and tuning.rank(new) > now
+
+
+class Reflecting:
+    """The engine of GEPA, with a model that reads what went wrong and writes system messages anew.
+
+    Source: Agrawal and others 2025, arXiv:2507.19457, whose package runs the loop. All that it draws is
+    seeded, and what the model wrote is kept, so that a stopped search goes on by beginning again.
+    """
+
+    def __init__(self, asked: Callable[[str], str], kept: Path, of: Mapping[str, Any], roles: Sequence[str]):
+        """`asked` is the model; `kept` the file of what it wrote so far, of settings `of`."""
+        self._asked, self._roles = asked, roles
+        self._cells = Cells(kept, sha256_bytes(canonical_json(of).encode()))
+        self.replies = 0
+
+    def __call__(self, tuning: Tuning) -> None:
+        gepa: Any = import_module("gepa")
+        adapter = _Adapter(tuning)
+        layouts = list(range(len(tuning.layouts)))
+        own = systems(tuning.base)
+        gepa.optimize(
+            {role: own[role] for role in self._roles if role in own}, trainset=layouts, valset=layouts,
+            adapter=adapter, reflection_lm=lambda prompt: self._reply(str(prompt), adapter),
+            reflection_prompt_template=ASKED, reflection_minibatch_size=min(BATCH, len(layouts)),
+            stop_callbacks=adapter.over, skip_perfect_score=False, seed=GEPA_SEED, logger=_Silent(),
+            raise_on_exception=False,
+        )  # fmt: skip
+        if adapter.error and not isinstance(adapter.error, Spent):
+            raise adapter.error
+
+    def _reply(self, prompt: str, adapter: "_Adapter") -> str:
+        number, self.replies = self.replies, self.replies + 1
+        try:
+            key = (number, sha256_bytes(prompt.encode()))
+            return str(self._cells.part(key, lambda: {"text": self._asked(prompt)})["text"])
+        except Exception as error:
+            adapter.error = error
+            raise
+
+
+def asked_of(backend: Backend) -> Callable[[str], str]:
+    """Return a model as a function from a question to its answer. It raises Unanswered if there is none."""
+
+    def asked(prompt: str) -> str:
+        request = Request(
+            "reflect",
+            "ego",
+            ({"role": "user", "content": prompt},),
+            ("SLOWER", "IDLE", "FASTER"),
+            REPLY_TOKENS,
+        )
+        [completion] = backend.complete([request])
+        if completion.error is not None:
+            raise Unanswered(f"--reflect: {printable(completion.error, 300)}")
+        return completion.text
+
+    return asked
+
+
+class _Silent:
+    def log(self, message: str) -> None:
+        """Print nothing: the command has a progress bar."""
+
+
+class _Adapter:
+    """What GEPA asks of a program: to play candidates, and to say what went wrong."""
+
+    propose_new_texts = None
+    IDLE = 5  # rounds in a row without a question, after which nothing new is expected
+
+    def __init__(self, tuning: Tuning) -> None:
+        self._tuning = tuning
+        self.error: Exception | None = None
+        self._still, self._spent = 0, -1
+
+    def over(self, state: Any) -> bool:
+        """Return whether the search is to end: the budget is spent, something failed, or nothing is new."""
+        self._still = self._still + 1 if self._tuning.spent == self._spent else 0
+        self._spent = self._tuning.spent
+        return self.error is not None or self._still > self.IDLE
+
+    def evaluate(
+        self, batch: list[int], candidate: dict[str, str], capture_traces: bool = False
+    ) -> "EvaluationBatch[Any, Any]":
+        from gepa.core.adapter import EvaluationBatch
+
+        tuning = self._tuning
+        try:
+            played = tuning.play(rewritten(tuning.base, candidate), batch)
+        except Unanswered as error:
+            self.error = error
+            raise
+        except UserError as error:  # what the model wrote is no template
+            nothing = [str(error)] * len(batch)
+            return EvaluationBatch(nothing, [0.0] * len(batch), nothing if capture_traces else None)
+        except Exception as error:
+            self.error = error
+            raise
+        weights = tuning.weights(np.arange(len(tuning.layouts))) * len(tuning.layouts)
+        scores = [each.score * float(weights[n]) for n, each in zip(batch, played, strict=True)]
+        return EvaluationBatch([each.score for each in played], scores, played if capture_traces else None)
+
+    def make_reflective_dataset(
+        self, candidate: dict[str, str], eval_batch: "EvaluationBatch[Any, Any]",
+        components_to_update: list[str],
+    ) -> Mapping[str, Sequence[Mapping[str, Any]]]:  # fmt: skip
+        records = [_reflected(self._tuning, candidate, each) for each in eval_batch.trajectories or ()]
+        return dict.fromkeys(components_to_update, records)
+
+
+def _reflected(tuning: Tuning, candidate: Mapping[str, str], trace: Played | str) -> dict[str, str]:
+    """Return one course for the reflecting model: a question, its answer, and what is to be said of it."""
+    if isinstance(trace, str):
+        return {"Inputs": "", "Generated Outputs": "", "Feedback": trace}
+    decision, text = of_course(trace)
+    prompt: Prompt = rewritten(tuning.base, candidate).prompt
+    graph, scenario = decision.scene.graphs[decision.scene.viewers[0]], decision.dataset.scenario
+    user = prompt.render(graph, decision.dataset.actions, words=scenario.prompt_words)[-1]["content"]
+    return {"Inputs": user, "Generated Outputs": decision.raw, "Feedback": text}

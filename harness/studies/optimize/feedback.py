@@ -1,0 +1,89 @@
+"""Say in words what other actions would have been worth: exact, from the tree, for who rewrites a prompt."""
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.dataset.forest import Forest
+from harness.studies.optimize.tuning import Decision, Played
+from harness.world.perception.graph import truth_graph
+from harness.world.scene_graph import Conflict
+
+
+def of_course(played: Played) -> tuple[Decision, str]:
+    """Return the decision of a course that lost most, and what is to be said of it and of the outcome."""
+    lost = [_lost(decision) for decision in played.course]
+    worst = played.course[int(np.argmax(lost))]
+    end = "The episode succeeded." if played.success == 1 else "The episode failed."
+    if played.success not in (0, 1):
+        end = f"The episode succeeded under {100 * played.success:.0f} % of the channel's draws."
+    return worst, f"{of_decision(worst)} {end}"
+
+
+def of_decision(decision: Decision) -> str:
+    """Return what was stated and done, what each action was worth, and who was out of sight and unreported.
+
+    An action's worth is the probability that the episode succeeds after it if all later actions are drawn
+    evenly (`Forest.worth`). What an action lost is the best action's worth less its own.
+    """
+    actions = decision.dataset.actions
+    stated = ", ".join(f"{a} {_share(p)}" for a, p in zip(actions, decision.policy.tolist(), strict=True))
+    return " ".join([
+        f"It stated {stated}, and did {actions[decision.action]}.", _worths(decision), *_unseen(decision)
+    ])  # fmt: skip
+
+
+def _worths(decision: Decision) -> str:
+    worth, actions = _worth(decision), decision.dataset.actions
+    best = int(np.argmax(worth))
+    if not worth[best]:
+        return "No action could save the episode any more."
+    parts = [f"{actions[best]} was worth {_share(worth[best])}"]
+    for n in np.argsort(-worth, kind="stable")[1:].tolist():
+        lost = worth[best] - worth[n]
+        after = ", and nothing could save the episode after it" if not worth[n] else ""
+        parts.append(
+            f"{actions[n]} lost {_share(lost)}{after}" if lost else f"{actions[n]} was worth as much"
+        )
+    return "; ".join(parts) + "."
+
+
+def _unseen(decision: Decision) -> list[str]:
+    """Return a sentence for each vehicle in the ego's way that the ego does not see."""
+    scene, scenario = decision.scene, decision.dataset.scenario
+    ego = scene.graphs[scene.viewers[0]]
+    truth = truth_graph(scenario, scene.state)
+    told = " ".join(str((answer.message or {}).get("evidence", answer.raw)) for answer in decision.heard)
+    sentences = []
+    for node in truth.nodes:
+        conflicts = [conflict for conflict in truth.conflicts if conflict.vehicle == node.id]
+        if node.id in {each.id for each in ego.nodes} or not conflicts:
+            continue
+        away_m = np.hypot(node.forward_m, node.left_m)
+        heard = "no message came" if not decision.heard else "it was in no message"
+        if node.id in told.replace(",", " ").replace(".", " ").split():
+            heard = "a message named it"
+        where = f"{away_m:.0f} m, {_meets(conflicts[0])}"
+        sentences.append(f"The {node.type} {node.id} at {where}, was out of sight, and {heard}.")
+    return sentences
+
+
+def _meets(conflict: Conflict) -> str:
+    ours, theirs = conflict.ego.time_s, conflict.other.time_s
+    if ours is None or theirs is None:
+        return f"from {conflict.sector}"
+    gap_s = theirs - ours
+    return f"from {conflict.sector}, {abs(gap_s):.1f} s {'later' if gap_s > 0 else 'earlier'} than the ego"
+
+
+def _share(p: float) -> str:
+    return f"{p:.2f}"
+
+
+def _worth(decision: Decision) -> Floats:
+    forest: Forest = decision.dataset.forest
+    return np.asarray(forest.worth[forest.place[decision.scene.id]])
+
+
+def _lost(decision: Decision) -> float:
+    worth = _worth(decision)
+    return float(worth.max() - decision.policy @ worth)

@@ -1,0 +1,305 @@
+"""Search the wording of a prompt version on tune layouts, and certify the winner once on report layouts."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.backends.swarm import open_each, together
+from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable
+from harness.core.figures import POINTS, as_mapping, shown
+from harness.core.progress import Progress
+from harness.core.seeds import FIRST, Purpose, purposes, stated
+from harness.core.statistics import Estimate, known_mean, mean_of
+from harness.core.versions import versions
+from harness.evaluate import latency as latencies
+from harness.evaluate.run import Opens, read_or_evaluate
+from harness.evaluate.spec import Spec
+from harness.prompts.versions import ROLES, Prompt, load
+from harness.report.document import Table
+from harness.runs.folder import Run
+from harness.runs.metrics import BALANCED, METRICS, SUCCESS, by_episode, difference, halved, over_episodes
+from harness.studies.optimize.candidate import Candidate, chosen, space, write
+from harness.studies.optimize.engines import Engine
+from harness.studies.optimize.tuning import Record, Spent, Tuning, changed
+from harness.studies.study import Study, ends
+
+HISTORY = "history.json"  # beside a version's files: where it comes from; no part of its digest
+OLD, NEW = "base", "winner"  # the folders of the two runs on report layouts
+
+
+@dataclass(frozen=True)
+class Search:
+    """What is searched, and where it is written."""
+
+    base: Prompt
+    tune: Sequence[Spec]  # evaluations of the base on tune layouts, one a family, each of one condition
+    # the same on report layouts: they are opened when a winner stands, and not before
+    report: Callable[[], Sequence[Spec]]
+    budget: int  # most questions on tune layouts
+    version: str  # name of the version that is made
+    prompts: Path  # the folder of versions that it is written to
+    engine: str  # name of the engine, and of what it uses
+    command: str  # the words that repeat it
+
+
+def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) -> None:
+    """Raise UserError unless all layout seeds of a dataset, `count` from `first` on, are for this purpose."""
+    if purposes(first, count) != [wanted]:
+        raise UserError(
+            f"{option} {printable(name)}: {stated(first, count)}; a prompt is searched on tune seeds "
+            f"({FIRST['tune']} to {FIRST['train'] - 1}) and certified on report "
+            f"seeds (from {FIRST['report']})"
+        )
+
+
+def choices(prompt: Prompt) -> dict[str, int]:
+    """Return the number of alternatives of each choice of a prompt. Raises UserError if there are none."""
+    sizes = space(prompt)
+    if not sizes:
+        raise UserError(
+            f"--prompt {prompt.version}: no alternatives are marked in it; mark some, such as "
+            "{% either name %}one{% or %}another{% endeither %}, or give --reflect MODEL"
+        )
+    return sizes
+
+
+def render_all(spec: Spec) -> None:
+    """Render each alternative once. Raises UserError if one does not render."""
+    sizes = space(spec.ego.prompt)
+    [scene] = spec.source.trial(1, ego_alone=False)
+    graphs = {graph.role: graph for graph in scene.graphs.values()}
+    for name, count in sizes.items():
+        for number in range(count):
+            try:
+                prompt = chosen(spec.ego.prompt, {name: number}).prompt
+                for role in ROLES:
+                    if role in graphs:
+                        words = spec.scenario.prompt_words
+                        prompt.render(graphs[role], spec.actions, words=words)
+            except UserError as error:
+                raise UserError(f"alternative {number + 1} of {name}: {error}") from None
+
+
+def search(
+    of: Search, engine: Engine, out: Path, place: Path, opens: Opens, progress: Progress,
+    cache_file: Path | None,
+) -> Study:  # fmt: skip
+    """Search, certify, write the version, and return what was tried and what it gained.
+
+    `place` is the folder of what is kept until the end. The two runs on report layouts stay in `out`. If no
+    candidate is better than the base on tune layouts, no report layout is read and no version written.
+    """
+    for spec in of.tune:
+        render_all(spec)
+    opens = cache(opens)
+    first = of.tune[0]
+    options = {"device": first.device, "dtype": first.dtype, "batch_size": first.batch_size}
+    models = open_each(first.cards, partial(opens, **options))
+    latency = latencies.known(first.latency, first.agents, models)
+    assert latency  # it is not to be measured
+    backend = together(first.cards, models, cache_file)
+    base = chosen(of.base)
+    tuning = Tuning(of.tune, of.budget, backend, latency, place, progress)
+    try:
+        tuning.rank(base)
+    except Spent:
+        raise UserError(
+            f"--budget {of.budget}: the base alone takes more on {len(tuning.layouts)} tune layouts; "
+            "give more, or fewer --layouts"
+        ) from None
+    with suppress(Spent):
+        engine(tuning)
+    winner = tuning.best()
+    report: Sequence[Spec] = ()
+    runs: dict[str, list[Run]] = {}
+    if winner.key != base.key:
+        new, report = replace(winner.prompt, version=of.version), of.report()
+        for name, prompt in ((OLD, of.base), (NEW, new)):
+            places = [f"{name}-{spec.source.name}" if len(report) > 1 else name for spec in report]
+            runs[name] = [
+                read_or_evaluate(changed(spec, prompt), out / place, progress, cache_file, opens)
+                for spec, place in zip(report, places, strict=True)
+            ]
+    study = _study(of, tuning, winner, report, runs)
+    if runs:
+        history = json.dumps(study.manifest, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+        write(replace(winner, prompt=new), of.prompts / of.version, {HISTORY: history})
+        load(of.version)
+    return study
+
+
+def looks(base: Prompt, where: Path) -> int:
+    """Return how often report layouts were read for the versions that a prompt comes from."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        return int(json.loads((where / base.version / HISTORY).read_text())["looks"])
+    return 0
+
+
+def _values(run: Run) -> dict[str, Floats]:
+    metrics = [METRICS[name] for name in (SUCCESS, *METRICS[BALANCED].halves)]
+    values = by_episode(metrics, run.grid, run.decisions, run.episodes)
+    return {name: each[0] for name, each in values.items()}  # of the one condition, (S, E)
+
+
+def _certificate(old: Sequence[Run], new: Sequence[Run]) -> tuple[str, list[dict[str, Estimate]]]:
+    """Return what is compared, and by family (and for all) both prompts' estimates and their difference."""
+    pairs = [(_values(a), _values(b)) for a, b in zip(old, new, strict=True)]
+    both = all(known_mean(a[half].ravel(), 0) >= 0 for a, _ in pairs for half in METRICS[BALANCED].halves)
+    metric = BALANCED if both else SUCCESS
+
+    def row(a: dict[str, Floats], b: dict[str, Floats]) -> dict[str, Estimate]:
+        return {
+            OLD: halved(metric, lambda m: over_episodes(m, a[m])),
+            NEW: halved(metric, lambda m: over_episodes(m, b[m])),
+            "difference": halved(metric, lambda m: difference(m, b[m].T, a[m].T)),
+        }
+
+    rows = [row(a, b) for a, b in pairs]
+    if len(rows) > 1:
+        rows.append({name: mean_of([row[name] for row in rows]) for name in rows[0]})
+    return metric, rows
+
+
+def _study(
+    of: Search, tuning: Tuning, winner: Candidate, report: Sequence[Spec],
+    runs: Mapping[str, Sequence[Run]],
+) -> Study:  # fmt: skip
+    import pandas as pd
+
+    base, agent = of.base, of.tune[0].ego
+    tried = [_row(tuning, record) for record in tuning.records.values()]
+    tune = [
+        {"scenario": s.scenario.name, "layouts": len(list(s.source.layout_seeds)), "seeds": _seeds(s)}
+        for s in tuning.specs
+    ]
+    where = f"{len(tuning.layouts)} tune layouts ({', '.join(sorted({_seeds(s) for s in tuning.specs}))})"
+    manifest: dict[str, Any] = {
+        "version": of.version, "sha256": winner.key, "base": {"version": base.version, "sha256": base.sha256},
+        "engine": of.engine, "model": agent.card.record(), "answer": agent.answer,
+        "condition": of.tune[0].points[0].name, "tune": tune, "budget": of.budget,
+        "questions": tuning.spent, "tried": tried, "chosen": winner.what, "command": of.command,
+        "versions": versions(),
+    }  # fmt: skip
+    best, first = (tuning.records[key] for key in (winner.key, chosen(base).key))
+    searched = (
+        f"{len(tried)} wordings of {base.version} were tried on {where} with {tuning.spent} questions of "
+        f"{of.budget}; the best is: {winner.what}."
+    )
+    tables = [_tried_table(tried)]
+    data = {"tried": pd.DataFrame(tried)}
+    if not runs:
+        headline = [
+            f"None is better than {base.version} for {agent.name} on the tune layouts, so no version was "
+            "written and no report layout was read.",
+            f"{len(tried)} wordings of {base.version} were tried on {where} with {tuning.spent} questions of "
+            f"{of.budget}.",
+        ]
+        return Study(
+            "optimize", f"Wordings of {base.version} for {agent.name}", headline, [_about(of)], tables, data,
+            {**manifest, "certificate": None}, manifest,
+        )  # fmt: skip
+    metric, rows = _certificate(runs[OLD], runs[NEW])
+    names = [spec.source.name for spec in report] + (["mean"] if len(rows) > len(report) else [])
+    asked = sum(len(run.answers) for name in runs for run in runs[name])
+    again = looks(base, of.prompts) + 1
+    certificate = {
+        "metric": metric, "seeds": [_seeds(spec) for spec in report], "questions": asked,
+        "families": [
+            {"dataset": name, **{side: as_mapping(e) for side, e in row.items()}}
+            for name, row in zip(names, rows, strict=True)
+        ],
+    }  # fmt: skip
+    manifest |= {"certificate": certificate, "looks": again}
+    last = rows[-1]
+    gain, what = last["difference"], "balanced success" if metric == BALANCED else "success"
+    verdict = "clear of zero" if gain.low > 0 else "clearly worse" if gain.high < 0 else "not clear of zero"
+    headline = [
+        f"{of.version} against {base.version}: {shown(gain, POINTS, '+')} points of {what} on report "
+        f"layouts, {verdict} (n = {gain.n} layouts, paired, 95 % interval over layouts; "
+        f"{', '.join(map(_seeds, report))}, read once, after the search).",
+        f"On the tune layouts that chose it: {100 * _mean(tuning, best):.1f} % against "
+        f"{100 * _mean(tuning, first):.1f} %. {searched}",
+        f"The certificate took {asked} questions more.",
+    ]
+    caveats = (
+        [f"Report layouts were read for versions that this one comes from, too: look number {again}."]
+        if again > 1
+        else []
+    )
+    table = Table(
+        "Certificate, on report layouts",
+        ("dataset", f"{base.version}, %", f"{of.version}, %", "difference, points", "n"),
+        [
+            (name, shown(row[OLD]), shown(row[NEW]), shown(row["difference"], POINTS, "+"),
+             str(row["difference"].n))
+            for name, row in zip(names, rows, strict=True)
+        ],
+        f"{what.capitalize()}, paired by layout, 95 % intervals over layouts.",
+        terminal=range(5),
+    )  # fmt: skip
+    flat = [
+        {"dataset": name, "side": side, **ends(e)}
+        for name, row in zip(names, rows, strict=True) for side, e in row.items()
+    ]  # fmt: skip
+    return Study(
+        "optimize", f"{of.version}, from {base.version}, for {agent.name}", headline, [_about(of)],
+        [table, *tables], {**data, "certificate": pd.DataFrame(flat)}, manifest, manifest, caveats=caveats,
+    )  # fmt: skip
+
+
+def _about(of: Search) -> str:
+    return (
+        f"Engine: {of.engine}. Condition: {of.tune[0].points[0].name}. Score on tune layouts: success, "
+        "balanced over layouts with and without a danger where there are both, then the worth of what is "
+        "stated (the tree's probability of success if later actions are drawn evenly), then the shorter text."
+    )
+
+
+def _seeds(spec: Spec) -> str:
+    seeds = list(spec.source.layout_seeds)
+    return stated(min(seeds), max(seeds) - min(seeds) + 1)
+
+
+def _mean(tuning: Tuning, record: Record) -> float:
+    layouts = np.array(sorted(record.played))
+    return float(tuning.weights(layouts) @ [record.played[n].success for n in layouts.tolist()])
+
+
+def _row(tuning: Tuning, record: Record) -> dict[str, Any]:
+    layouts = np.array(sorted(record.played), dtype=int)
+    known = len(layouts) > 0
+    worth = [record.played[n].worth for n in layouts.tolist()]
+    return {
+        "wording": record.candidate.what, "sha256": record.candidate.key, "layouts": len(layouts),
+        "questions": len(record.asked), "characters": record.length,
+        "success": round(_mean(tuning, record), 6) if known else None,
+        "worth": round(float(tuning.weights(layouts) @ worth), 6) if known else None,
+    }  # fmt: skip
+
+
+def _tried_table(tried: Sequence[Mapping[str, Any]]) -> Table:
+    def cell(value: float | None, factor: float, form: str) -> str:
+        return "–" if value is None else format(factor * value, form)
+
+    return Table(
+        "Wordings tried, on tune layouts",
+        ("wording", "layouts", "success, %", "worth", "questions", "characters"),
+        [
+            (
+                row["wording"], str(row["layouts"]), cell(row["success"], 100, ".1f"),
+                cell(row["worth"], 1, ".3f"), str(row["questions"]), str(row["characters"]),
+            )
+            for row in tried
+        ],
+        "Success is balanced where there are layouts with and without a danger. A wording that was worse on "
+        "half of the layouts was not played on the rest. These layouts chose, so that the best one's figure "
+        "flatters it. Characters are those of the ego's prompt in the first decision point.",
+        terminal=range(5), most=12,
+    )  # fmt: skip

@@ -1,0 +1,236 @@
+"""Play candidates on tune layouts within a budget of questions, and say which is best.
+
+A candidate's score is its success, balanced over layouts with and without a danger where there are both, and
+a thousandth of the worth of what it states: the probability that the tree gives success if its policy decides
+once and all later actions are drawn evenly. So a layout more outweighs any worth, and worth decides between
+equals; of prompts with equal scores, the shorter is better.
+"""
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from itertools import chain, repeat
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.backends.base import Backend
+from harness.coordination.operating_point import AS_SENT, Rewrites
+from harness.core.arrays import Floats, Ints
+from harness.core.progress import Progress
+from harness.dataset.load import Dataset, Scene
+from harness.evaluate.asking import Asker, Places
+from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.spec import Spec
+from harness.evaluate.walk import Fuses, walk
+from harness.prompts.versions import Prompt
+from harness.runs.records import Answer, Latency
+from harness.studies.optimize.candidate import Candidate
+
+TIE = 1e-3  # weight of worth in a score
+
+
+class Spent(Exception):
+    """The budget does not suffice for what would be asked next."""
+
+
+class Decision(NamedTuple):
+    """One decision on a course, for feedback."""
+
+    dataset: Dataset  # of the layout alone
+    scene: Scene
+    policy: Floats  # what was stated, (A,)
+    action: int  # what was done
+    heard: tuple[Answer, ...]  # the answers of the helpers whose messages came in time
+    raw: str  # the ego's own answer
+
+
+class Played(NamedTuple):
+    """What a candidate did on one layout."""
+
+    success: float  # over the channel seeds
+    worth: float  # of what it stated, over the decisions in which success was still possible
+    course: tuple[Decision, ...]  # under the first channel seed
+
+    @property
+    def score(self) -> float:
+        return self.success + TIE * self.worth
+
+
+@dataclass
+class Record:
+    """What is known of a candidate."""
+
+    candidate: Candidate
+    length: int  # characters of the ego's prompt, in the first decision point of each family
+    played: dict[int, Played] = field(default_factory=dict)  # by the layout's number
+    asked: set[Hashable] = field(default_factory=set)  # the questions so far
+
+
+class Tuning:
+    """Scores candidates, each question once, until the budget is spent.
+
+    Attributes:
+        specs: the evaluations of the base on tune layouts, one a family; each has one condition.
+        base: the prompt that is searched.
+        budget: most questions.
+        records: every candidate that was played, by digest, in order.
+        spent: questions so far, those of an earlier, stopped search included.
+    """
+
+    def __init__(
+        self, specs: Sequence[Spec], budget: int, backend: Backend, latency: Latency,
+        place: Path, progress: Progress,
+    ) -> None:  # fmt: skip
+        """`place` is the folder of the answers so far; `progress` gets the number of questions."""
+        self.specs, self.base, self.budget = specs, specs[0].ego.prompt, budget
+        self.records: dict[str, Record] = {}
+        self.spent = 0
+        self._backend, self._latency, self._place, self._progress = backend, latency, place, progress
+
+    @cached_property
+    def layouts(self) -> list[tuple[int, int]]:
+        """The family and the number of each layout's episode; layouts are named by their place here."""
+        return [(n, e) for n, spec in enumerate(self.specs) for e in _dataset(spec).episodes]
+
+    @cached_property
+    def _dangerous(self) -> Floats:
+        return np.concatenate([_dataset(spec).dangerous for spec in self.specs])
+
+    @cached_property
+    def first_half(self) -> Ints:
+        """Every second layout of each family with a danger, and of those without."""
+        return np.sort(np.concatenate([np.flatnonzero(cell)[::2] for cell in self._cells()]))
+
+    def _cells(self) -> list[Floats]:
+        family = np.array([family for family, _ in self.layouts])
+        cells = [(family == n) & (self._dangerous == d) for n in range(len(self.specs)) for d in (0, 1)]
+        return [cell for cell in cells if cell.any()]
+
+    def weights(self, layouts: Ints) -> Floats:
+        """Return what each of some layouts counts, 1 in all: families alike, and both halves of each."""
+        family = np.array([self.layouts[n][0] for n in layouts])
+        weights = np.zeros(len(layouts))
+        for cell in self._cells():
+            inside = cell[layouts]
+            if inside.any():
+                halves = len(np.unique(self._dangerous[layouts][family == family[inside][0]]))
+                weights[inside] = 1 / (inside.sum() * halves)
+        return np.asarray(weights / weights.sum())
+
+    def play(self, candidate: Candidate, layouts: Iterable[int]) -> list[Played]:
+        """Return what a candidate does on some layouts. Raises Spent before the budget is exceeded."""
+        wanted = list(layouts)
+        record = self.records.get(candidate.key)
+        if record is None:
+            record = self.records[candidate.key] = Record(candidate, self._length(candidate.prompt))
+        for family in range(len(self.specs)):
+            missing = {self.layouts[n][1]: n for n in wanted if self.layouts[n][0] == family}
+            missing = {episode: n for episode, n in missing.items() if n not in record.played}
+            if missing:
+                played = self._walked(record, family, missing)
+                record.played.update({missing[episode]: each for episode, each in played.items()})
+        return [record.played[n] for n in wanted]
+
+    def score(self, candidate: Candidate, layouts: Ints) -> float:
+        """Return a candidate's score over some layouts. Raises Spent before the budget is exceeded."""
+        return float(self.weights(layouts) @ [each.score for each in self.play(candidate, layouts.tolist())])
+
+    def rank(self, candidate: Candidate) -> tuple[float, int]:
+        """Return what grows with how good a candidate is on all layouts."""
+        score = self.score(candidate, np.arange(len(self.layouts)))
+        return round(score, 9), -self.records[candidate.key].length
+
+    def best(self) -> Candidate:
+        """Return the best candidate of those that were played on all layouts; of equals the first."""
+        whole = [r.candidate for r in self.records.values() if len(r.played) == len(self.layouts)]
+        return max(whole, key=self.rank)
+
+    def _length(self, prompt: Prompt) -> int:
+        chats = [
+            changed(spec, prompt).ego.rendered(scene.graphs[scene.viewers[0]], spec.actions, (), words)
+            for spec in self.specs
+            for scene in spec.source.trial(1, ego_alone=True)
+            for words in [spec.scenario.prompt_words]
+        ]
+        return sum(len(message["content"]) for chat in chats for message in chat)
+
+    def _walked(self, record: Record, family: int, episodes: Mapping[int, int]) -> dict[int, Played]:
+        dataset = _dataset(self.specs[family]).of_episodes(episodes.keys())
+        spec = replace(changed(self.specs[family], record.candidate.prompt), source=FrozenSource(dataset))
+        kept = self._place / f"answers-{record.candidate.key[:16]}-{family}.jsonl"
+        asker = _Asker(self, record, spec, kept)
+        world, [point] = FrozenWorld(dataset, spec.points, spec.seeds), spec.points
+        decided = list(chain.from_iterable(walk(world, spec.points, asker, spec.ties)))
+        asker.settle()
+        forest, success = dataset.forest, world.ends(point)["success_rate"].mean(axis=0)
+        values: dict[int, list[float]] = {episode: [] for episode in episodes}
+        courses: dict[int, list[Decision]] = {episode: [] for episode in episodes}
+        for part in decided:
+            for row, at in enumerate(part.due.at.tolist()):
+                scene = part.decision_points[at]
+                node, policy = forest.place[scene.id], part.result.fused[row]
+                if forest.value[node]:
+                    values[scene.record.episode].append(float(policy @ forest.worth[node]))
+                if part.due.seed[row] == spec.seeds[0]:
+                    on_time = part.result.on_time[row]
+                    heard = [v for v, h in zip(scene.viewers[1:], on_time.tolist(), strict=False) if h]
+                    own, *theirs = (asker.answers.get(f"{scene.id}/{v}") for v in (scene.viewers[0], *heard))
+                    action, said = int(part.result.action[row]), tuple(filter(None, theirs))
+                    courses[scene.record.episode].append(
+                        Decision(dataset, scene, policy, action, said, own.raw if own else "")
+                    )
+        return {
+            episode: Played(
+                float(success[n]), float(np.mean(values[episode])) if values[episode] else 0.0,
+                tuple(courses[episode]),
+            )
+            for n, episode in enumerate(dataset.episodes)
+        }  # fmt: skip
+
+    def take(self, record: Record, questions: Iterable[Hashable]) -> None:
+        """Take new questions from the budget. Raises Spent, and takes none, if too few are left."""
+        new = set(questions) - record.asked
+        if self.spent + len(new) > self.budget:
+            raise Spent
+        record.asked |= new
+        self.spent += len(new)
+        self._progress.more(len(new))
+        self._progress(len(new))
+
+
+class _Asker(Asker):
+    """Takes questions from the budget before they are asked, also those that a stopped search asked."""
+
+    def __init__(self, tuning: Tuning, record: Record, spec: Spec, kept: Path) -> None:
+        super().__init__(spec, lambda: tuning._backend, tuning._latency, kept)
+        self._charge = partial(tuning.take, record)
+
+    def _ask_at(self, scenes: Sequence[Scene], places: Places | None = None, blind: bool = False) -> None:
+        viewers = (range(int(blind), len(self.spec.viewers(scene))) for scene in scenes)
+        wanted = [
+            (scene.id, place, blind)
+            for scene, there, asked in zip(scenes, viewers, places or repeat(None), strict=False)
+            for place in there if asked is None or place in asked
+        ]  # fmt: skip
+        self._charge(wanted)
+        super()._ask_at(scenes, places, blind)
+
+    def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
+        self._charge([(scenes[0].id, code, rewrites) for code in codes.tolist()])
+        return super().fusion_call(scenes, codes, rewrites)
+
+
+def changed(spec: Spec, prompt: Prompt) -> Spec:
+    """Return an evaluation with another prompt, of all agents that have the ego's."""
+    version = spec.ego.prompt.version
+    helpers = [
+        replace(each, prompt=prompt) if each.prompt.version == version else each for each in spec.helpers
+    ]
+    return replace(spec, ego=replace(spec.ego, prompt=prompt), helpers=tuple(helpers))
+
+
+def _dataset(spec: Spec) -> Dataset:
+    assert isinstance(spec.source, FrozenSource)
+    return spec.source.dataset
