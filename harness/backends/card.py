@@ -25,10 +25,10 @@ Share = Annotated[float, Meta(ge=0, le=1, description="a share, 0 to 1")]
 
 # Keys that only some engines understand; a `Registration` says which.
 _ENGINE_KEYS = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation",
-                "failures", "privileged", "vision", "projector", "system")  # fmt: skip
+                "failures", "privileged", "vision", "projector", "system", "adapter")  # fmt: skip
 # Keys that a model may set again for each further engine.
 _PER_ENGINE = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
-               "server", "projector")  # fmt: skip
+               "server", "projector", "adapter")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,8 @@ class Card:
     failures: Failures | None = None  # how often the proxy fails on purpose
     vision: Vision | None = None  # how the model takes pictures; None if it only reads text
     projector: str | None = None  # name of the GGUF file beside `file` that turns pictures into tokens
+    # folder of a LoRA adapter, absolute or beside the cards, that changes the weights; None without
+    adapter: str | None = None
     # `first-user` puts the system text at the beginning of the first user turn, for a chat template that has
     # no place for it; None gives it a message of its own.
     system: System | None = None
@@ -123,6 +125,8 @@ class Card:
         """Return the card as plain values, from which `convert` makes it again."""
         record = asdict(self)
         del record["letters"]  # the agent's settings say how its letters are read
+        if self.adapter is None:
+            del record["adapter"]
         if self.server:
             server = {key: value for key, value in record["server"].items() if value is not None}
             if self.server.fields:

@@ -12,6 +12,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from harness.backends import adapters
 from harness.backends.base import Letters
 from harness.backends.card import Card, Latency, System, Thinking, read_cards
 from harness.backends.gguf import read_facts
@@ -29,7 +30,7 @@ _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
 _SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
 # Keys that decide no answer, or whose effect is in the identity of the opened model.
 _PLACE = ("description", "latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
-          "licence", "projector", "letters")  # fmt: skip
+          "licence", "projector", "letters", "adapter")  # fmt: skip
 _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 
 
@@ -175,6 +176,8 @@ def _run_card(run: Path) -> Card:
 
 
 def _directory_card(text: str, where: Path, engine: str | None) -> Card:
+    if (where / adapters.CONFIG).is_file():
+        return _adapted(f"model directory {printable(text)!r}", where, engine)
     files = sorted(file for file in where.glob("*.gguf") if not file.name.startswith(PROJECTOR))
     if (where / "config.json").is_file() and engine != "llama-cpp":
         return _new_card(
@@ -197,6 +200,24 @@ def _directory_card(text: str, where: Path, engine: str | None) -> Card:
         f"model directory {printable(text)!r} holds no config.json and no .gguf file; "
         "give the directory of a transformers checkpoint, or a .gguf file"
     )
+
+
+def _adapted(shown: str, where: Path, engine: str | None) -> Card:
+    """Return the card of the model that an adapter names as its base, with the adapter."""
+    named = adapters.read_config(where, shown).get("base_model_name_or_path")
+    path = _path(str(named))
+    if path and path.is_dir() and (path / adapters.CONFIG).is_file():
+        raise UserError(f"{shown} is an adapter of an adapter; give one of a whole model")
+    base = resolve(str(named), engine)
+    if base.adapter or not registration(base.engine).capabilities.has_weights:
+        raise UserError(
+            f"{shown} is an adapter of {printable(named)!r}, which is no model with weights alone"
+        )
+    _, _, other = base.name.partition(":")
+    return replace(
+        base, name=f"{where.name}:{other}" if other else where.name, adapter=str(where),
+        description=f"Local adapter of {base.name}", letters=_letters(where),
+    )  # fmt: skip
 
 
 def _gguf_card(text: str, file: Path, engine: str | None) -> Card:

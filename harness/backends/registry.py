@@ -63,7 +63,7 @@ class Registration:
 
 _RULE = Capabilities(language_model=False, answer_modes=("json",), thinks="never", renders=False)
 _DECIDES = Capabilities(answer_modes=("decision",), thinks="never")
-_WEIGHTS = ("revision", "sha256", "gated")
+_WEIGHTS = ("revision", "sha256", "gated", "adapter")
 BUILT_IN: Mapping[str, Registration] = {
     "proxy": Registration("harness.backends.proxy:open", _RULE, card_keys=("failures",)),
     "driver": Registration(

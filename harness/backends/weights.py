@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from harness.backends import packages
+from harness.backends.adapters import find_adapter
 from harness.backends.card import Card
 from harness.backends.gguf import ModelFacts, read_facts
 from harness.backends.registry import capabilities, import_object, locate, missing_package, registration
@@ -28,6 +29,7 @@ _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 
 def find_checkpoint(card: Card) -> Path:
     """Find the directory of a card's checkpoint: as given, beside the cards, or in the hub's cache."""
+    find_adapter(card)
     local = find("models", card.weights or "")
     where = local if local.is_dir() else _snapshot(card)
     if where is None:
@@ -59,6 +61,7 @@ def _check_files(card: Card, checkpoint: Path) -> None:
 
 def find_gguf(card: Card) -> Path:
     """Find the GGUF file of a card: as given, beside the cards, out of a package, or in the hub's cache."""
+    find_adapter(card)
     if wanted := packages.find_packaged(card):
         if not wanted.place.is_file():
             raise UserError(

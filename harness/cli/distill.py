@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -9,11 +10,18 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.core import extras
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, unknown
 from harness.core.seeds import FIRST, purpose, stated
+
+if TYPE_CHECKING:
+    from harness.backends.card import Card
 
 SAMPLES = "60000,160000,30000,50000"
 BATCH = 16
+RANK = 16
+RATES = {True: 1e-3, False: 1e-4}  # with an adapter, and without
+MOST = 512  # of a rank
+DTYPES = ("float32", "bfloat16")
 
 
 def command(
@@ -24,16 +32,27 @@ def command(
     prompt: list[str] = typer.Option(
         ["v2", "v4"], help="Prompt version to learn; it is used in the scenarios that it fits. Repeatable."
     ),
-    base: Path | None = typer.Option(
+    base: str | None = typer.Option(
         None,
-        help="Folder of a distilled text model to start from; its tokenizer is kept. Default: from scratch.",
+        help="Model to begin as, by card, folder, .gguf file or hub id. Default: random weights.",
+    ),
+    lora: bool = typer.Option(
+        False, "--lora", help="Train an adapter of a published base and keep its weights as they are."
+    ),
+    rank: int | None = typer.Option(None, help=f"Rank of the adapter. Default: {RANK}."),
+    rate: float | None = typer.Option(
+        None,
+        help=f"Learning rate for a published base. Default: {RATES[False]:g}; {RATES[True]:g} with --lora.",
+    ),
+    dtype: str = typer.Option(
+        DTYPES[0], help="What layers of a published base compute in: float32 or bfloat16."
     ),
     layouts: int = typer.Option(240, help="Number of layouts of each scenario."),
     first_seed: int = typer.Option(
         FIRST["train"], help="Layout seed of the first layout; train seeds are 100000 to 199999."
     ),
     samples: str = typer.Option(
-        SAMPLES, help="Training sequences of the four stages excerpts, alone, messages and answers."
+        SAMPLES, help="Sequences of the stages excerpts, alone, messages and answers; 0 leaves one out."
     ),
     seed: int = typer.Option(0, help="Seed of the initial weights and of the order of the sequences."),
     batch: int = typer.Option(BATCH, help="Sequences per training step."),
@@ -41,10 +60,10 @@ def command(
     threads: int | None = typer.Option(None, help="Number of CPU threads. Default: PyTorch's choice."),
     workers: options.Workers = "2",
 ) -> None:
-    """Train a small Qwen3 to imitate the planner in some scenarios.
+    """Train a small Qwen3, or a published model, to imitate the planner in some scenarios.
 
-    With an image prompt it is a Qwen3-VL, which takes pictures and text. If the training is stopped, the same
-    command continues it.
+    With an image prompt the small one is a Qwen3-VL, which takes pictures and text. If the training is
+    stopped, the same command continues it.
     """
     from harness.prompts import versions as prompts
 
@@ -52,11 +71,7 @@ def command(
     for flag, value, least in (("--batch", batch, 1), ("--threads", threads, 1), ("--seed", seed, 0)):
         if value is not None and value < least:
             raise UserError(f"{flag} {value}: give {least} or more")
-    if base and not all((base / name).is_file() for name in ("model.safetensors", "tokenizer.json")):
-        raise UserError(
-            f"--base {printable(base)}: no model.safetensors with a tokenizer.json; give the folder of a "
-            "model that `harness model distill` made"
-        )
+    start, adapt = _base(base, lora, rank, rate, dtype)
     versions = [prompts.load(version) for version in dict.fromkeys(prompt)]
     driven = [ready_to_drive(name, layouts, first_seed) for name in dict.fromkeys(scenario)]
     if purpose(first_seed, layouts) != "train":
@@ -74,23 +89,26 @@ def command(
     # A stage has a batch at least, and that of messages takes a scene for four sequences of each prompt.
     counts = _counts(samples, max(batch, 4 * sum(map(len, learnt.values()))))
 
+    from harness.backends.card import Card
     from harness.backends.transformers.engine import choose_device
     from harness.training.distill import Curriculum
     from harness.training.distill import distill as run
+    from harness.training.published import Adapt
     from harness.training.train import STAGES, Plan
 
-    plan = Plan(dict(zip(STAGES, counts, strict=True)), batch=batch, seed=seed)
+    how = Adapt(*adapt) if isinstance(start, Card) else None
+    plan = Plan(dict(zip(STAGES, counts, strict=True)), batch=batch, seed=seed, adapt=how)
     begun_s = time.monotonic()
     drawn = layouts * len(learnt)
     with bar("drawing layouts", drawn) as progress:
 
-        def show(stage: str, seen: int, loss: float) -> None:
-            progress.label = f"{stage} loss {loss:.3f}"
+        def show(stage: str, seen: int, loss: float, kl: float | None = None) -> None:
+            progress.label = f"{stage} loss {loss:.3f}" + ("" if kl is None else f", held-out KL {kl:.3f}")
             progress.more(drawn + sum(counts) - progress.total)
             progress(drawn + sum(counts[: STAGES.index(stage)]) + seen - progress.done)
 
         facts = run(
-            Curriculum(learnt, layouts, first_seed, base), plan, out, progress, show, choose_device(device),
+            Curriculum(learnt, layouts, first_seed, start), plan, out, progress, show, choose_device(device),
             threads, options.workers_of(workers),
         )  # fmt: skip
     for apart in facts["held_out"]:
@@ -109,8 +127,39 @@ def _counts(text: str, least: int) -> list[int]:
         counts = [int(part) for part in text.split(",")]
     except ValueError:
         counts = []
-    if len(counts) != len(SAMPLES.split(",")) or min(counts) < least:
+    if len(counts) != len(SAMPLES.split(",")) or not any(counts) or any(0 != n < least for n in counts):
         raise UserError(
-            f"--samples {printable(text)}: give four whole numbers, such as {SAMPLES}, {least} or more each"
+            f"--samples {printable(text)}: give four whole numbers, such as {SAMPLES}, {least} or more each, "
+            "or 0 to leave a stage out"
         )
     return counts
+
+
+def _base(
+    text: str | None, lora: bool, rank: int | None, rate: float | None, dtype: str
+) -> "tuple[Path | Card | None, tuple[int | None, float, Any]]":
+    """Return what a model begins as, and how a published one is changed: rank, learning rate, number format.
+
+    That is the folder of a model of texts that was distilled here, or the card of a published one.
+    """
+    from harness.backends import cards
+
+    if rank is not None and not lora:
+        raise UserError(f"--rank {rank} goes with --lora, which trains an adapter")
+    for flag, value in (("--rank", rank), ("--rate", rate)):
+        if value is not None and not 0 < value <= MOST:
+            raise UserError(f"{flag} {value:g}: give more than 0 and at most {MOST}")
+    if dtype not in DTYPES:
+        raise unknown("--dtype", dtype, DTYPES)
+    adapt = (rank or RANK if lora else None, rate or RATES[lora], dtype)
+    folder = Path(text or "")
+    ours = (cards.DISTILLED, "model.safetensors", "tokenizer.json")
+    if text and not lora and all((folder / name).is_file() for name in ours):
+        text, start = None, folder
+    elif text:
+        return cards.resolve(text, "transformers"), adapt
+    else:
+        start = None
+    if lora or rate or dtype != DTYPES[0]:
+        raise UserError("--lora, --rate and --dtype go with --base, a published model")
+    return start, adapt

@@ -9,17 +9,20 @@ from typing import Any
 import torch
 import transformers
 
+from harness.backends.card import Card
 from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, sha256_bytes, sha256_file, write_whole
 from harness.core.formats import WORK
 from harness.core.parallel import Workers
 from harness.prompts.versions import Prompt
+from harness.training import published
 from harness.training.gguf_export import export
 from harness.training.lessons import draw
 from harness.training.model import WEIGHTS, save_tokenizer
 from harness.training.student import Progress, Student
 from harness.training.train import STAGES, Plan
+from harness.world import scenarios
 from harness.world.scenario import Scenario
 
 FACTS = "training.json"  # written last
@@ -32,8 +35,19 @@ class Curriculum:
     prompts: Mapping[Scenario, tuple[Prompt, ...]]  # of each scenario, the versions that are learnt
     layouts: int  # how many of each scenario
     seed: int  # layout seed of the first
-    # folder of the model of texts that it begins as; None begins with random weights
-    base: Path | None = None
+    # folder of a model of texts that was distilled here, which it begins as, or the card of a published one;
+    # None begins with random weights
+    base: Path | Card | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.base, Card):
+            return
+        name = printable(self.base.name)
+        if self.base.vision or self.base.adapter:
+            has = "takes pictures" if self.base.vision else "has an adapter already"
+            raise UserError(f"--base {name} {has}; give a plain model of texts")
+        if any(prompt.image for prompts in self.prompts.values() for prompt in prompts):
+            raise UserError(f"--base {name} is taught texts alone; leave image prompts out of --prompt")
 
     def settings(self) -> dict[str, Any]:
         """Return, as plain values, what a resumed training must have in common with its start."""
@@ -45,7 +59,8 @@ class Curriculum:
             "prompts": {p.version: p.sha256 for prompts in self.prompts.values() for p in prompts},
             "layouts": self.layouts,
             "first_seed": self.seed,
-            "base_sha256": self.base and sha256_file(self.base / WEIGHTS),
+            "base_sha256": sha256_file(self.base / WEIGHTS) if isinstance(self.base, Path) else None,
+            **({"base": published.base_name(self.base)} if isinstance(self.base, Card) else {}),
         }
 
 
@@ -97,19 +112,33 @@ def _trained(learnt: Mapping[str, Any], student: Student, out: Path, progress: P
     facts = {
         **learnt,
         "scenes": {each.scenario.name: len(each.scenes) for each in student.lessons},
+        "spellings": [scenarios.argument(each.scenario) for each in student.lessons],
         "plan": asdict(plan),
-        "parameters": sum(p.numel() for p in student.model.parameters()),
-        "vocabulary": student.tokenizer.get_vocab_size(),
-        "sees": hasattr(student.model.config, "vision_config"),
+        "parameters": sum(p.numel() for p in student.model.parameters() if p.requires_grad),
         "held_out": student.held_out_kl(),
         "curves": curves,
     }
     student.model.eval()
+    if student.published:
+        facts |= {"base_sha256": student.published.sha256, "licence": student.published.card.licence}
+        student.published.write(out, weights)
+        return _described(out, facts, published.model_card)
+    facts |= {
+        "vocabulary": student.tokenizer.get_vocab_size(),
+        "sees": hasattr(student.model.config, "vision_config"),
+    }
     transformers.utils.logging.disable_progress_bar()  # of a file that is written in no time
     student.model.save_pretrained(out, state_dict=weights)
     save_tokenizer(student.tokenizer, out)
     export(out, out / f"{out.absolute().name}-f16.gguf")
-    write_whole(out / "README.md", model_card(out.absolute().name, facts))
+    return _described(out, facts, model_card)
+
+
+def _described(
+    out: Path, facts: dict[str, Any], card: Callable[[str, Mapping[str, Any]], str]
+) -> dict[str, Any]:
+    """Write the facts for people and for programs, and return them."""
+    write_whole(out / "README.md", card(out.absolute().name, facts))
     write_whole(out / FACTS, json.dumps(facts, indent=1) + "\n")
     return facts
 

@@ -49,6 +49,8 @@ class Point(msgspec.Struct, frozen=True):
 
     record: Record
     label: list[float]  # soft label, (A,)
+    # seconds until the episode succeeds after each action, (A,), null for never; None in older files
+    ends_s: list[float | None] | None = None
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,8 @@ def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
                 if np.isfinite(list(ends_s.values())).any():
                     taken += 1
                     record = record_of(world, state, number, (state.ego, *state.helpers))
-                    points.append(Point(record, label(ends_s).tolist()))
+                    seconds = [s if np.isfinite(s) else None for s in ends_s.values()]
+                    points.append(Point(record, label(ends_s).tolist(), seconds))
             following.update({scene_id(number, child.state()): child for child in children})
         level = list(following.values())
     return points

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from harness.backends.card import Card
 from harness.backends.tokens import token_ids, whole
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
@@ -16,15 +17,16 @@ from harness.prompts import readout
 from harness.training.answers import CLASSES, answer, evidence, sights
 from harness.training.lessons import Lessons
 from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
+from harness.training.published import Published
 from harness.training.questions import Question, alone, excerpts, key, kl_nats, with_messages
-from harness.training.train import Plan, Sample, read_out, run_stage, save
+from harness.training.train import Curve, Plan, Sample, learnt, read_out, restore, run_stage, save
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
 BARE = 0.25  # texts without free text, as constrained answers are; a share of all that can be
 HELD_OUT = 0.05  # layouts that are not trained on, a share of all
+WATCHED = 256  # most questions of held-out layouts that are read along the way
 
-
-Progress = Callable[[str, int, float], None]
+Progress = Callable[..., None]  # of the stage, the sequences seen in it, the loss, and the KL if watched
 T = TypeVar("T")
 
 
@@ -32,22 +34,28 @@ class Student:
     """The lessons as questions, the tokenizer, and the model as it grows."""
 
     def __init__(
-        self, lessons: Sequence[Lessons], plan: Plan, work: Path, device: str, base: Path | None = None
+        self, lessons: Sequence[Lessons], plan: Plan, work: Path, device: str, base: Path | Card | None = None
     ) -> None:
         self.plan, self.work = plan, work
         self.lessons, self.held_out = zip(*(each.split(HELD_OUT) for each in lessons), strict=True)
         self.questions = [q for each in self.lessons for q in alone(each)]
         sees = any(p.image for each in lessons for p in each.prompts)
-        self.tokenizer = read_tokenizer(base, sees) if base else self._tokenizer(sees)
         most = max((each.scenario.actions for each in lessons), key=len)
+        self._shared: dict[str, Any] = {}
+        self.taught: dict[str, Floats] = {}  # by scenario, scene and viewer
+        self.published, self.digits = None, list[int]()
+        if isinstance(base, Card):
+            assert plan.adapt
+            self.published = Published(base, plan.adapt, plan.seed, device)
+            self.model, self.letters = self.published.model, self.published.letters(readout.letters(most))
+            return
+        self.tokenizer = read_tokenizer(base, sees) if base else self._tokenizer(sees)
         self.letters = [self.tokenizer.token_to_id(x) for x in readout.letters(most)]
         self.digits = [self.tokenizer.token_to_id(str(digit)) for digit in range(CLASSES)]
         self.model = new_model(self.tokenizer, plan.seed, sees)
         if base:
             take_over(self.model, base)
         self.model.to(device)
-        self._shared: dict[str, Any] = {}
-        self.taught: dict[str, Floats] = {}  # by scenario, scene and viewer
         if base and sees:
             texts = [q for q in self.questions if q.image is None]
             read = self.read(self.reading(texts))
@@ -67,14 +75,14 @@ class Student:
             target = self.taught.get(_place(q), q.label) if q.image else q.label
             letter = readout.letters(q.actions)[rng.choice(len(q.actions), p=target)]
             report = sights(q.graph) if seen and q.image else evidence(q.graph, q.named)
-            samples.append(self._sample(q, q.read_out, f"{letter}: {report}{END}", target))
+            samples.append(self._sample(q, q.read_out, f"{letter}: {report}", target))
         return samples
 
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
         """Make samples whose answer states a distribution."""
         bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
         replies = [
-            answer(q.prompt, q.graph, p, q.actions, bare=bool(b), named=q.named) + END
+            answer(q.prompt, q.graph, p, q.actions, bare=bool(b), named=q.named)
             for q, p, b in zip(questions, intents, bare, strict=True)
         ]
         return [self._sample(q, q.messages, text, None) for q, text in zip(questions, replies, strict=True)]
@@ -123,13 +131,14 @@ class Student:
             return self.reading(list(excerpts(self.questions)), seen=True)
         if stage == "alone":
             return self.asked
-        with_heard = self.reading(self.heard)
+        heard = self.heard if self.plan.samples["messages"] else []
+        with_heard = self.reading(heard)
         if stage == "messages":
-            return with_heard + self.some(self.asked, len(self.heard))
+            return with_heard + self.some(self.asked, len(heard))
         # As many texts of the ego, alone and with messages, as of all helpers: each decision needs the ego's.
         pairs = list(zip(self.questions, self.asked, strict=True))
         kinds = [[pair for pair in pairs if pair[0].graph.role == role] for role in ("helper", "ego")]
-        kinds.append(list(zip(self.heard, with_heard, strict=True)))
+        kinds.append(list(zip(heard, with_heard, strict=True)))
         most = self.plan.samples["answers"] // 6
         stated = [pair for kind in kinds for pair in self.some(kind, most)]
         texts = self.writing([q for q, _ in stated], self.read([sample for _, sample in stated]))
@@ -140,27 +149,40 @@ class Student:
         places = np.random.default_rng(self.plan.seed).permutation(len(items))[:most]
         return [items[i] for i in sorted(places)]
 
-    def stage(self, name: str, progress: Progress) -> list[tuple[int, float]]:
-        """Train one stage, or read it if it is done already; return its curve."""
+    def stage(self, name: str, progress: Progress) -> Curve:
+        """Train one stage, or read it if it is done already; return its curve, empty without sequences."""
         done = self.work / f"{name}.pt"
         if done.is_file():
-            state = torch.load(done, weights_only=True)
-            self.model.load_state_dict(state["model"])
+            state = torch.load(done, weights_only=True, map_location=self.model.device)
+            restore(self.model, state["model"])
             return [tuple(point) for point in state["curve"]]
         going = self.work / f"{name}.going.pt"
         count, show = self.plan.samples[name], partial(progress, name)
+        if not count:
+            return []
         curve = run_stage(
-            self.model, self.samples(name), self.letters, self.digits, count, self.plan, show, going
-        )
-        save({"model": self.model.state_dict(), "curve": curve}, done)
+            self.model, self.samples(name), self.letters, self.digits, count, self.plan, show, going,
+            self._watched if self.published else None,
+        )  # fmt: skip
+        save({"model": learnt(self.model), "curve": curve}, done)
         going.unlink(missing_ok=True)
         return curve
 
+    @cached_property
+    def _watched_samples(self) -> tuple[list[Sample], Floats]:
+        questions = self.some([q for each in self.held_out for q in alone(each)], WATCHED)
+        return self.reading(questions), np.stack([q.label for q in questions])
+
+    def _watched(self) -> float:
+        """Return the KL (nats) on some questions of held-out layouts."""
+        samples, labels = self._watched_samples
+        return kl_nats(labels, np.stack(self.read(samples)))
+
     def rounded(self) -> dict[str, Any]:
-        """Round the model's weights to F16, so that every engine reads the same numbers, and return them."""
+        """Round what learnt to F16, so that every engine reads the same numbers, and return all weights."""
         halves: dict[int, Any] = {}  # by address, since some have two names
         with torch.no_grad():
-            for p in self.model.parameters():
+            for p in (p for p in self.model.parameters() if p.requires_grad):
                 halves[p.data_ptr()] = half = p.half()
                 p.copy_(half)
         return {name: halves.get(p.data_ptr(), p) for name, p in self.model.state_dict().items()}
@@ -175,13 +197,17 @@ class Student:
             questions = list(alone(each))
             labels = np.stack([q.label for q in questions])
             mean = np.broadcast_to(labels.mean(axis=0), labels.shape)
+            read = np.stack(self.read(self.reading(questions)))
+            actions = each.scenario.actions
+            shares = np.bincount(read.argmax(axis=1), minlength=len(actions)) / len(questions)
             facts.append(
                 {
                     "scenario": each.scenario.name,
                     "layouts": len(each.episodes),
                     "questions": len(questions),
-                    "kl_nats": kl_nats(labels, np.stack(self.read(self.reading(questions)))),
+                    "kl_nats": kl_nats(labels, read),
                     "kl_of_the_mean_nats": kl_nats(labels, mean),
+                    "likeliest": dict(zip(actions, shares.tolist(), strict=True)),
                 }
             )
         return facts
@@ -192,11 +218,15 @@ class Student:
     def _sample(
         self, question: Question, messages: Sequence[Mapping[str, str]], reply: str, target: Floats | None
     ) -> Sample:
+        if self.published:
+            prompt, shared, kind = self.published.read(messages)
+            ids = np.concatenate([prompt, self.published.encode(reply + self.published.end)], dtype=np.int32)
+            return Sample(ids, shared, kind, len(prompt), target, question.weight)
         system, rest = chat(messages)
         if system not in self._shared:
             self._shared[system] = self._encode(system)
         head, asked = self._shared[system], self._encode(rest)
-        ids = np.concatenate([head, asked, self._encode(reply)])
+        ids = np.concatenate([head, asked, self._encode(reply + END)])
         answer_at = len(head) + len(asked)
         return Sample(ids, len(head), system, answer_at, target, question.weight, question.image)
 

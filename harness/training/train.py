@@ -15,7 +15,7 @@ numbers in it has to come from somewhere. For the same reason each token of a pi
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -31,10 +31,11 @@ from harness.core.files import replacing
 from harness.training.answers import cells
 from harness.training.model import image_processor
 from harness.training.muon import Muon
+from harness.training.published import Adapt
 from harness.world.perception.camera import Sight
 
 STAGES = ("excerpts", "alone", "messages", "answers")
-PROMPT_WEIGHT = 0.3  # of the cross-entropy of the prompt's own tokens
+PROMPT_WEIGHT = 0.3  # of the cross-entropy of the prompt's own tokens, for a model that cannot read yet
 TEXT_WEIGHT = 3.0  # of that of the answer's: two thirds of these say nothing, and would drown the numbers
 LOG_STEPS = 50  # the loss is averaged over so many steps
 CELLS_WEIGHT = 1.0  # of the cross-entropy of what each token of a picture shows
@@ -68,56 +69,94 @@ class Plan:
     muon_lr: float = 3e-3  # learning rate of the matrices (Muon)
     adam_lr: float = 3e-3  # learning rate of embeddings and norms (AdamW)
     seed: int = 0  # of the weights and of the order
+    adapt: Adapt | None = None  # how a published model is changed; None for one of ours
+
+    @property
+    def prompt_weight(self) -> float:
+        """Weight of the cross-entropy of the prompt's own tokens: a published model can read."""
+        return 0.0 if self.adapt else PROMPT_WEIGHT
+
+
+Curve = list[tuple[Any, ...]]  # sequences seen, mean loss, and the held-out KL if it is watched
 
 
 def run_stage(
     model: Any, samples: Sequence[Sample], letters: Sequence[int], digits: Sequence[int], count: int,
-    plan: Plan, progress: Callable[[int, float], None], going: Path,
-) -> list[tuple[int, float]]:  # fmt: skip
+    plan: Plan, progress: Callable[..., None], going: Path, watch: Callable[[], float] | None = None,
+) -> Curve:  # fmt: skip
     """Train on `count` sequences drawn from `samples`, resuming from the checkpoint `going` if there is one.
 
     `letters` and `digits` are the ids of the tokens that a read-out and a picture's tokens are fitted to.
-    Returns, along the way, the sequences seen and the mean loss since the last.
+    Returns, along the way, the sequences seen, the mean loss since the last, and what `watch` returns then.
     """
     device = next(model.parameters()).device
-    blocks = [p for n, p in model.named_parameters() if p.ndim == 2 and "embed" not in n]
-    rest = [p for n, p in model.named_parameters() if p.ndim != 2 or "embed" in n]
-    opts = [
-        Muon(blocks, lr=plan.muon_lr, weight_decay=0.05),
-        torch.optim.AdamW(rest, lr=plan.adam_lr, weight_decay=0.0, betas=(0.9, 0.98)),
-    ]
+    opts, rates = _optimizers(model, plan)
     batches = _batches(samples, count, plan)
     start, curve = 0, []
+    losses: list[Any] = []
     if going.is_file():
-        state = torch.load(going, weights_only=True)
-        model.load_state_dict(state["model"])
+        state = torch.load(going, weights_only=True, map_location=device)
+        restore(model, state["model"])
         for opt, kept in zip(opts, state["opts"], strict=True):
             opt.load_state_dict(kept)
         start, curve = state["step"], [tuple(point) for point in state["curve"]]
+        losses = list(state.get("losses", ()))
     letter_ids, digit_ids = (torch.tensor(ids, device=device) for ids in (letters, digits))
     model.train()
-    losses: list[float] = []
     kept_s = time.monotonic()
     for step in range(start, len(batches)):
         scale = max(0.02, min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / len(batches))))
-        for opt, rate in zip(opts, (plan.muon_lr, plan.adam_lr), strict=True):
+        for opt, rate in zip(opts, rates, strict=True):
             opt.param_groups[0]["lr"] = rate * scale
-        loss = loss_of(model, [samples[i] for i in batches[step]], letter_ids, digit_ids)
+        batch = [samples[i] for i in batches[step]]
+        loss = loss_of(model, batch, letter_ids, digit_ids, plan.prompt_weight)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         for opt in opts:
             opt.step()
             opt.zero_grad(set_to_none=True)
-        losses.append(float(loss.detach()))
+        losses.append(loss.detach())  # not yet a number: a GPU need not wait for it
         if (step + 1) % LOG_STEPS == 0 or step + 1 == len(batches):
-            curve.append(((step + 1) * plan.batch, float(np.mean(losses))))
+            mean = float(torch.stack(losses).double().mean())
+            curve.append(((step + 1) * plan.batch, mean, *([watch()] if watch else [])))
+            model.train()
             progress(*curve[-1])
             losses = []
-            if time.monotonic() - kept_s > KEEP_S:
-                kept_s = time.monotonic()
-                states = [opt.state_dict() for opt in opts]
-                save({"model": model.state_dict(), "opts": states, "step": step + 1, "curve": curve}, going)
+        if time.monotonic() - kept_s > KEEP_S and step + 1 < len(batches):
+            states = [opt.state_dict() for opt in opts]
+            save(
+                {"model": learnt(model), "opts": states, "step": step + 1, "curve": curve, "losses": losses},
+                going,
+            )
+            kept_s = time.monotonic()
     return curve
+
+
+def _optimizers(model: Any, plan: Plan) -> tuple[list[Any], list[float]]:
+    """Return what moves the weights that learn, and its learning rates."""
+    learning = [(n, p) for n, p in model.named_parameters() if p.requires_grad]
+    if plan.adapt:
+        every = [p for _, p in learning]
+        return [torch.optim.AdamW(every, lr=plan.adapt.rate, weight_decay=0.0, betas=(0.9, 0.98))], [
+            plan.adapt.rate
+        ]
+    blocks = [p for n, p in learning if p.ndim == 2 and "embed" not in n]
+    rest = [p for n, p in learning if p.ndim != 2 or "embed" in n]
+    return [
+        Muon(blocks, lr=plan.muon_lr, weight_decay=0.05),
+        torch.optim.AdamW(rest, lr=plan.adam_lr, weight_decay=0.0, betas=(0.9, 0.98)),
+    ], [plan.muon_lr, plan.adam_lr]
+
+
+def learnt(model: Any) -> dict[str, Any]:
+    """Return a model's state without the weights that do not learn."""
+    frozen = {name for name, p in model.named_parameters() if not p.requires_grad}
+    return {name: value for name, value in model.state_dict().items() if name not in frozen}
+
+
+def restore(model: Any, state: Mapping[str, Any]) -> None:
+    """Give a model the state that `learnt` returned."""
+    model.load_state_dict({**model.state_dict(), **state})
 
 
 def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.int64]:
@@ -149,12 +188,14 @@ def hidden_states(model: Any, batch: Sequence[Sample]) -> Any:
     device = next(model.parameters()).device
     shared = batch[0].shared
     cache = DynamicCache(config=model.config)
-    first = torch.from_numpy(batch[0].ids[None, :shared].astype(np.int64)).to(device)
-    model.model(first, past_key_values=cache, use_cache=True)
-    cache.batch_repeat_interleave(len(batch))
     ids = _padded([s.ids for s in batch]).to(device)
+    model.base_model(ids[:1, :shared], past_key_values=cache, use_cache=True)
+    cache.batch_repeat_interleave(len(batch))
     options = _pictures(model, batch, ids)
-    return model.model(ids[:, shared:], past_key_values=cache, use_cache=True, **options).last_hidden_state
+    states = model.base_model(ids[:, shared:], past_key_values=cache, use_cache=True, **options)
+    return (
+        states.last_hidden_state.float()
+    )  # letters are told apart in float32, whatever the layers compute in
 
 
 def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
@@ -171,14 +212,18 @@ def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
     return {**patches, "position_ids": places[:, :, batch[0].shared :]}
 
 
-def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any) -> Any:
+def loss_of(
+    model: Any, batch: Sequence[Sample], letters: Any, digits: Any, prompt_weight: float = PROMPT_WEIGHT
+) -> Any:
     """Return the KL of the read-out to its target (nats) plus mean cross-entropies of text and pictures."""
     hidden = hidden_states(model, batch)
-    weight, device, shared = model.get_input_embeddings().weight, hidden.device, batch[0].shared
+    weight, device, shared = model.get_output_embeddings().weight, hidden.device, batch[0].shared
     rest = _padded([s.ids[shared:] for s in batch]).to(device)
     picture = rest == getattr(model.config, "image_token_id", -1)  # a model of texts has no such token
     pictures = [s.image for s in batch if s.image is not None]  # of all or of none
-    total = PROMPT_WEIGHT * _prompt_loss(hidden, weight, batch, rest, picture)
+    total = hidden.new_zeros(())
+    if prompt_weight:
+        total = prompt_weight * _prompt_loss(hidden, weight, batch, rest, picture)
     if pictures:
         total = total + CELLS_WEIGHT * _cells_loss(hidden[picture] @ weight[digits].T, pictures)
     targets = {i: s.target for i, s in enumerate(batch) if s.target is not None}
@@ -229,7 +274,7 @@ def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batc
     """Return the distribution over the letters after each prompt, (A,) each."""
     model.eval()
     device = next(model.parameters()).device
-    of_letters = model.get_input_embeddings().weight[torch.tensor(letters, device=device)]
+    of_letters = model.get_output_embeddings().weight[torch.tensor(letters, device=device)]
     p: dict[int, Floats] = {}
     order = sorted(range(len(samples)), key=lambda i: (samples[i].kind, samples[i].answer_at))
     for _, group in groupby(order, key=lambda i: samples[i].kind):
@@ -255,7 +300,7 @@ def _padded(rows: Sequence[NDArray[np.int32]]) -> Any:
     return torch.from_numpy(ids)
 
 
-def save(state: dict[str, Any], path: Path) -> None:
+def save(state: Mapping[str, Any], path: Path) -> None:
     """Write a checkpoint, whole or not at all."""
     with replacing(path) as part:
         torch.save(state, part)

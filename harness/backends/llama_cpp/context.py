@@ -120,6 +120,7 @@ class LlamaContext:
         self._context = c.llama_init_from_model(self._model.pointer, params)
         if not self._context:
             raise RuntimeError(f"no memory for {self._sequences} x {self._room} tokens: {last_error()}")
+        self._model.adapt(self._context)
 
     def _fill(self) -> None:
         """Compute all sequences again, sorted, so that each shares its longest beginning with the last."""

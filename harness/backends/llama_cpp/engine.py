@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import llama_cpp as c
 import numpy as np
 
+from harness.backends.adapters import find_adapter_gguf
 from harness.backends.card import Card
 from harness.backends.chat import Chat
 from harness.backends.engine import Session, check_logits, common_beginning, common_length, group_by_beginning
@@ -35,7 +36,7 @@ def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> La
     most = c.llama_max_parallel_sequences() - BEGINNINGS
     if batch_size > most:
         raise UserError(f"batch size {batch_size}; llama.cpp takes {most} at most")
-    model = LlamaModel(card.name, file, device)
+    model = LlamaModel(card.name, file, device, find_adapter_gguf(card))
     projector = None
     if card.vision and card.projector:
         projector = Projector(card.name, file.with_name(card.projector), model, card.vision)
@@ -173,6 +174,7 @@ class LlamaEngine:
             "device": self._model.device,
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
             **({"system": self.chat.system} if self.chat.system else {}),
+            **({"adapter_sha256": sha256_file(self._model.adapter_file)} if self._model.adapter_file else {}),
         }
 
     @cached_property

@@ -29,9 +29,9 @@ def last_error() -> str:
 
 
 class LlamaModel:
-    """A loaded model, and the `harness.backends.chat.Tokenizer` in its file."""
+    """A loaded model, perhaps with a LoRA adapter, and the `harness.backends.chat.Tokenizer` in its file."""
 
-    def __init__(self, name: str, file: Path, device: str | None) -> None:
+    def __init__(self, name: str, file: Path, device: str | None, adapter: Path | None = None) -> None:
         c.llama_log_set(keep_errors, ctypes.c_void_p(0))
         shown = f"model {name!r} in {printable(file)}"
         if device not in (None, "cpu") and not (device == "gpu" and c.llama_supports_gpu_offload()):
@@ -46,6 +46,13 @@ class LlamaModel:
         self.pointer = c.llama_model_load_from_file(bytes(file), params)
         if not self.pointer:
             raise UserError(f"{shown} does not load: {last_error()}; copy or download the file again")
+        self.adapter_file = adapter
+        self._adapter = adapter and c.llama_adapter_lora_init(self.pointer, bytes(adapter))
+        if adapter and not self._adapter:
+            raise UserError(
+                f"{shown}: {printable(adapter)} is no adapter of this model: {last_error()}; give the "
+                "adapter that was trained on it"
+            )
         self._vocab = c.llama_model_get_vocab(self.pointer)
         self.vocabulary: int = c.llama_vocab_n_tokens(self._vocab)
         if not self.vocabulary or c.llama_vocab_type(self._vocab) == c.LLAMA_VOCAB_TYPE_NONE:
@@ -71,6 +78,13 @@ class LlamaModel:
             self.pointer
         )
         self.device = "gpu" if c.llama_supports_gpu_offload() and device != "cpu" else "cpu"
+
+    def adapt(self, context: int) -> None:
+        """Have a new context of the model heed the adapter, if there is one."""
+        if self._adapter:
+            adapters = (c.llama_adapter_lora_p_ctypes * 1)(self._adapter)
+            if c.llama_set_adapters_lora(context, adapters, 1, (ctypes.c_float * 1)(1.0)):
+                raise RuntimeError(f"llama.cpp takes no adapter here: {last_error()}")
 
     def encode(self, text: str) -> list[int]:
         data = text.encode(errors="replace")

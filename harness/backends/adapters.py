@@ -1,0 +1,115 @@
+"""LoRA adapters beside a card's weights: a folder in the format of the package peft.
+
+It holds `adapter_config.json` and `adapter_model.safetensors`, by which a checkpoint's weights are changed
+when they are loaded, and for llama.cpp the same numbers as one GGUF file.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from harness.backends.card import Card
+from harness.core.errors import UserError, one_line, printable
+from harness.core.files import text_of
+from harness.core.resources import find
+
+CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
+PREFIX = "base_model.model."  # of a tensor's name, before that of the module which it changes
+A, B = ".lora_A.weight", ".lora_B.weight"
+# Kinds of adapter that are more than W + alpha / r * B A, by their key in the config.
+_MORE = ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern", "modules_to_save", "fan_in_fan_out")
+
+
+def read_config(folder: Path, shown: str) -> dict[str, Any]:
+    """Read what a folder says of its adapter. Raises UserError if it is none that is understood."""
+    try:
+        config: dict[str, Any] = json.loads(text_of(folder / CONFIG, "record"))
+        rank, kind = int(config["r"]), config["peft_type"]
+        float(config["lora_alpha"])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        raise UserError(
+            f"{shown}: {printable(folder / CONFIG)} cannot be read ({printable(repr(error), 120)}); give the "
+            "folder of a LoRA adapter in peft's format"
+        ) from None
+    more = [key for key in _MORE if config.get(key)]
+    if kind != "LORA" or rank < 1 or more or config.get("bias", "none") != "none":
+        odd = (
+            more[0]
+            if more
+            else f"peft_type {printable(kind)}, r {rank}, bias {printable(config.get('bias'))}"
+        )
+        raise UserError(
+            f"{shown}: its adapter has {odd}; allowed: plain LoRA of linear layers, without biases"
+        )
+    return config
+
+
+def find_adapter(card: Card) -> Path | None:
+    """Return the folder of a card's adapter, absolute or beside the cards; None if the card names none.
+
+    Raises UserError if there is no such folder.
+    """
+    if card.adapter is None:
+        return None
+    folder = find("models", card.adapter)
+    if not (folder / CONFIG).is_file():
+        raise UserError(
+            f"{card.shown}: no adapter in {printable(folder)} ({CONFIG}); put its folder beside the card, or "
+            "leave adapter out"
+        )
+    return folder
+
+
+def find_tensors(card: Card) -> Path | None:
+    """Return the adapter's safetensors file; None without an adapter."""
+    return _file(card, TENSORS)
+
+
+def find_adapter_gguf(card: Card) -> Path | None:
+    """Return the adapter's GGUF file; None without an adapter."""
+    return _file(card, "*.gguf")
+
+
+def _file(card: Card, pattern: str) -> Path | None:
+    if (folder := find_adapter(card)) is None:
+        return None
+    files = sorted(folder.glob(pattern))
+    if len(files) != 1:
+        raise UserError(
+            f"{card.shown}: its adapter in {printable(folder)} has {len(files)} files {pattern}; allowed: one"
+        )
+    return files[0]
+
+
+def merge(card: Card, model: Any) -> None:
+    """Change a transformers model's weights by its card's adapter: W + alpha / r * B A, in float32.
+
+    Raises UserError if the adapter is of another model, or its file is not whole.
+    """
+    if (file := find_tensors(card)) is None:
+        return
+    import torch
+    from safetensors.torch import load_file
+
+    config = read_config(file.parent, card.shown)
+    scale = float(config["lora_alpha"]) / int(config["r"])
+    try:
+        tensors = load_file(file)
+        names = [name.removesuffix(A) for name in tensors if name.endswith(A)]
+        if not names or 2 * len(names) != len(tensors):
+            raise ValueError(f"{len(tensors)} tensors, of which {len(names)} are {A}")
+        changes = {}
+        for name in names:
+            weight = model.get_submodule(name.removeprefix(PREFIX)).weight
+            change = tensors[name + B].float() @ tensors[name + A].float()
+            if change.shape != weight.shape:
+                raise ValueError(f"{name} is {tuple(change.shape)}, and {tuple(weight.shape)} in the model")
+            changes[name] = weight, change
+    except Exception as error:  # a broken file surfaces as any of a dozen exception types
+        raise UserError(
+            f"{card.shown}: {printable(file)} is no adapter of this model: {one_line(error)}; give the "
+            "adapter that was trained on it"
+        ) from None
+    with torch.no_grad():
+        for weight, change in changes.values():
+            weight.copy_(weight.float() + scale * change.to(weight.device))

@@ -1,0 +1,159 @@
+"""A published model that is taught: opened as it is evaluated, its chat template and tokenizer kept."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import transformers
+from numpy.typing import NDArray
+
+from harness.backends.card import Card
+from harness.backends.cards import argument
+from harness.backends.chat import Chat, HubTokenizer
+from harness.backends.engine import common_length
+from harness.backends.transformers.engine import checkpoint, load
+from harness.backends.weights import find_gguf, hub_commit, is_gguf
+from harness.core.errors import UserError, printable
+from harness.core.files import sha256_file
+from harness.training import low_rank
+
+WEIGHTS = "model.safetensors"
+_TELLING = 1e-3  # largest difference of logits that is rounding
+
+
+@dataclass(frozen=True)
+class Adapt:
+    """How a published model is changed."""
+
+    rank: int | None  # of the LoRA adapter that is trained; None trains all weights
+    rate: float  # learning rate of AdamW
+    dtype: Literal["float32", "bfloat16"] = "float32"  # in which its layers compute; weights are float32
+
+
+class Published:
+    """A published model of texts that learns, and how it reads a chat."""
+
+    def __init__(self, card: Card, adapt: Adapt, seed: int, device: str) -> None:
+        """Open a card's weights on transformers. Raises UserError if they cannot be found or taught."""
+        where = checkpoint(card)
+        hub, self.model = load(card, where, dtype="float32", device=device)
+        self.card, self.hub = card, hub
+        self.sha256 = _digest(card, where)
+        self.chat = Chat(card.name, HubTokenizer(hub), None, card.system)
+        stops = self.chat.ends or (hub.eos_token_id,)
+        self.end = self.chat.pieces(stops[:1])[0]
+        self.encode = self.chat.encode
+        self._heads: dict[str, list[int]] = {}
+        self._check()
+        if adapt.rank:
+            low_rank.widen(self.model, adapt.rank, seed)
+            self.model.to(device)
+        if adapt.dtype == "bfloat16":
+            trunk = self.model.base_model
+            trunk.forward = torch.autocast(torch.device(device).type, torch.bfloat16)(trunk.forward)
+
+    def read(self, messages: Sequence[Mapping[str, str]]) -> tuple[NDArray[np.int32], int, str]:
+        """Return a prompt's tokens, how many of them all of its kind share, and a name for that kind."""
+        ids = self.encode(self.chat.render(messages, thinking=False))
+        kind = "\n".join(message["content"] for message in messages[:-1])
+        if kind not in self._heads:
+            other = ({**message, "content": "?"} for message in messages[-1:])
+            asked = self.encode(self.chat.render((*messages[:-1], *other), thinking=False))
+            self._heads[kind] = ids[: common_length([ids, asked])]
+        shared = common_length([ids, self._heads[kind]])
+        return np.array(ids, dtype=np.int32), shared, f"{shared} {kind}"
+
+    def letters(self, texts: str) -> list[int]:
+        """Return the token of each letter. Raises UserError if one is none."""
+        tokens = [self.encode(text) for text in texts]
+        if any(len(each) != 1 for each in tokens):
+            raise UserError(f"--base {printable(self.card.name)}: a letter of {texts} is no token of its own")
+        return [token for (token,) in tokens]
+
+    def write(self, out: Path, weights: Mapping[str, Any]) -> None:
+        """Write the adapter, or the whole checkpoint with these weights, to a folder."""
+        if any(isinstance(module, low_rank.LowRank) for module in self.model.modules()):
+            low_rank.write(self.model, out, base_name(self.card))
+            return
+        transformers.utils.logging.disable_progress_bar()  # of a file that is written in no time
+        self.model.save_pretrained(out, state_dict=weights)
+        self.hub.save_pretrained(out)
+
+    def _check(self) -> None:
+        """Raise UserError if a model's logits are more than its states times its output embedding."""
+        with torch.no_grad():
+            ids = torch.tensor([self.encode("Answer with one letter.")], device=self.model.device)
+            states = self.model.base_model(ids).last_hidden_state
+            ours, theirs = states @ self.model.get_output_embeddings().weight.T, self.model(ids).logits
+        if (ours - theirs).abs().max() > _TELLING * max(1.0, float(theirs.abs().max())):
+            raise UserError(
+                f"--base {printable(self.card.name)} changes its logits, which is not taught here"
+            )
+
+
+def base_name(card: Card) -> str:
+    """Return what `--model` opens a base by, on any engine: the name of its card file, a path or an id."""
+    named = argument(card)
+    return named.partition(":")[0] if named == card.name else named
+
+
+def _digest(card: Card, where: Path) -> str:
+    """Return the sha256 of a model's weights: of its GGUF file or its only shard, else its commit."""
+    file = find_gguf(card) if is_gguf(card) else where / WEIGHTS
+    return sha256_file(file) if file.is_file() else str(hub_commit(where))
+
+
+def model_card(name: str, facts: Mapping[str, Any]) -> str:
+    """Write README.md of a taught model's folder from what `distill` returns: base, data and losses."""
+    plan, adapt = facts["plan"], facts["plan"]["adapt"]
+    losses = "\n".join(
+        f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} | "
+        f"{curve[-1][2]:.3f} |"
+        for stage, curve in facts["curves"].items() if curve
+    )  # fmt: skip
+    held_out = "\n".join(
+        f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | {row['questions']} "
+        f"| {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} | {_shares(row['likeliest'])} |"
+        for row in facts["held_out"]
+    )
+    kind = f"A LoRA adapter of rank {adapt['rank']} for" if adapt["rank"] else "All weights, taught, of"
+    licence = facts["licence"] or "not stated"
+    first, count = facts["first_seed"], facts["layouts"]
+    scenarios = "; ".join(f"`{spelling}`" for spelling in facts["spellings"])
+    return f"""# {name}
+
+{kind} `{facts["base"]}`, made by `harness model distill` from outcomes in the scenarios
+below. {facts["parameters"]:,} weights learnt. The base's weights have sha256
+`{facts["base_sha256"]}` and the licence {licence}.
+
+- Data: {count} layouts a scenario, train seeds {first} to {first + count - 1}, decision points drawn from
+  each level of their trees; every viewer, and the ego with messages. The last layouts are held out. No report
+  seed was read.
+- Scenarios: {scenarios}. Prompts: {", ".join(facts["prompts"])}.
+- Teacher: outcomes, as soft labels over the actions after which success is possible. A viewer that cannot
+  tell scenes apart learns their mean, so what is hidden makes it unsure.
+- Seed {plan["seed"]}, batches of {plan["batch"]}, AdamW {adapt["rate"]:g}, layers in {adapt["dtype"]}.
+
+The read-out on layouts held out, KL to the soft labels in nats, beside that of always answering their mean,
+and how often each action is the likeliest.
+
+| scenario | scenes learnt | layouts held out | questions | KL | of the mean | likeliest |
+|---|---|---|---|---|---|---|
+{held_out}
+
+| stage | sequences | first loss | last loss | held-out KL at its end |
+|---|---|---|---|---|
+{losses}
+
+`alone` fits the probabilities of one letter an action and a report in words; `excerpts` before it does so on
+prompts that show nothing but the conflicts, `messages` after it with helpers' messages in the ego's prompt.
+`answers` is the JSON text, which states the read-out's own distribution. A stage of no sequences was left
+out. The losses are of different sums and compare within a stage only; curves are in `training.json`.
+"""
+
+
+def _shares(likeliest: Mapping[str, float]) -> str:
+    return ", ".join(f"{action} {share:.2f}" for action, share in likeliest.items())

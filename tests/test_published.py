@@ -1,0 +1,243 @@
+"""A published model is taught: small ones stand for it, a Qwen3 and a Llama."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the transformers extra")
+pytest.importorskip("transformers", reason="needs the transformers extra")
+
+import tiny_llama
+import torch
+from teaching import drawn_once
+from typer.testing import CliRunner
+
+from harness.backends import adapters, cards
+from harness.backends.base import Request
+from harness.backends.card import Card
+from harness.backends.registry import missing
+from harness.backends.registry import open_backend as _open
+from harness.cli import app
+from harness.core.errors import UserError
+from harness.prompts import versions as prompts
+from harness.training import lessons, low_rank
+from harness.training.distill import Curriculum, distill
+from harness.training.published import Adapt, Published
+from harness.training.train import Plan
+from harness.world import scenarios
+
+BASE = cards.resolve("swarm-tiny", "transformers")
+PLAN = Plan(
+    {"excerpts": 0, "alone": 96, "messages": 0, "answers": 32}, batch=8, adapt=Adapt(rank=4, rate=2e-2)
+)
+LEARNT = {scenarios.get("occluded-intersection"): (prompts.load("v9"),)}
+CURRICULUM = Curriculum(LEARNT, layouts=2, seed=100_000, base=BASE)
+
+
+class Killed(Exception):
+    pass
+
+
+def silent(*_: object) -> None:
+    pass
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(lessons, "decision_points", drawn_once)
+    monkeypatch.setattr("harness.training.train.LOG_STEPS", 4)
+    monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture(scope="module")
+def taught(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("taught") / "pupil"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lessons, "decision_points", drawn_once)
+        patch.setattr("harness.training.train.LOG_STEPS", 4)
+        distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
+    return out
+
+
+def asked(n: int) -> Request:
+    messages = ({"role": "system", "content": "You drive."}, {"role": "user", "content": f"Speed 1{n} m/s"})
+    return Request(str(n), "ego", messages, ("SLOWER", "IDLE", "FASTER"), 12)
+
+
+def open_backend(card: Card, **options: Any) -> Any:
+    return _open(card, **options)
+
+
+QUESTIONS = [asked(n) for n in range(3)]
+
+
+# -- an adapter -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def llama(tmp_path: Path) -> Card:
+    return cards.resolve(str(tiny_llama.build(tmp_path / "tiny.gguf")), "transformers")
+
+
+def adapter(card: Card, out: Path) -> Published:
+    """Write an adapter of random numbers, and return the model that wears it."""
+    model = Published(card, Adapt(rank=3, rate=1e-3), 0, "cpu")
+    torch.manual_seed(1)
+    out.mkdir()
+    with torch.no_grad():
+        for layer in (m for m in model.model.modules() if isinstance(m, low_rank.LowRank)):
+            layer.a.copy_(layer.a.half())
+            layer.b.copy_(torch.randn_like(layer.b).mul(0.1).half())
+    model.write(out, {})
+    return model
+
+
+def test_an_adapter_is_one_model_on_every_engine(llama: Card, tmp_path: Path) -> None:
+    """The rows of a Llama's queries and keys lie in another order in llama.cpp."""
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    worn = adapter(llama, tmp_path / "worn")
+    ids = [worn.read(q.messages)[0].tolist() for q in QUESTIONS]
+    with torch.no_grad():
+        logits = torch.cat([worn.model(torch.tensor([each])).logits[:, -1] for each in ids])
+    expected = torch.log_softmax(logits.double(), -1).numpy()
+    rows = expected.shape[1]
+    here, there = (
+        open_backend(cards.resolve(str(tmp_path / "worn"), engine), device="cpu")
+        for engine in ("transformers", "llama-cpp")
+    )
+    assert np.abs(here.next_log_probs(QUESTIONS, rows) - expected).max() < 1e-4
+    assert np.abs(there.next_log_probs(QUESTIONS, rows) - expected).max() < 1e-3
+    plain = open_backend(llama, device="cpu")
+    assert np.abs(plain.next_log_probs(QUESTIONS, rows) - expected).max() > 0.1
+    assert len(here.identity()["adapter_sha256"]) == len(there.identity()["adapter_sha256"]) == 64
+    assert "adapter_sha256" not in plain.identity()
+
+
+@pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
+def test_an_adapter_of_another_model_is_refused_in_one_line(engine: str, llama: Card, tmp_path: Path) -> None:
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    adapter(llama, tmp_path / "worn")
+    other = replace(cards.resolve("swarm-tiny", engine), adapter=str(tmp_path / "worn"))
+    with pytest.raises(
+        UserError, match=r"is no adapter of this model: .*; give the adapter that was"
+    ) as told:
+        open_backend(other, device="cpu")
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("config", "said"),
+    [
+        ({"use_dora": True}, "its adapter has use_dora; allowed: plain LoRA of linear layers"),
+        ({"peft_type": "IA3"}, "its adapter has peft_type IA3, r 3, bias none"),
+        ({"r": "many"}, "cannot be read"),
+        (
+            {"base_model_name_or_path": "replay:."},
+            "is an adapter of 'replay:.', which is no model with weights",
+        ),
+        ({"base_model_name_or_path": "no-such"}, "unknown model 'no-such'"),
+        ({"base_model_name_or_path": "SELF"}, "is an adapter of an adapter; give one of a whole model"),
+    ],
+)
+def test_what_is_no_plain_adapter_is_refused_in_one_line(
+    config: dict[str, object], said: str, llama: Card, tmp_path: Path
+) -> None:
+    folder = tmp_path / "worn"
+    adapter(llama, folder)
+    file = folder / adapters.CONFIG
+    changed = {key: str(folder) if value == "SELF" else value for key, value in config.items()}
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changed}))
+    with pytest.raises(UserError) as told:
+        cards.resolve(str(folder))
+    assert said in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_a_card_without_its_adapter_lacks_weights() -> None:
+    card = replace(BASE, adapter="no-such-folder")
+    assert missing(card) == "weights"
+    with pytest.raises(UserError, match=r"no adapter in .*no-such-folder .*put its folder beside the card"):
+        open_backend(card, device="cpu")
+    assert "adapter" not in BASE.record()
+    assert card.record()["adapter"] == "no-such-folder"
+
+
+# -- a training -------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
+    names = {path.name for path in taught.iterdir()}
+    assert names == {
+        *("README.md", "adapter_config.json", "adapter_model.safetensors", "pupil-lora-f16.gguf"),
+        "training.json",
+    }
+    facts = json.loads((taught / "training.json").read_text())
+    assert facts["base"] == "swarm-tiny"
+    assert facts["curves"]["excerpts"] == facts["curves"]["messages"] == []
+    assert [len(point) for point in facts["curves"]["alone"]] == [3] * 3
+    held_out = facts["held_out"][0]
+    assert held_out["kl_nats"] < facts["curves"]["alone"][0][2], "the KL on layouts held out falls"
+    assert sum(held_out["likeliest"].values()) == pytest.approx(1.0)
+    text = (taught / "README.md").read_text()
+    assert "A LoRA adapter of rank 4 for `swarm-tiny`" in text
+    assert "train seeds 100000 to 100001" in text
+    card = cards.resolve(str(taught))
+    assert (card.adapter, card.letters, card.weights) == (str(taught), "raw", "swarm-tiny")
+
+
+@pytest.mark.slow
+def test_a_killed_teaching_goes_on_to_the_same_adapter(
+    taught: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("harness.training.train.KEEP_S", 0.0)
+    out = tmp_path / "pupil"
+    for kill in (("alone", 64), ("answers", 32)):
+
+        def progress(stage: str, seen: int, *_: float, kill: tuple[str, int] = kill) -> None:
+            if (stage, seen) == kill:
+                raise Killed
+
+        with pytest.raises(Killed):
+            distill(CURRICULUM, PLAN, out, silent, progress, "cpu")
+    with pytest.raises(UserError, match="was begun with another adapt"):
+        distill(CURRICULUM, replace(PLAN, adapt=Adapt(8, 2e-2)), out, silent, silent, "cpu")
+    distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
+    for name in ("adapter_model.safetensors", "pupil-lora-f16.gguf"):
+        assert (out / name).read_bytes() == (taught / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_all_weights_of_a_base_can_learn(tmp_path: Path) -> None:
+    plan = replace(
+        PLAN, samples={**PLAN.samples, "alone": 16, "answers": 0}, adapt=Adapt(None, 1e-3, "bfloat16")
+    )
+    distill(CURRICULUM, plan, tmp_path / "whole", silent, silent, "cpu")
+    assert not (tmp_path / "whole" / adapters.CONFIG).exists()
+    answers = open_backend(cards.resolve(str(tmp_path / "whole")), device="cpu").complete(QUESTIONS)
+    assert [answer.error for answer in answers] == [None] * 3
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--rank", "8"], "--rank 8 goes with --lora, which trains an adapter"),
+        (["--lora"], "--lora, --rate and --dtype go with --base, a published model"),
+        (["--lora", "--base", "swarm-tiny", "--rank", "0"], "--rank 0: give more than 0"),
+        (["--base", "swarm-tiny", "--rate", "nan"], "--rate nan: give more than 0"),
+        (["--base", "no-such"], "unknown model 'no-such'"),
+        (["--base", "swarm-tiny-vl", "--prompt", "v9"], "takes pictures; give a plain model of texts"),
+        (["--base", "swarm-tiny", "--prompt", "v8"], "is taught texts alone; leave image prompts out"),
+        (["--samples", "0,0,0,0"], "or 0 to leave a stage out"),
+    ],
+)
+def test_bad_input_writes_nothing(options: list[str], said: str, tmp_path: Path) -> None:
+    arguments = ["model", "distill", "occluded-intersection", "--layouts", "2", "--out", str(tmp_path / "m")]
+    with pytest.raises(UserError) as told:
+        CliRunner().invoke(app, [*arguments, *options], standalone_mode=False, catch_exceptions=False)
+    assert said in str(told.value)
+    assert not (tmp_path / "m").exists()
