@@ -4,6 +4,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -284,12 +285,18 @@ def test_every_profile_that_ships_says_what_each_number_is(name: str) -> None:
     device = devices.load(name)
     for row in device.rows:
         each = dict(devices.constants(device, row))
+        if row.memory_gb and device.memory_gb:
+            assert row.memory_gb.value < device.memory_gb.value
+        if row.answer_ms:
+            assert "Liquid AI" in row.answer_ms.source
+            continue
         assert each["decode_tokens_per_s"] is not None
         assert all(c is None or c.source not in ("edge-llm", "silybench") for c in each.values())
         # Writing a token moves all weights, reading many at once does so once for all of them.
         if each["prefill_tokens_per_s"]:
             assert each["prefill_tokens_per_s"].value > each["decode_tokens_per_s"].value
-    for smaller, larger in zip(device.rows, device.rows[1:], strict=False):
+    rated = [row for row in device.rows if not row.answer_ms]
+    for smaller, larger in pairwise(rated):
         if smaller.billions < larger.billions and smaller.prefill_tokens_per_s:
             assert smaller.decode_tokens_per_s.value >= larger.decode_tokens_per_s.value
 
@@ -301,6 +308,31 @@ def test_what_nobody_states_is_not_known() -> None:
     assert np.isnan(devices.joules(speed, 300, 1))
     h200 = devices.load("h200")
     assert np.isnan(devices.seconds(devices.speed(h200, h200.rows[0]), 300, 1))
+
+
+def test_a_decision_takes_what_its_maker_states_whatever_its_tokens(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nano = devices.load("orin-nano")
+    speed = devices.speed(nano, devices.find_row(nano, "d1-3b"))
+    assert devices.seconds(speed, 300, 0) == devices.seconds(speed, 3000, 40) == 0.05
+    scaled = devices.find_row(nano, "3b")
+    assert "d1-3b" not in scaled.model
+    assert scaled.memory_gb is not None
+    assert scaled.memory_gb.value == pytest.approx(3 * 4.25 / 8, rel=0.01)
+    monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: Scripted({}))  # which counts no tokens
+    out = tmp_path / "run"
+    run(spec_of(small, "swarm-tiny", device_profile=nano, device_model="d1-3b", points=(ALONE,)), out)
+    told = folder.read(out)
+    assert set(told.decisions["latency_ms"].tolist()) == {50.0}
+    assert np.isnan(told.decisions["inference_j"]).all(), "nobody states its joules"
+
+
+def test_a_row_has_an_answers_time_or_rates(project: Path) -> None:
+    stated = 'batch_size = 1\nanswer_ms = { value = 5, status = "cited", source = "me" }'
+    (project / "mine.toml").write_text(MINE.replace("batch_size = 1", stated))
+    with pytest.raises(UserError, match="row of swarm-tiny: give answer_ms or rates, not both"):
+        devices.load("mine")
 
 
 def test_a_size_is_scaled_from_the_nearest_row_where_the_profile_says_how() -> None:
@@ -367,7 +399,7 @@ def test_a_mistake_in_a_file_is_one_line(change: tuple[str, str], says: str, pro
     ("options", "says"),
     [
         (("--device-profile", "agx-ori"), "unknown device profile 'agx-ori'; did you mean 'agx-orin'?"),
-        (("--device-profile", "agx-orin"), "unknown model of device profile agx-orin 'swarm-tiny'; known: q"),
+        (("--device-profile", "agx-orin"), "unknown model of device profile agx-orin 'swarm-tiny'; known: d"),
         (("--device-profile", "agx-orin", "--device-model", "\x1b[2J"), "unknown model of device profile"),
         (("--device-model", "qwen3-4b"), "--device-model qwen3-4b is a device's row; give --device-pro"),
         (("--device-profile", "h200", "--device-model", "llama-3.1-8b"), "states no prefill_tokens_per_s of"),

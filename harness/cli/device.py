@@ -74,17 +74,20 @@ def show(
             "fits": [
                 {"model": fit.row.model, "answer": fit.answer, "prompt_tokens": fit.prompt_tokens,
                  "output_tokens": fit.output_tokens, "ms": known(1000 * fit.seconds),
-                 "in_time": fit.in_time, "joules": fit.joules}
+                 "in_time": fit.in_time, "joules": fit.joules,
+                 "memory_gb": fit.row.memory_gb and fit.row.memory_gb.value}
                 for fit in results
             ],
         })  # fmt: skip
         return
     typer.echo(f"{printable(device.name)} · {printable(device.description)}")
+    if device.memory_gb:
+        typer.echo(f"{device.memory_gb.value:g} GB of memory")
     typer.echo()
     fitting = "in time %" if run else f"in {window_ms:g} ms"
     yes_or_no, joules = ("no", "yes"), Unit("J", 2)
     table(
-        ["model", "answer", "in + out", "ms", fitting, "J"],
+        ["model", "answer", "in + out", "ms", fitting, "J", "GB"],
         [
             (
                 printable(fit.row.model),
@@ -95,6 +98,7 @@ def show(
                 _known(
                     fit.joules.value, shown(fit.joules, joules) if run else joules.number(fit.joules.value)
                 ),
+                f"{fit.row.memory_gb.value:.2g}" if fit.row.memory_gb else "unknown",
             )
             for fit in results
         ],
@@ -208,13 +212,15 @@ def measure(
 
 def _origins(device: "Device", rows: "Sequence[DeviceRow]") -> None:
     """Print what the numbers rest on, each source once."""
-    from harness.runs.devices import JOULES, RATES, constants
+    from harness.runs.devices import APART, JOULES, RATES, constants
 
-    for names, head in ((RATES, "rates"), (tuple(JOULES), "J")):
+    for names, head in (((*RATES, "answer_ms"), "times"), (tuple(JOULES), "J"), (("memory_gb",), "GB")):
         sources = {
             f"{c.status} ({_source(device, c)})": None
-            for row in rows for name, c in constants(device, row) if name in names and c
-        }  # fmt: skip
+            for row in rows
+            for name, c in (*constants(device, row), *((name, getattr(row, name)) for name in APART))
+            if name in names and c
+        }
         echo_text(f"{head}: {'; '.join(sources) or 'unknown, since nobody states them'}")
     echo_text(f"power mode: {device.power_mode}")
 

@@ -37,7 +37,7 @@ def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> lis
         if not agent.can.language_model:
             raise UserError(f"{flag}: {name} is no language model and counts no tokens; leave it out")
         row = devices.find_row(device, model or agent.card.name.partition(":")[0])
-        for rate in devices.RATES:
+        for rate in devices.RATES if row.answer_ms is None else ():
             if getattr(row, rate) is None:
                 raise UserError(
                     f"{flag} states no {rate} of {printable(row.model)}, so it cannot time answers; "
@@ -53,7 +53,8 @@ def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> L
     for agent, row in zip(agents, rows, strict=True):
         own_row = agent.card.name.partition(":")[0] == row.model
         answerer = agent.card.name + ("" if own_row else f"'s answers at the speed of {row.model}")
-        rates = [cast("Constant", getattr(row, rate)) for rate in devices.RATES]
+        timed = ["answer_ms"] if row.answer_ms else devices.RATES
+        rates = [cast("Constant", getattr(row, name)) for name in timed]
         origin = "; ".join(dict.fromkeys(f"{rate.status}: {rate.source}" for rate in rates))
         joules = {c.status for name, c in devices.constants(device, row) if c and name in devices.JOULES}
         descriptions.append(
@@ -67,14 +68,16 @@ def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> L
 def answer_s(speed: Speed, answer: Answer) -> float:
     """Return the seconds of one answer by its tokens, its repair turn included; NaN if the engine failed.
 
-    Raises UserError if the answer has no token counts.
+    Raises UserError if the answer has no token counts, and its model's time goes by them.
     """
+    if speed.answer_s is not None:
+        return math.nan if answer.error is not None else speed.answer_s * answer.turns + answer.slow_s
     return devices.seconds(speed, *tokens(answer)) + answer.slow_s
 
 
 def answer_j(speed: Speed, answer: Answer) -> float:
     """Return the joules of one answer; NaN and errors as in `answer_s`."""
-    return devices.joules(speed, *tokens(answer))
+    return math.nan if speed.answer_s is not None else devices.joules(speed, *tokens(answer))
 
 
 def vehicles_j(latency: Latency, scenes: "Sequence[Scene]", answers: Mapping[str, Answer]) -> Floats:

@@ -19,6 +19,7 @@ Status = Literal["measured", "cited", "modelled", "assumed"]
 RATES = ("prefill_tokens_per_s", "decode_tokens_per_s")
 # Joules that a row lacks are derived from the power that the device draws, and the rate.
 JOULES = {"joules_per_prompt_token": RATES[0], "joules_per_output_token": RATES[1]}
+APART = ("answer_ms", "memory_gb")  # numbers of a row from which nothing is derived
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)b")
 
 
@@ -30,6 +31,7 @@ class Speed(Struct, frozen=True):
     decode_tokens_per_s: Rate | None  # output tokens written in a second
     joules_per_prompt_token: Rate | None = None  # energy to read one token
     joules_per_output_token: Rate | None = None  # energy to write one token
+    answer_s: Rate | None = None  # seconds of an answer of any length, as makers of decision models state it
 
 
 class Constant(Struct, frozen=True):
@@ -53,6 +55,10 @@ class DeviceRow(Struct, frozen=True, kw_only=True):
     joules_per_prompt_token: Constant | None = None
     # energy to write one token, the device's idle draw included
     joules_per_output_token: Constant | None = None
+    # one answer of a decision model, in ms; it stands in place of rates, since nobody says how long the
+    # question was
+    answer_ms: Constant | None = None
+    memory_gb: Constant | None = None  # memory that the model takes, in 10^9 bytes
 
 
 class Device(Struct, frozen=True, kw_only=True):
@@ -73,11 +79,15 @@ class Device(Struct, frozen=True, kw_only=True):
     # least time on air of a message under a channel that states bits and bandwidth alone; None counts
     # only these
     frame_ms: Constant | None = None
+    memory_gb: Constant | None = None  # the computer's memory, shared by its CPU and GPU where it has one
 
     def __post_init__(self) -> None:
         names = [row.model for row in self.rows]
         if not names or len(set(names)) < len(names):
             raise ValueError("rows: give one or more, of different models")
+        for row in self.rows:
+            if row.answer_ms and (row.prefill_tokens_per_s or row.decode_tokens_per_s):
+                raise ValueError(f"row of {printable(row.model)}: give answer_ms or rates, not both")
 
 
 def names() -> list[str]:
@@ -128,14 +138,15 @@ def find_row(device: Device, model: str) -> DeviceRow:
 
 def _scaled(device: Device, billions: float) -> DeviceRow:
     """Scale the row with the nearest number of weights, by ratio; rates go down as the weights go up."""
-    near = min(device.rows, key=lambda row: max(row.billions, billions) / min(row.billions, billions))
+    rated = [row for row in device.rows if not row.answer_ms]
+    near = min(rated, key=lambda row: max(row.billions, billions) / min(row.billions, billions))
     ratio = billions / near.billions
 
     def scaled(constant: Constant | None, factor: float) -> Constant | None:
         source = f"{near.model} times {factor:.3g}, by the number of weights"
         return constant and Constant(constant.value * factor, "modelled", source)
 
-    factors = {**dict.fromkeys(RATES, 1 / ratio), **dict.fromkeys(JOULES, ratio)}
+    factors = {**dict.fromkeys(RATES, 1 / ratio), **dict.fromkeys((*JOULES, "memory_gb"), ratio)}
     values = {name: scaled(getattr(near, name), factor) for name, factor in factors.items()}
     return msgspec.structs.replace(
         near, model=f"{billions:g}b from {near.model}", billions=billions, **values
@@ -157,11 +168,15 @@ def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | 
 
 def speed(device: Device, row: DeviceRow) -> Speed:
     """Return the rates and joules of a row as plain numbers."""
-    return Speed(row.model, **{name: c.value if c else None for name, c in constants(device, row)})
+    answer_s = row.answer_ms.value / 1000 if row.answer_ms else None
+    known = {name: c.value if c else None for name, c in constants(device, row)}
+    return Speed(row.model, **known, answer_s=answer_s)
 
 
 def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
     """Return the seconds of one answer: prompt and output tokens, each over its rate; NaN if unknown."""
+    if speed.answer_s is not None:
+        return speed.answer_s
     rates = _or_nan(speed.prefill_tokens_per_s), _or_nan(speed.decode_tokens_per_s)
     return prompt_tokens / rates[0] + output_tokens / rates[1]
 

@@ -14,7 +14,7 @@ from harness.runs.devices import Device, DeviceRow
 from harness.runs.folder import Run
 from harness.runs.records import Answer
 
-READOUT, WRITTEN = "readout", "written"
+READOUT, WRITTEN, DECISION = "readout", "written", "decision"
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Fit:
     """One answer of a model on a device, asked alone; NaN where a number of it is not known."""
 
     row: DeviceRow  # the model's
-    answer: str  # `readout`, which is one token, or how it is written
+    answer: str  # `readout`, which is one token, `decision`, which is none, or how it is written
     prompt_tokens: float  # read; of a run, the median
     output_tokens: float  # written; of a run, the median
     seconds: float  # that it takes; of a run, the median
@@ -33,7 +33,10 @@ class Fit:
 
 def fits(device: Device, rows: Sequence[DeviceRow], answers: "Answers", window_s: float) -> list[Fit]:
     """Return each row with each kind of answer, of which `window_s` is the time from seeing to the answer."""
-    return [_fit(device, row, kind, answers, window_s) for row in rows for kind in answers.output]
+    return [
+        _fit(device, row, kind, answers, window_s) for row in rows
+        for kind in ([DECISION] if row.answer_ms else answers.output)
+    ]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ def answers_of(run: Run) -> Answers:
 
 
 def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: float) -> Fit:
-    speed, output = devices.speed(device, row), answers.output[kind]
+    speed, output = devices.speed(device, row), answers.output.get(kind, np.zeros(len(answers.prompt)))
     pairs = list(zip(answers.prompt.tolist(), output.tolist(), strict=True))
     seconds, joules = (
         np.array([of(speed, *pair) for pair in pairs]) for of in (devices.seconds, devices.joules)
