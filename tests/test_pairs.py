@@ -18,7 +18,7 @@ from harness.parsing.status import Status
 from harness.prompts import versions as prompts
 from harness.runs.folder import read
 from harness.training.lessons import label
-from harness.training.pairs import pairs
+from harness.training.pairs import pairs, preferences
 
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]
@@ -70,6 +70,8 @@ def test_every_question_of_a_point_that_can_be_won_has_the_answer_of_its_tree(
         parsed = parse(said["content"], role="helper" if asked.role == "helper" else "ego", actions=actions)
         assert (said["role"], parsed.status) == ("assistant", Status.STRICT)
         ends_s = {a: row[f"delay_s_{a}"] if row[f"safe_{a}"] else float("inf") for a in actions}
+        assert (line["actions"], line["probabilities"]) == ([*actions], label(ends_s).tolist())
+        assert line["values"] == [float(row[f"safe_{a}"]) for a in actions]
         assert max(abs(parsed.intent - label(ends_s))) <= 0.05
         assert all(p == 0 for a, p in zip(actions, parsed.intent, strict=True) if not row[f"safe_{a}"])
     assert {(line["layout_seed"], line["purpose"]) for line in lines} <= {(100 + n, "tune") for n in range(4)}
@@ -98,6 +100,7 @@ def test_helpers_with_a_prompt_and_answer_mode_of_their_own_have_their_own_pairs
 
 def test_layouts_that_numbers_are_of_become_no_training_data_silently(run: Path, harness: Harness) -> None:
     change(run, episode=lambda row: row.update(layout_seed=row["layout_seed"] + 199_897))
+    assert "--dpo pairs.jsonl: " in harness("run", "export", run, "--dpo", "pairs.jsonl")[2]
     code, out, err = harness("run", "export", run, "--sft", "pairs.jsonl")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "has layout seeds 199997 to 200000 (train and report), and a model that learns from them" in err
@@ -154,6 +157,51 @@ def test_a_driven_run_knows_no_best_action(tmp_path: Path, harness: Harness) -> 
     assert "driven was driven, and only frozen scenes know what each action leads to" in err
 
 
+def test_an_answer_is_rejected_where_it_is_worth_less_by_the_margin(run: Path, harness: Harness) -> None:
+    """Half on a lost action is worth .5 less; an unreadable answer is worth nothing; no answer is none."""
+
+    def worse(row: Row) -> None:
+        kind = sum(map(ord, row["scene"] + row["viewer"])) % 3
+        if kind == 0:
+            row |= {"intent": (0.5, 0.5, 0.0), "raw": "half"}
+        elif kind == 1:
+            row |= {"intent": None, "raw": "brake!", "verdict": "failed", "status": "no_json"}
+        else:
+            row |= {"intent": None, "raw": "", "error": "gone", "finish_reason": "error", "verdict": "failed",
+                    "status": "no_answer"}  # fmt: skip
+
+    change(run, answer=worse)
+    by_tree = {(line["scene"], line["viewer"]): line for line in pairs(read(run))}
+    for margin, most in ((0.1, 0.9), (0.5, 0.5), (0.6, 0.4), (1, 0.0)):
+        given = () if margin == 0.1 else ("--margin", str(margin))
+        code, out, err = harness("run", "export", run, "--dpo", "dpo.jsonl", *given)
+        assert (code, out, err) == (0, "dpo.jsonl\n", "")
+        lines = [json.loads(line) for line in Path("dpo.jsonl").read_text().splitlines()]
+        expected = set()
+        for answer in answers_of(run):
+            asked = by_tree.get((answer.scene, answer.key))
+            if asked and answer.error is None:
+                worth = sum(asked["values"][:2]) / 2 if answer.raw == "half" else 0
+                if worth <= most:
+                    expected.add((answer.scene, answer.key, answer.raw, worth))
+        assert expected == {
+            (at["scene"], at["viewer"], at["rejected"][0]["content"], at["value_rejected"]) for at in lines
+        }
+        assert ({at[2] for at in expected} == {"half", "brake!"}) == (margin <= 0.5)
+        for line in lines:
+            asked = by_tree[line["scene"], line["viewer"]]
+            assert (line["prompt"], line["chosen"]) == ([*map(dict, asked["prompt"])], asked["completion"])
+
+
+def test_a_rejected_letter_is_the_likeliest(run: Path) -> None:
+    configure(run, answer="readout")
+    change(run, answer=lambda row: row.update(intent=(0.2, 0.3, 0.5), raw="the shares"))
+    lines = [*preferences(read(run), 0.1)]
+    assert {line["rejected"][0]["content"] for line in lines} == {"C"}
+    assert all(line["values"][2] == line["value_rejected"] == 0 for line in lines)
+    assert all(line["chosen"][0]["content"] in "AB" for line in lines)
+
+
 @pytest.mark.slow
 def test_a_model_learns_from_the_pairs(run: Path, harness: Harness, tmp_path: Path) -> None:
     """Steps as TRL takes them: the chat template over both, the loss of the completion alone."""
@@ -188,8 +236,8 @@ def test_a_model_learns_from_the_pairs(run: Path, harness: Harness, tmp_path: Pa
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_trl_trains_on_the_file_as_it_is(run: Path, harness: Harness, tmp_path: Path) -> None:
-    trl = pytest.importorskip("trl", reason="needs trl, which no extra has")
-    datasets = pytest.importorskip("datasets", reason="needs trl, which no extra has")
+    trl = pytest.importorskip("trl", reason="needs the trl extra")
+    datasets = pytest.importorskip("datasets", reason="needs the trl extra")
     from tiny_qwen3 import build
     from transformers import AutoTokenizer
 
@@ -207,3 +255,27 @@ def test_trl_trains_on_the_file_as_it_is(run: Path, harness: Harness, tmp_path: 
     )  # fmt: skip
     assert len(trainer.train_dataset) == len(lines)
     assert trainer.train().global_step == 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_trl_prefers_by_the_file_as_it_is(run: Path, harness: Harness, tmp_path: Path) -> None:
+    trl = pytest.importorskip("trl", reason="needs the trl extra")
+    datasets = pytest.importorskip("datasets", reason="needs the trl extra")
+    from tiny_qwen3 import build
+    from transformers import AutoTokenizer
+
+    change(run, answer=lambda row: row.update(intent=None, raw="brake!"))
+    assert harness("run", "export", run, "--dpo", "dpo.jsonl")[0] == 0
+    read_by = {"data_files": "dpo.jsonl", "split": "train", "cache_dir": tmp_path / "hf"}
+    folder = build(tmp_path / "tiny", context_tokens=4096)
+    trainer = trl.DPOTrainer(
+        model=str(folder),
+        processing_class=AutoTokenizer.from_pretrained(folder),
+        train_dataset=datasets.load_dataset("json", **read_by),
+        args=trl.DPOConfig(
+            output_dir=str(tmp_path / "out"), max_steps=1, per_device_train_batch_size=2, use_cpu=True,
+            bf16=False, max_length=4096, report_to="none",
+        ),
+    )  # fmt: skip
+    assert trainer.train().global_step == 1

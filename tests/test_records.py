@@ -70,6 +70,7 @@ def test_commands_read_every_run(run: str, command: str, harness: Typed) -> None
 
 STUDIES = {
     "sft": "run export {run} --sft out.jsonl --report-seeds-too",
+    "dpo": "run export {run} --dpo out.jsonl --report-seeds-too",
     "sweep": "study sweep {run} --over loss --grid 0,0.5 --seeds 0 --no-model --quiet",
     "trust": "study trust {run} --attacks liar --rules median --share 1/3 --seeds 0 --no-model --quiet",
     "schedule": "study schedule compare {run} --schedule random --seeds 0 --quiet",

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from harness.report.history import Line
     from harness.runs.listing import Listed
 
+MARGIN = 0.1  # by how much an answer is worth less than the one that is preferred to it
 VARIANT = 32  # columns of model, prompt and answer mode
 
 
@@ -178,26 +179,37 @@ def export(
         help="Write chats to fine-tune on as JSON Lines; their answers are those that the decision trees "
         "show to be right.",
     ),
+    dpo: Path | None = typer.Option(
+        None,
+        help="Write the same chats with the model's own answers as the rejected ones, where these are worse.",
+    ),
+    margin: float | None = typer.Option(
+        None,
+        help="With --dpo: how much less an answer must be worth, above 0 to 1. Default: 0.1.",
+        show_default=False,
+    ),
     dataset: options.RunsDataset = None,
     report_seeds_too: bool = typer.Option(
         False,
         "--report-seeds-too",
-        help="With --sft: also allow layouts with report seeds (200000 and above).",
+        help="With --sft and --dpo: also allow layouts with report seeds (200000 and above).",
     ),
 ) -> None:
     """Write a run's data for spreadsheets and other programs. Give exactly one format."""
     from harness.runs import export
     from harness.runs.folder import read
 
-    files = {"--junit": junit, "--inspect": inspect, "--sft": sft}
+    files = {"--junit": junit, "--inspect": inspect, "--sft": sft, "--dpo": dpo}
     asked = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
     [option, *surplus] = [name for name, given in asked.items() if given] or [""]
     if surplus or not option:
         raise UserError(f"{', '.join(asked)}: give exactly one of them")
-    if report_seeds_too and not sft:
-        raise UserError("--report-seeds-too only goes with --sft; give --sft, or leave it out")
-    if dataset and option not in ("--inspect", "--sft"):
-        raise UserError("--dataset only goes with --inspect and --sft; leave it out")
+    if report_seeds_too and not (sft or dpo):
+        raise UserError("--report-seeds-too only goes with --sft and --dpo; give one, or leave it out")
+    if margin is not None and not (dpo and 0 < margin <= 1):
+        raise UserError(f"--margin {margin:g}: it goes with --dpo, and is above 0 and at most 1")
+    if dataset and option not in ("--inspect", "--sft", "--dpo"):
+        raise UserError("--dataset only goes with --inspect, --sft and --dpo; leave it out")
     if out and option in files:
         raise UserError(
             f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
@@ -221,11 +233,12 @@ def export(
             written = [export.decisions_jsonl(source.decisions, folder / "decisions.jsonl")]
         elif junit:
             written = [export.junit(source, junit)]
-        elif sft:
+        elif lessons := sft or dpo:
             from harness.training import pairs
 
+            least = (margin or MARGIN) if dpo else None
             with bar("writing chats"):
-                written = [pairs.write(source, sft, report_seeds_too, dataset)]
+                written = [pairs.write(source, lessons, report_seeds_too, dataset, least)]
         elif inspect:
             extras.need("--inspect", "inspect_ai")
             from harness.report import inspect_log

@@ -1,7 +1,8 @@
 """A run's questions with the answers that they should have had, as chats for fine-tuning.
 
-A line a question, in TRL's conversational form of prompt and completion. The answer states the soft label of
-`harness.training.lessons`, with the outcomes of the dataset's decision trees: the best action has most of it.
+A line a question, in TRL's conversational form: a prompt, and its completion or a chosen and a rejected one.
+The answer states the soft label of `harness.training.lessons`, with the outcomes of the dataset's decision
+trees: the best action has most of it. Chats are messages, since a chat template is the model's own.
 """
 
 from collections.abc import Iterator
@@ -20,33 +21,39 @@ from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.prompts import readout
 from harness.runs.folder import Run, check_scenes, dataset_of
-from harness.runs.records import BLIND, FrozenScenes
+from harness.runs.records import BLIND, Answer, FrozenScenes
 from harness.runs.sources import prompt_of
 from harness.training.answers import answer
 from harness.training.lessons import Lessons, label
 from harness.training.questions import question
 
+ROUNDING = 1e-9  # of probabilities that sum to 1
 
-def write(run: Run, path: Path, report_seeds_too: bool, dataset: Path | None = None) -> Path:
-    """Write a run's pairs to a file, and return its path.
+
+def write(
+    run: Run, path: Path, report_seeds_too: bool, dataset: Path | None = None, margin: float | None = None
+) -> Path:
+    """Write a run's pairs to a file, with a `margin` its preferences, and return its path.
 
     Raises UserError if the run was driven, its dataset or prompt is not here as it was, or its layouts are
     those that numbers are reported of and `report_seeds_too` is false.
     """
+    option = "--sft" if margin is None else "--dpo"
     if not isinstance(run.manifest.world, FrozenScenes):
         raise UserError(
-            f"--sft: {printable(run.path)} was driven, and only frozen scenes know what each action leads "
+            f"{option}: {printable(run.path)} was driven, and only frozen scenes know what each action leads "
             "to; give a run of `harness eval`"
         )
     seeds = sorted({episode.layout_seed for episode in run.episodes})
     first, count = seeds[0], seeds[-1] - seeds[0] + 1
     if seeds[-1] >= FIRST["report"] and not report_seeds_too:
         raise UserError(
-            f"--sft {printable(path)}: {printable(run.path)} has {stated(first, count)}, and a model that "
+            f"{option} {printable(path)}: {printable(run.path)} has {stated(first, count)}, and a model that "
             "learns from them can no longer be measured on them; make a run on a dataset of train seeds, "
             f"`harness dataset build --seed {FIRST['train']}`, or give --report-seeds-too"
         )
-    write_whole(path, msgspec.json.Encoder().encode_lines(pairs(run, dataset)))
+    lines = pairs(run, dataset) if margin is None else preferences(run, margin, dataset)
+    write_whole(path, msgspec.json.Encoder().encode_lines(lines))
     return path
 
 
@@ -56,17 +63,48 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
     A decision point after which no action succeeds teaches nothing and is left out. The dataset is the one
     that the run states, or lies in `folder`. Raises UserError if it or the prompt is not here as it was.
     """
+    for asked, completion, _ in _answered(run, folder):
+        yield {"prompt": asked.pop("prompt"), "completion": _said(completion), **asked}
+
+
+def preferences(run: Run, margin: float, folder: Path | None = None) -> Iterator[dict[str, Any]]:
+    """Yield the same with the model's own answer as the rejected one, where it is worth less by `margin`.
+
+    An answer is worth the probability with which its distribution leaves success possible; one that cannot be
+    read is worth nothing, and of a read-out the likeliest letter counts. What got no answer is left out.
+    """
+    for asked, completion, stored in _answered(run, folder):
+        values, p, raw = asked["values"], stored.intent, stored.raw
+        letters = readout.letters(asked["actions"])
+        if p is not None and completion in letters:
+            best = int(np.argmax(p))
+            raw, p = letters[best], tuple(np.eye(len(p))[best].tolist())
+        worth = 0.0 if p is None else float(np.dot(p, values))
+        least = float(np.dot(asked["probabilities"], values)) - margin
+        if stored.error is None and raw.strip() and worth <= least + ROUNDING:
+            yield {
+                "prompt": asked.pop("prompt"), "chosen": _said(completion), "rejected": _said(raw),
+                **asked, "value_rejected": worth,
+            }  # fmt: skip
+
+
+def _said(text: str) -> list[dict[str, str]]:
+    return [{"role": "assistant", "content": text}]
+
+
+def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], str, Answer]]:
+    """Yield each question with its labels, the answer that its tree asks for, and the one that was given."""
     prompts = {}
     for agent in (run.manifest.agent(0), *run.manifest.helpers):
         version, sha256 = (agent["prompt"][key] for key in ("version", "sha256"))
         if (prompt := prompt_of(run, agent["prompt"])) is None:
             raise UserError(
-                f"--sft: {printable(run.path)} was made with prompt {printable(version)} with sha256 "
+                f"{printable(run.path)} was made with prompt {printable(version)} with sha256 "
                 f"{printable(sha256, 13)}, which is not here as it was; restore it, or make the run again"
             )
         if prompt.image and agent["image"] != "none":
             raise UserError(
-                f"--sft: {printable(run.path)} showed pictures by prompt {printable(version)}, and the file "
+                f"{printable(run.path)} showed pictures by prompt {printable(version)}, and the file "
                 "holds texts alone; give a run with --image none, or of another prompt"
             )
         prompts[version] = prompt
@@ -105,7 +143,10 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
             if agent["answer"] in BARE:
                 completion = readout.letters(q.actions)[int(q.label.argmax())]
             seed = int(scene.record.episode_seed)
-            yield {
-                "prompt": sent, "completion": [{"role": "assistant", "content": completion}],
-                "scene": scene.id, "viewer": stored.key, "layout_seed": seed, "purpose": purpose(seed, 1),
+            safe = forest.safe[forest.place[scene.id]]
+            asked = {
+                "prompt": sent, "scene": scene.id, "viewer": stored.key, "layout_seed": seed,
+                "purpose": purpose(seed, 1), "actions": list(q.actions),
+                "probabilities": q.label.tolist(), "values": safe.astype(float).tolist(),
             }  # fmt: skip
+            yield asked, completion, stored
