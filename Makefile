@@ -59,6 +59,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/own_time.py
 	$(BIN)/python benchmarks/coordinate.py
 	$(BIN)/python benchmarks/radio.py
+	$(BIN)/python benchmarks/rewards.py
 	$(BIN)/python benchmarks/study.py
 	$(BIN)/python benchmarks/ledger.py
 	$(BIN)/python benchmarks/answer_modes.py
