@@ -226,9 +226,11 @@ def test_all_weights_of_a_base_can_learn(tmp_path: Path) -> None:
     ("options", "said"),
     [
         (["--rank", "8"], "--rank 8 goes with --lora, which trains an adapter"),
-        (["--lora"], "--lora, --rate and --dtype go with --base, a published model"),
+        (["--lora"], "--lora, --rate, --dtype and --report go with --base, a published model"),
         (["--lora", "--base", "swarm-tiny", "--rank", "0"], "--rank 0: give more than 0"),
         (["--base", "swarm-tiny", "--rate", "nan"], "--rate nan: give more than 0"),
+        (["--base", "swarm-tiny", "--report", "-1"], "--report -1: give 0 to 512"),
+        (["--base", "swarm-tiny", "--dtype", "int8"], "unknown --dtype 'int8'"),
         (["--base", "no-such"], "unknown model 'no-such'"),
         (["--base", "swarm-tiny-vl", "--prompt", "v9"], "takes pictures; give a plain model of texts"),
         (["--base", "swarm-tiny", "--prompt", "v8"], "is taught texts alone; leave image prompts out"),

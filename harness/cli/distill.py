@@ -22,6 +22,7 @@ RANK = 16
 RATES = {True: 1e-3, False: 1e-4}  # with an adapter, and without
 MOST = 512  # of a rank
 DTYPES = ("float32", "bfloat16")
+REPORT = 0.3
 
 
 def command(
@@ -47,6 +48,9 @@ def command(
     dtype: str = typer.Option(
         DTYPES[0], help="What layers of a published base compute in: float32 or bfloat16."
     ),
+    report: float | None = typer.Option(
+        None, help=f"Weight of the words behind a letter, for a published base. Default: {REPORT:g}."
+    ),
     layouts: int = typer.Option(240, help="Number of layouts of each scenario."),
     first_seed: int = typer.Option(
         FIRST["train"], help="Layout seed of the first layout; train seeds are 100000 to 199999."
@@ -71,7 +75,7 @@ def command(
     for flag, value, least in (("--batch", batch, 1), ("--threads", threads, 1), ("--seed", seed, 0)):
         if value is not None and value < least:
             raise UserError(f"{flag} {value}: give {least} or more")
-    start, adapt = _base(base, lora, rank, rate, dtype)
+    start, adapt = _base(base, lora, rank, rate, dtype, report)
     versions = [prompts.load(version) for version in dict.fromkeys(prompt)]
     driven = [ready_to_drive(name, layouts, first_seed) for name in dict.fromkeys(scenario)]
     if purpose(first_seed, layouts) != "train":
@@ -136,9 +140,9 @@ def _counts(text: str, least: int) -> list[int]:
 
 
 def _base(
-    text: str | None, lora: bool, rank: int | None, rate: float | None, dtype: str
-) -> "tuple[Path | Card | None, tuple[int | None, float, Any]]":
-    """Return what a model begins as, and how a published one is changed: rank, learning rate, number format.
+    text: str | None, lora: bool, rank: int | None, rate: float | None, dtype: str, report: float | None
+) -> "tuple[Path | Card | None, tuple[int | None, float, Any, float]]":
+    """Return what a model begins as, and how a published one is changed, in the order of `Adapt`.
 
     That is the folder of a model of texts that was distilled here, or the card of a published one.
     """
@@ -151,7 +155,9 @@ def _base(
             raise UserError(f"{flag} {value:g}: give more than 0 and at most {MOST}")
     if dtype not in DTYPES:
         raise unknown("--dtype", dtype, DTYPES)
-    adapt = (rank or RANK if lora else None, rate or RATES[lora], dtype)
+    if report is not None and not 0 <= report <= MOST:
+        raise UserError(f"--report {report:g}: give 0 to {MOST}")
+    adapt = (rank or RANK if lora else None, rate or RATES[lora], dtype, REPORT if report is None else report)
     folder = Path(text or "")
     ours = (cards.DISTILLED, "model.safetensors", "tokenizer.json")
     if text and not lora and all((folder / name).is_file() for name in ours):
@@ -160,6 +166,6 @@ def _base(
         return cards.resolve(text, "transformers"), adapt
     else:
         start = None
-    if lora or rate or dtype != DTYPES[0]:
-        raise UserError("--lora, --rate and --dtype go with --base, a published model")
+    if lora or rate or dtype != DTYPES[0] or report is not None:
+        raise UserError("--lora, --rate, --dtype and --report go with --base, a published model")
     return start, adapt

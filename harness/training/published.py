@@ -31,6 +31,7 @@ class Adapt:
     rank: int | None  # of the LoRA adapter that is trained; None trains all weights
     rate: float  # learning rate of AdamW
     dtype: Literal["float32", "bfloat16"] = "float32"  # in which its layers compute; weights are float32
+    report: float = 0.3  # weight of the words behind a letter, which it learns soon, beside the letter's KL
 
 
 class Published:
@@ -136,6 +137,7 @@ below. {facts["parameters"]:,} weights learnt. The base's weights have sha256
 - Teacher: outcomes, as soft labels over the actions after which success is possible. A viewer that cannot
   tell scenes apart learns their mean, so what is hidden makes it unsure.
 - Seed {plan["seed"]}, batches of {plan["batch"]}, AdamW {adapt["rate"]:g}, layers in {adapt["dtype"]}.
+  The words behind a letter weigh {adapt["report"]:g}.
 
 The read-out on layouts held out, KL to the soft labels in nats, beside that of always answering their mean,
 and how often each action is the likeliest.

@@ -71,11 +71,6 @@ class Plan:
     seed: int = 0  # of the weights and of the order
     adapt: Adapt | None = None  # how a published model is changed; None for one of ours
 
-    @property
-    def prompt_weight(self) -> float:
-        """Weight of the cross-entropy of the prompt's own tokens: a published model can read."""
-        return 0.0 if self.adapt else PROMPT_WEIGHT
-
 
 Curve = list[tuple[Any, ...]]  # sequences seen, mean loss, and the held-out KL if it is watched
 
@@ -95,12 +90,12 @@ def run_stage(
     start, curve = 0, []
     losses: list[Any] = []
     if going.is_file():
-        state = torch.load(going, weights_only=True, map_location=device)
+        state = torch.load(going, weights_only=True, map_location="cpu")  # where AdamW counts its steps
         restore(model, state["model"])
         for opt, kept in zip(opts, state["opts"], strict=True):
             opt.load_state_dict(kept)
         start, curve = state["step"], [tuple(point) for point in state["curve"]]
-        losses = list(state.get("losses", ()))
+        losses = [loss.to(device) for loss in state.get("losses", ())]
     letter_ids, digit_ids = (torch.tensor(ids, device=device) for ids in (letters, digits))
     model.train()
     kept_s = time.monotonic()
@@ -109,7 +104,7 @@ def run_stage(
         for opt, rate in zip(opts, rates, strict=True):
             opt.param_groups[0]["lr"] = rate * scale
         batch = [samples[i] for i in batches[step]]
-        loss = loss_of(model, batch, letter_ids, digit_ids, plan.prompt_weight)
+        loss = loss_of(model, batch, letter_ids, digit_ids, plan)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         for opt in opts:
@@ -212,9 +207,7 @@ def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
     return {**patches, "position_ids": places[:, :, batch[0].shared :]}
 
 
-def loss_of(
-    model: Any, batch: Sequence[Sample], letters: Any, digits: Any, prompt_weight: float = PROMPT_WEIGHT
-) -> Any:
+def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan: Plan) -> Any:
     """Return the KL of the read-out to its target (nats) plus mean cross-entropies of text and pictures."""
     hidden = hidden_states(model, batch)
     weight, device, shared = model.get_output_embeddings().weight, hidden.device, batch[0].shared
@@ -222,8 +215,8 @@ def loss_of(
     picture = rest == getattr(model.config, "image_token_id", -1)  # a model of texts has no such token
     pictures = [s.image for s in batch if s.image is not None]  # of all or of none
     total = hidden.new_zeros(())
-    if prompt_weight:
-        total = prompt_weight * _prompt_loss(hidden, weight, batch, rest, picture)
+    if not plan.adapt:  # a published model can read
+        total = PROMPT_WEIGHT * _prompt_loss(hidden, weight, batch, rest, picture)
     if pictures:
         total = total + CELLS_WEIGHT * _cells_loss(hidden[picture] @ weight[digits].T, pictures)
     targets = {i: s.target for i, s in enumerate(batch) if s.target is not None}
@@ -244,9 +237,15 @@ def loss_of(
         rows = np.concatenate([np.full(end - start, i) for i, start, end in writing])
         columns = np.concatenate([np.arange(start, end) for _, start, end in writing])
         ids = np.concatenate([batch[i].ids[start:end] for i, start, end in writing]).astype(np.int64)
-        logits = hidden[torch.from_numpy(rows), torch.from_numpy(columns - shared - 1)] @ weight.T
-        text = F.cross_entropy(logits, torch.from_numpy(ids).to(device))
-        total = total + TEXT_WEIGHT * text * len(writing) / len(batch)
+        row, column = (torch.from_numpy(at).to(device) for at in (rows, columns - shared - 1))
+        text = F.cross_entropy(
+            hidden[row, column] @ weight.T, torch.from_numpy(ids).to(device), reduction="none"
+        )
+        weights = np.full(len(batch), TEXT_WEIGHT)
+        if plan.adapt:
+            weights[list(targets)] = plan.adapt.report
+        text = text * torch.from_numpy(weights[rows]).to(text)
+        total = total + text.mean() * len(writing) / len(batch)
     return total
 
 
