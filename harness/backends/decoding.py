@@ -65,7 +65,7 @@ class Decoding:
         self._engine = engine
         self._chat = engine.chat
         self._skeletons: dict[Shape, Skeleton] = {}
-        self._letters: dict[tuple[str, ...], list[list[int]]] = {}
+        self._letters: dict[str, list[list[int]]] = {}
 
     def room(self, request: Request) -> int:
         """Return the most tokens that the answer can take after the prompt.
@@ -202,19 +202,18 @@ class Decoding:
 
     def _letter_tokens(self, actions: tuple[str, ...]) -> list[list[int]]:
         """Return the tokens of each letter, in all its spellings: with a blank before it, and without."""
-        if actions not in self._letters:
-            encodings = [tokens_after(self._chat, "\n", letter) for letter in letters(actions)]
+        if (names := letters(actions)) not in self._letters:
+            encodings = [tokens_after(self._chat, "\n", letter) for letter in names]
             if any(len(tokens) != 1 for tokens in encodings) or len(set(encodings)) < len(encodings):
                 raise UserError(
                     f"{self._chat.shown}: its tokenizer has no single token for each of "
-                    f"the letters {letters(actions)}; use --answer json"
+                    f"the letters {names}; use --answer json"
                 )
-            known = self._chat.spellings(letters(actions))
-            self._letters[actions] = [
-                sorted({token, *known[letter]})
-                for (token,), letter in zip(encodings, letters(actions), strict=True)
+            known = self._chat.spellings(names)
+            self._letters[names] = [
+                sorted({token, *known[letter]}) for (token,), letter in zip(encodings, names, strict=True)
             ]
-        return self._letters[actions]
+        return self._letters[names]
 
 
 def _completion(

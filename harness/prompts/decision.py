@@ -6,9 +6,14 @@ chat model answers the same question by a read-out of letters (`harness.prompts.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from harness.prompts import readout
 from harness.world.scene_graph import SceneGraph
+
+# `choice` between options; `score`, of levels named by their place from 0, the lowest first; `noul`, how
+# probable `true` is and how probable `false`.
+Kind = Literal["choice", "score", "noul"]
 
 # What actions mean; the words of a scenario go before it, under the action's name.
 MEANINGS = {
@@ -28,11 +33,12 @@ CARE = {
 
 @dataclass(frozen=True)
 class Question:
-    """A choice between actions."""
+    """A choice between actions, or what somebody else asks of a served model."""
 
     state: str  # what the prompt says of the scene
     instructions: str  # what is asked, in the scenario's words
-    meanings: Mapping[str, str | None]  # of each action; None where nobody says
+    meanings: Mapping[str, str | None]  # of each action or other option; None where nobody says
+    kind: Kind = "choice"
 
     def reworded(self, change: Callable[[str], str]) -> "Question":
         """Return the question with all its texts changed."""

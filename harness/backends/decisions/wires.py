@@ -21,6 +21,7 @@ from harness.core.image import Image
 from harness.prompts.decision import Question
 
 NAME = "action"  # of the one question of a request
+Shares = Iterable[tuple[Any, Any]]  # each option with its probability, as stated
 
 
 def asked_of(request: Request) -> Question:
@@ -33,8 +34,13 @@ def asked_of(request: Request) -> Question:
 def questions(request: Request) -> dict[str, Any]:
     """Return the question as System One has it, its options in the order of the actions."""
     question = asked_of(request)
-    criteria = {action: question.meanings[action] for action in request.actions}
-    return {NAME: {"type": "choice", "instructions": question.instructions, "criteria": criteria}}
+    meant: Any = {action: question.meanings[action] for action in request.actions}
+    if question.kind == "score":
+        meant = [meaning or action for action, meaning in meant.items()]
+    elif question.kind == "noul":  # a model has words of its own for what nobody describes
+        meant = {action: meaning for action, meaning in meant.items() if meaning}
+    criteria = {"criteria": meant} if meant else {}
+    return {NAME: {"type": question.kind, "instructions": question.instructions, **criteria}}
 
 
 def _systemone(card: Card, server: Server, request: Request, url: Callable[[Image], str]) -> dict[str, Any]:
@@ -50,39 +56,56 @@ def _decisions(card: Card, server: Server, request: Request, url: Callable[[Imag
         parts = [picture, {"type": "input_text", "text": question.state}]
         content = [{"role": "user", "content": parts}]
     meant = {action: question.meanings[action] for action in request.actions}
-    choices = [{"value": a, "description": m} if m else {"value": a} for a, m in meant.items()]
-    asked = {"type": "choice", "name": NAME, "instructions": question.instructions, "choices": choices}
+    asked: dict[str, Any] = {"name": NAME, "instructions": question.instructions}
+    if question.kind == "choice":
+        choices = [{"value": a, "description": m} if m else {"value": a} for a, m in meant.items()]
+        asked |= {"type": "choice", "choices": choices}
+    elif question.kind == "score":
+        asked |= {"type": "score", "levels": [{"label": m or a} for a, m in meant.items()]}
+    else:  # a predicate has no place for what its outcomes mean
+        described = [f"{action}: {meaning}" for action, meaning in meant.items() if meaning]
+        asked |= {"type": "predicate", "instructions": "\n".join([question.instructions, *described])}
     return {"model": card.weights, "input": content, "questions": [asked]}
 
 
 def read_systemone(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
     """Read an answer to `POST /v1/systemone`, without its time; a malformed one is an error."""
     try:
-        answer = payload["answers"][NAME]
-        shares = [] if answer["type"] == "refusal" else answer["probabilities"].items()
+        shares = _shares(payload["answers"][NAME], "noul", lambda listed: listed.items())
     except (LookupError, TypeError, AttributeError):
         return failed(request, "the answer is no decision: it has no probabilities of the question")
-    return _completion(payload, request, answer["type"] == "refusal", shares)
+    return _completion(payload, request, shares)
 
 
 def read_decisions(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
     """Read an answer to `POST /v1/decisions`, without its time; a malformed one is an error."""
     try:
         [answer] = payload["answers"]
-        listed = [] if answer["type"] == "refusal" else answer["probabilities"]
-        shares = [(each["value"], each["probability"]) for each in listed]
+        shares = _shares(
+            answer, "probability", lambda listed: [(each["value"], each["probability"]) for each in listed]
+        )
     except (LookupError, TypeError, AttributeError, ValueError):
         return failed(request, "the answer is no decision: it has no probabilities of the question")
-    return _completion(payload, request, answer["type"] == "refusal", shares)
+    return _completion(payload, request, shares)
 
 
-def _completion(
-    payload: Mapping[str, Any], request: Request, refused: bool, shares: Iterable[tuple[Any, Any]]
-) -> Completion:
+def _shares(answer: Any, yes: str, pairs: Callable[[Any], Shares]) -> Shares | None:
+    """Return each option with its probability; None where the question is refused.
+
+    `yes` is where the probability of a yes stands, `pairs` reads the list of a choice or of levels.
+    """
+    if answer["type"] == "refusal":
+        return None
+    if answer["type"] in ("noul", "predicate"):
+        return ("true", answer[yes]), ("false", 1 - answer[yes])
+    return pairs(answer["probabilities"])
+
+
+def _completion(payload: Mapping[str, Any], request: Request, shares: Shares | None) -> Completion:
     usage = payload.get("usage")
     usage = usage if isinstance(usage, dict) else {}
     read = tokens_in(usage.get("input_tokens")) or None  # some count none
-    if refused:
+    if shares is None:
         return Completion(request.id, "", read, 0, "refusal", None, 1)
     # Written out, so that the parser sees an option that stands there twice.
     members = ",".join(f"{json.dumps(str(option))}:{json.dumps(share)}" for option, share in shares)
