@@ -9,6 +9,7 @@ COMMANDS = {
     "compare": "compare",
     "report": "report",
     "view": "view",
+    "serve": "serve",
     "study sweep": "sweep",
     "study contents": "contents",
     "study trust": "trust",
@@ -74,7 +75,7 @@ GROUPS = {
 PANELS = {
     "Evaluate": ("init", "eval", "drive"),
     "Look at results": ("compare", "report", "view"),
-    "More": ("study", "run", "model", "prompt", "dataset", "radio"),
+    "More": ("serve", "study", "run", "model", "prompt", "dataset", "radio"),
 }
 
 # Spellings of 0.2 and what replaces them; they work until 0.4.0, with a note.

@@ -194,7 +194,7 @@ PLAIN: dict[str, str] = {
     "dataset scenario audit name": "do-not-pass", "radio show name": "6g", "radio check name": "mode4",
     "model check name": "proxy", "model pull name": "proxy", "model device show name": "laptop-cpu",
     "model device check name": "laptop-cpu", "model parity model": "models/evil-weights", "port": "0",
-    "limit": "1", "episodes": "1", "seeds": "0:1", "workers": "1", "layouts": "20",
+    "serve model": "mine", "limit": "1", "episodes": "1", "seeds": "0:1", "workers": "1", "layouts": "20",
     "study attribute sample": "2", "count": "1", "over": "consensus", "grid": "ego-prompt", "attacks": "jump",
     "rules": "linear", "share": "1/3", "twin": "mirrored", "schedule": "entropy", "samples": "1,1,1,1",
     "prompts": "1", "window_s": "1", "out": "written",
@@ -316,10 +316,16 @@ def test_a_hostile_copy_causes_nothing(
 
 
 def visited(self: uvicorn.Server, sockets: Any) -> None:
-    """The pages of `harness view` as a browser opens them, in place of a server."""
+    """The pages of `harness view` as a browser opens them, in place of a server; or a question."""
     browser = TestClient(
         cast("Any", self.config.app), base_url="http://127.0.0.1:7654", raise_server_exceptions=False
     )
+    if browser.get("/v1/models").status_code == 200:  # of `harness serve`
+        asked = {"type": "choice", "criteria": {"{{ environ }}": None, MODULE: None}}
+        said = browser.post("/v1/systemone", json={"state": "evil.txt", "questions": {"a": asked}})
+        assert said.status_code == 502
+        assert SECRET not in said.text
+        return
     assert browser.get("/?token=token").status_code == 200
     for name in ("served", "moved", "named", "driven", "traffic"):
         browser.get("/run", params={"path": name})

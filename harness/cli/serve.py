@@ -1,0 +1,64 @@
+"""`harness serve`: a model, to be asked by others."""
+
+import os
+
+import typer
+
+from harness.cli import options
+from harness.core.errors import UserError, in_range, printable
+from harness.evaluate.settings import HELP
+
+TOKEN = "SWARMDRIVE_SERVE_TOKEN"
+LEAST = 8  # characters of a token
+
+
+def command(
+    model: options.Model,
+    engine: options.Engine = None,
+    letters: str | None = typer.Option(None, help=HELP["letters"]),
+    batch_size: int = typer.Option(
+        1, help="Most questions that the model is asked together. With 1 none moves another's answer."
+    ),
+    device: options.Device = None,
+    dtype: options.Dtype = None,
+    host: str = typer.Option(
+        "127.0.0.1", help="Address to serve at. One that other machines reach needs a token."
+    ),
+    port: int = typer.Option(8080, help="Port; 0 picks a free one."),
+    token: str | None = typer.Option(
+        None, help=f"What clients must give as their API key. Default: the value of {TOKEN}, if any."
+    ),
+) -> None:
+    """Serve a model's decisions to other programs.
+
+    It answers POST /v1/systemone, POST /v1/decisions and GET /v1/models until Ctrl-C. A language model
+    answers by a read-out of letters, a decision model as it does.
+    """
+    from harness.backends.cards import resolve
+    from harness.backends.registry import open_backend
+    from harness.core import web
+    from harness.serving.app import CONNECTIONS, Service
+    from harness.serving.model import ServedModel, served
+
+    in_range("--port", port, 0, 65535)
+    local, token = web.is_loopback(host), token or os.environ.get(TOKEN) or None
+    if token is None and not local:
+        raise UserError(
+            f"--host {printable(host)}: other machines reach it; give a --token, or set {TOKEN}, or leave "
+            "--host out"
+        )
+    if token is not None and not (token.isascii() and token.isprintable() and " " not in token):
+        raise UserError("--token: it has characters that no key has; give letters and digits")
+    if token is not None and len(token) < LEAST:
+        raise UserError(f"--token: it has {len(token)} characters; give {LEAST} or more")
+    agent = served(resolve(model, engine), letters)
+    backend = open_backend(agent.card, device=device, dtype=dtype, batch_size=batch_size)
+    service = Service(ServedModel(agent, backend), batch_size, token, local)
+
+    def listening(url: str) -> None:
+        typer.echo(f"{url}/v1 serves {printable(agent.card.name)} until Ctrl-C")
+
+    try:
+        web.serve(service.app(), host, port, listening, limit_concurrency=CONNECTIONS)
+    except KeyboardInterrupt:
+        return

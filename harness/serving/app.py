@@ -1,0 +1,188 @@
+"""The application of `harness serve`: a model's decisions by two wire shapes, and nothing else.
+
+A request names no file, address or code: its texts are data of a question, and its pictures come with it. Who
+may ask is decided before its body is read; browsers' pages of other sites may not, since they cannot send
+JSON without leave, and names other than this machine's are refused (DNS rebinding) where only it is served.
+"""
+
+import asyncio
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from secrets import compare_digest
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from harness.backends import base
+from harness.core import web
+from harness.core.errors import Unanswered, UserError, one_line, printable
+from harness.serving import decisions, systemone
+from harness.serving.asked import Answered, Enquiry, Refusal, answered
+from harness.serving.desk import AGAIN_S, PLACES, Desk
+from harness.serving.model import ServedModel
+
+MOST_BYTES = 2**20  # of a request
+MOST_SEEN_BYTES = 5 * 2**20  # of one with a picture
+BODY_S = 30.0  # within which a request must have come
+ANSWER_S = 120.0  # within which it is answered; a client's usual patience
+CONNECTIONS = 128  # open at the same time
+_OVERFLOW = "context overflow"
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One wire shape."""
+
+    path: str
+    body: type[Any]
+    read: Callable[[Any], Enquiry]
+    write: Callable[[str, Sequence[Answered]], dict[str, Any]]
+
+
+SHAPES = (
+    Shape("/v1/systemone", systemone.Body, systemone.read, systemone.write),
+    Shape("/v1/decisions", decisions.Body, decisions.read, decisions.write),
+)
+
+
+class Service:
+    """Answers the requests for one model."""
+
+    def __init__(
+        self, model: ServedModel, batch_size: int = 1, token: str | None = None, local: bool = True,
+        places: int = PLACES, answer_s: float = ANSWER_S,
+    ) -> None:  # fmt: skip
+        """Prepare to answer.
+
+        Args:
+            model: the model.
+            batch_size: most questions that it is asked together.
+            token: what clients must give as their key; None asks for none.
+            local: whether only this machine is served.
+            places: most questions that wait.
+            answer_s: seconds within which a request is answered.
+        """
+        self._model, self._token, self._local, self._answer_s = model, token, local, answer_s
+        self._desk = Desk(model.backend, batch_size, places)
+
+    def app(self) -> Starlette:
+        """Return the application."""
+        routes = [Route("/v1/models", self._models, methods=["GET"])]
+        routes += [Route(shape.path, self._answerer(shape), methods=["POST"]) for shape in SHAPES]
+        handlers: Any = {HTTPException: self._missing, Exception: self._bug}
+        return Starlette(routes=routes, exception_handlers=handlers)
+
+    async def _models(self, request: Request) -> Response:
+        try:
+            self._admit(request)
+        except Refusal as refusal:
+            return _refused(refusal)
+        return JSONResponse({"object": "list", "data": [self._model.listed()]})
+
+    def _answerer(self, shape: Shape) -> Callable[[Request], Any]:
+        async def answer(request: Request) -> Response:
+            try:
+                self._admit(request)
+                return JSONResponse(await self._answer(shape, await self._body(request)))
+            except Refusal as refusal:
+                return _refused(refusal)
+
+        return answer
+
+    def _admit(self, request: Request) -> None:
+        """Raise Refusal unless who asks may."""
+        headers = request.headers
+        if self._local:
+            try:
+                host = urlsplit(f"//{headers.get('host', '')}").hostname
+            except ValueError:
+                host = None
+            if host not in web.NAMES:
+                raise Refusal("this machine is called 127.0.0.1 or localhost here", 403, "forbidden")
+        if "origin" in headers:
+            raise Refusal("pages of other sites are not served", 403, "forbidden")
+        if self._token is not None:
+            kind, _, given = headers.get("authorization", "").partition(" ")
+            if kind.lower() != "bearer" or not compare_digest(given.strip().encode(), self._token.encode()):
+                raise Refusal("give the server's token as the API key", 401, "invalid_api_key")
+
+    async def _body(self, request: Request) -> bytes:
+        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        if kind != "application/json" or request.headers.get("content-encoding", "identity") != "identity":
+            raise Refusal("a request is JSON, as application/json and not compressed", code="content_type")
+        most = MOST_SEEN_BYTES if self._model.sees else MOST_BYTES
+        data = bytearray()
+        try:
+            async with asyncio.timeout(BODY_S):
+                async for chunk in request.stream():
+                    data += chunk
+                    if len(data) > most:
+                        raise Refusal(f"the request has more than {most} bytes", 413, "too_large")
+        except TimeoutError:
+            raise Refusal(f"the request did not come within {BODY_S:g} s", 408, "timeout") from None
+        except ClientDisconnect:
+            raise Refusal("the client is gone", 400, "gone") from None
+        return bytes(data)
+
+    async def _answer(self, shape: Shape, body: bytes) -> dict[str, Any]:
+        enquiry, requests = await run_in_threadpool(self._read, shape, body)
+        try:
+            async with asyncio.timeout(self._answer_s):
+                completions = await self._desk.ask(requests)
+        except TimeoutError:
+            raise Refusal(f"no answer within {self._answer_s:g} s", 503, "timeout") from None
+        except Unanswered as error:
+            raise Refusal(one_line(error), 503, "no_answer") from None
+        except UserError as error:  # such as a chat template that refuses the texts
+            raise Refusal(one_line(error)) from None
+        for completion in completions:
+            _raise(completion)
+        pairs = zip(enquiry.questions, completions, strict=True)
+        return shape.write(self._model.name, [answered(*pair) for pair in pairs])
+
+    def _read(self, shape: Shape, body: bytes) -> tuple[Enquiry, list[base.Request]]:
+        try:
+            enquiry = shape.read(msgspec.json.decode(body, type=shape.body))
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            raise Refusal(f"not what POST {shape.path} takes: {one_line(error)}") from None
+        return enquiry, self._model.requests(enquiry)
+
+    def _missing(self, request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        paths = ", ".join(["GET /v1/models", *(f"POST {shape.path}" for shape in SHAPES)])
+        where = printable(f"{request.method} {request.url.path}")
+        return _refused(Refusal(f"nothing answers {where}; there is {paths}", error.status_code, "not_found"))
+
+    def _bug(self, request: Request, error: Exception) -> Response:
+        traceback.print_exception(error)
+        return _refused(Refusal("the server failed; its terminal says why", 500, "bug"))
+
+
+def _raise(completion: base.Completion) -> None:
+    """Raise Refusal if a question got no answer, with the engine's words."""
+    if completion.error is None:
+        return
+    words = printable(completion.error, 300)
+    if completion.error.startswith(_OVERFLOW):
+        raise Refusal(words, code="context_length_exceeded")
+    raise Refusal(f"the model gave no answer: {words}", 502, "no_answer")
+
+
+def _refused(refusal: Refusal) -> Response:
+    """Return an error as OpenAI writes one."""
+    kind = {429: "rate_limit_error"}.get(
+        refusal.status, "server_error" if refusal.status >= 500 else "invalid_request_error"
+    )
+    error = {"message": refusal.words, "type": kind, "param": None, "code": refusal.code}
+    headers = {"retry-after": str(AGAIN_S)} if refusal.status in (429, 503) else {}
+    if refusal.status == 413 or refusal.status == 408:
+        headers["connection"] = "close"  # what is left of it is not read
+    return JSONResponse({"error": error}, refusal.status, headers)

@@ -1,0 +1,103 @@
+"""What a client asks: one state, and typed questions about it, whatever the wire shape."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from harness.backends.base import Completion
+from harness.core.errors import printable
+from harness.prompts.decision import Question
+
+MOST_QUESTIONS = 64  # of one request
+MOST_OPTIONS = 255  # of one question, as other servers of the class
+
+
+class Refusal(Exception):
+    """A request that gets no answer: an HTTP status and one line, with a word for programs."""
+
+    def __init__(self, words: str, status: int = 400, code: str = "invalid_request") -> None:
+        super().__init__(words)
+        self.words, self.status, self.code = words, status, code
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One question of a request."""
+
+    name: str | None  # by which its answer is known
+    question: Question
+    values: tuple[Any, ...]  # its options as the client writes them, in their order
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        return tuple(self.question.meanings)
+
+
+@dataclass(frozen=True)
+class Enquiry:
+    """A whole request."""
+
+    model: str | None  # the name that it asks for; None takes the one that there is
+    questions: tuple[Asked, ...]
+    images: tuple[str, ...] = ()  # URLs of the pictures before the state
+
+
+@dataclass(frozen=True)
+class Answered:
+    """The answer to one question; `shares` is None where the model refused it."""
+
+    asked: Asked
+    shares: tuple[float, ...] | None  # probability of each option, as the model states it
+    tokens: int | None  # that were read; None if nobody counts them
+
+    @property
+    def likeliest(self) -> int:
+        assert self.shares is not None
+        return self.shares.index(max(self.shares))
+
+    @property
+    def confidence(self) -> float:
+        """0 where all options are equally likely, 1 where one is certain: (K max p - 1) / (K - 1)."""
+        assert self.shares is not None
+        k = len(self.shares)
+        return min(1.0, max(0.0, (k * max(self.shares) - 1) / (k - 1)))
+
+    @property
+    def mean_level(self) -> float:
+        assert self.shares is not None
+        return sum(level * share for level, share in enumerate(self.shares))
+
+
+def text_of(content: Any) -> str:
+    """Return content as the model reads it: text as it is, anything else as JSON."""
+    return content if isinstance(content, str) else json.dumps(content, indent=2, ensure_ascii=False)
+
+
+def asked(name: str | None, question: Question, options: Sequence[tuple[Any, str | None]]) -> Asked:
+    """Return a question with its options, a value and what it means each.
+
+    Raises Refusal if there are too few options, too many, or two of one name.
+    """
+    who = "a question" if name is None else f"question {printable(name, 40)!r}"
+    if not 2 <= len(options) <= MOST_OPTIONS:
+        raise Refusal(f"{who} has {len(options)} options; give 2 to {MOST_OPTIONS}", code="options")
+    meanings = {text_of(value): meaning for value, meaning in options}
+    if len(meanings) < len(options):
+        raise Refusal(f"{who} has an option twice; give each once", code="options")
+    full = Question(question.state, question.instructions, meanings, question.kind)
+    return Asked(name, full, tuple(value for value, _ in options))
+
+
+def answered(asked: Asked, completion: Completion) -> Answered:
+    """Read a completion. Raises Refusal if it has no probability of each option."""
+    if completion.finish_reason == "refusal":
+        return Answered(asked, None, completion.prompt_tokens)
+    try:
+        stated: Mapping[str, Any] = json.loads(completion.text)["action_distribution"]
+        shares = [stated[option] for option in asked.options]
+    except (ValueError, LookupError, TypeError, RecursionError):
+        shares = []
+    if not shares or not all(type(p) in (int, float) and 0 <= p <= 1 for p in shares):
+        raise Refusal("the model stated no probability of each option", 502, "no_answer")
+    return Answered(asked, tuple(map(float, shares)), completion.prompt_tokens)

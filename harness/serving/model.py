@@ -1,0 +1,95 @@
+"""A model as it is served: what it is sent of a question, what it may be asked, and what it is called."""
+
+import time
+from itertools import count
+from typing import Any
+
+from harness.backends.base import Backend, Request
+from harness.backends.card import Card
+from harness.backends.registry import capabilities
+from harness.core.errors import UserError, printable
+from harness.core.files import digest
+from harness.core.image import Image
+from harness.evaluate.agent import Agent
+from harness.prompts import decision, versions
+from harness.prompts.readout import LETTERS
+from harness.serving.asked import Asked, Enquiry, Refusal
+from harness.serving.picture import picture
+
+ANY = "default"  # the name that asks for whatever there is
+WIDEST = 16  # characters of a token; a longer question is refused before it is split
+_PROMPT = "v9"  # no text of it is asked
+
+
+def served(card: Card, letters: Any = None) -> Agent:
+    """Return the agent that answers for a card. Raises UserError if its model cannot be asked questions."""
+    can = capabilities(card.engine)
+    if not ("decision" in can.answer_modes and can.closed_loop):
+        raise UserError(
+            f"{card.shown}: its engine {card.engine} reads scenes or recorded answers, and no question of "
+            "others, so it cannot be served; give a language model or a decision model"
+        )
+    return Agent(card, versions.load(_PROMPT), "decision", letters=letters)
+
+
+class ServedModel:
+    """Turns questions into requests of a model."""
+
+    def __init__(self, agent: Agent, backend: Backend) -> None:
+        self._agent, self.backend = agent, backend
+        self.name = agent.card.name
+        self._reads_letters = "readout" in agent.can.answer_modes
+        self.sees = agent.card.vision is not None
+        self._numbers = count()  # of requests, which several threads make
+        self._started_s = int(time.time())
+        self._digest = digest({**backend.identity(), "letters": agent.letters})
+
+    def listed(self) -> dict[str, Any]:
+        """Return its entry in `GET /v1/models`; a served model gives decisions and writes nothing."""
+        reads = ["text", *(["image"] if self.sees else [])]
+        return {
+            "id": self.name, "object": "model", "created": self._started_s,
+            "owned_by": "swarmdrive-harness",
+            "architecture": {"input_modalities": reads, "output_modalities": ["decisions"]},
+            "meta": {"digest": self._digest},
+        }  # fmt: skip
+
+    def requests(self, enquiry: Enquiry) -> list[Request]:
+        """Return a request for each question. Raises Refusal if the model cannot be asked one."""
+        if enquiry.model not in (None, ANY, self.name):
+            raise Refusal(
+                f"there is no model {printable(enquiry.model)!r}; ask for {printable(self.name)!r}, or for "
+                f"{ANY!r}",
+                code="model_not_found",
+            )
+        if enquiry.images and not self.sees:
+            raise Refusal(f"{printable(self.name)} reads texts alone; leave pictures out", code="picture")
+        if len(enquiry.images) > 1:
+            raise Refusal(f"{len(enquiry.images)} pictures; give one", code="picture")
+        image = picture(enquiry.images[0]) if enquiry.images else None
+        return [self._request(each, image) for each in enquiry.questions]
+
+    def _request(self, asked: Asked, image: Image | None) -> Request:
+        if self._reads_letters and len(asked.options) > len(LETTERS):
+            raise Refusal(
+                f"question {printable(asked.name, 40)!r} has {len(asked.options)} options; "
+                f"{printable(self.name)} answers by a letter each, and takes {len(LETTERS)} at most",
+                code="options",
+            )
+        turn = {"role": "user", **({"image": "camera"} if image else {})}
+        chats = self._agent.in_orders(
+            asked.options, lambda order: decision.asked(asked.question, (turn,), order)
+        )
+        self._refuse_long(chats["messages"])
+        blank = self._agent.blank("ego", asked.options)
+        return blank.alike(id=f"{next(self._numbers)}/asked", question=asked.question, image=image, **chats)
+
+    def _refuse_long(self, messages: Any) -> None:
+        """Refuse what no tokenizer makes short enough, before all orders of it are split into tokens."""
+        most = getattr(getattr(self.backend, "engine", None), "context_tokens", None)
+        length = sum(len(message["content"]) for message in messages)
+        if most is not None and length > WIDEST * most:
+            raise Refusal(
+                f"{length} characters are asked; {printable(self.name)} reads {most} tokens at most",
+                code="context_length_exceeded",
+            )

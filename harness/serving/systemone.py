@@ -1,0 +1,89 @@
+"""`POST /v1/systemone`, as TypeSafe's API and llama.cpp have it (llama.cpp, tools/server/README.md)."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from msgspec import Meta, Struct
+
+from harness.prompts.decision import Question
+from harness.serving.asked import MOST_QUESTIONS, Answered, Asked, Enquiry, asked, text_of
+
+Content = str | dict[str, Any] | list[Any]
+
+
+class Choice(Struct, tag_field="type", tag="choice"):
+    """One of several options."""
+
+    criteria: dict[str, Content | None]
+    instructions: Content | None = None
+
+
+class Score(Struct, tag_field="type", tag="score"):
+    """A level, the lowest first."""
+
+    criteria: Annotated[list[Content], Meta(min_length=2, max_length=10)]
+    instructions: Content | None = None
+
+
+class Noul(Struct, tag_field="type", tag="noul"):
+    """Whether something is true."""
+
+    instructions: Content | None = None
+    criteria: dict[str, Content | None] | None = None
+
+
+class Body(Struct):
+    """A request; fields that are not listed are ignored."""
+
+    state: Content
+    questions: Annotated[dict[str, Choice | Score | Noul], Meta(min_length=1, max_length=MOST_QUESTIONS)]
+    model: str | None = None
+    images: list[str] = []
+    files: list[str] = []
+
+
+def read(body: Body) -> Enquiry:
+    """Return what is asked. Raises Refusal where it cannot be."""
+    state = text_of(body.state)
+    questions = tuple(_asked(name, each, state) for name, each in body.questions.items())
+    return Enquiry(body.model, questions, (*body.files, *body.images))
+
+
+def _asked(name: str, question: Choice | Score | Noul, state: str) -> Asked:
+    instructions = "" if question.instructions is None else text_of(question.instructions)
+    match question:
+        case Choice(criteria=criteria):
+            options = [(option, _meaning(content)) for option, content in criteria.items()]
+            return asked(name, Question(state, instructions, {}), options)
+        case Score(criteria=levels):
+            options = [(str(level), text_of(content)) for level, content in enumerate(levels)]
+            return asked(name, Question(state, instructions, {}, "score"), options)
+        case Noul(criteria=outcomes):
+            options = [(option, _meaning((outcomes or {}).get(option))) for option in ("true", "false")]
+            return asked(name, Question(state, instructions, {}, "noul"), options)
+
+
+def _meaning(content: Content | None) -> str | None:
+    return None if content is None else text_of(content)
+
+
+def write(model: str, answers: Sequence[Answered]) -> dict[str, Any]:
+    """Return the answer's JSON. `input_tokens` is 0 where nobody counts them."""
+    written = {each.asked.name: _answer(each) for each in answers}
+    usage = {"input_tokens": sum(each.tokens or 0 for each in answers), "output_tokens": 0}
+    return {"model": model, "answers": written, "usage": usage}
+
+
+def _answer(answer: Answered) -> dict[str, Any]:
+    if answer.shares is None:  # which these servers' documents do not know
+        return {"type": "refusal"}
+    kind, options = answer.asked.question.kind, answer.asked.options
+    if kind == "noul":
+        return {"type": kind, "noul": answer.shares[options.index("true")]}
+    spread = {
+        "probabilities": dict(zip(options, answer.shares, strict=True)), "confidence": answer.confidence,
+    }  # fmt: skip
+    if kind == "score":
+        legend = dict(answer.asked.question.meanings)
+        return {"type": kind, "score": answer.mean_level, "legend": legend, **spread}
+    return {"type": kind, "choice": options[answer.likeliest], **spread}
