@@ -1,6 +1,6 @@
 """The two ways to ask a server of decision models: System One's, and that of OpenAI's decisions.
 
-`POST /v1/systemone` is what others say of llama.cpp and of Ollama 0.35 and later, and what the server of
+`POST /v1/systemone` is llama.cpp's (tools/server/README.md), Ollama's from 0.35 on, and what the server of
 sparrow-decider answers; `POST /v1/decisions` is OpenAI's (openai-python, types/decision_create_params.py and
 types/decision.py). Whatever a server promises, `harness.parsing.parse` judges the probabilities, which are
 kept as they are stated.
