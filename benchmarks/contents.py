@@ -17,11 +17,12 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from markupsafe import Markup
 from pages import harness, write_tables
 
 from harness.coordination.contents import CONTENTS
-from harness.core.arrays import Floats
+from harness.core.arrays import Bools, Floats
 from harness.core.figures import shown
 from harness.core.progress import Progress
 from harness.dataset import suites
@@ -30,6 +31,7 @@ from harness.report.document import Table
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, SUCCESS, by_episode
 from harness.studies.contents import BASE, NOTHING, Outcome, folders, models, panels_of, run_contents
+from harness.studies.contents_page import contents_study
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, write_study
 from harness.world import scenarios
@@ -115,7 +117,8 @@ def play(row: Row, here: Path) -> Study:
     print(f"harness study contents {here / 'frozen'} --out {here / 'contents'}", file=sys.stderr, flush=True)
     runs = [ReplayedRun(run) for run in folders(here / "frozen")]
     panels = panels_of(runs, row.panels, (), ())
-    study = run_contents(models([runs], panels), panels, runs[0].seeds, here / "contents", Progress())
+    results = run_contents(models([runs], panels), panels, runs[0].seeds, here / "contents", Progress())
+    study = contents_study(results, runs[0].seeds)
     write_study(study, here / "contents")
     return study
 
@@ -136,17 +139,19 @@ def drive(row: Row, here: Path, limit: int | None, study: Study) -> None:
 def driven(row: Row, here: Path) -> dict[str, Outcome]:
     """Return what a model comes to driven, by content; nothing unless all is done."""
     families: dict[str, dict[str, dict[str, Floats]]] = {}
+    dangerous: dict[str, Bools] = {}
     outs = {name: here / "driven" / name for name in row.datasets}
     if not all((out / "run.json").exists() for out in outs.values()):
         return {}
     for name, out in outs.items():
         run = read(out)
         [success] = by_episode([METRICS[SUCCESS]], run.grid, run.decisions, run.episodes).values()
+        dangerous[name] = np.array([e.danger != "none" for e in run.episodes[: len(run.grid.episodes)]])
         for content, point in PLAYED.items():
             if point in run.conditions:
                 at = run.conditions.index(point)
                 families.setdefault(content, {})[name] = {SUCCESS: success[at]}
-    return {content: Outcome(of) for content, of in families.items()}
+    return {content: Outcome(of, dangerous) for content, of in families.items()}
 
 
 def written(row: Row, study: Study, driven: Mapping[str, Outcome]) -> str:
@@ -157,7 +162,7 @@ def written(row: Row, study: Study, driven: Mapping[str, Outcome]) -> str:
         heads = (*first.heads, "driven %", "driven, over intents")
         cells = [
             (
-                *cells, shown(driven[cells[0]].estimate(SUCCESS)),
+                *cells, shown(driven[cells[0]].leading),
                 "" if cells[0] == "intent" else shown(driven[cells[0]].over(driven["intent"]), sign="+"),
             )
             for cells in first.rows

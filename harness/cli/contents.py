@@ -52,6 +52,7 @@ def command(
     """
     from harness.core import extras
     from harness.studies.contents import asked_at_most, folders, models, panels_of, run_contents
+    from harness.studies.contents_page import contents_study
     from harness.studies.replayed_run import ReplayedRun
 
     extras.need("harness study contents", "matplotlib")
@@ -76,5 +77,5 @@ def command(
             return
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or runs[0] / "contents"
-        study = run_contents(swarms, panels, draws, where, progress)
-    finish(study, where, as_json, quiet)
+        results = run_contents(swarms, panels, draws, where, progress)
+    finish(contents_study(results, draws), where, as_json, quiet)

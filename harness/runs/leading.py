@@ -20,12 +20,11 @@ class Scored(Protocol):
     def scores(self) -> "Sequence[Score]": ...
 
 
-def leading(names: Container[str]) -> str:
-    """Return the metric by which what has metrics of these names is read."""
-    return BALANCED if BALANCED in names else SUCCESS
+def leading(*names: Container[str]) -> str:
+    """Return the metric by which what has metrics of these names is read, or several such together."""
+    return BALANCED if all(BALANCED in each for each in names) else SUCCESS
 
 
 def lead_of(*runs: Scored) -> str:
     """Return the metric by which runs are read together: balanced success where all of them state it."""
-    stated = [{score.metric for score in run.scores if score.value is not None} for run in runs]
-    return leading(set.intersection(*stated))
+    return leading(*({score.metric for score in run.scores if score.value is not None} for run in runs))

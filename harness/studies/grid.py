@@ -22,7 +22,7 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import PLAIN, shown
 from harness.core.multiplicity import LEVEL
 from harness.core.progress import Progress
-from harness.core.statistics import Estimate, resampled, resampled_estimate
+from harness.core.statistics import Estimate, resampled_estimate
 from harness.core.versions import versions
 from harness.evaluate.agent import Agent
 from harness.evaluate.run import read_or_evaluate
@@ -31,17 +31,10 @@ from harness.report.compare.page import beside
 from harness.report.document import Table, linked
 from harness.report.drawing.colours import conditions
 from harness.runs.folder import Run
-from harness.runs.metrics import (
-    LATENCY,
-    METRICS,
-    SUCCESS,
-    by_episode,
-    difference,
-    mean_by_place,
-    over_episodes,
-    p_value,
-)
+from harness.runs.leading import lead_of
+from harness.runs.metrics import LATENCY, METRICS, SUCCESS, by_episode, mean_by_place, over_episodes
 from harness.runs.records import Answer
+from harness.runs.success import Success
 from harness.studies.figures.heat_map import heat_map
 from harness.studies.figures.points import Steps, fronts
 from harness.studies.study import Study, corrected, ends, p_cell
@@ -95,7 +88,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Effect:
-    """What a change of level is worth in success, averaged over all other factors."""
+    """What a change of level is worth in what leads, averaged over all other factors."""
 
     condition: str  # the operating point
     what: str  # the factor and its two levels; two of them for an interaction
@@ -112,7 +105,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class Halves:
-    """Shares of the variance of success between the cells that each half explains.
+    """Shares of the variance of what leads between the cells that each half explains.
 
     What episodes by chance add is taken off, as a bootstrap over episodes says; so are intervals made.
     """
@@ -174,7 +167,9 @@ def run_cells(
             if answer.role in roles and answer.error is None:
                 asked.setdefault((answer.role, roles[answer.role]), {})[answer.id] = answer
         cells.append(Cell(ego, helper, run))
-    return Grid(tuple(cells), len(egos), len(helpers))
+    runs = [cell.run for cell in cells]
+    episodes = runs[0].episodes[: len(runs[0].grid.episodes)]
+    return Grid(tuple(cells), len(egos), len(helpers), Success.of(episodes, lead_of(*runs)))
 
 
 @dataclass(frozen=True)
@@ -184,6 +179,7 @@ class Grid:
     cells: tuple[Cell, ...]
     rows: int
     columns: int
+    counting: Success  # of all cells
 
     def __post_init__(self) -> None:
         if len({(cell.run.conditions, cell.run.grid) for cell in self.cells}) > 1:
@@ -203,6 +199,10 @@ class Grid:
         )
         return tuple(factor for factor in every if len(factor.levels) > 1)
 
+    def success(self, cell: Cell, condition: str) -> Estimate:
+        """Return what leads of a cell under a condition."""
+        return self.counting.estimate(cell.values[SUCCESS][self.conditions.index(condition)])
+
     def name(self, agent: Agent, half: str) -> str:
         """Return an agent by what is varied of its half; by its model where nothing is."""
         varied = [factor.field for factor in self.factors if factor.half == half]
@@ -216,21 +216,21 @@ class Grid:
             for condition in self.conditions
             for contrast in (*self._main(condition), *self._interactions(condition))
         ]
-        p_values = corrected([p_value(SUCCESS, high, low) for _, _, low, high in contrasts])
+        p_values = corrected([self.counting.p_value(high, low) for _, _, low, high in contrasts])
         return tuple(
-            Effect(condition, what, difference(SUCCESS, high, low), p)
+            Effect(condition, what, self.counting.difference(high, low), p)
             for (condition, what, low, high), p in zip(contrasts, p_values, strict=True)
         )
 
     def _mean(self, condition: str, **levels: str) -> Floats:
-        """Return mean success of the cells with these levels, by factor's name, (E, S)."""
+        """Return mean success of the cells with these levels, by factor's name, (S, E)."""
         at = self.conditions.index(condition)
         having = [
             cell.values[SUCCESS][at]
             for cell in self.cells
             if all(cell.level(*name.split()) == wanted for name, wanted in levels.items())
         ]
-        return np.asarray(np.mean(having, axis=0).T)
+        return np.asarray(np.mean(having, axis=0))
 
     def _main(self, condition: str) -> Iterator[tuple[str, Floats, Floats]]:
         for factor in self.factors:
@@ -256,7 +256,8 @@ class Grid:
             return None
         each = np.array([np.mean(cell.values[SUCCESS][at], axis=0) for cell in self.cells])
         n = each.shape[1]
-        weights = resampled(noise.generator("grid", "halves"), n, RESAMPLES) / n
+        counts = self.counting.resampled(noise.generator("grid", "halves"), RESAMPLES)
+        weights = self.counting.weights(counts)
         squares = _squares((each @ weights.T).reshape(self.rows, self.columns, -1))
         # Episodes by chance add as much to the squares of what was played as resampling adds to those.
         by_chance = squares[:, 1:].mean(axis=1) - squares[:, 0]
@@ -291,10 +292,10 @@ def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
     data, episodes = tables(grid), grid.cells[0].run.grid.episodes
     factors = "; ".join(f"{factor.name} ({', '.join(factor.levels)})" for factor in grid.factors)
     last, colours = grid.conditions[-1], conditions(grid.conditions)
-    rates = {c: [100 * cell.estimate(SUCCESS, c).value for cell in grid.cells] for c in grid.conditions}
+    rates = {c: [100 * grid.success(cell, c).value for cell in grid.cells] for c in grid.conditions}
     steps = []
     for c, colour in colours.items():
-        best = front(grid.cells, c)
+        best = front(grid, c)
         look: dict[str, Any] = {"color": colour, "marker": "o", "markersize": 4}
         steps += [
             Steps(
@@ -303,7 +304,7 @@ def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
             ),
             Steps(
                 "", [cell.estimate(LATENCY, c).value for cell in best],
-                [100 * cell.estimate(SUCCESS, c).value for cell in best], look, pair(grid, best[-1]),
+                [100 * grid.success(cell, c).value for cell in best], look, pair(grid, best[-1]),
             ),
         ]  # fmt: skip
     return Study(
@@ -336,7 +337,7 @@ def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
                 [grid.name(grid.cells[i * grid.columns].ego, "ego") for i in range(grid.rows)],
                 [grid.name(cell.helper, "helper") for cell in grid.cells[: grid.columns]], "ego", "helpers",
             ),
-            "pareto": fronts([("", "latency of a decision, ms", steps)]),
+            "pareto": fronts([("", "latency of a decision, ms", steps)], grid.counting.words),
         },
     )  # fmt: skip
 
@@ -347,12 +348,12 @@ def headline(grid: Grid) -> list[str]:
 
 
 def _range(grid: Grid, condition: str) -> str:
-    rates = [100 * cell.estimate(SUCCESS, condition).value for cell in grid.cells]
+    rates = [100 * grid.success(cell, condition).value for cell in grid.cells]
     effects = [effect for effect in grid.effects if effect.condition == condition]
     return (
-        f"Under {condition}, the {len(rates)} combinations succeed in {min(rates):.1f} to {max(rates):.1f} % "
-        f"of the episodes; {sum(e.clear for e in effects)} of {len(effects)} effects are more than chance "
-        f"explains (n = {grid.cells[0].estimate(SUCCESS, condition).n})."
+        f"Under {condition}, {grid.counting.words} of the {len(rates)} combinations is {min(rates):.1f} to "
+        f"{max(rates):.1f} %; {sum(e.clear for e in effects)} of {len(effects)} effects are more than chance "
+        f"explains (n = {grid.success(grid.cells[0], condition).n})."
     )
 
 
@@ -364,19 +365,22 @@ def _halves(grid: Grid, h: Halves) -> str:
         verdict = "the choice of the helpers matters more"
     return (
         f"Under {h.condition}, {verdict}: the choice among {grid.rows} egos explains {shown(h.ego)} % of the "
-        f"differences between the {len(grid.cells)} combinations, the choice among {grid.columns} helpers "
-        f"{shown(h.helpers)} %, both together {shown(h.together)} % (n = {h.ego.n} episodes)."
+        f"differences in {grid.counting.words} between the {len(grid.cells)} combinations, the choice among "
+        f"{grid.columns} helpers {shown(h.helpers)} %, both together {shown(h.together)} % (n = {h.ego.n} "
+        "episodes)."
     )
 
 
-def front(cells: Sequence[Cell], condition: str) -> list[Cell]:
+def front(grid: Grid, condition: str) -> list[Cell]:
     """Return the cells that none beats in success without taking longer, fastest first."""
 
     def success(cell: Cell) -> float:
-        return cell.estimate(SUCCESS, condition).value
+        return grid.success(cell, condition).value
 
     taken: list[Cell] = []
-    for cell in sorted(cells, key=lambda cell: (cell.estimate(LATENCY, condition).value, -success(cell))):
+    for cell in sorted(
+        grid.cells, key=lambda cell: (cell.estimate(LATENCY, condition).value, -success(cell))
+    ):
         if not taken or success(cell) > success(taken[-1]):
             taken.append(cell)
     return taken
@@ -388,18 +392,25 @@ def pair(grid: Grid, cell: Cell) -> str:
 
 
 def _cells(grid: Grid, condition: str, out: Path, terminal: bool) -> Table:
-    best = {cell.run.path for cell in front(grid.cells, condition)}
+    best = {cell.run.path for cell in front(grid, condition)}
     place, rows = beside(out / "index.html"), []
-    for cell in sorted(grid.cells, key=lambda cell: -cell.estimate(SUCCESS, condition).value):
+    for cell in sorted(grid.cells, key=lambda cell: -grid.success(cell, condition).value):
         run = f"cells/{cell.run.path.name}"
         latency = f"{cell.estimate(LATENCY, condition).value:.1f}{' ◆' * (cell.run.path in best)}"
         report = place(cell.run)
         rows.append((
-            pair(grid, cell), shown(cell.estimate(SUCCESS, condition)), latency,
+            pair(grid, cell), shown(grid.success(cell, condition)), latency,
             PLAIN.number(cell.estimate("tokens", condition).value), f"{cell.ego.name} + {cell.helper.name}",
             linked(run, report),
         ))  # fmt: skip
-    heads = ("ego + helpers", "success %, 95 % CI", "latency, ms", "tokens a decision", "agents", "run")
+    heads = (
+        "ego + helpers",
+        f"{grid.counting.words} %, 95 % CI",
+        "latency, ms",
+        "tokens a decision",
+        "agents",
+        "run",
+    )
     note = "Tokens: of prompts and answers of the ego and every asked helper; a dash: a model counts none."
     return Table(condition, heads, rows, note, terminal=range(4) if terminal else ())
 
@@ -411,10 +422,10 @@ def _effects(grid: Grid, condition: str, terminal: bool) -> Table:
     ]
     return Table(
         f"Effect of each choice, {condition}", ("effect", "points, 95 % CI", "p"), rows,
-        "An effect is the difference in success when one factor changes, averaged over all other factors. "
-        "An interaction (×) is half the difference between the effects of one factor at two levels of the "
-        f"other. p comes from the interval and is corrected by Holm's method for all {len(grid.effects)} "
-        "effects; bold: 0.05 or less.",
+        f"An effect is the difference in {grid.counting.words} when one factor changes, averaged over all "
+        "other factors. An interaction (×) is half the difference between the effects of one factor at two "
+        "levels of the other. p comes from the interval and is corrected by Holm's method for all "
+        f"{len(grid.effects)} effects; bold: 0.05 or less.",
         terminal=range(3) if terminal else (), most=MOST_EFFECTS,
     )  # fmt: skip
 
@@ -430,6 +441,12 @@ def tables(grid: Grid) -> "dict[str, pd.DataFrame]":
         {**who(cell), "run": cell.run.path.name, "condition": c, "metric": m, **ends(cell.estimate(m, c))}
         for cell in grid.cells for c in grid.conditions for m in cell.values
     ]  # fmt: skip
+    if (lead := grid.counting.metric) != SUCCESS:
+        cells += [
+            {**who(cell), "run": cell.run.path.name, "condition": c, "metric": lead,
+             **ends(grid.success(cell, c))}
+            for cell in grid.cells for c in grid.conditions
+        ]  # fmt: skip
     effects = [
         {"condition": e.condition, "effect": e.what, **ends(e.estimate), "p_holm": e.p} for e in grid.effects
     ]

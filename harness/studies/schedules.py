@@ -383,7 +383,7 @@ def schedule_study(compared: Sequence[Compared], runs: Sequence[ReplayedRun], se
             "sources": [run.manifest() for run in runs], "condition": first.point.name,
             "schedules": first.names, "budget": first.budget, "seeds": list(seeds), "versions": versions(),
         },
-        data["schedules"], {"fronts": fronts(panels)},
+        data["schedules"], {"fronts": fronts(panels, "success")},
         [caveat for run in runs for caveat in run.caveats],
     )  # fmt: skip
 

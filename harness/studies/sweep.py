@@ -12,7 +12,7 @@ from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.report.document import Table
-from harness.runs.metrics import SUCCESS
+from harness.runs.leading import IN_WORDS, leading
 from harness.studies.axes import (
     AXES,
     CORE,
@@ -27,7 +27,7 @@ from harness.studies.axes import (
     grid,
     usual_at,
 )
-from harness.studies.figures.axes import interval_of
+from harness.studies.figures.axes import interval_of, lead_in
 from harness.studies.figures.bars import operating_points
 from harness.studies.figures.heat_map import heat_map
 from harness.studies.figures.lines import along
@@ -227,7 +227,7 @@ def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
 def _map(part: "pd.DataFrame") -> Figure:
     """Draw success of crossed axes: the first down, the second across, a panel for each of the others."""
     down, across, *panel_axes = part.variable.iloc[0].split(CROSS)
-    rows = part[(part.metric == SUCCESS) & (part.interval == interval_of(part))]
+    rows = part[(part.metric == lead_in(part)) & (part.interval == interval_of(part))]
     groups = rows.groupby(panel_axes, sort=False) if panel_axes else [((), rows)]
     panels = {}
     for values, group in groups:
@@ -240,7 +240,7 @@ def _map(part: "pd.DataFrame") -> Figure:
 
 def tables(summary: "pd.DataFrame") -> list[Table]:
     """Return a study's main figures, a table a source and curve."""
-    heads, rows = dict[str, str](), dict[str, list[Sequence[str]]]()
+    heads, rows = dict[str, tuple[str, str]](), dict[str, list[Sequence[str]]]()
     places = ["source", "panel", "condition", "value"]
     known = summary.assign(value=summary.value.where(summary.panel != CORE, None))
     for (source, panel, condition, value), group in known.groupby(places, sort=False, dropna=False):
@@ -250,24 +250,26 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
         means = (f"{scale * metrics['mean'][name]:.1f}" for name, scale in HEADS.values())
         core = panel == CORE
         title = str(source) if core else f"{source} · {condition} over {panel}"
-        heads[title] = "condition" if core else str(panel)
-        cells = (str(condition) if core else _text(value), percent(metrics.loc[SUCCESS], *ESTIMATE), *means)
+        lead = leading(set(metrics.index))
+        heads[title] = "condition" if core else str(panel), f"{IN_WORDS[lead]} %, 95 % CI"
+        cells = (str(condition) if core else _text(value), percent(metrics.loc[lead], *ESTIMATE), *means)
         rows.setdefault(title, []).append(cells)
     return [
-        Table(title, (head, "success %, 95 % CI", *HEADS), rows[title], terminal=range(2 + len(HEADS)))
+        Table(title, (*head, *HEADS), rows[title], terminal=range(2 + len(HEADS)))
         for title, head in heads.items()
     ]
 
 
 def in_a_sentence(table: Table) -> str:
-    """Say success at the ends of an axis and where it is best; of crossed axes where it is worst and best."""
+    """Say what leads at the ends of an axis and where it is best; of crossed axes where worst and best."""
 
     def success(row: Sequence[str]) -> float:
         return float(row[1].split()[0])
 
-    best, axis = max(table.rows, key=success), table.heads[0]
+    best, (axis, head, *_) = max(table.rows, key=success), table.heads
+    words = head.partition(" %")[0]
     around = [min(table.rows, key=success), best] if CROSS in axis else [table.rows[0], best, table.rows[-1]]
-    return "; ".join(dict.fromkeys(f"{row[1]} % of episodes succeed at {axis} {row[0]}" for row in around))
+    return "; ".join(dict.fromkeys(f"{words} is {row[1]} % at {axis} {row[0]}" for row in around))
 
 
 def _text(value: Any) -> str:

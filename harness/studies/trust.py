@@ -29,7 +29,8 @@ from harness.dataset.load import Scene
 from harness.evaluate.walk import Decided
 from harness.radio.profiles import CHANNELS
 from harness.report.document import Table, strong
-from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
+from harness.runs.metrics import SUCCESS, mean_by_place, over_episodes
+from harness.runs.success import Success
 from harness.studies.axes import AXES, NONE, Setting, usual_at
 from harness.studies.figures.heat_map import heat_map
 from harness.studies.play import WalkResult
@@ -182,6 +183,7 @@ class Bench:
     seeds: tuple[int, ...]  # of the channel
     cells: Mapping[Key, Cell]
     alone: Floats  # success of an ego that never asks, (S, E)
+    counting: Success  # of all cells
     caveats: tuple[str, ...] = ()  # what the run lacks
     unfused: str | None = None  # why no rule fuses here, where the only one is the linear pool in name
 
@@ -205,23 +207,23 @@ class Bench:
         return self.cells[rule, attack, share]
 
     def success(self, *key: Any) -> Estimate:
-        """Return success in a cell, over episodes."""
-        return over_episodes(SUCCESS, self.at(*key).success)
+        """Return what leads in a cell, over episodes."""
+        return self.counting.estimate(self.at(*key).success)
 
     def price(self, rule: str) -> Estimate:
         """Return what a rule costs while nobody attacks: its success less the linear pool's, paired."""
-        return difference(SUCCESS, self.at(rule).success.T, self.at(BASE).success.T)
+        return self.counting.difference(self.at(rule).success, self.at(BASE).success)
 
     def loss(self, rule: str, attack: str, share: float) -> Estimate:
         """Return what an attack takes from a rule: success under it less success in peace, paired."""
-        return difference(SUCCESS, self.at(rule, attack, share).success.T, self.at(rule).success.T)
+        return self.counting.difference(self.at(rule, attack, share).success, self.at(rule).success)
 
     @cached_property
     def holm(self) -> Mapping[Key, float | None]:
         """P of no difference to the linear pool under the same attack, by Holm's method over the grid."""
         keys = [key for key in self.cells if key[0] != BASE and key[1] not in (PEACE, EXCLUDED)]
-        pairs = ((self.cells[key].success.T, self.at(BASE, *key[1:]).success.T) for key in keys)
-        return dict(zip(keys, corrected([p_value(SUCCESS, *pair) for pair in pairs]), strict=True))
+        pairs = ((self.cells[key].success, self.at(BASE, *key[1:]).success) for key in keys)
+        return dict(zip(keys, corrected([self.counting.p_value(*pair) for pair in pairs]), strict=True))
 
     def clear(self, *key: Any) -> bool:
         """Return whether a rule differs from the linear pool under an attack by more than chance explains."""
@@ -232,9 +234,9 @@ class Bench:
         return min(self.attacks, key=lambda attack: self.success(rule, attack, share).value)
 
     def mean(self, rule: str, share: float) -> Estimate:
-        """Return success as a mean over all attacks, over episodes."""
+        """Return the same as a mean over all attacks."""
         values = [self.at(rule, attack, share).success for attack in self.attacks]
-        return over_episodes(SUCCESS, np.mean(values, axis=0))
+        return self.counting.estimate(np.asarray(np.mean(values, axis=0)))
 
 
 def run_bench(
@@ -296,8 +298,9 @@ def run_bench(
     [[alone]] = run.walked([Setting(condition, OperatingPoint.of("never asks"), run.vehicles)], seeds)
     run.settle()
     return Bench(
-        run.name, run.run.source, condition, tuple(seeds), cells, alone.ends[SUCCESS], run.caveats, unfused
-    )
+        run.name, run.run.source, condition, tuple(seeds), cells, alone.ends[SUCCESS],
+        Success(run.dataset.dangerous), run.caveats, unfused,
+    )  # fmt: skip
 
 
 def trust_study(bench: Bench) -> Study:
@@ -316,6 +319,7 @@ def trust_study(bench: Bench) -> Study:
     cells = [
         {"rule": c.rule, "attack": c.attack or None, "share": c.share,
          "success": as_mapping(over_episodes(SUCCESS, c.success)),
+         bench.counting.metric: as_mapping(bench.counting.estimate(c.success)),
          "detection": {k: as_mapping(e) for k, e in c.detection().items()} or None}
         for c in bench.cells.values()
     ]  # fmt: skip
@@ -325,8 +329,9 @@ def trust_study(bench: Bench) -> Study:
         [
             f"n = {n} episodes × {len(bench.seeds)} channel seeds under {bench.condition}. All cells have "
             "the same episodes, channel draws and attackers, so differences are paired by episode; 95 % "
-            "intervals are over episodes. Price in peace: the difference in success from linear while "
-            "nobody attacks, in points. All figures are in figures.csv."
+            "intervals are over episodes. Price in peace: the difference in "
+            f"{bench.counting.words} from linear while nobody attacks, in points. All figures are in "
+            "figures.csv."
         ],
         [table for share in bench.shares for table in _tables(bench, share)] + [*_detections(bench)],
         {"figures": pd.DataFrame(rows)},
@@ -343,22 +348,23 @@ def trust_study(bench: Bench) -> Study:
 def headline(bench: Bench) -> list[str]:
     """Say what asking is worth in peace, what the worst attack takes from linear, and who withstands it."""
     share, peace = bench.shares[0], bench.success(BASE)
-    alone, worst = over_episodes(SUCCESS, bench.alone), bench.worst(BASE, share)
+    alone, worst = bench.counting.estimate(bench.alone), bench.worst(BASE, share)
+    words = bench.counting.words
     if bench.unfused:
         return [
-            f"While nobody attacks, {shown(peace)} % of episodes succeed, and {shown(alone)} % with an ego "
-            "that never asks.",
+            f"While nobody attacks, {words} is {shown(peace)} %, and {shown(alone)} % with an ego that never "
+            "asks.",
             f"If {100 * share:.0f} % of the helpers attack, {worst} harms most: "
-            f"{shown(bench.success(BASE, worst, share))} % succeed. No rule fuses anything, since "
+            f"{words} is {shown(bench.success(BASE, worst, share))} %. No rule fuses anything, since "
             f"{bench.unfused}; what is called linear is the ego's own answer.",
         ]
     best = max(bench.rules, key=lambda rule: bench.mean(rule, share).value)
     sentences = [
-        f"While nobody attacks, {shown(peace)} % of episodes succeed under the linear pool, and "
-        f"{shown(alone)} % with an ego that never asks.",
+        f"While nobody attacks, {words} is {shown(peace)} % under the linear pool, and {shown(alone)} % with "
+        "an ego that never asks.",
         f"If {100 * share:.0f} % of the helpers attack, {worst} harms the linear pool most: "
-        f"{shown(bench.success(BASE, worst, share))} % succeed.",
-        f"On average over all {len(bench.attacks)} attacks, {best} succeeds most often, in "
+        f"{words} is {shown(bench.success(BASE, worst, share))} %.",
+        f"On average over all {len(bench.attacks)} attacks, {best} has the most, "
         f"{shown(bench.mean(best, share))} % (linear: {shown(bench.mean(BASE, share))}); its price in "
         f"peace, in points: {_price(bench, best)}.",
     ]
@@ -403,7 +409,7 @@ def _tables(bench: Bench, share: float) -> Iterator[Table]:
         for attack in bench.attacks
     ]  # fmt: skip
     yield Table(
-        f"{_title(share)}: success, %", ("attack", *bench.rules), rows,
+        f"{_title(share)}: {bench.counting.words}, %", ("attack", *bench.rules), rows,
         "Bold: the rule differs from the linear pool under the same attack, with p at most 0.05 after Holm's "
         "correction over the grid. For comparison, a linear pool that knows the attackers and does not hear "
         f"them succeeds in {shown(bench.success(BASE, EXCLUDED, share))} %.",
@@ -435,6 +441,7 @@ def _rows(bench: Bench, cell: Cell) -> Iterator[dict[str, Any]]:
     place = {"rule": cell.rule, "attack": cell.attack or "none", "share": cell.share}
     estimates = {
         SUCCESS: over_episodes(SUCCESS, cell.success),
+        bench.counting.metric: bench.counting.estimate(cell.success),
         "unsafe_rate": over_episodes("unsafe_rate", cell.unsafe),
         "nats": over_episodes("nats", cell.nats),
         **{f"detection_{name}": e for name, e in cell.detection().items()},
@@ -444,7 +451,7 @@ def _rows(bench: Bench, cell: Cell) -> Iterator[dict[str, Any]]:
     elif cell.attack != EXCLUDED:
         estimates["loss_to_attack"] = bench.loss(*key)
     for name, e in estimates.items():
-        p = bench.holm.get(key) if name == SUCCESS else None
+        p = bench.holm.get(key) if name == bench.counting.metric else None
         yield {**place, "metric": name, **ends(e), "p_holm_against_linear": p}
     if cell.flagged is not None:
         found = {"value": cell.time_to_detection, "n": len(cell.caught)}

@@ -15,7 +15,7 @@ from harness.core.statistics import mean_of
 from harness.dataset.load import Dataset
 from harness.report.suite import MEAN
 from harness.runs.folder import read
-from harness.runs.metrics import SUCCESS, difference, over_episodes
+from harness.runs.metrics import BALANCED, SUCCESS, difference, over_episodes
 from harness.studies.contents import NOTHING, Outcome, holding, witnesses
 from harness.studies.replayed_run import ReplayedRun
 
@@ -33,11 +33,13 @@ def done(proxy_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def played(done: Path, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
     from harness.core.progress import Progress
     from harness.studies.contents import models, panels_of, run_contents
+    from harness.studies.contents_page import contents_study
 
     source = ReplayedRun(done)
     panels = panels_of([source], ["6g"], ["loss", "size"], ["0,1", "1,4"])
     out = tmp_path_factory.mktemp("study")
-    return run_contents(models([[source]], panels), panels, source.seeds, out, Progress()).data["points"]
+    results = run_contents(models([[source]], panels), panels, source.seeds, out, Progress())
+    return contents_study(results, source.seeds).data["points"]
 
 
 def cell(
@@ -101,6 +103,19 @@ def test_a_mean_gives_families_the_same_weight_and_differences_are_paired_within
     p = better.p_over(worse)
     assert p is not None
     assert p < 1e-6
+    dangerous = {"one": np.arange(30) < 10, "two": np.arange(90) < 10}
+    balanced = Outcome(better.families, dangerous)
+    parts = [
+        over_episodes(SUCCESS, v[:, half]) for n, v in a.items() for half in (dangerous[n], ~dangerous[n])
+    ]
+    assert (balanced.lead, balanced.leading) == (BALANCED, mean_of([mean_of(parts[:2]), mean_of(parts[2:])]))
+    gains = [
+        difference(SUCCESS, a["two"][:, half].T, b["two"][:, half].T)
+        for half in (dangerous["two"], ~dangerous["two"])
+    ]
+    assert balanced.over(worse, "two") == mean_of(gains)
+    assert balanced.over(worse, metric=SUCCESS) == better.over(worse)
+    assert Outcome(better.families, {"one": dangerous["one"]}).lead == SUCCESS, "balanced in all or in none"
     assert better.pooled({"one": np.arange(30) < 2, "two": np.arange(90) < 3}).shape == (2, 5)
 
 
@@ -134,7 +149,9 @@ def test_it_is_counted_first_then_played_and_goes_on(harness: Callable[..., Said
     code, out, err = harness("study", "contents", here, *VARIED)
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
-    assert out.startswith("Intent or objects?\nproxy · v2 · json, 6g, points over intents: objects ")
+    assert out.startswith(
+        "Intent or objects?\nproxy · v2 · json, 6g, points of balanced success over intents: "
+    )
     page = (here / "contents" / "index.html").read_text()
     for text in ("at the bits of intents", "at the age of intents", "by who sees the danger", "6g over loss"):
         assert text in page

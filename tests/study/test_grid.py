@@ -20,7 +20,8 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
 from harness.prompts import versions
-from harness.runs.metrics import LATENCY, SUCCESS
+from harness.runs.metrics import BALANCED, LATENCY, SUCCESS
+from harness.runs.success import Success
 from harness.studies.grid import Cell, Grid, front, grid_study, headline, run_cells
 from harness.studies.study import write_study
 
@@ -80,7 +81,7 @@ def test_a_stopped_grid_goes_on_and_asks_only_what_is_missing(small: Dataset, tm
 # -- effects, played by hand --------------------------------------------------------------------------------
 
 
-def made_up(success: Mapping[tuple[str, str], Sequence[float]]) -> Grid:
+def made_up(success: Mapping[tuple[str, str], Sequence[float]], dangerous: Sequence[int] = ()) -> Grid:
     """Cells by prompt of ego and helpers: success of each episode under 6g, one seed."""
     n = len(next(iter(success.values())))
     told = {
@@ -93,7 +94,7 @@ def made_up(success: Mapping[tuple[str, str], Sequence[float]]) -> Grid:
         of = {SUCCESS: np.array(values).reshape(1, 1, n), LATENCY: np.full((1, 1, n), 100.0)}
         cell.__dict__["values"] = of
         cells.append(cell)
-    return Grid(tuple(cells), 2, 2)
+    return Grid(tuple(cells), 2, 2, Success(np.array(dangerous or [0] * n, dtype=bool)))
 
 
 def test_main_effects_and_the_interaction_are_those_of_a_factorial() -> None:
@@ -109,6 +110,22 @@ def test_main_effects_and_the_interaction_are_those_of_a_factorial() -> None:
         "ego prompt → v2 × helper prompt → v2": 0.125,
     })  # fmt: skip
     assert all(e.n == 4 and e.low < e.value < e.high for e in effects.values())
+
+
+def test_effects_halves_and_the_front_go_by_balanced_success_where_it_leads() -> None:
+    """Helpers of v2 win both dangers and lose 1 of 8 harmless episodes: half of 1 - 1/8 in all."""
+    of = {
+        (ego, helper): ([0] * 2 + [1] * 8 if helper == "v1" else [1] * 9 + [0])
+        for ego in ("v1", "v2") for helper in ("v1", "v2")
+    }  # fmt: skip
+    grid = made_up(of, [1] * 2 + [0] * 8)
+    assert grid.counting.metric == BALANCED
+    [effect] = [e for e in grid.effects if e.what == "helper prompt: v1 → v2"]
+    assert (effect.estimate.value, effect.estimate.n) == (pytest.approx((1 - 1 / 8) / 2), 10)
+    assert grid.success(front(grid, "6g")[-1], "6g").value == pytest.approx((1 + 7 / 8) / 2)
+    halves = grid.halves("6g")
+    assert halves is not None
+    assert halves.helpers.value == pytest.approx(1)
 
 
 def test_holms_method_counts_every_effect() -> None:
@@ -140,8 +157,8 @@ def test_cells_that_do_not_differ_have_no_half_that_matters() -> None:
     of = {(ego, helper): [1.0, 0.0, 1.0] for ego in ("v1", "v2") for helper in ("v1", "v2")}
     [said] = headline(made_up(of))
     assert said == (
-        "Under 6g, the 4 combinations succeed in 66.7 to 66.7 % of the episodes; 0 of 3 effects are more "
-        "than chance explains (n = 3)."
+        "Under 6g, success of the 4 combinations is 66.7 to 66.7 %; 0 of 3 effects are more than chance "
+        "explains (n = 3)."
     )
 
 
@@ -154,7 +171,7 @@ def test_the_front_is_what_none_beats_without_taking_longer() -> None:
     grid = made_up({("v1", "v1"): [1, 0], ("v1", "v2"): [1, 1], ("v2", "v1"): [0, 0], ("v2", "v2"): [1, 1]})
     for cell, ms in zip(grid.cells, (100, 200, 150, 300), strict=True):
         cell.values[LATENCY][:] = ms
-    names = [(c.ego.prompt.version, c.helper.prompt.version) for c in front(grid.cells, "6g")]
+    names = [(c.ego.prompt.version, c.helper.prompt.version) for c in front(grid, "6g")]
     assert names == [("v1", "v1"), ("v1", "v2")]
 
 
@@ -165,7 +182,7 @@ def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset
     (out / "cells/1-2/report.html").write_text("what `harness report` wrote")
     page = write_study(grid_study(grid, spec_of(small), out), out).read_text()
     cells, effects = pd.read_csv(out / "cells.csv"), pd.read_csv(out / "effects.csv")
-    assert len(cells) == 4 * 3 * 3
+    assert len(cells) == 4 * 3 * 4
     assert len(effects) == 3 * 3
     assert set(cells[cells.metric != "tokens"].n) == set(effects.n) == {len(small.episodes)}
     made = json.loads((out / "grid.json").read_text())
@@ -179,7 +196,7 @@ def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset
 def test_names_in_the_figure_stay_inside_of_its_axes() -> None:
     figures = pytest.importorskip("harness.studies.figures.points", reason="needs the report extra")
     steps = [figures.Steps("", [x], [x], name=letter * 30) for x, letter in ((0.0, "a"), (100.0, "b"))]
-    figure = figures.fronts([("", "latency of a decision, ms", steps)])
+    figure = figures.fronts([("", "latency of a decision, ms", steps)], "success")
     figure.draw_without_rendering()
     [axes] = figure.axes
     for name in axes.texts:
@@ -193,7 +210,7 @@ def test_a_grid_is_printed_as_json(harness: Callable[..., Any], small_path: Path
     code, out, err = harness("study", "grid", "--prompt", "v1,v2", *few, "--out", "grid", "--json")
     assert code == 0, err
     answer = json.loads(out)
-    assert {row["metric"] for row in answer["cells"]} == {SUCCESS, LATENCY, "tokens"}
+    assert {row["metric"] for row in answer["cells"]} >= {SUCCESS, LATENCY, "tokens"}
     assert next(row["effect"] for row in answer["effects"]) == "ego prompt: v1 → v2"
 
 

@@ -83,7 +83,7 @@ def test_axes_that_are_crossed_give_every_combination_what_it_has_alone(
     points = {"attack × consensus": settings([source], axes, grids, ["6g"])}
     study = run_sweep([source], points, source.seeds, tmp_path, lambda n: None)
     page = write_study(study, tmp_path).read_text()
-    assert "% of episodes succeed at attack × consensus liar+spoof × linear" in page
+    assert "% at attack × consensus liar+spoof × linear" in page
     assert (tmp_path / "sweep.svg").is_file()
     rows = study.data["conditions"]
     assert list(rows.value.unique()) == [f"{a} × {rule}" for a in grids[0] for rule in grids[1]]

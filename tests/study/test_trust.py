@@ -52,11 +52,11 @@ def bench(done: Evaluated, tmp_path_factory: pytest.TempPathFactory) -> Bench:
 
 
 def test_its_cells_are_what_a_run_says_under_the_same_condition(done: Evaluated, bench: Bench) -> None:
-    assert bench.success("linear").value == pytest.approx(figure(done, "6g", "success_rate").value)
+    assert bench.success("linear").value == pytest.approx(figure(done, "6g", "balanced_success_rate").value)
     attacked = bench.success("linear", "liar+spoof", THIRD)
-    assert attacked.value == pytest.approx(figure(done, ATTACKED.name, "success_rate").value)
-    alone = float(np.mean(bench.alone))
-    assert alone == pytest.approx(figure(done, "single-local", "success_rate").value)
+    assert attacked.value == pytest.approx(figure(done, ATTACKED.name, "balanced_success_rate").value)
+    alone = bench.counting.mean(bench.alone)
+    assert alone == pytest.approx(figure(done, "single-local", "balanced_success_rate").value)
 
 
 def test_every_rule_meets_every_attack_and_peace_and_the_reference_is_there(bench: Bench) -> None:
@@ -122,6 +122,7 @@ def test_its_folder_has_a_page_figures_and_a_picture(bench: Bench, tmp_path: Pat
     assert (listed.kind, listed.state, listed.model) == ("trust", "finished", bench.name)
     assert {row["metric"] for row in rows} >= {
         "success_rate",
+        "balanced_success_rate",
         "unsafe_rate",
         "nats",
         "detection_f1",

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.report.drawing.colours import INK, PALE
+from harness.runs.leading import leading
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,6 +33,11 @@ def cross(axes: Any, theirs: "pd.DataFrame", x: Any) -> None:
     if not single.all():
         middle, half = (low + high)[~single] / 2, (high - low)[~single] / 2
         axes.errorbar(x[~single], middle, half, fmt="none", ecolor=INK, capsize=2, linewidth=1, zorder=5)
+
+
+def lead_in(rows: "pd.DataFrame") -> str:
+    """Return the metric by which the sources of a summary's rows are read together."""
+    return leading(*(set(of.metric) for _, of in rows.groupby("source")))
 
 
 def interval_of(rows: "pd.DataFrame") -> str:

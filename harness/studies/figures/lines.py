@@ -11,8 +11,9 @@ from harness.core.arrays import Floats
 from harness.radio.reception import by_sight
 from harness.report.drawing.colours import COLOURS, FAINT, GREY, INK, MARKERS
 from harness.report.drawing.pictures import styled
+from harness.runs.leading import IN_WORDS, SUCCESS
 from harness.studies.axes import axis_of
-from harness.studies.figures.axes import cross, interval_of, lettered, paper_values, plain
+from harness.studies.figures.axes import cross, interval_of, lead_in, lettered, paper_values, plain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,7 +49,8 @@ def along(panels: "Sequence[pd.DataFrame]", paper: "pd.DataFrame | None" = None)
 
 def _along(axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None") -> None:
     variable = str(panel.variable.iloc[0])
-    curves = [(axes, "success_rate", "success")]
+    lead = lead_in(panel)
+    curves = [(axes, lead, IN_WORDS[lead])]
     if variable in BESIDE:
         metric, label = BESIDE[variable]
         beside = axes.twinx()
@@ -78,7 +80,7 @@ def _along(axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None") -> No
     if ticks:
         axes.set_xticks(range(len(ticks)), ticks, rotation=30, ha="right", fontsize=7)
     for where, metric, _ in curves:
-        theirs = paper_values(paper, str(panel.panel.iloc[0]), metric)
+        theirs = paper_values(paper, str(panel.panel.iloc[0]), SUCCESS if where is axes else metric)
         cross(where, theirs, theirs.value.to_numpy(dtype=float))
     for where, metric, _ in curves[1:]:
         where.set_ylim(0, 125 if metric == "trigger_rate" else None)
@@ -86,7 +88,7 @@ def _along(axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None") -> No
             where.set_yticks(range(0, 101, 20))
     if variable == "tau" and paper is not None:
         axes.axvspan(*BEST_BAND, color=FAINT, zorder=0, label="best band of the paper")
-    axes.set(xlabel=axis_of(variable).label, ylabel="success, %")
+    axes.set(xlabel=axis_of(variable).label, ylabel=f"{IN_WORDS[lead]}, %")
     plain(axes, "y")
 
 

@@ -28,8 +28,11 @@ class Steps:
 
 
 @styled
-def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]]) -> Figure:
-    """Draw success in percent against a cost; a panel has a title, the cost with its unit, and its steps."""
+def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]], success: str) -> Figure:
+    """Draw success, by what it is called, in percent against a cost.
+
+    A panel has a title, the cost with its unit, and its steps.
+    """
     width = max(3.6 * len(panels), 4.4)
     figure = Figure(figsize=(width, 3.6), layout=ConstrainedLayoutEngine(w_pad=0.1))
     for axes, (title, cost, lines) in zip(
@@ -37,7 +40,7 @@ def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]]) -> Figure:
     ):
         for line in lines:
             axes.plot(line.x, line.y, drawstyle="steps-post", linewidth=1, label=line.label, **line.look)
-        axes.set(xlabel=cost, ylabel="success, %" if axes is figure.axes[0] else "")
+        axes.set(xlabel=cost, ylabel=f"{success}, %" if axes is figure.axes[0] else "")
         axes.set_title(title, fontsize=8)
         axes.margins(x=0.1, y=0.1)
         plain(axes, "both")

@@ -1,0 +1,390 @@
+"""The page of `harness study contents`: at equal bits and age, along axes, and by who sees the danger."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.coordination.contents import INTENT
+from harness.core.errors import printable
+from harness.core.figures import shown
+from harness.core.multiplicity import LEVEL
+from harness.core.statistics import Estimate
+from harness.core.versions import versions
+from harness.report.document import Table, strong
+from harness.report.drawing.colours import COLOURS, MARKERS
+from harness.runs.leading import SUCCESS
+from harness.runs.metrics import LATENCY, difference, entry, over_episodes
+from harness.studies.axes import Setting
+from harness.studies.contents import (
+    BITS,
+    LATE,
+    METRICS,
+    OFF_LAG,
+    Model,
+    Outcome,
+    Panel,
+    Place,
+    Result,
+    groups,
+    manifest_of,
+    place,
+)
+from harness.studies.figures.lines import along
+from harness.studies.figures.points import Steps, fronts
+from harness.studies.ledger import paper_numbers
+from harness.studies.study import Study, p_cell, percent
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+BESIDE = 3  # panels of a figure
+SPENDING = ("tau_nats", "max_helpers")  # axes that vary the bits
+# The paper's panels by axis, and what is added to their values: its N counts the ego.
+PAPER = {"loss": ("loss", 0.0), "tau_nats": ("tau", 0.0), "max_helpers": ("size", -1.0)}
+
+
+def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
+    """Declare the study of what some models' runs came to."""
+    manifest = manifest_of([result.model for result in results], results[0].panels, seeds)
+    points, by_group, figures = points_table(results), groups_table(results), {}
+    for n, result in enumerate(results, 1):
+        figures[f"cost-{n}"] = fronts(list(_costs(result)), result.words)
+        curves = _curves(result)
+        for first in range(0, len(curves), BESIDE):
+            beside = curves[first : first + BESIDE]
+            figures[f"along-{n}-{first // BESIDE + 1}"] = along(beside, _marks(beside))
+    runs = [run for result in results for run in result.model.runs.values()]
+    lags_s = sorted({run.dataset.scenario.parameters.decision_lag_s for run in runs})
+    return Study(
+        "contents", "Intent or objects?", [text for result in results for text in headline(result)],
+        [
+            f"{'; '.join(map(_counted, results))}; channel seeds {', '.join(map(str, seeds))}. Stored "
+            f"answers are coordinated again with the same random draws at {len(results[0].points)} points "
+            "with every content, so differences are paired by episode. 95 % intervals are over episodes; a "
+            "mean gives each family the same weight and is about these families alone. Clear: p at most "
+            f"{LEVEL:g} by Holm's method for all comparisons of a model with intents.",
+            "Bits are of all requests and replies; they add no load to a radio. All that the ego knows was "
+            "seen at the decision's start, so its age when the ego acts is the decision's latency. Frozen "
+            f"scenes let each action begin {' or '.join(f'{1000 * s:g}' for s in lags_s)} ms after its "
+            "decision, whatever it took. Off lag are decisions that would begin in another frame: where a "
+            "content has more of them, its success is of an ego that is faster than this one; harness drive "
+            "counts that time.",
+            "No message can tell what nobody sees: the last table of each model has success by how many "
+            "helpers have the danger in sight at the first decision. Where costs are drawn, a line joins the "
+            "points of a content that no cheaper one beats. Crosses are the paper's values, of intents and "
+            "plain success.",
+        ],
+        [table for result in results for table in _tables(result, by_group)],
+        {"points": points, "groups": by_group}, {**manifest, "versions": versions()}, points, figures,
+        [*_left_out(results), *(caveat for run in runs for caveat in run.caveats)],
+    )  # fmt: skip
+
+
+def headline(result: Result) -> list[str]:
+    """Say which content wins where, and what each costs at the first condition."""
+    base, name, intent = result.base, result.model.name, result.at(result.base, INTENT)
+    gains = [f"{c} {shown(result.at(base, c).over(intent), sign='+')}" for c in result.sent]
+    costs = [
+        f"{content} {shown(each.leading)} % with {_kbit(each):.1f} kbit and {_age(each):.0f} ms"
+        for content in result.model.contents if (each := result.at(base, content))
+    ]  # fmt: skip
+    return [
+        f"{name}, {base.condition}, points of {result.words} over intents: {'; '.join(gains)}. "
+        f"Of {len(result.points)} points, "
+        f"clearly better than intents: {_clear(result, True)}; clearly worse: {_clear(result, False)}.",
+        f"{name}, {result.words}, bits of an episode, and time until the ego acts: {', '.join(costs)}; "
+        f"n = {_episodes(result.model)} episodes.",
+    ]
+
+
+def _clear(result: Result, better: bool) -> str:
+    """Say where each content is clearly better than intents, or clearly worse."""
+    texts = []
+    for content in result.sent:
+        points, values = set[Place](), dict[str, list[str]]()
+        for panel in result.panels:
+            for setting in panel.settings:
+                p = result.p(setting, content)
+                gain = result.at(setting, content).over(result.at(setting, INTENT)).value
+                if p is not None and p <= LEVEL and (gain > 0) == better:
+                    points.add(place(setting, content))
+                    if panel.axis:
+                        values.setdefault(panel.axis, []).append(_value(setting))
+        where = "; ".join(f"{axis} {', '.join(each)}" for axis, each in values.items())
+        if points:
+            texts.append(f"{content} at {len(points)}{f' ({where})' if where else ''}")
+    return " and ".join(texts) or "none"
+
+
+def _value(setting: Setting) -> str:
+    return setting.value if isinstance(setting.value, str) else f"{setting.value:g}"
+
+
+def _episodes(model: Model) -> int:
+    return sum(run.episodes for run in model.runs.values())
+
+
+def _kbit(outcome: Outcome) -> float:
+    return outcome.estimate(BITS).value / 1000
+
+
+def _age(outcome: Outcome) -> float:
+    return outcome.estimate(LATENCY).value
+
+
+def _counted(result: Result) -> str:
+    families = ", ".join(f"{family} {run.episodes}" for family, run in result.model.runs.items())
+    return f"{result.model.name}: n = {_episodes(result.model)} episodes ({families})"
+
+
+def _left_out(results: Sequence[Result]) -> list[str]:
+    return [
+        f"{printable(result.model.name)}: {content} is left out: {why}"
+        for result in results for content, why in result.model.left_out.items()
+    ]  # fmt: skip
+
+
+def _tables(result: Result, by_group: "pd.DataFrame") -> Iterator[Table]:
+    yield _at_base(result)
+    yield _at_equal(result, "bits", _kbit)
+    yield _at_equal(result, "age", _age)
+    if len(result.families) > 1:
+        yield _by_family(result)
+    yield from (_along(result, panel) for panel in result.panels if panel.axis)
+    yield _by_group(result, by_group[by_group.model == result.model.name])
+
+
+def _over(result: Result, setting: Setting, content: str) -> str:
+    """Return success over intents as a cell, bold where it is clear; empty for intents."""
+    if content == INTENT:
+        return ""
+    gain = result.at(setting, content).over(result.at(setting, INTENT))
+    p = result.p(setting, content)
+    return strong(shown(gain, sign="+"), p is not None and p <= LEVEL)
+
+
+def _at_base(result: Result) -> Table:
+    rows = []
+    for content in result.model.contents:
+        outcome = result.at(result.base, content)
+        late, off_lag = (f"{100 * outcome.estimate(name).value:.1f}" for name in (LATE, OFF_LAG))
+        p = "" if content == INTENT else p_cell(result.p(result.base, content))
+        rows.append((
+            content, shown(outcome.leading), _over(result, result.base, content), p,
+            f"{_kbit(outcome):.2f}", f"{_age(outcome):.1f}", late, off_lag,
+            *(shown(outcome.estimate(half)) for half in entry(result.lead).halves),
+        ))  # fmt: skip
+    return Table(
+        f"{result.model.name}, {result.base.condition}",
+        (
+            "content", f"{result.words} %", "over intents", "p", "kbit", "age, ms", "late %",
+            "off lag %", *(("with a danger %", "without %") if entry(result.lead).halves else ()),
+        ), rows,
+        "Over intents: in points, bold where it is clear. kbit: of all requests and replies of an episode. "
+        "Age: of what the ego knows when it acts. Late: decisions longer than the window.",
+        terminal=(0, 1, 2, 4, 5, 6),
+    )  # fmt: skip
+
+
+def _at_equal(result: Result, title: str, cost: Callable[[Outcome], float]) -> Table:
+    """Of settings in the first condition that cost no more than intents in it, show each content's best."""
+    intent = result.at(result.base, INTENT)
+    settings = {"as it is": result.base} | {
+        f"{panel.axis} {_value(setting)}": setting
+        for panel in result.panels for setting in panel.settings
+        if setting.condition == result.base.condition and panel.axis in SPENDING
+    }  # fmt: skip
+    rows = []
+    for content in result.model.contents:
+        outcomes = [(result.at(setting, content), name) for name, setting in settings.items()]
+        within = [each for each in outcomes if cost(each[0]) <= cost(intent) + 1e-9]
+        if not within:
+            rows.append((content, "none", "", "", "", ""))
+            continue
+        best, name = max(within, key=lambda each: each[0].leading.value)
+        gain = "" if best is intent else shown(best.over(intent), sign="+")
+        costs = (f"{_kbit(best):.2f}", f"{_age(best):.1f}")
+        rows.append((content, name, shown(best.leading), gain, *costs))
+    return Table(
+        f"{result.model.name}, {result.base.condition}: at the {title} of intents",
+        ("content", "setting", f"{result.words} %", "over intents", "kbit", "age, ms"), rows,
+        f"Of the settings of {' and '.join(SPENDING)} that cost no more than intents with the condition as "
+        "it is, the best of each content; chosen on these episodes, which flatters it.",
+    )  # fmt: skip
+
+
+def _by_family(result: Result) -> Table:
+    contents = result.model.contents
+    rows = []
+    for family in result.families:
+        outcomes = {content: result.at(result.base, content) for content in contents}
+        gains = (shown(outcomes[c].over(outcomes[INTENT], family), sign="+") for c in result.sent)
+        scores = (shown(outcome.estimate(result.lead, family)) for outcome in outcomes.values())
+        rows.append((family, *scores, *gains))
+    heads = (
+        "family",
+        *(f"{content}, %" for content in contents),
+        *(f"{c} over intents" for c in result.sent),
+    )
+    note = "Differences are in points, paired by episode."
+    title = f"{result.model.name}, {result.base.condition}: {result.words} by family"
+    return Table(title, heads, rows, note, total=True)
+
+
+def _along(result: Result, panel: Panel) -> Table:
+    contents, rows = result.model.contents, []
+    theirs = _theirs(panel.axis)
+    for setting in panel.settings:
+        outcomes = [result.at(setting, content) for content in contents]
+        rows.append((
+            _value(setting), *(shown(outcome.leading) for outcome in outcomes),
+            *(_over(result, setting, content) for content in result.sent),
+            *([theirs.get(setting.value, "")] if theirs else []),
+        ))  # fmt: skip
+    heads = (
+        panel.axis, *(f"{content}, %" for content in contents), *(f"{c} over intents" for c in result.sent),
+        *(["the paper, %"] if theirs else []),
+    )  # fmt: skip
+    note = (
+        "Differences are in points, bold where they are clear. The paper's value is of intents and of plain "
+        "success, in scenes of its own."
+    )
+    return Table(f"{result.model.name}, {panel.name}: {result.words}", heads, rows, note, folded=True)
+
+
+def _by_group(result: Result, rows: "pd.DataFrame") -> Table:
+    contents, cells = result.model.contents, list[Sequence[str]]()
+    for group, each in rows.groupby("group", sort=False):
+        of = each.set_index("content")
+        scores = [percent(of.loc[c], "success", "success_low", "success_high") for c in contents]
+        gains = [
+            percent(of.loc[c], "over_intent", "over_intent_low", "over_intent_high") for c in result.sent
+        ]
+        cells.append((str(group), str(of.n.iloc[0]), *scores, *gains))
+    heads = (
+        "group",
+        "n",
+        *(f"{content}, %" for content in contents),
+        *(f"{c} over intents" for c in result.sent),
+    )
+    title = f"{result.model.name}, {result.base.condition}: by who sees the danger"
+    return Table(title, heads, cells, "Episodes of all families together; n is their number.")
+
+
+def _costs(result: Result) -> Iterator[tuple[str, str, list[Steps]]]:
+    """Yield success against bits, and against age, of all points, a front a content."""
+    costs = (("bits of an episode, kbit", _kbit), ("age when the ego acts, ms", _age))
+    for title, cost in costs:
+        steps = []
+        for n, content in enumerate(result.model.contents):
+            look: dict[str, Any] = {"color": COLOURS[n % len(COLOURS)]}
+            places = sorted(
+                (cost(outcome), -100 * outcome.leading.value)
+                for setting in result.points if (outcome := result.at(setting, content))
+            )  # fmt: skip
+            x, y = np.array(places).T * [[1], [-1]]
+            best = y >= np.maximum.accumulate(y)
+            marker = look | {"marker": MARKERS[n % len(MARKERS)], "markersize": 4}
+            steps += [Steps(content, x, y, marker | {"linestyle": ""}), Steps("", x[best], y[best], look)]
+        yield result.model.name, title, steps
+
+
+def _curves(result: Result) -> "list[pd.DataFrame]":
+    """Return a part of a summary for each panel, as figures take it: a content in place of a condition."""
+    import pandas as pd
+
+    return [
+        pd.DataFrame([
+            {
+                "source": result.model.name, "panel": PAPER.get(panel.axis, (panel.axis,))[0],
+                "condition": content, "variable": panel.axis, "value": setting.value, "metric": result.lead,
+                "mean": e.value, "ci_low": e.low, "ci_high": e.high, "interval": "episodes",
+            }
+            for content in result.model.contents for setting in panel.settings
+            if (e := result.at(setting, content).leading)
+        ])
+        for panel in result.panels if panel.axis
+    ]  # fmt: skip
+
+
+def _theirs(axis: str) -> dict[Any, str]:
+    """Return the paper's success of intents by the value of an axis, in percent."""
+    panel, shift = PAPER.get(axis, ("", 0.0))
+    return {
+        float(row["value"]) + shift: row["paper_value"]
+        for row in paper_numbers()
+        if row["panel"] == panel and row["metric"] == "success" and row["paper_value"]
+    }
+
+
+def _marks(curves: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
+    """Return the paper's success of intents as figures take it, as far as panels have its values."""
+    import pandas as pd
+
+    return pd.DataFrame([
+        {"panel": curve.panel[0], "metric": SUCCESS, "value": value, "low": float(text), "high": float(text)}
+        for curve in curves for value, text in _theirs(curve.variable[0]).items()
+        if curve.value.min() <= value <= curve.value.max()
+    ], columns=["panel", "metric", "value", "low", "high"])  # fmt: skip
+
+
+def points_table(results: Sequence[Result]) -> "pd.DataFrame":
+    """Return a row for each model, grid point, content and family, with the mean over families."""
+    import pandas as pd
+
+    def row(result: Result, panel: Panel, setting: Setting, content: str, family: str) -> dict[str, Any]:
+        outcome, intent = result.at(setting, content), result.at(setting, INTENT)
+        last = family == result.families[-1]
+        return {
+            "model": result.model.name, "family": family, "condition": setting.condition,
+            "variable": panel.axis, "value": setting.value, "content": content,
+            **_success(outcome.estimate(SUCCESS, family), outcome.over(intent, family, metric=SUCCESS)),
+            **_balanced(result, outcome, intent, family), "lead": result.lead,
+            "p_holm": result.p(setting, content) if last else None,
+            **{
+                key: value
+                for name in METRICS for key, value in _ends(name, outcome.estimate(name, family)).items()
+            },
+        }  # fmt: skip
+
+    return pd.DataFrame([
+        row(result, panel, setting, content, family)
+        for result in results for panel in result.panels for setting in panel.settings
+        for content in result.model.contents for family in result.families
+    ])  # fmt: skip
+
+
+def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
+    """Return a row for each model, group of episodes and content, at the first condition."""
+    import pandas as pd
+
+    rows = []
+    for result in results:
+        for name, within in groups(result.model).items():
+            intent = result.at(result.base, INTENT).pooled(within)
+            for content in result.model.contents:
+                success = result.at(result.base, content).pooled(within)
+                rows.append({
+                    "model": result.model.name, "condition": result.base.condition, "group": name,
+                    "content": content,
+                    **_success(over_episodes(SUCCESS, success), difference(SUCCESS, success.T, intent.T)),
+                })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def _balanced(result: Result, outcome: Outcome, intent: Outcome, family: str) -> dict[str, Any]:
+    """Return what leads, its halves and what it is over intents, where it is not plain success."""
+    if result.lead == SUCCESS:
+        return {}
+    each = {name.removesuffix("_rate"): outcome.estimate(name, family) for name in result.successes}
+    each["balanced_over_intent"] = outcome.over(intent, family)
+    return {key: value for name, e in each.items() for key, value in _ends(name, e).items()}
+
+
+def _success(e: Estimate, gain: Estimate) -> dict[str, Any]:
+    return {**_ends("success", e), "n": e.n, **_ends("over_intent", gain)}
+
+
+def _ends(name: str, e: Estimate) -> dict[str, float]:
+    return {name: e.value, f"{name}_low": e.low, f"{name}_high": e.high}
