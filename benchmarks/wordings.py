@@ -70,7 +70,7 @@ ROWS = {
             "you collide.\n": f"you collide.{either('hint', '', NEAR, FREE)}\n",
             SPEED: either("speed", SPEED, KMH),
         },
-        "--engine llama-cpp --layouts 8 --budget 190 --limit 20",
+        "--engine llama-cpp --layouts 4 --budget 80 --limit 6",
     ),
 }
 

@@ -261,6 +261,24 @@ def test_a_stopped_search_goes_on_and_comes_to_the_same(
     assert len(model.chats) == asked, "nothing was asked twice"
 
 
+@pytest.mark.slow
+def test_a_suite_is_certified_family_by_family(optimize: Typed, tmp_path: Path, small_path: Path) -> None:
+    names = [REPORT, "occluded-intersection-v3"]
+    suite = f'[two]\ndescription = "two"\ndatasets = {json.dumps(names)}\n'
+    (tmp_path / "datasets").mkdir()
+    (tmp_path / "datasets" / "suites.toml").write_text(suite)
+    tune = ("--tune", small_path, "--tune", small_path)
+    code, _, wrong = optimize("--dataset", "suite:two", tune=tune, budget=500)
+    assert code == 0, wrong
+    told = history(tmp_path)
+    *each, mean = told["certificate"]["families"]
+    assert [family["dataset"] for family in each] == names
+    gains = [family["difference"]["value"] for family in each]
+    assert mean["dataset"] == "mean"
+    assert mean["difference"]["value"] == pytest.approx(np.mean(gains))
+    assert told["tried"][0]["layouts"] == 8, "four of each family"
+
+
 def broken_report(tmp_path: Path) -> Path:
     """Copy the report dataset without anything in its layouts: whoever reads one fails."""
     path = tmp_path / "datasets" / "broken"
@@ -433,12 +451,17 @@ def test_gepa_rewrites_the_system_text_by_what_went_wrong(
     optimize: Typed, model: Model, tmp_path: Path, small: Dataset
 ) -> None:
     pytest.importorskip("gepa")
-    model.lives = 40  # dies on the way, and goes on
-    assert optimize("--reflect", "m", "--budget", 200)[0] == 3
-    model.lives = 10**6
-    code, _, wrong = optimize("--reflect", "m", "--budget", 200)
+    code, _, wrong = optimize("--reflect", "m", "--budget", 200, out="whole")
     assert code == 0, wrong
+    whole = history(tmp_path, "whole")
+    for lives in (0, 40):
+        model.lives = lives
+        assert optimize("--reflect", "m", "--budget", 200)[0] == 3, "it stops on the way"
+    model.lives = 10**6
+    assert optimize("--reflect", "m", "--budget", 200)[0] == 0
     told = history(tmp_path)
+    for name in ("tried", "chosen", "questions", "certificate", "sha256"):
+        assert told[name] == whole[name], name
     assert told["engine"] == "GEPA with m"
     assert told["chosen"] == "system text of the ego rewritten"
     asked = [chat for chat in model.chats if "Write only the template" in chat]

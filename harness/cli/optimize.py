@@ -274,11 +274,11 @@ def _show_counted(counted: dict[str, Any], engine: str) -> None:
             "round of the search"
         )
     typer.echo(
-        f"search ({printable(engine)}): at most {counted['budget']} questions; a wording takes about "
+        f"search ({printable(engine)}): at most {counted['budget']} questions; a wording takes up to "
         f"{counted['questions_a_wording']} on the tune layouts"
     )
     typer.echo(
-        f"certificate: about {counted['certificate_questions']} questions on report layouts, both prompts"
+        f"certificate: up to {counted['certificate_questions']} questions on report layouts, both prompts"
     )
     for each in counted["prompt_tokens"]:
         for role, s in (each or {}).items():

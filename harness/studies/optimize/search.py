@@ -220,6 +220,7 @@ def _study(
     last = rows[-1]
     gain, what = last["difference"], "balanced success" if metric == BALANCED else "success"
     verdict = "clear of zero" if gain.low > 0 else "clearly worse" if gain.high < 0 else "not clear of zero"
+    verdict = verdict if gain.low == gain.low else "too few layouts for an interval"
     headline = [
         f"{of.version} against {base.version}: {shown(gain, POINTS, '+')} points of {what} on report "
         f"layouts, {verdict} (n = {gain.n} layouts, paired, 95 % interval over layouts; "
