@@ -16,7 +16,7 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import POINTS, as_mapping, shown
 from harness.core.progress import Progress
 from harness.core.seeds import FIRST, Purpose, purposes, stated
-from harness.core.statistics import Estimate, known_mean, mean_of
+from harness.core.statistics import Estimate, mean_of
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
 from harness.evaluate.run import Opens, read_or_evaluate
@@ -24,7 +24,9 @@ from harness.evaluate.spec import Spec
 from harness.prompts.versions import ROLES, Prompt, load
 from harness.report.document import Table
 from harness.runs.folder import Run
-from harness.runs.metrics import BALANCED, METRICS, SUCCESS, by_episode, difference, halved, over_episodes
+from harness.runs.leading import BALANCED, SUCCESS
+from harness.runs.metrics import METRICS, by_episode
+from harness.runs.success import Success, alike
 from harness.studies.optimize.candidate import Candidate, chosen, space, write
 from harness.studies.optimize.engines import Engine
 from harness.studies.optimize.tuning import Record, Spent, Tuning, changed
@@ -142,29 +144,22 @@ def looks(base: Prompt, where: Path) -> int:
     return 0
 
 
-def _values(run: Run) -> dict[str, Floats]:
-    metrics = [METRICS[name] for name in (SUCCESS, *METRICS[BALANCED].halves)]
-    values = by_episode(metrics, run.grid, run.decisions, run.episodes)
-    return {name: each[0] for name, each in values.items()}  # of the one condition, (S, E)
+def _success(run: Run) -> Floats:
+    """Return success under the one condition, (S, E)."""
+    values = by_episode([METRICS[SUCCESS]], run.grid, run.decisions, run.episodes)
+    return np.asarray(values[SUCCESS][0])
 
 
-def _certificate(old: Sequence[Run], new: Sequence[Run]) -> tuple[str, list[dict[str, Estimate]]]:
-    """Return what is compared, and by family (and for all) both prompts' estimates and their difference."""
-    pairs = [(_values(a), _values(b)) for a, b in zip(old, new, strict=True)]
-    both = all(known_mean(a[half].ravel(), 0) >= 0 for a, _ in pairs for half in METRICS[BALANCED].halves)
-    metric = BALANCED if both else SUCCESS
-
-    def row(a: dict[str, Floats], b: dict[str, Floats]) -> dict[str, Estimate]:
-        return {
-            OLD: halved(metric, lambda m: over_episodes(m, a[m])),
-            NEW: halved(metric, lambda m: over_episodes(m, b[m])),
-            "difference": halved(metric, lambda m: difference(m, b[m].T, a[m].T)),
-        }
-
-    rows = [row(a, b) for a, b in pairs]
+def _certificate(old: Sequence[Run], new: Sequence[Run]) -> tuple[Success, list[dict[str, Estimate]]]:
+    """Return how success counts, and by family (and for all) both prompts' estimates and their difference."""
+    counts = alike([Success.of(run.episodes[: len(run.grid.episodes)], BALANCED) for run in old])
+    rows = [
+        {OLD: of.estimate(a), NEW: of.estimate(b), "difference": of.difference(b, a)}
+        for of, a, b in zip(counts, map(_success, old), map(_success, new), strict=True)
+    ]
     if len(rows) > 1:
         rows.append({name: mean_of([row[name] for row in rows]) for name in rows[0]})
-    return metric, rows
+    return counts[0], rows
 
 
 def _study(
@@ -205,12 +200,12 @@ def _study(
             "optimize", f"Wordings of {base.version} for {agent.name}", headline, [_about(of)], tables, data,
             {**manifest, "certificate": None}, manifest,
         )  # fmt: skip
-    metric, rows = _certificate(runs[OLD], runs[NEW])
+    success, rows = _certificate(runs[OLD], runs[NEW])
     names = [spec.source.name for spec in report] + (["mean"] if len(rows) > len(report) else [])
     asked = sum(len(run.answers) for name in runs for run in runs[name])
     again = looks(base, of.prompts) + 1
     certificate = {
-        "metric": metric, "seeds": [_seeds(spec) for spec in report], "questions": asked,
+        "metric": success.metric, "seeds": [_seeds(spec) for spec in report], "questions": asked,
         "families": [
             {"dataset": name, **{side: as_mapping(e) for side, e in row.items()}}
             for name, row in zip(names, rows, strict=True)
@@ -218,7 +213,7 @@ def _study(
     }  # fmt: skip
     manifest |= {"certificate": certificate, "looks": again}
     last = rows[-1]
-    gain, what = last["difference"], "balanced success" if metric == BALANCED else "success"
+    gain, what = last["difference"], success.words
     verdict = "clear of zero" if gain.low > 0 else "clearly worse" if gain.high < 0 else "not clear of zero"
     verdict = verdict if gain.low == gain.low else "too few layouts for an interval"
     headline = [

@@ -17,7 +17,7 @@ import numpy as np
 
 from harness.backends.base import Backend
 from harness.coordination.operating_point import AS_SENT, Rewrites
-from harness.core.arrays import Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints
 from harness.core.progress import Progress
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.asking import Asker, Places
@@ -26,6 +26,7 @@ from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Fuses, walk
 from harness.prompts.versions import Prompt
 from harness.runs.records import Answer, Latency
+from harness.runs.success import Success
 from harness.studies.optimize.candidate import Candidate
 
 TIE = 1e-3  # weight of worth in a score
@@ -95,28 +96,24 @@ class Tuning:
         return [(n, e) for n, spec in enumerate(self.specs) for e in _dataset(spec).episodes]
 
     @cached_property
-    def _dangerous(self) -> Floats:
+    def _dangerous(self) -> Bools:
         return np.concatenate([_dataset(spec).dangerous for spec in self.specs])
 
     @cached_property
     def first_half(self) -> Ints:
         """Every second layout of each family with a danger, and of those without."""
-        return np.sort(np.concatenate([np.flatnonzero(cell)[::2] for cell in self._cells()]))
-
-    def _cells(self) -> list[Floats]:
-        family = np.array([family for family, _ in self.layouts])
-        cells = [(family == n) & (self._dangerous == d) for n in range(len(self.specs)) for d in (0, 1)]
-        return [cell for cell in cells if cell.any()]
+        kinds: dict[tuple[int, bool], list[int]] = {}
+        for n, (family, _) in enumerate(self.layouts):
+            kinds.setdefault((family, bool(self._dangerous[n])), []).append(n)
+        return np.array(sorted(n for those in kinds.values() for n in those[::2]))
 
     def weights(self, layouts: Ints) -> Floats:
         """Return what each of some layouts counts, 1 in all: families alike, and both halves of each."""
         family = np.array([self.layouts[n][0] for n in layouts])
         weights = np.zeros(len(layouts))
-        for cell in self._cells():
-            inside = cell[layouts]
-            if inside.any():
-                halves = len(np.unique(self._dangerous[layouts][family == family[inside][0]]))
-                weights[inside] = 1 / (inside.sum() * halves)
+        for inside in (family == n for n in np.unique(family)):
+            there = self._dangerous[layouts][inside]
+            weights[inside] = Success(there).weights(np.ones(len(there), dtype=int))
         return np.asarray(weights / weights.sum())
 
     def play(self, candidate: Candidate, layouts: Iterable[int]) -> list[Played]:
