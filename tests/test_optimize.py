@@ -198,15 +198,15 @@ def outcome(dataset: Dataset, does: Callable[[bool], str]) -> tuple[float, float
 def test_the_best_on_tune_layouts_is_certified_on_report_layouts(
     optimize: Typed, model: Model, tmp_path: Path, small: Dataset
 ) -> None:
-    code, said, wrong = optimize()
-    assert (code, said) == (0, ""), wrong
-    told = history(tmp_path)
+    code, out_text, wrong = optimize()
+    assert (code, out_text) == (0, ""), wrong
+    record = history(tmp_path)
     rules: dict[str, Callable[[bool], str]] = {
         "first alternatives": lambda meets: "Creep.",
         "pace 2 of 3": lambda meets: "Creep." if meets else "Go.",
         "pace 3 of 3": lambda meets: "Go.",
     }
-    tried = {row["wording"]: row for row in told["tried"]}
+    tried = {row["wording"]: row for row in record["tried"]}
     for wording, does in rules.items():
         if tried[wording]["layouts"] == len(small.episodes):
             success, worth = outcome(small, does)
@@ -215,21 +215,23 @@ def test_the_best_on_tune_layouts_is_certified_on_report_layouts(
     scores = {name: np.dot((1, TIE), outcome(small, does)) for name, does in rules.items()}
     best = max(scores, key=scores.__getitem__)
     assert best != "first alternatives"
-    assert told["chosen"] == best, "the order of parts changes nothing, so the first one stays"
-    assert told["questions"] == sum(row["questions"] for row in told["tried"]) <= told["budget"]
+    assert record["chosen"] == best, "the order of parts changes nothing, so the first one stays"
+    assert record["questions"] == sum(row["questions"] for row in record["tried"]) <= record["budget"]
     new = prompts.load("new", tmp_path / "prompts")
-    assert new.sha256 == told["sha256"]
+    assert new.sha256 == record["sha256"]
     assert not space(new)
     assert best in new.changed
     shown = load(find(REPORT), 3)
     a, b = outcome(shown, rules["first alternatives"])[0], outcome(shown, rules[best])[0]
-    [family] = told["certificate"]["families"]
-    assert told["certificate"]["metric"] == "balanced_success_rate"
+    [family] = record["certificate"]["families"]
+    assert record["certificate"]["metric"] == "balanced_success_rate"
     assert family["base"]["value"] == pytest.approx(a)
     assert family["winner"]["value"] == pytest.approx(b)
     assert family["difference"]["value"] == pytest.approx(b - a)
     assert family["difference"]["n"] == 3
-    assert len(model.chats) == told["questions"] + told["certificate"]["questions"]
+    assert len(model.chats) == record["questions"] + record["certificate"]["questions"]
+    for cost in (record, record["certificate"]):
+        assert cost["tokens"] == 15 * cost["questions"], "the server counts 12 tokens in and 3 out"
     page = (tmp_path / "reports" / "new" / "index.html").read_text()
     assert "read once, after the search" in page
     assert best in page
@@ -256,7 +258,7 @@ def test_a_stopped_search_goes_on_and_comes_to_the_same(
     assert optimize(budget=299)[0] == 2, "another budget is another search"
     assert optimize()[0] == 0
     again = history(tmp_path)
-    for name in ("tried", "chosen", "questions", "certificate", "sha256"):
+    for name in ("tried", "chosen", "questions", "tokens", "certificate", "sha256"):
         assert again[name] == whole[name], name
     assert len(model.chats) == asked, "nothing was asked twice"
 
@@ -270,13 +272,13 @@ def test_a_suite_is_certified_family_by_family(optimize: Typed, tmp_path: Path, 
     tune = ("--tune", small_path, "--tune", small_path)
     code, _, wrong = optimize("--dataset", "suite:two", tune=tune, budget=500)
     assert code == 0, wrong
-    told = history(tmp_path)
-    *each, mean = told["certificate"]["families"]
+    record = history(tmp_path)
+    *each, mean = record["certificate"]["families"]
     assert [family["dataset"] for family in each] == names
     gains = [family["difference"]["value"] for family in each]
     assert mean["dataset"] == "mean"
     assert mean["difference"]["value"] == pytest.approx(np.mean(gains))
-    assert told["tried"][0]["layouts"] == 8, "four of each family"
+    assert record["tried"][0]["layouts"] == 8, "four of each family"
 
 
 def broken_report(tmp_path: Path) -> Path:
@@ -310,8 +312,8 @@ def test_the_budget_is_never_exceeded(optimize: Typed, model: Model, tmp_path: P
     assert "the base alone takes more" in wrong
     assert len(model.chats) <= 3
     assert optimize("--folder", tmp_path / "some", budget=30)[0] == 0
-    told = json.loads((tmp_path / "some" / "optimize.json").read_text())
-    assert told["questions"] <= 30
+    record = json.loads((tmp_path / "some" / "optimize.json").read_text())
+    assert record["questions"] <= 30
 
 
 @pytest.mark.slow
@@ -335,8 +337,8 @@ def test_what_cannot_be_searched_is_refused_in_a_line(
     args: list[str], reason: str, optimize: Typed, model: Model, tmp_path: Path, small_path: Path
 ) -> None:
     args = [str(small_path) if word == "SMALL" else word for word in args]
-    code, said, wrong = optimize(*args, tune=() if args[0] == "--tune" else ("--tune", small_path))
-    assert (code, said, len(wrong.strip().splitlines())) == (2, "", 1), wrong
+    code, out_text, wrong = optimize(*args, tune=() if args[0] == "--tune" else ("--tune", small_path))
+    assert (code, out_text, len(wrong.strip().splitlines())) == (2, "", 1), wrong
     assert reason in wrong
     assert not model.chats
     assert not (tmp_path / "reports").exists()
@@ -355,16 +357,16 @@ def test_a_dry_run_asks_nothing_and_writes_nothing(
     harness: Typed, optimize: Typed, model: Model, tmp_path: Path, small_path: Path
 ) -> None:
     usual = ("--model", "m", "--prompt", "mine", "--tune", small_path, "--budget", 99, "--out", "new")
-    code, said, _ = harness("prompt", "optimize", *usual, "--dry-run", "--json")
-    told = json.loads(said)
+    code, out_text, _ = harness("prompt", "optimize", *usual, "--dry-run", "--json")
+    record = json.loads(out_text)
     assert code == 0
     assert not model.chats
     assert not (tmp_path / "reports").exists()
-    assert told["choices"] == {"pace": 3, "parts": 2}
-    assert told["wordings"] == 6
-    assert told["wordings_in_a_round"] == 4
-    assert told["budget"] == 99
-    assert told["questions_a_wording"] >= len(load(small_path).episodes)
+    assert record["choices"] == {"pace": 3, "parts": 2}
+    assert record["wordings"] == 6
+    assert record["wordings_in_a_round"] == 4
+    assert record["budget"] == 99
+    assert record["questions_a_wording"] >= len(load(small_path).episodes)
 
 
 def played(small: Dataset, episode: int, step: int, p: tuple[float, ...]) -> Decision:
@@ -459,18 +461,18 @@ def test_gepa_rewrites_the_system_text_by_what_went_wrong(
         assert optimize("--reflect", "m", "--budget", 200)[0] == 3, "it stops on the way"
     model.lives = 10**6
     assert optimize("--reflect", "m", "--budget", 200)[0] == 0
-    told = history(tmp_path)
-    for name in ("tried", "chosen", "questions", "certificate", "sha256"):
-        assert told[name] == whole[name], name
-    assert told["engine"] == "GEPA with m"
-    assert told["chosen"] == "system text of the ego rewritten"
+    record = history(tmp_path)
+    for name in ("tried", "chosen", "questions", "tokens", "certificate", "sha256"):
+        assert record[name] == whole[name], name
+    assert record["engine"] == "GEPA with m"
+    assert record["tried"][1]["system"] == {"ego": "You drive. Go."}
     asked = [chat for chat in model.chats if "Write only the template" in chat]
     assert (asked and "{{ words.task }}" in asked[0]) or "{{ graph.ego.id }}" in asked[0]
     assert "was worth" in asked[0]
     assert "The episode" in asked[0]
     new = prompts.load("new", tmp_path / "prompts")
     assert systems(new)["ego"] == "You drive. Go."
-    assert told["questions"] <= 200
+    assert record["questions"] <= 200
 
 
 @pytest.mark.slow

@@ -134,12 +134,12 @@ def command(
     ):
         sources = given or _built(scenarios, place, layouts, first_seed, who, progress)
         specs = [resolve.spec(settings, source) for source in sources]
-        of = Search(
+        plan = Search(
             base, specs, partial(_report, settings, names), budget, out, Path("prompts"), engine_name,
             shlex.join(["harness", *sys.argv[1:]]),
         )  # fmt: skip
         engine = _reflecting(reflect, specs[0], place, begins.settings) if reflect else engines.alternatives
-        study = search(of, engine, where, place, open_backend, progress, cache)
+        study = search(plan, engine, where, place, open_backend, progress, cache)
     finish(study, where, as_json, quiet)
     if not silent and Path("prompts", out).is_dir():
         typer.echo(f"wrote prompts/{printable(out)}, sha256 {prompts.load(out).sha256}; a draft")
@@ -235,7 +235,7 @@ def _built(
     return sources
 
 
-def _reflecting(model: str, first: "Spec", place: Path, of: Mapping[str, Any]) -> "Engine":
+def _reflecting(model: str, first: "Spec", place: Path, settings: Mapping[str, Any]) -> "Engine":
     from harness.backends.cards import resolve
     from harness.backends.registry import open_backend
     from harness.prompts.versions import ROLES
@@ -243,7 +243,7 @@ def _reflecting(model: str, first: "Spec", place: Path, of: Mapping[str, Any]) -
 
     backend = open_backend(resolve(model), device=first.device, dtype=first.dtype, batch_size=1)
     roles = ROLES if first.points[0].asks and not first.ego_alone else ROLES[:1]
-    return Reflecting(asked_of(backend), place / "reflections.jsonl", of, roles)
+    return Reflecting(asked_of(backend), place / "reflections.jsonl", settings, roles)
 
 
 def _counted(

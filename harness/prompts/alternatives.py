@@ -32,7 +32,7 @@ def counts(texts: Iterable[str]) -> dict[str, int]:
 
     Raises ValueError if a mark cannot be chosen from.
     """
-    found: dict[str, int] = {}
+    sizes: dict[str, int] = {}
     for text in texts:
         for mark in MARK.finditer(text):
             name, n = mark[2], len(_alternatives(mark))
@@ -40,11 +40,11 @@ def counts(texts: Iterable[str]) -> dict[str, int]:
                 raise ValueError(f"a mark is named {EXAMPLES}, which example_sets are; give another name")
             if n < 2:
                 raise ValueError(f"mark {name} has one alternative; divide them by {{% or %}}")
-            if found.setdefault(name, n) != n:
+            if sizes.setdefault(name, n) != n:
                 raise ValueError(
-                    f"mark {name} has {found[name]} and {n} alternatives; give as many each time"
+                    f"mark {name} has {sizes[name]} and {n} alternatives; give as many each time"
                 )
-    return found
+    return sizes
 
 
 def _alternatives(mark: re.Match[str]) -> list[str]:

@@ -3,13 +3,13 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from harness.core.config import loads
 from harness.core.errors import UserError
-from harness.core.files import write_whole
+from harness.core.files import canonical_json, sha256_bytes, write_whole
 from harness.prompts.alternatives import EXAMPLES as SETS
 from harness.prompts.alternatives import FIRST, counts, resolved
 from harness.prompts.examples import EXAMPLES, text_of
@@ -26,6 +26,7 @@ class Candidate:
 
     prompt: Prompt  # of the base's name
     what: str  # how it differs from the base, in a line
+    rewritten: Mapping[str, str] = field(default_factory=dict)  # texts of blocks `system`, by role
 
     @property
     def key(self) -> str:
@@ -71,10 +72,11 @@ def rewritten(base: Prompt, texts: Mapping[str, str]) -> Candidate:
             files[f"{role}.j2"],
             count=1,
         )
-    roles = [role for role, text in texts.items() if text != own[role]]
-    return (
-        _candidate(base, files, f"system text of the {' and the '.join(roles)} rewritten") if roles else first
-    )
+    new = {role: text for role, text in texts.items() if text != own[role]}
+    if not new:
+        return first
+    what = f"system text {sha256_bytes(canonical_json(new).encode())[:8]} of the {' and the '.join(new)}"
+    return replace(_candidate(base, files, what), rewritten=new)
 
 
 def _candidate(base: Prompt, files: Mapping[str, str], what: str) -> Candidate:

@@ -72,10 +72,12 @@ class Reflecting:
     seeded, and what the model wrote is kept, so that a stopped search goes on by beginning again.
     """
 
-    def __init__(self, asked: Callable[[str], str], kept: Path, of: Mapping[str, Any], roles: Sequence[str]):
-        """`asked` is the model; `kept` the file of what it wrote so far, of settings `of`."""
+    def __init__(
+        self, asked: Callable[[str], str], kept: Path, settings: Mapping[str, Any], roles: Sequence[str]
+    ):
+        """`asked` is the model; `kept` the file of what it wrote so far in a search of these settings."""
         self._asked, self._roles = asked, roles
-        self._cells = Cells(kept, sha256_bytes(canonical_json(of).encode()))
+        self._cells = Cells(kept, sha256_bytes(canonical_json(settings).encode()))
         self.replies = 0
 
     def __call__(self, tuning: Tuning) -> None:

@@ -52,7 +52,7 @@ def _unseen(decision: Decision) -> list[str]:
     scene, scenario = decision.scene, decision.dataset.scenario
     ego = scene.graphs[scene.viewers[0]]
     truth = truth_graph(scenario, scene.state)
-    told = " ".join(str((answer.message or {}).get("evidence", answer.raw)) for answer in decision.heard)
+    reported = " ".join(str((answer.message or {}).get("evidence", answer.raw)) for answer in decision.heard)
     sentences = []
     for node in truth.nodes:
         conflicts = [conflict for conflict in truth.conflicts if conflict.vehicle == node.id]
@@ -60,7 +60,7 @@ def _unseen(decision: Decision) -> list[str]:
             continue
         away_m = np.hypot(node.forward_m, node.left_m)
         heard = "no message came" if not decision.heard else "it was in no message"
-        if node.id in told.replace(",", " ").replace(".", " ").split():
+        if node.id in reported.replace(",", " ").replace(".", " ").split():
             heard = "a message named it"
         where = f"{away_m:.0f} m, {_meets(conflicts[0])}"
         sentences.append(f"The {node.type} {node.id} at {where}, was out of sight, and {heard}.")

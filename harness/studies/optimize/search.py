@@ -29,7 +29,7 @@ from harness.runs.metrics import METRICS, by_episode
 from harness.runs.success import Success, alike
 from harness.studies.optimize.candidate import Candidate, chosen, space, write
 from harness.studies.optimize.engines import Engine
-from harness.studies.optimize.tuning import Record, Spent, Tuning, changed
+from harness.studies.optimize.tuning import Record, Spent, Tuning, changed, tokens
 from harness.studies.study import Study, ends
 
 HISTORY = "history.json"  # beside a version's files: where it comes from; no part of its digest
@@ -90,7 +90,7 @@ def render_all(spec: Spec) -> None:
 
 
 def search(
-    of: Search, engine: Engine, out: Path, place: Path, opens: Opens, progress: Progress,
+    plan: Search, engine: Engine, out: Path, place: Path, opens: Opens, progress: Progress,
     cache_file: Path | None,
 ) -> Study:  # fmt: skip
     """Search, certify, write the version, and return what was tried and what it gained.
@@ -98,22 +98,22 @@ def search(
     `place` is the folder of what is kept until the end. The two runs on report layouts stay in `out`. If no
     candidate is better than the base on tune layouts, no report layout is read and no version written.
     """
-    for spec in of.tune:
+    for spec in plan.tune:
         render_all(spec)
     opens = cache(opens)
-    first = of.tune[0]
+    first = plan.tune[0]
     options = {"device": first.device, "dtype": first.dtype, "batch_size": first.batch_size}
     models = open_each(first.cards, partial(opens, **options))
     latency = latencies.known(first.latency, first.agents, models)
     assert latency  # it is not to be measured
     backend = together(first.cards, models, cache_file)
-    base = chosen(of.base)
-    tuning = Tuning(of.tune, of.budget, backend, latency, place, progress)
+    base = chosen(plan.base)
+    tuning = Tuning(plan.tune, plan.budget, backend, latency, place, progress)
     try:
         tuning.rank(base)
     except Spent:
         raise UserError(
-            f"--budget {of.budget}: the base alone takes more on {len(tuning.layouts)} tune layouts; "
+            f"--budget {plan.budget}: the base alone takes more on {len(tuning.layouts)} tune layouts; "
             "give more, or fewer --layouts"
         ) from None
     with suppress(Spent):
@@ -122,18 +122,18 @@ def search(
     report: Sequence[Spec] = ()
     runs: dict[str, list[Run]] = {}
     if winner.key != base.key:
-        new, report = replace(winner.prompt, version=of.version), of.report()
-        for name, prompt in ((OLD, of.base), (NEW, new)):
+        new, report = replace(winner.prompt, version=plan.version), plan.report()
+        for name, prompt in ((OLD, plan.base), (NEW, new)):
             places = [f"{name}-{spec.source.name}" if len(report) > 1 else name for spec in report]
             runs[name] = [
                 read_or_evaluate(changed(spec, prompt), out / place, progress, cache_file, opens)
                 for spec, place in zip(report, places, strict=True)
             ]
-    study = _study(of, tuning, winner, report, runs)
+    study = _study(plan, tuning, winner, report, runs, getattr(engine, "replies", 0))
     if runs:
         history = json.dumps(study.manifest, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-        write(replace(winner, prompt=new), of.prompts / of.version, {HISTORY: history})
-        load(of.version)
+        write(replace(winner, prompt=new), plan.prompts / plan.version, {HISTORY: history})
+        load(plan.version)
     return study
 
 
@@ -152,23 +152,23 @@ def _success(run: Run) -> Floats:
 
 def _certificate(old: Sequence[Run], new: Sequence[Run]) -> tuple[Success, list[dict[str, Estimate]]]:
     """Return how success counts, and by family (and for all) both prompts' estimates and their difference."""
-    counts = alike([Success.of(run.episodes[: len(run.grid.episodes)], BALANCED) for run in old])
+    rules = alike([Success.of(run.episodes[: len(run.grid.episodes)], BALANCED) for run in old])
     rows = [
-        {OLD: of.estimate(a), NEW: of.estimate(b), "difference": of.difference(b, a)}
-        for of, a, b in zip(counts, map(_success, old), map(_success, new), strict=True)
+        {OLD: rule.estimate(a), NEW: rule.estimate(b), "difference": rule.difference(b, a)}
+        for rule, a, b in zip(rules, map(_success, old), map(_success, new), strict=True)
     ]
     if len(rows) > 1:
         rows.append({name: mean_of([row[name] for row in rows]) for name in rows[0]})
-    return counts[0], rows
+    return rules[0], rows
 
 
 def _study(
-    of: Search, tuning: Tuning, winner: Candidate, report: Sequence[Spec],
-    runs: Mapping[str, Sequence[Run]],
+    plan: Search, tuning: Tuning, winner: Candidate, report: Sequence[Spec],
+    runs: Mapping[str, Sequence[Run]], replies: int,
 ) -> Study:  # fmt: skip
     import pandas as pd
 
-    base, agent = of.base, of.tune[0].ego
+    base, agent = plan.base, plan.tune[0].ego
     tried = [_row(tuning, record) for record in tuning.records.values()]
     tune = [
         {"scenario": s.scenario.name, "layouts": len(list(s.source.layout_seeds)), "seeds": _seeds(s)}
@@ -176,36 +176,39 @@ def _study(
     ]
     where = f"{len(tuning.layouts)} tune layouts ({', '.join(sorted({_seeds(s) for s in tuning.specs}))})"
     manifest: dict[str, Any] = {
-        "version": of.version, "sha256": winner.key, "base": {"version": base.version, "sha256": base.sha256},
-        "engine": of.engine, "model": agent.card.record(), "answer": agent.answer,
-        "condition": of.tune[0].points[0].name, "tune": tune, "budget": of.budget,
-        "questions": tuning.spent, "tried": tried, "chosen": winner.what, "command": of.command,
+        "version": plan.version, "sha256": winner.key,
+        "base": {"version": base.version, "sha256": base.sha256},
+        "engine": plan.engine, "model": agent.card.record(), "answer": agent.answer,
+        "condition": plan.tune[0].points[0].name, "tune": tune, "budget": plan.budget,
+        "questions": tuning.spent, "tokens": tuning.tokens, "reflections": replies,
+        "tried": [
+            {**row, **({"system": dict(r.candidate.rewritten)} if r.candidate.rewritten else {})}
+            for row, r in zip(tried, tuning.records.values(), strict=True)
+        ], "chosen": winner.what, "command": plan.command,
         "versions": versions(),
     }  # fmt: skip
     best, first = (tuning.records[key] for key in (winner.key, chosen(base).key))
-    searched = (
-        f"{len(tried)} wordings of {base.version} were tried on {where} with {tuning.spent} questions of "
-        f"{of.budget}; the best is: {winner.what}."
-    )
-    tables = [_tried_table(tried)]
-    data = {"tried": pd.DataFrame(tried)}
+    cost = f"{tuning.spent} questions of {plan.budget}, {tuning.tokens} tokens"
+    cost += f", {replies} texts of the reflecting model" if replies else ""
+    searched = f"{len(tried)} wordings of {base.version} were tried on {where} with {cost}"
+    tables, data = [_tried_table(tried)], {"tried": pd.DataFrame(tried)}
     if not runs:
         headline = [
             f"None is better than {base.version} for {agent.name} on the tune layouts, so no version was "
             "written and no report layout was read.",
-            f"{len(tried)} wordings of {base.version} were tried on {where} with {tuning.spent} questions of "
-            f"{of.budget}.",
+            f"{searched}.",
         ]
         return Study(
-            "optimize", f"Wordings of {base.version} for {agent.name}", headline, [_about(of)], tables, data,
-            {**manifest, "certificate": None}, manifest,
+            "optimize", f"Wordings of {base.version} for {agent.name}", headline, [_about(plan)], tables,
+            data, {**manifest, "certificate": None}, manifest,
         )  # fmt: skip
     success, rows = _certificate(runs[OLD], runs[NEW])
     names = [spec.source.name for spec in report] + (["mean"] if len(rows) > len(report) else [])
-    asked = sum(len(run.answers) for name in runs for run in runs[name])
-    again = looks(base, of.prompts) + 1
+    answers = [answer for side in runs.values() for run in side for answer in run.answers]
+    again = looks(base, plan.prompts) + 1
     certificate = {
-        "metric": success.metric, "seeds": [_seeds(spec) for spec in report], "questions": asked,
+        "metric": success.metric, "seeds": [_seeds(spec) for spec in report], "questions": len(answers),
+        "tokens": tokens(answers),
         "families": [
             {"dataset": name, **{side: as_mapping(e) for side, e in row.items()}}
             for name, row in zip(names, rows, strict=True)
@@ -217,12 +220,13 @@ def _study(
     verdict = "clear of zero" if gain.low > 0 else "clearly worse" if gain.high < 0 else "not clear of zero"
     verdict = verdict if gain.low == gain.low else "too few layouts for an interval"
     headline = [
-        f"{of.version} against {base.version}: {shown(gain, POINTS, '+')} points of {what} on report "
+        f"{plan.version} against {base.version}: {shown(gain, POINTS, '+')} points of {what} on report "
         f"layouts, {verdict} (n = {gain.n} layouts, paired, 95 % interval over layouts; "
         f"{', '.join(map(_seeds, report))}, read once, after the search).",
         f"On the tune layouts that chose it: {100 * _mean(tuning, best):.1f} % against "
-        f"{100 * _mean(tuning, first):.1f} %. {searched}",
-        f"The certificate took {asked} questions more.",
+        f"{100 * _mean(tuning, first):.1f} %. {searched}; the best is: "
+        f"{winner.what}.",
+        f"The certificate took {len(answers)} questions and {tokens(answers)} tokens more.",
     ]
     caveats = (
         [f"Report layouts were read for versions that this one comes from, too: look number {again}."]
@@ -231,7 +235,7 @@ def _study(
     )
     table = Table(
         "Certificate, on report layouts",
-        ("dataset", f"{base.version}, %", f"{of.version}, %", "difference, points", "n"),
+        ("dataset", f"{base.version}, %", f"{plan.version}, %", "difference, points", "n"),
         [
             (name, shown(row[OLD]), shown(row[NEW]), shown(row["difference"], POINTS, "+"),
              str(row["difference"].n))
@@ -245,14 +249,14 @@ def _study(
         for name, row in zip(names, rows, strict=True) for side, e in row.items()
     ]  # fmt: skip
     return Study(
-        "optimize", f"{of.version}, from {base.version}, for {agent.name}", headline, [_about(of)],
+        "optimize", f"{plan.version}, from {base.version}, for {agent.name}", headline, [_about(plan)],
         [table, *tables], {**data, "certificate": pd.DataFrame(flat)}, manifest, manifest, caveats=caveats,
     )  # fmt: skip
 
 
-def _about(of: Search) -> str:
+def _about(plan: Search) -> str:
     return (
-        f"Engine: {of.engine}. Condition: {of.tune[0].points[0].name}. Score on tune layouts: success, "
+        f"Engine: {plan.engine}. Condition: {plan.tune[0].points[0].name}. Score on tune layouts: success, "
         "balanced over layouts with and without a danger where there are both, then the worth of what is "
         "stated (the tree's probability of success if later actions are drawn evenly), then the shorter text."
     )

@@ -22,6 +22,7 @@ from harness.core.progress import Progress
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.asking import Asker, Places
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.kept_answers import read_kept
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Fuses, walk
 from harness.prompts.versions import Prompt
@@ -139,6 +140,11 @@ class Tuning:
         score = self.score(candidate, np.arange(len(self.layouts)))
         return round(score, 9), -self.records[candidate.key].length
 
+    @property
+    def tokens(self) -> int:
+        """The `tokens` of all answers so far."""
+        return sum(tokens(read_kept(file).values()) for file in self._place.glob("answers-*.jsonl"))
+
     def best(self) -> Candidate:
         """Return the best candidate of those that were played on all layouts; of equals the first."""
         whole = [r.candidate for r in self.records.values() if len(r.played) == len(self.layouts)]
@@ -217,6 +223,11 @@ class _Asker(Asker):
     def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         self._charge([(scenes[0].id, code, rewrites) for code in codes.tolist()])
         return super().fusion_call(scenes, codes, rewrites)
+
+
+def tokens(answers: Iterable[Answer]) -> int:
+    """Return the tokens of questions and answers together, as far as their engine counts them."""
+    return sum((each.prompt_tokens or 0) + (each.completion_tokens or 0) for each in answers)
 
 
 def changed(spec: Spec, prompt: Prompt) -> Spec:
