@@ -3,7 +3,7 @@
     python benchmarks/results.py [--limit N] [--device D] [--only TEXT] [--out reports/results]
                                  [--page docs/results.md] [--picture docs/pictures/results.svg]
 
-It evaluates each row of `ROWS` on the report layouts of the shipped dataset, one run a row, and writes the
+It evaluates each row of `ROWS` on the report layouts of `DATASET`, one run a row, and writes the
 tables of the page between its marks, and the picture. Finished runs are read and not made again; a stopped
 one goes on with the same command. On a CPU, a published model takes seconds an answer: with `--limit` it is
 asked on fewer layouts, and each row says on how many.
@@ -26,6 +26,7 @@ from harness.report.drawing.pictures import save, styled
 from harness.runs.folder import Run, read
 from harness.runs.records import Score
 
+DATASET = "occluded-intersection-v2"  # all rows are of it; published models take hours
 CONDITIONS_SHOWN = ("single-local", "v2x", "6g", "6g:messages=shuffled")
 HEADS = ("alone", "v2x", "6g", "6g, shuffled")
 ARGUMENTS = ("--control", "shuffled-messages", "--ask", "all")  # every helper's answers are described
@@ -100,7 +101,8 @@ def make(row: Row, given: argparse.Namespace) -> None:
         return
     old = given.answers / row.folder if given.answers else None
     model = f"replay:{old}" if old and old.exists() else row.model
-    words = ["eval", "--model", model, "--prompt", row.prompt, "--answer", row.answer, "--out", str(out)]
+    words = ["eval", "--model", model, "--dataset", DATASET, "--prompt", row.prompt]
+    words += ["--answer", row.answer, "--out", str(out)]
     if model != row.model:
         words += ["--ties", "drawn"]  # else as it was in the run
     elif row in PUBLISHED:

@@ -29,6 +29,8 @@ READER_HAS = {
     "tokenizer.json": ROOT / "models/swarm-tiny/tokenizer.json",
 }
 
+CHECKED = "harness prompt check mine --tokenizer ../tokenizer.json --dataset occluded-intersection-v2"
+
 # Added to what is typed, where it would take minutes; of an option given twice the last one counts. A whole
 # line has its own, or its command's.
 SHARD = "--episodes 4 --seeds 0 --workers 1"
@@ -59,7 +61,7 @@ CUT = {
     "harness dataset scenario drive": "--episodes 2 --workers 1",  # of 100 and of 500
     "harness dataset scenario audit": "--layouts 24 --workers 1",  # of 300
     "harness model distill": "--layouts 2 --samples 16,16,16,16 --workers 1",  # of 240 and 300 000
-    "harness prompt check mine --tokenizer ../tokenizer.json": "--dataset ../few",  # 4 episodes of 240
+    CHECKED: "--dataset ../few",  # 4 episodes of 240
     "harness prompt optimize": "--tune ../few --limit 2",  # 4 layouts of 24, and 2 of 240
     "harness model parity": "--prompts 1",  # of 64, on two engines
 }
@@ -70,7 +72,7 @@ CUT_ENDS = {
     "harness compare reports/a reports/b"
     " --fail-if '6g:success_rate < -0.01' --fail-if '6g:unsafe_rate > 0.01'": 0,
     # The model that ships has 768 tokens; the page counts those of a Qwen.
-    "harness prompt check mine --tokenizer ../tokenizer.json": 1,
+    CHECKED: 1,
 }
 
 # Held against the program's options, and not run.
@@ -93,7 +95,7 @@ NOT_RUN = {
     " --batch-size 256": "needs servers; tests/test_servers.py has some",
     "harness eval --model qwen3-4b --engine llama-cpp": "needs weights from a hub",
     "harness eval --model swarm-tiny --latency measured": "a busy machine is refused",
-    "harness run export reports/proxy-v2-occluded-intersection-v2 --inspect logs/run.eval": "needs inspect",
+    "harness run export reports/proxy-v2-occluded-intersection-v3 --inspect logs/run.eval": "needs inspect",
     "harness dataset rank occluded-intersection-v2 --json": "long; docs/datasets.md ranks a small one",
 }
 OTHER_PROGRAMS = {

@@ -5,6 +5,7 @@ import tomllib
 from pathlib import Path
 from shutil import copyfile
 
+import former
 import pytest
 
 from harness.core import resources
@@ -42,12 +43,12 @@ def test_a_shipped_prompt_is_released(version: str) -> None:
     assert prompts.load(version).released
 
 
-def test_a_wheel_holds_the_newest_of_each_family_and_the_usual_one() -> None:
+def test_a_wheel_holds_the_newest_of_each_family_and_the_former_default() -> None:
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
     held = {Path(source).name for source in wheel["force-include"] if source.startswith("datasets/")}
     suite = suites.named("suite:v2v-safety-2")
     assert suite
-    assert held & {*DATASETS} == {*suite.datasets, resources.DATASET}
+    assert held & {*DATASETS} == {*suite.datasets, former.DATASET}
 
 
 def test_a_released_dataset_that_an_installation_lacks_is_one_line(

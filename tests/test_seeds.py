@@ -5,12 +5,12 @@ import re
 from pathlib import Path
 
 import pytest
+from former import DATASET
 from hypothesis import given
 from hypothesis import strategies as st
 from reference import pages
 
 from harness.core.errors import UserError
-from harness.core.resources import DATASET
 from harness.core.seeds import purpose, stated
 
 ROOT = Path(__file__).parent.parent

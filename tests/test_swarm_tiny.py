@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evaluating import decisions, figure, run, spec_of
+from former import DATASET
 from run_on_disk import answers_of
 
 from harness.coordination.operating_point import POINTS
-from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.lifecycle import Evaluated
 

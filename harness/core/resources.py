@@ -13,7 +13,7 @@ from typing import TypeVar
 from harness.core.errors import UserError, printable
 
 T = TypeVar("T")
-DATASET = "occluded-intersection-v2"  # the dataset that ships
+DATASET = "occluded-intersection-v3"  # taken if none is named
 MARKER = "swarmdrive.toml"
 
 _PACKAGE = Path(__file__).resolve().parent.parent

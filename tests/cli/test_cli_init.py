@@ -36,7 +36,7 @@ def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Pat
             args[args.index("--episodes") + 1] = "1"
         code, _, err = harness(*args, *(["--limit", "1"] if "eval" in args else []))
         assert (program, code, err) == ("harness", 0, "")
-    report = project / "reports/swarm-tiny-mine-occluded-intersection-v2"
+    report = project / "reports/swarm-tiny-mine-occluded-intersection-v3"
     assert json.loads((report / "run.json").read_text())["prompt"]["version"] == "mine"
     code, out, err = harness("eval", "--prompt", "mine", "--dataset", "mine", "--seeds", "0", "--json")
     assert (code, err) == (0, "")

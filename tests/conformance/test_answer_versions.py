@@ -15,6 +15,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from evaluating import run, scenes_of, spec_of
+from former import DATASET
 from misbehaving import serving
 from test_every_backend import answered
 from test_real_answers import FILE as REAL_ANSWERS
@@ -30,7 +31,6 @@ from harness.coordination.rules import RULES
 from harness.coordination.scheduling import FORMULAS
 from harness.core import versions
 from harness.core.files import sha256_bytes
-from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.asking import requests
 from harness.runs import folder

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluating import live_spec_of, run, spec_of
+from former import DATASET
 
 from harness.coordination.contents import CONTENTS, TEXT
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
-from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
 from harness.report.caveats import of_run
 from harness.runs import folder
