@@ -3,14 +3,17 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from evaluating import run, spec_of
 from msgspec import structs
 
+from harness.cli.run import BY_WITNESSES, by_witnesses
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
 from harness.evaluate.live_world import LiveSource
 from harness.runs.folder import Run, read
 from harness.runs.metrics import GAIN
+from harness.runs.records import Score
 
 NAMES = [f"success_rate_{k}_witness{'' if k == 1 else 'es'}" for k in range(4)]
 
@@ -36,10 +39,48 @@ def test_rows_have_witnesses_and_the_dangers_radio(small: Dataset, tmp_path: Pat
         assert (score.value, score.n, score.n_excluded) == (sum(own) / 2, 2, 6)
 
 
-def test_where_none_are_declared_nothing_is_said(small: Dataset, tmp_path: Path) -> None:
+def test_dangers_stand_by_who_can_tell_of_them_beside_the_harmless_layouts(
+    small: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = "occluded-intersection:witnesses=each,radio_share=0.5"
+    done = driven(small, tmp_path / "run", name, "single-local", episodes=24)
+    dangers = [e for e in done.episodes if e.danger != "none"]
+    groups = {
+        f"seen by {k}": [e for e in dangers if e.witnesses == k and not e.danger_radio] for k in range(4)
+    }
+    groups["with a radio"] = [e for e in dangers if e.danger_radio]
+    assert sum(map(len, groups.values())) == len(dangers) < 24
+    for group, own in groups.items():
+        score = done.score("single-local", BY_WITNESSES[group])
+        assert score is not None
+        assert (score.value, score.n) == (sum(e.success for e in own) / len(own), len(own))
+    by_witnesses({(s.condition, s.metric): s for s in done.scores}, ["single-local"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[:12].rstrip() for line in lines[2:-2]] == list(BY_WITNESSES)
+    assert max(map(len, lines)) <= 80
+
+
+def test_the_table_of_three_conditions_fits_into_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    names = ["single-local", "v2x", "6g:content=objects,encoding=etsi", "6g"]
+    figures = {
+        (name, metric): Score(name, metric, 1.0, 0.956, 1.0, 100, 0, "episodes")
+        for name in names for metric in BY_WITNESSES.values()
+    }  # fmt: skip
+    by_witnesses(figures, names)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert lines.count("") == 3, "two tables, and the room below"
+    assert sum(line.startswith("no danger") for line in lines) == 2
+
+
+def test_where_none_are_declared_nothing_is_said(
+    small: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     done = driven(small, tmp_path / "run", "occluded-intersection", "single-local", episodes=2)
     assert {(e.witnesses, e.danger_radio) for e in done.episodes} == {(None, None)}
-    assert not {*NAMES} & {score.metric for score in done.scores}
+    assert not {*NAMES, *list(BY_WITNESSES.values())[1:]} & {score.metric for score in done.scores}
+    by_witnesses({(s.condition, s.metric): s for s in done.scores}, ["single-local"])
+    assert capsys.readouterr().out == ""
 
 
 def test_without_a_witness_messages_make_up_no_gain(small: Dataset, tmp_path: Path) -> None:

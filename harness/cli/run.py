@@ -48,6 +48,18 @@ BALANCED = (
 )
 
 
+# Rows of success by who can tell of the danger; the first stands for layouts without one.
+BY_WITNESSES = {
+    "no danger": "success_harmless_rate",
+    "seen by 0": "success_dangerous_rate_0_witnesses",
+    "seen by 1": "success_dangerous_rate_1_witness",
+    "seen by 2": "success_dangerous_rate_2_witnesses",
+    "seen by 3": "success_dangerous_rate_3_witnesses",
+    "with a radio": "success_dangerous_rate_with_radio",
+}
+MOST_BESIDE = 3  # conditions of a table of intervals
+
+
 def file_name(model: str) -> str:
     """Return a model's name as part of a folder's."""
     return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
@@ -203,8 +215,30 @@ def show(
         if shown is not columns:
             of_each = " and ".join(str(half.n) for half in halves if half)
             text.print(f"balanced: mean of both, of {of_each} episodes\n")
+    by_witnesses(figures, names)
     for note in (*notes, *in_a_line(run), *origins(m, figures)):
         text.print(note)
+
+
+def by_witnesses(figures: "Mapping[tuple[str, str], Score]", conditions: Sequence[str]) -> None:
+    """Print success by who can tell of the danger, where layouts have declared witnesses."""
+    known = {name: metric for name, metric in BY_WITNESSES.items() if (conditions[0], metric) in figures}
+    if known.keys() <= {"no danger"}:
+        return
+    for start in range(0, len(conditions), MOST_BESIDE):
+        some = conditions[start : start + MOST_BESIDE]
+        typer.echo()
+        table(
+            ("success %", "n", *some),
+            [
+                (
+                    name, str(figures[some[0], metric].n),
+                    *(Column("", metric, interval=True).cell(figures.get((c, metric))) for c in some),
+                )
+                for name, metric in known.items()
+            ],
+        )  # fmt: skip
+    typer.echo("seen by: helpers, at the first decision; with a radio: it tells of itself\n")
 
 
 def of_letter(figures: "Mapping[tuple[str, str], Score]", role: str) -> str | None:

@@ -158,6 +158,11 @@ def _witnessed(count: int) -> Callable[[Episode], bool | None]:
     return lambda e: e.success if e.witnesses == count else None
 
 
+def _seen_by(count: int) -> Callable[[Episode], bool | None]:
+    """Build the function of success where so many helpers see the danger, which sends nothing itself."""
+    return lambda e: e.success if e.danger != "none" and e.witnesses == count and not e.danger_radio else None
+
+
 def _column(name: str) -> Callable[[Columns], Floats]:
     return lambda d: d[name]
 
@@ -280,6 +285,11 @@ BUILT_IN = (
     *(_rate(f"success_rate_{k}_witness{'' if k == 1 else 'es'}", "success rate in the layouts in which so "
             "many helpers have, or would have, the danger in sight at the first decision",
             _witnessed(k), "higher", optional=True) for k in range(4)),
+    *(_rate(f"success_dangerous_rate_{k}_witness{'' if k == 1 else 'es'}", "success rate where so many "
+            "helpers have the danger in sight at the first decision, and it has no radio", _seen_by(k),
+            "higher", optional=True, half=True) for k in range(4)),
+    _rate("success_dangerous_rate_with_radio", "success rate where the danger has a radio and tells of "
+          "itself", lambda e: e.success if e.danger_radio else None, "higher", optional=True, half=True),
     Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision", METRES,
            "higher", label="least gap", episodes=_field("least_gap_m")),
     Metric("hard_brakings_per_episode", "number of times that the ego begins to brake harder than 4 m/s²",

@@ -269,7 +269,8 @@ def in_a_sentence(table: Table) -> str:
     best, (axis, head, *_) = max(table.rows, key=success), table.heads
     words = head.partition(" %")[0]
     around = [min(table.rows, key=success), best] if CROSS in axis else [table.rows[0], best, table.rows[-1]]
-    return "; ".join(dict.fromkeys(f"{words} is {row[1]} % at {axis} {row[0]}" for row in around))
+    parts = dict.fromkeys(f"{row[1]} % at {axis} {row[0]}" for row in around)
+    return f"{words} {'; '.join(parts)}"
 
 
 def _text(value: Any) -> str:

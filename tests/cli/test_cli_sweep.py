@@ -30,7 +30,7 @@ def test_without_an_axis_it_draws_the_papers_panels_beside_the_proxys(
     assert out.splitlines()[-1] == "wrote swept/index.html"
     page, table = Path("swept/index.html").read_text(), pd.read_csv("swept/conditions.csv")
     assert page.count('class="headline"') == page.count("<h2>") > 4
-    assert re.search(r"over loss: balanced success is [^<]+ % at loss 0; ", page)
+    assert re.search(r"over loss: balanced success [^<]+ % at loss 0; ", page)
     assert set(table.panel) == {"core", "size", "loss", "tau"}
     assert set(table[table.panel == "core"].condition) == {"single-local", "v2x", "6g"}
     assert table.source.nunique() == 2
