@@ -11,6 +11,7 @@ import threading
 from base64 import b64encode
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -21,6 +22,9 @@ import numpy as np
 import pytest
 from answering import answering, asking
 from evaluating import requests, run, scenes_of, spec_of, with_ego
+from hypothesis import given
+from hypothesis import strategies as st
+from starlette.testclient import TestClient
 
 from harness.backends import cards
 from harness.backends.base import Completion, Request
@@ -31,9 +35,10 @@ from harness.core.image import Image
 from harness.dataset.load import Dataset, find, load
 from harness.prompts.decision import Question
 from harness.runs import folder
+from harness.serving.app import Service
 from harness.serving.asked import Refusal
 from harness.serving.desk import Desk
-from harness.serving.model import served
+from harness.serving.model import ServedModel, served
 
 Said = tuple[int, str, str]
 WIRES = ("systemone", "decisions")
@@ -250,6 +255,48 @@ def test_what_cannot_be_asked_is_refused_in_words(url: str, wire: str, body: Any
     assert len(error["message"]) < 400
     ok = post(url, "systemone", {"state": "s", "questions": {"a": choice()}})
     assert ok.status_code == 200, "the next one is answered"
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=9), inner, max_size=3),
+    max_leaves=9,
+)
+KINDS = st.sampled_from(["choice", "score", "noul", "predicate", "box"])
+OPTIONS = st.dictionaries(st.text(max_size=5), JSON, max_size=4)
+LISTED = st.lists(st.fixed_dictionaries({"value": st.text() | st.booleans(), "label": st.text()}), max_size=4)
+QUESTION = st.fixed_dictionaries(
+    {"type": KINDS},
+    optional={"instructions": JSON, "criteria": OPTIONS | st.lists(JSON, max_size=4), "choices": LISTED,
+              "levels": LISTED, "name": st.none() | st.text(max_size=9)},
+)  # fmt: skip
+BODY = st.fixed_dictionaries(
+    {
+        "questions": st.dictionaries(st.text(max_size=9), QUESTION, max_size=3)
+        | st.lists(QUESTION, max_size=3)
+    },
+    optional={"state": JSON, "input": st.text() | JSON, "images": st.lists(st.text(), max_size=1)},
+)
+
+
+@pytest.fixture(scope="module")
+def answers() -> TestClient:
+    """A client of an engine that answers whatever it is asked evenly."""
+    engine = Patient()
+    engine.go.set()
+    service = Service(ServedModel(served(cards.load("sparrow-robot")), engine))
+    return TestClient(service.app(), base_url="http://127.0.0.1", raise_server_exceptions=False)
+
+
+@pytest.mark.slow
+@given(wire=st.sampled_from(WIRES), body=BODY | JSON)
+def test_whatever_is_asked_is_answered_or_refused(answers: TestClient, wire: str, body: Any) -> None:
+    with suppress(UnicodeEncodeError):  # half a character, which JSON can write and bytes cannot
+        content = json.dumps(body, ensure_ascii=False).encode()
+        said = answers.post(f"/v1/{wire}", content=content, headers={"content-type": "application/json"})
+        assert said.status_code in (200, 400), said.text
+        if said.status_code == 200:
+            assert len(said.json()["answers"]) == len(body["questions"])
 
 
 def test_who_may_not_ask_is_told_so(url: str) -> None:

@@ -17,7 +17,7 @@ from harness.serving.asked import Asked, Enquiry, Refusal
 from harness.serving.picture import picture
 
 ANY = "default"  # the name that asks for whatever there is
-WIDEST = 16  # characters of a token; a longer question is refused before it is split
+MOST_CHARACTERS = 2**18  # of a state and its question: each order of the letters is split into tokens
 _PROMPT = "v9"  # no text of it is asked
 
 
@@ -80,16 +80,11 @@ class ServedModel:
         chats = self._agent.in_orders(
             asked.options, lambda order: decision.asked(asked.question, (turn,), order)
         )
-        self._refuse_long(chats["messages"])
-        blank = self._agent.blank("ego", asked.options)
-        return blank.alike(id=f"{next(self._numbers)}/asked", question=asked.question, image=image, **chats)
-
-    def _refuse_long(self, messages: Any) -> None:
-        """Refuse what no tokenizer makes short enough, before all orders of it are split into tokens."""
-        most = getattr(getattr(self.backend, "engine", None), "context_tokens", None)
-        length = sum(len(message["content"]) for message in messages)
-        if most is not None and length > WIDEST * most:
+        length = sum(len(message["content"]) for message in chats["messages"])
+        if length > MOST_CHARACTERS:
             raise Refusal(
-                f"{length} characters are asked; {printable(self.name)} reads {most} tokens at most",
+                f"a question and its state have {length} characters; give {MOST_CHARACTERS} at most",
                 code="context_length_exceeded",
             )
+        blank = self._agent.blank("ego", asked.options)
+        return blank.alike(id=f"{next(self._numbers)}/asked", question=asked.question, image=image, **chats)
