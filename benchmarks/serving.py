@@ -4,7 +4,7 @@ The model is asked what `harness eval --answer decision` asks about scenes of si
 time: in this process, and by this program's own client through a `harness serve` of the same model, engine
 and number format.
 
-    python benchmarks/serving.py [--model swarm-tiny] [--wire systemone] [--prompts 500]
+    python benchmarks/serving.py [--model swarm-tiny] [--wire systemone] [--prompts 500] [--letters cyclic]
 """
 
 import argparse
@@ -41,11 +41,12 @@ def main() -> None:
     arguments.add_argument("--model", default="swarm-tiny")
     arguments.add_argument("--wire", default="systemone", choices=["systemone", "decisions"])
     arguments.add_argument("--prompts", type=int, default=500)
+    arguments.add_argument("--letters", choices=["raw", "cyclic"])
     given = arguments.parse_args()
-    agent = Agent(cards.resolve(given.model), versions.load("v9"), "decision")
+    agent = Agent(cards.resolve(given.model), versions.load("v9"), "decision", letters=given.letters)
     asked = questions(agent, given.prompts)
     here, here_ms = answers(open_backend(agent.card, batch_size=1), asked)
-    with serving(given.model) as url:
+    with serving(given.model, *(["--letters", given.letters] if given.letters else [])) as url:
         card = cards.load(f"{given.wire}-example")
         assert card.server is not None
         client = open_backend(replace(card, server=replace(card.server, base_url=url)), batch_size=1)
@@ -82,9 +83,9 @@ def answers(backend: Backend, asked: list[Request]) -> tuple[list[dict[str, Any]
 
 
 @contextmanager
-def serving(model: str) -> Iterator[str]:
+def serving(model: str, *options: str) -> Iterator[str]:
     """Yield the base URL of `harness serve`."""
-    command = [sys.executable, "-m", "harness", "serve", "--model", model, "--port", "0"]
+    command = [sys.executable, "-m", "harness", "serve", "--model", model, "--port", "0", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         try:

@@ -111,13 +111,14 @@ def test_what_is_served_is_what_is_answered_here(
 
 
 @pytest.mark.slow
-def test_a_run_over_a_server_is_the_run_in_this_process(data: Dataset, tmp_path: Path) -> None:
+@pytest.mark.parametrize("wire", WIRES)
+def test_a_run_over_a_server_is_the_run_in_this_process(wire: str, data: Dataset, tmp_path: Path) -> None:
     model = needs("swarm-tiny")
     points = tuple(map(named_point, ("single-local", "6g", "6g:loss=0,tau=0,content=objects")))
     here = with_ego(spec_of(data, model, "v9", answer="decision", points=points, batch_size=1), flip=True)
     run(here, tmp_path / "here")
     with answering(model) as there:
-        card = cards.load("systemone-example")
+        card = cards.load(f"{wire}-example")
         card = replace(card, server=replace(card.server, base_url=there))
         run(replace(here, ego=replace(here.ego, card=card, letters=None)), tmp_path / "there")
     one, other = (folder.read(tmp_path / name) for name in ("here", "there"))
