@@ -324,6 +324,7 @@ def environment(
         UserError: a value is unknown or not allowed, or layouts are those that numbers are reported of.
     """
     from harness.core import extras
+    from harness.core.parallel import workers_of
 
     extras.need("an environment", "highway_env")
     from harness.cli.progress import bar
@@ -346,7 +347,7 @@ def environment(
             source = Roads(played, of, then)
         else:
             with bar(f"freezing {played.name}", layouts, quiet) as progress:
-                source = Trees(allowed.trees(played, of, workers, progress), then or BEST)
+                source = Trees(allowed.trees(played, of, workers_of(str(workers)), progress), then or BEST)
     ask = asking.Asking.of(source.scenario, prompt, answer)
     return Driving(
         source, ask, observation=observation, viewer=viewer, reward=reward, distributions=distributions

@@ -85,6 +85,14 @@ def test_gymnasium_finds_nothing_wrong(options: dict[str, Any], make: Make) -> N
     check_env(make(**options), skip_render_check=True)
 
 
+def test_several_go_side_by_side(make: Make) -> None:
+    several = gymnasium.vector.SyncVectorEnv([lambda: make(observation="arrays")] * 3)
+    seen, info = several.reset(seed=1)
+    assert seen["numbers"].shape == seen["known"].shape == (3, len(several.envs[0].numbers))
+    _, rewards, *_ = several.step([0, 1, 2])
+    assert rewards.tolist() == [values[action] for action, values in enumerate(info["values"])]
+
+
 @pytest.mark.parametrize("driver", ["cruise", "full-view"])
 def test_whoever_drives_as_a_driver_ends_as_it_does(driver: str, make: Make, small: Dataset) -> None:
     env, forest = make(then=driver), small.forest
@@ -192,6 +200,7 @@ def test_arrays_are_of_the_viewers_own_graph(make: Make, small: Dataset) -> None
         ({"seeds": "tain"}, "unknown seeds 'tain'"),
         ({"seeds": -1}, "seeds -1, layouts 32: give a seed from 0 on"),
         ({"layouts": 0}, "layouts 0: give a seed from 0 on, and 1 layout or more"),
+        ({"workers": 0}, "--workers 0: give 1 to 256 processes"),
         ({"scenario": "moon"}, "unknown scenario 'moon'"),
         ({"dataset": "occluded-intersection-v2"}, "numbers are reported of layout seeds from 200000 on"),
         ({"dataset": "prompts"}, "prompts is no dataset (no manifest.json); build one with"),
