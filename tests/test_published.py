@@ -1,6 +1,7 @@
 """A published model is taught: small ones stand for it, a Qwen3 and a Llama."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 
 import tiny_llama
 import torch
+from msgspec import structs
 from teaching import drawn_once
 from typer.testing import CliRunner
 
@@ -23,12 +25,17 @@ from harness.backends.registry import missing
 from harness.backends.registry import open_backend as _open
 from harness.cli import app
 from harness.core.errors import UserError
+from harness.dataset.load import Scene
+from harness.dataset.schema import Danger
 from harness.prompts import versions as prompts
 from harness.training import lessons, low_rank
 from harness.training.distill import Curriculum, distill
 from harness.training.published import Adapt, Published
-from harness.training.train import Plan
+from harness.training.questions import value
+from harness.training.train import Plan, fitting
 from harness.world import scenarios
+from harness.world.reference import drive, finish
+from harness.world.world import World
 
 BASE = cards.resolve("swarm-tiny", "transformers")
 PLAN = Plan(
@@ -179,7 +186,7 @@ def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
     facts = json.loads((taught / "training.json").read_text())
     assert facts["base"] == "swarm-tiny"
     assert facts["curves"]["excerpts"] == facts["curves"]["messages"] == []
-    assert [len(point) for point in facts["curves"]["alone"]] == [3] * 3
+    assert [len(point) for point in facts["curves"]["alone"]] == [4] * 3
     held_out = facts["held_out"][0]
     assert held_out["kl_nats"] < facts["curves"]["alone"][0][2], "the KL on layouts held out falls"
     assert sum(held_out["likeliest"].values()) == pytest.approx(1.0)
@@ -211,6 +218,69 @@ def test_a_killed_teaching_goes_on_to_the_same_adapter(
         assert (out / name).read_bytes() == (taught / name).read_bytes()
 
 
+# -- what is learnt ----------------------------------------------------------------------------------
+
+
+def test_a_decisions_gradient_is_the_exact_policy_gradient() -> None:
+    """By hand: SLOWER and FASTER succeed, so V = 0.5, and the loss falls as p rises by p (v - V)."""
+    p, labels = torch.tensor([[0.2, 0.5, 0.3]]), torch.tensor([[0.6, 0.0, 0.4]])
+    logits = torch.log(p).requires_grad_()
+    loss = fitting(logits, labels, "values")
+    loss.backward()
+    assert loss.item() == pytest.approx(0.5)
+    assert logits.grad[0].tolist() == pytest.approx([-0.1, 0.25, -0.15])
+    imitated = torch.log(p).requires_grad_()
+    fitting(imitated, labels, "imitation").backward()
+    assert imitated.grad[0].tolist() == pytest.approx([0.2 - 0.6, 0.5, 0.3 - 0.4])
+
+
+def test_a_value_is_what_the_episode_comes_to_when_the_decision_is_played() -> None:
+    """Played in the simulator from the start of a layout, action by action."""
+    scenario = scenarios.get("do-not-pass")
+    [first] = [p for p in drawn_once(scenario, 100_001, 1) if p.record.step == 0]
+    reference, safe = drive(scenario, "full-view", 100_001), []
+    for action in scenario.actions:
+        world = World.start(scenario, 100_001)
+        world.act(action)
+        [outcome] = finish([world], [lessons.TEACHER])
+        safe.append(outcome.judged(reference, world.layout.danger, scenario.parameters).success)
+    assert (np.array(first.label) > 0).tolist() == safe
+    uniform = np.full((1, len(safe)), 1 / len(safe))
+    assert value(np.array([first.label]), uniform, [1.0]) == pytest.approx(sum(safe) / len(safe))
+
+
+def test_layouts_with_a_danger_weigh_as_much_as_those_without() -> None:
+    [scenario] = LEARNT
+    records = [p.record for n in range(2) for p in drawn_once(scenario, 100_000 + n, n)]
+    scenes = tuple(
+        Scene(structs.replace(r, danger=Danger(*((None, None) if r.step > 2 else ("left", "v5")))))
+        for r in records
+    )
+    plain = lessons.Lessons(scenario, (), scenes, {})
+    halves = {scene.id: scene.record.danger.sector is not None for scene in scenes}
+
+    def share(weights: Mapping[str, float]) -> float:
+        return sum(w for name, w in weights.items() if halves[name]) / sum(weights.values())
+
+    assert share(replace(plain, balanced=True).weights) == pytest.approx(0.5)
+    assert share(plain.weights) != pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.slow
+def test_the_value_rises_where_it_is_what_is_learnt(tmp_path: Path) -> None:
+    samples = {"excerpts": 0, "alone": 64, "messages": 32, "answers": 0}
+    plan = replace(PLAN, samples=samples, objective="values")
+    facts = distill(CURRICULUM, plan, tmp_path / "pupil", silent, silent, "cpu")
+    assert facts["held_out"][0]["value"] > facts["curves"]["alone"][0][3]
+    assert len(facts["curves"]["messages"]) == 1
+    assert "- Objective: `values`, the probability of actions" in (tmp_path / "pupil/README.md").read_text()
+
+
+def test_a_training_that_was_begun_before_there_were_objectives_goes_on() -> None:
+    assert "objective" not in PLAN.settings()
+    assert replace(PLAN, objective="values").settings()["objective"] == "values"
+
+
 @pytest.mark.slow
 def test_all_weights_of_a_base_can_learn(tmp_path: Path) -> None:
     plan = replace(
@@ -234,6 +304,7 @@ def test_all_weights_of_a_base_can_learn(tmp_path: Path) -> None:
         (["--base", "no-such"], "unknown model 'no-such'"),
         (["--base", "swarm-tiny-vl", "--prompt", "v9"], "takes pictures; give a plain model of texts"),
         (["--base", "swarm-tiny", "--prompt", "v8"], "is taught texts alone; leave image prompts out"),
+        (["--objective", "value"], "unknown --objective 'value'; did you mean 'values'?"),
         (["--samples", "0,0,0,0"], "or 0 to leave a stage out"),
     ],
 )

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
@@ -23,6 +23,7 @@ RATES = {True: 1e-3, False: 1e-4}  # with an adapter, and without
 MOST = 512  # of a rank
 DTYPES = ("float32", "bfloat16")
 REPORT = 0.3
+OBJECTIVES = ("imitation", "values")
 
 
 def command(
@@ -51,6 +52,9 @@ def command(
     report: float | None = typer.Option(
         None, help=f"Weight of the words behind a letter, for a published base. Default: {REPORT:g}."
     ),
+    objective: str = typer.Option(
+        OBJECTIVES[0], help="What letters learn: imitation of soft labels, or values of actions."
+    ),
     layouts: int = typer.Option(240, help="Number of layouts of each scenario."),
     first_seed: int = typer.Option(
         FIRST["train"], help="Layout seed of the first layout; train seeds are 100000 to 199999."
@@ -75,6 +79,8 @@ def command(
     for flag, value, least in (("--batch", batch, 1), ("--threads", threads, 1), ("--seed", seed, 0)):
         if value is not None and value < least:
             raise UserError(f"{flag} {value}: give {least} or more")
+    if objective not in OBJECTIVES:
+        raise unknown("--objective", objective, OBJECTIVES)
     start, adapt = _base(base, lora, rank, rate, dtype, report)
     versions = [prompts.load(version) for version in dict.fromkeys(prompt)]
     driven = [ready_to_drive(name, layouts, first_seed) for name in dict.fromkeys(scenario)]
@@ -98,16 +104,19 @@ def command(
     from harness.training.distill import Curriculum
     from harness.training.distill import distill as run
     from harness.training.published import Adapt
-    from harness.training.train import STAGES, Plan
+    from harness.training.train import STAGES, Objective, Plan
 
     how = Adapt(*adapt) if isinstance(start, Card) else None
-    plan = Plan(dict(zip(STAGES, counts, strict=True)), batch=batch, seed=seed, adapt=how)
+    samples_of = dict(zip(STAGES, counts, strict=True))
+    plan = Plan(samples_of, batch=batch, seed=seed, adapt=how, objective=cast("Objective", objective))
     begun_s = time.monotonic()
     drawn = layouts * len(learnt)
     with bar("drawing layouts", drawn) as progress:
 
-        def show(stage: str, seen: int, loss: float, kl: float | None = None) -> None:
-            progress.label = f"{stage} loss {loss:.3f}" + ("" if kl is None else f", held-out KL {kl:.3f}")
+        def show(stage: str, seen: int, loss: float, *watched: float) -> None:
+            progress.label = f"{stage} loss {loss:.3f}"
+            if watched:
+                progress.label += f", held-out KL {watched[0]:.3f}, value {watched[1]:.3f}"
             progress.more(drawn + sum(counts) - progress.total)
             progress(drawn + sum(counts[: STAGES.index(stage)]) + seen - progress.done)
 
@@ -118,7 +127,8 @@ def command(
     for apart in facts["held_out"]:
         typer.echo(
             f"{apart['scenario']}: held-out KL {apart['kl_nats']:.3f} nats (mean label "
-            f"{apart['kl_of_the_mean_nats']:.3f}, n = {apart['questions']})"
+            f"{apart['kl_of_the_mean_nats']:.3f}), value {apart['value']:.3f} "
+            f"({apart['value_of_the_mean']:.3f}), n = {apart['questions']}"
         )
     typer.echo(
         f"wrote {printable(out)}: {facts['parameters']:,} parameters, {time.monotonic() - begun_s:.0f} s"

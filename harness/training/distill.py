@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import torch
 import transformers
 
 from harness.backends.card import Card
+from harness.backends.registry import locate
 from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, sha256_bytes, sha256_file, write_whole
@@ -48,6 +49,7 @@ class Curriculum:
             raise UserError(f"--base {name} {has}; give a plain model of texts")
         if any(prompt.image for prompts in self.prompts.values() for prompt in prompts):
             raise UserError(f"--base {name} is taught texts alone; leave image prompts out of --prompt")
+        locate(self.base)  # now, and not after the layouts are drawn
 
     def settings(self) -> dict[str, Any]:
         """Return, as plain values, what a resumed training must have in common with its start."""
@@ -89,7 +91,7 @@ def distill(
             f"--out {printable(out)} already holds a finished model; choose another folder or delete it"
         )
     learnt = curriculum.settings()  # once: the base's file may change while this learns from it
-    settings = {**learnt, **asdict(plan)}
+    settings = {**learnt, **plan.settings()}
     if begun := work.begun(out, work.WorkStart):
         work.same(out, settings, begun.settings)
     with work.working(out, begun or work.WorkStart(settings=settings)) as place:
@@ -98,6 +100,7 @@ def distill(
             draw(scenario, prompts, layouts, seed, folder / scenario.name, workers, drawing)
             for scenario, prompts in curriculum.prompts.items()
         ]
+        lessons = [replace(each, balanced=plan.objective == "values") for each in lessons]
         student = Student(lessons, plan, place, device, curriculum.base)
         facts = _trained(learnt, student, out, progress)
         work.tidy(out)
@@ -115,7 +118,7 @@ def _trained(learnt: Mapping[str, Any], student: Student, out: Path, progress: P
         "spellings": [scenarios.argument(each.scenario) for each in student.lessons],
         "plan": asdict(plan),
         "parameters": sum(p.numel() for p in student.model.parameters() if p.requires_grad),
-        "held_out": student.held_out_kl(),
+        "held_out": student.held_out_facts(),
         "curves": curves,
     }
     student.model.eval()
@@ -152,10 +155,12 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
     losses = "\n".join(
         f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} |"
         for stage, curve in facts["curves"].items()
+        if curve
     )
     held_out = "\n".join(
         f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | {row['questions']} "
-        f"| {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} |"
+        f"| {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} "
+        f"| {row['value']:.3f} | {row['value_of_the_mean']:.3f} |"
         for row in facts["held_out"]
     )
     return f"""# {name}
@@ -169,12 +174,14 @@ language model that fits beside the source; it says nothing about Qwen3-4B or an
 - Teacher: outcomes, as soft labels over the actions after which success is possible. A viewer that cannot
   tell scenes apart learns their mean, so what is hidden makes it unsure.
 - Seed {plan["seed"]}, batches of {plan["batch"]}, Muon {plan["muon_lr"]:g} and AdamW {plan["adam_lr"]:g}.
+- Objective: `{plan["objective"]}`, {published.OBJECTIVES[plan["objective"]]}.
 
-The read-out on layouts held out, KL to the soft labels in nats, beside that of always answering the mean
-label.{before}
+The read-out on layouts held out: its KL to the soft labels in nats and its value, the probability that it
+gives to actions after which the episode succeeds, layouts with a danger and without weighing alike. Beside
+them stand those of always answering the mean label.{before}
 
-| scenario | scenes learnt | layouts held out | questions | KL | of the mean |
-|---|---|---|---|---|---|
+| scenario | scenes learnt | layouts held out | questions | KL | of the mean | value | of the mean |
+|---|---|---|---|---|---|---|---|
 {held_out}
 
 | stage | sequences | first loss | last loss |

@@ -49,8 +49,6 @@ class Point(msgspec.Struct, frozen=True):
 
     record: Record
     label: list[float]  # soft label, (A,)
-    # seconds until the episode succeeds after each action, (A,), null for never; None in older files
-    ends_s: list[float | None] | None = None
 
 
 @dataclass(frozen=True)
@@ -61,6 +59,8 @@ class Lessons:
     prompts: tuple[Prompt, ...]  # versions that are learnt
     scenes: tuple[Scene, ...]  # decision points, layout by layout
     labels: Mapping[str, Floats]  # soft label of each, (A,), by its id
+    # whether layouts with a danger and those without weigh alike, as in balanced success
+    balanced: bool = False
 
     @property
     def episodes(self) -> tuple[int, ...]:
@@ -72,7 +72,13 @@ class Lessons:
         """Return how often each scene is learnt from, by its id: each level of a layout in all as often."""
         levels = [(scene.record.episode, scene.record.step) for scene in self.scenes]
         points = Counter(levels)
-        return {scene.id: 1 / points[level] for scene, level in zip(self.scenes, levels, strict=True)}
+        weights = np.array([1 / points[level] for level in levels])
+        dangerous = np.array([scene.record.danger.sector is not None for scene in self.scenes])
+        if self.balanced and 0 < dangerous.sum() < len(dangerous):
+            for half in (dangerous, ~dangerous):
+                weights[half] /= weights[half].sum()
+            weights *= len(weights)
+        return dict(zip((scene.id for scene in self.scenes), weights.tolist(), strict=True))
 
     def split(self, held_out: float) -> "tuple[Lessons, Lessons]":
         """Split off a share of the layouts, the last ones, at least one: those that are kept, and those."""
@@ -136,8 +142,7 @@ def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
                 if np.isfinite(list(ends_s.values())).any():
                     taken += 1
                     record = record_of(world, state, number, (state.ego, *state.helpers))
-                    seconds = [s if np.isfinite(s) else None for s in ends_s.values()]
-                    points.append(Point(record, label(ends_s).tolist(), seconds))
+                    points.append(Point(record, label(ends_s).tolist()))
             following.update({scene_id(number, child.state()): child for child in children})
         level = list(following.values())
     return points

@@ -21,6 +21,10 @@ from harness.core.files import sha256_file
 from harness.training import low_rank
 
 WEIGHTS = "model.safetensors"
+OBJECTIVES = {  # by name, what a letter's probability is fitted to
+    "imitation": "the soft label",
+    "values": "the probability of actions after which the episode succeeds",
+}
 _TELLING = 1e-3  # largest difference of logits that is rounding
 
 
@@ -117,7 +121,9 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
     )  # fmt: skip
     held_out = "\n".join(
         f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | {row['questions']} "
-        f"| {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} | {_shares(row['likeliest'])} |"
+        f"| {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} "
+        f"| {row['value']:.3f} | {row['value_of_the_mean']:.3f} | {row['value_of_the_likeliest']:.3f} "
+        f"| {_shares(row['likeliest'])} |"
         for row in facts["held_out"]
     )
     kind = f"A LoRA adapter of rank {adapt['rank']} for" if adapt["rank"] else "All weights, taught, of"
@@ -138,12 +144,15 @@ below. {facts["parameters"]:,} weights learnt. The base's weights have sha256
   tell scenes apart learns their mean, so what is hidden makes it unsure.
 - Seed {plan["seed"]}, batches of {plan["batch"]}, AdamW {adapt["rate"]:g}, layers in {adapt["dtype"]}.
   The words behind a letter weigh {adapt["report"]:g}.
+- Objective: `{plan["objective"]}`, {OBJECTIVES[plan["objective"]]}.
 
-The read-out on layouts held out, KL to the soft labels in nats, beside that of always answering their mean,
-and how often each action is the likeliest.
+The read-out on layouts held out: its KL to the soft labels in nats and its value, the probability that it
+gives to actions after which the episode succeeds, layouts with a danger and without weighing alike. Beside
+them stand those of always answering the mean label, the value of its likeliest action, and how often each
+action is that. `held out` are layouts, and `scenes` are learnt from.
 
-| scenario | scenes learnt | layouts held out | questions | KL | of the mean | likeliest |
-|---|---|---|---|---|---|---|
+| scenario | scenes | held out | questions | KL | mean's | value | mean's | likeliest's | likeliest action |
+|---|---|---|---|---|---|---|---|---|---|
 {held_out}
 
 | stage | sequences | first loss | last loss | held-out KL at its end |

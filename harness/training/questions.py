@@ -106,6 +106,14 @@ def key(lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt) -> str:
     return f"{lessons.scenario.name}/{scene.id}/{viewer}/{prompt.version}"
 
 
+def value(labels: Floats, p: Floats, weights: Sequence[float]) -> float:
+    """Return the mean probability that answers (n, A) give to actions after which the episode succeeds.
+
+    Those are the actions that the soft labels (n, A) give any.
+    """
+    return float(np.average((p * (labels > 0)).sum(axis=1), weights=weights))
+
+
 def kl_nats(labels: Floats, p: Floats) -> float:
     """Return the mean KL divergence of answers (n, A) from soft labels (n, A)."""
     with np.errstate(divide="ignore", invalid="ignore"):

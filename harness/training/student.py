@@ -1,6 +1,7 @@
 """What is learnt from, stage by stage, and the model that learns it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,7 +19,7 @@ from harness.training.answers import CLASSES, answer, evidence, sights
 from harness.training.lessons import Lessons
 from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
 from harness.training.published import Published
-from harness.training.questions import Question, alone, excerpts, key, kl_nats, with_messages
+from harness.training.questions import Question, alone, excerpts, key, kl_nats, value, with_messages
 from harness.training.train import Curve, Plan, Sample, learnt, read_out, restore, run_stage, save
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
@@ -26,7 +27,7 @@ BARE = 0.25  # texts without free text, as constrained answers are; a share of a
 HELD_OUT = 0.05  # layouts that are not trained on, a share of all
 WATCHED = 256  # most questions of held-out layouts that are read along the way
 
-Progress = Callable[..., None]  # of the stage, the sequences seen in it, the loss, and the KL if watched
+Progress = Callable[..., None]  # of the stage, the sequences seen in it, the loss, and what is watched
 T = TypeVar("T")
 
 
@@ -162,7 +163,7 @@ class Student:
             return []
         curve = run_stage(
             self.model, self.samples(name), self.letters, self.digits, count, self.plan, show, going,
-            self._watched if self.published else None,
+            self._watched if self.published or self.plan.objective != "imitation" else tuple,
         )  # fmt: skip
         save({"model": learnt(self.model), "curve": curve}, done)
         going.unlink(missing_ok=True)
@@ -171,12 +172,16 @@ class Student:
     @cached_property
     def _watched_samples(self) -> tuple[list[Sample], Floats]:
         questions = self.some([q for each in self.held_out for q in alone(each)], WATCHED)
-        return self.reading(questions), np.stack([q.label for q in questions])
+        most = max(len(q.label) for q in questions)
+        return self.reading(questions), np.stack(
+            [np.pad(q.label, (0, most - len(q.label))) for q in questions]
+        )
 
-    def _watched(self) -> float:
-        """Return the KL (nats) on some questions of held-out layouts."""
+    def _watched(self) -> tuple[float, float]:
+        """Return the KL (nats) and the value on some questions of held-out layouts."""
         samples, labels = self._watched_samples
-        return kl_nats(labels, np.stack(self.read(samples)))
+        read = np.stack([np.pad(p, (0, labels.shape[1] - len(p))) for p in self.read(samples)])
+        return kl_nats(labels, read), value(labels, read, [sample.weight for sample in samples])
 
     def rounded(self) -> dict[str, Any]:
         """Round what learnt to F16, so that every engine reads the same numbers, and return all weights."""
@@ -187,19 +192,21 @@ class Student:
                 p.copy_(half)
         return {name: halves.get(p.data_ptr(), p) for name, p in self.model.state_dict().items()}
 
-    def held_out_kl(self) -> list[dict[str, Any]]:
-        """Return the KL (nats) of each scenario's read-out to the soft labels on held-out layouts.
+    def held_out_facts(self) -> list[dict[str, Any]]:
+        """Return how each scenario's read-out fits the soft labels on held-out layouts.
 
-        Beside it stands that of always answering the mean label.
+        That is its KL (nats), and its value, balanced over layouts with and without a danger. Beside them
+        stand those of always answering the mean label, and the value of its likeliest action.
         """
         facts = []
         for each in self.held_out:
-            questions = list(alone(each))
+            questions = list(alone(replace(each, balanced=True)))
+            weights = [q.weight for q in questions]
             labels = np.stack([q.label for q in questions])
             mean = np.broadcast_to(labels.mean(axis=0), labels.shape)
             read = np.stack(self.read(self.reading(questions)))
             actions = each.scenario.actions
-            shares = np.bincount(read.argmax(axis=1), minlength=len(actions)) / len(questions)
+            likeliest = np.eye(len(actions))[read.argmax(axis=1)]
             facts.append(
                 {
                     "scenario": each.scenario.name,
@@ -207,7 +214,10 @@ class Student:
                     "questions": len(questions),
                     "kl_nats": kl_nats(labels, read),
                     "kl_of_the_mean_nats": kl_nats(labels, mean),
-                    "likeliest": dict(zip(actions, shares.tolist(), strict=True)),
+                    "value": value(labels, read, weights),
+                    "value_of_the_mean": value(labels, mean, weights),
+                    "value_of_the_likeliest": value(labels, likeliest, weights),
+                    "likeliest": dict(zip(actions, likeliest.mean(axis=0).tolist(), strict=True)),
                 }
             )
         return facts

@@ -16,10 +16,10 @@ numbers in it has to come from somewhere. For the same reason each token of a pi
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ from harness.training.muon import Muon
 from harness.training.published import Adapt
 from harness.world.perception.camera import Sight
 
+Objective = Literal["imitation", "values"]
 STAGES = ("excerpts", "alone", "messages", "answers")
 PROMPT_WEIGHT = 0.3  # of the cross-entropy of the prompt's own tokens, for a model that cannot read yet
 TEXT_WEIGHT = 3.0  # of that of the answer's: two thirds of these say nothing, and would drown the numbers
@@ -70,14 +71,22 @@ class Plan:
     adam_lr: float = 3e-3  # learning rate of embeddings and norms (AdamW)
     seed: int = 0  # of the weights and of the order
     adapt: Adapt | None = None  # how a published model is changed; None for one of ours
+    objective: Objective = "imitation"  # what a letter's probability is fitted to
+
+    def settings(self) -> dict[str, Any]:
+        """Return, as plain values, what a resumed training must have in common with its start."""
+        settings = asdict(self)
+        if self.objective == "imitation":  # trainings that were begun before there was another say nothing
+            del settings["objective"]
+        return settings
 
 
-Curve = list[tuple[Any, ...]]  # sequences seen, mean loss, and the held-out KL if it is watched
+Curve = list[tuple[Any, ...]]  # sequences seen, mean loss, and held-out KL and value if they are watched
 
 
 def run_stage(
     model: Any, samples: Sequence[Sample], letters: Sequence[int], digits: Sequence[int], count: int,
-    plan: Plan, progress: Callable[..., None], going: Path, watch: Callable[[], float] | None = None,
+    plan: Plan, progress: Callable[..., None], going: Path, watch: Callable[[], Sequence[float]] = tuple,
 ) -> Curve:  # fmt: skip
     """Train on `count` sequences drawn from `samples`, resuming from the checkpoint `going` if there is one.
 
@@ -113,7 +122,7 @@ def run_stage(
         losses.append(loss.detach())  # not yet a number: a GPU need not wait for it
         if (step + 1) % LOG_STEPS == 0 or step + 1 == len(batches):
             mean = float(torch.stack(losses).double().mean())
-            curve.append(((step + 1) * plan.batch, mean, *([watch()] if watch else [])))
+            curve.append(((step + 1) * plan.batch, mean, *watch()))
             model.train()
             progress(*curve[-1])
             losses = []
@@ -188,9 +197,7 @@ def hidden_states(model: Any, batch: Sequence[Sample]) -> Any:
     cache.batch_repeat_interleave(len(batch))
     options = _pictures(model, batch, ids)
     states = model.base_model(ids[:, shared:], past_key_values=cache, use_cache=True, **options)
-    return (
-        states.last_hidden_state.float()
-    )  # letters are told apart in float32, whatever the layers compute in
+    return states.last_hidden_state.float()  # in which letters are told apart, whatever layers compute in
 
 
 def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
@@ -208,7 +215,7 @@ def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
 
 
 def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan: Plan) -> Any:
-    """Return the KL of the read-out to its target (nats) plus mean cross-entropies of text and pictures."""
+    """Return how ill the read-out fits its target, plus mean cross-entropies of text and pictures."""
     hidden = hidden_states(model, batch)
     weight, device, shared = model.get_output_embeddings().weight, hidden.device, batch[0].shared
     rest = _padded([s.ids[shared:] for s in batch]).to(device)
@@ -226,11 +233,11 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan
         logits = hidden[torch.tensor(reading, device=device), at] @ weight.T
         target = torch.from_numpy(np.stack(list(targets.values()))).to(logits)
         letters = letters[: target.shape[1]]
-        kl = F.kl_div(F.log_softmax(logits[:, letters], -1), target, reduction="batchmean")
+        fit = fitting(logits[:, letters], target, plan.objective)
         # Beside the letters nothing should be likely where a letter is asked for.
         outside = torch.logsumexp(logits, -1) - torch.logsumexp(logits[:, letters], -1)
-        kl_weight = SEEN_WEIGHT if pictures else 1.0
-        total = total + (kl_weight * kl + 0.1 * outside.mean()) * len(reading) / len(batch)
+        fit_weight = SEEN_WEIGHT if pictures else 1.0
+        total = total + (fit_weight * fit + 0.1 * outside.mean()) * len(reading) / len(batch)
     answers = [(i, s.answer_at + (s.target is not None), len(s.ids)) for i, s in enumerate(batch)]
     writing = [(i, start, end) for i, start, end in answers if start < end]
     if writing:
@@ -247,6 +254,18 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan
         text = text * torch.from_numpy(weights[rows]).to(text)
         total = total + text.mean() * len(writing) / len(batch)
     return total
+
+
+def fitting(logits: Any, labels: Any, objective: Objective) -> Any:
+    """Return the mean loss of letters' logits (n, A) beside soft labels (n, A), by the objective.
+
+    `imitation` is the KL to the label, in nats. `values` is what the stated distribution p loses of the value
+    that it can have, 1 - sum_a p(a) v(a), where v(a) is 1 if the episode succeeds after the action: its
+    gradient is the policy gradient, exact since the tree knows v of every action.
+    """
+    if objective == "imitation":
+        return F.kl_div(F.log_softmax(logits, -1), labels, reduction="batchmean")
+    return (1 - (torch.softmax(logits, -1) * (labels > 0)).sum(-1)).mean()
 
 
 def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample], ids: Any, picture: Any) -> Any:
