@@ -1,0 +1,75 @@
+"""What each answer mode scores: decision, read-out, constrained and json of the same models.
+
+    python benchmarks/answers.py [--only TEXT] [--out reports/answers] [--page docs/answers.md]
+
+It evaluates each of `ASKED` in each of its modes on report layouts, alone and with helpers under `6g`, and
+writes the table of the page between its marks. What is finished is read and not made again; a stopped one
+goes on with the same command.
+"""
+
+import argparse
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from families import Families, Row
+from pages import markdown, write_tables
+
+from harness.core.figures import shown
+from harness.core.statistics import Estimate
+from harness.runs.metrics import ALL, BALANCED, BASELINE, GAINS
+
+MODES = ("json", "constrained", "readout", "decision")
+ONE = "occluded-intersection-v3"
+ASKED = {
+    Row("swarm-tiny", "v2", "", ONE, 60): MODES,
+    Row("swarm-tiny-six", "v4", "", limit=20): MODES,
+    Row("smollm2-135m", "v9", "", ONE, 4): MODES,
+    Row("sparrow-general", "v9", "", limit=60): ("decision",),
+    Row("constant", "v4", "", limit=20): ("json",),
+    Row("constant", "v2", "", ONE, 60): ("json",),
+}
+POINTS = ("--condition", BASELINE, "--condition", "6g")
+RULES = ("constant",)
+
+
+def main() -> None:
+    """Make what is missing, and write the page's table."""
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("--only", default="", help="only rows whose folder holds this text")
+    arguments.add_argument("--out", type=Path, default=Path("reports/answers"))
+    arguments.add_argument("--page", type=Path)
+    given = arguments.parse_args()
+    for row in (asked._replace(answer=mode) for asked, modes in ASKED.items() for mode in modes):
+        if given.only in row.name:
+            row.evaluate(given.out / row.name, *POINTS)
+    lines: list[list[str]] = []
+    for asked, modes in ASKED.items():
+        found = {m: Families.read(given.out / asked._replace(answer=m).name) for m in modes}
+        lines += written(asked, {mode: runs for mode, runs in found.items() if runs})
+    heads = ("model · prompt · mode", "n", "alone", "6g", "6g over alone", "over read-out, alone",
+             "failed, ego", "on the letters")  # fmt: skip
+    text = markdown(heads, lines)
+    print(text)
+    if given.page:
+        write_tables(given.page, text)
+
+
+def written(asked: Row, found: Mapping[str, Families]) -> Iterator[list[str]]:
+    """Yield a model's lines: balanced success, what helpers add, and what the text says of the mode."""
+    for mode, runs in found.items():
+        base = found.get("readout")
+        beside: Estimate | None = runs.over(base, BASELINE) if base and mode != "readout" else None
+        yield [
+            asked.model if asked.model in RULES else str(asked._replace(answer=mode)),
+            runs.counted,
+            runs.shown(BASELINE, BALANCED),
+            runs.shown("6g", BALANCED),
+            runs.shown("6g", GAINS[BALANCED], "+"),
+            shown(beside, sign="+") if beside else "",
+            runs.shown(ALL, "failed_rate_ego"),
+            runs.shown(ALL, "label_mass_ego"),
+        ]
+
+
+if __name__ == "__main__":
+    main()
