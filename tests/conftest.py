@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 from _pytest.runner import runtestprotocol
 from evaluating import run, spec_of
+from former import SCENARIO
 from hypothesis import settings
 
 from harness import cli
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
-from harness.world.scenarios.occluded_intersection import SCENARIO
 
 EPISODES, SEED = 4, 100
 Once = Callable[[str, Callable[[Path], object]], Path]

@@ -5,8 +5,12 @@ from harness.world.scenario import Scenario
 
 DATASET = "occluded-intersection-v2"
 SETTINGS = "witnesses=any,radio_share=0,limits=1,perception=1"
+NAME = f"{scenarios.DEFAULT}:{SETTINGS}"
 
 
 def scenes(name: str = scenarios.DEFAULT) -> Scenario:
     """A scenario as its bare name was until then."""
     return scenarios.get(f"{name}:{SETTINGS}")
+
+
+SCENARIO = scenes()

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from evaluating import Scripted, failed, same_decisions, spec_of
+from former import SCENARIO
 from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import completion, serving
@@ -33,7 +34,6 @@ from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.prompts.decision import Question
-from harness.world.scenarios.occluded_intersection import SCENARIO
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 BASE = Request("00000-0/v1", "ego", ({"role": "user", "content": "Scene"},), ACTIONS, 64)

@@ -16,6 +16,7 @@ from harness.world.scene_graph import Node
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("highway_env", reason="needs the sim extra")
 
+from former import SCENARIO
 from teaching import drawn_once
 
 from harness.backends import cards
@@ -42,7 +43,6 @@ from harness.training.questions import Question, alone
 from harness.training.student import Student
 from harness.training.train import STAGES, Plan
 from harness.world.perception.camera import Sight
-from harness.world.scenarios.occluded_intersection import SCENARIO
 
 VERSIONS = (prompts.load("v7"), prompts.load("v8"))
 PLAN = Plan(dict.fromkeys(STAGES, 16), batch=8)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluating import all_scenes, run, same_decisions, spec_of, with_ego
+from former import SCENARIO
 from run_on_disk import answers_of
 
 from harness.backends import cards
@@ -28,7 +29,6 @@ from harness.prompts import readout, versions
 from harness.report.caveats import of_run
 from harness.runs import folder
 from harness.runs.records import Answer
-from harness.world.scenarios.occluded_intersection import SCENARIO
 
 Said = tuple[int, str, str]
 LETTERS = pytest.mark.parametrize("letters", ["raw", "cyclic"])

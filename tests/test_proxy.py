@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from evaluating import scenes_of
+from former import SCENARIO
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
@@ -19,7 +20,6 @@ from harness.parsing.parse import parse
 from harness.prompts.answer_schema import FORMS, ROLES
 from harness.prompts.versions import load
 from harness.world.perception.graph import truth_graph
-from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.scene_graph import (
     Arrival,
     Conflict,

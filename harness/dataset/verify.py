@@ -22,6 +22,7 @@ from harness.dataset.schema import LAYOUTS, Manifest, Record, Tree, plain_type, 
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
 from harness.world.environments import environment
+from harness.world.parameters import LATER
 from harness.world.scenario import Scenario
 from harness.world.state import Snapshot
 
@@ -71,7 +72,7 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
             isinstance(value, a) != isinstance(expected[name], b) for a, b in ((list, tuple), (str, str))
         ):
             yield f"[parameters]: {name} = {printable(value)}; wanted is a value such as {expected[name]}"
-    if missing := scenario.parameters.stated().keys() - manifest.parameters.keys():
+    if missing := expected.keys() - dict(LATER).keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"
     if scenario.is_environment and manifest.environment != (here := environment.config(scenario.name)):
         differing = sorted(k for k, v in here.items() if (manifest.environment or {}).get(k, here) != v)

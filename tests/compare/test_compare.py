@@ -11,6 +11,7 @@ import pytest
 from changing import SEEDS, ends
 from evaluating import live_spec_of, spec_of
 from evaluating import run as evaluate
+from former import SCENARIO
 from run_on_disk import Row, answers_of, change, configure, made_up, rows_of
 
 from harness.coordination.operating_point import POINTS
@@ -22,7 +23,6 @@ from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
 from harness.report.compare.pair import pair
 from harness.runs.metrics import BALANCED, METRICS
-from harness.world.scenarios.occluded_intersection import SCENARIO
 
 Said = tuple[int, str, str]
 BY_DANGER = {name for name, metric in METRICS.items() if metric.half}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from driving import ALONE, FROM_LEFT, NO_DANGER, ONCOMING, Script, column, decisions, driven, spec
 from evaluating import spec_of
+from former import SCENARIO
 from run_on_disk import UNTIMED
 
 from harness.backends.registry import open_backend
@@ -22,7 +23,6 @@ from harness.runs.decisions import Decisions
 from harness.world import reference as live
 from harness.world.drivers import DRIVERS
 from harness.world.parameters import frames
-from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 
 IDLE, SLOWER, FASTER, UNSURE = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.4, 0.3)

@@ -4,10 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from former import SCENARIO
 
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
-from harness.world.scenarios.occluded_intersection import SCENARIO
 
 FIRST_SEED = 178  # left, none, left, right, left, oncoming
 

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from former import SCENARIO
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
@@ -16,7 +17,6 @@ from harness.dataset.freeze import record_of
 from harness.world import scenarios
 from harness.world.beacons import broadcast, known, last_heard
 from harness.world.perception.graph import scene_graph
-from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import Beacon, Snapshot, WorldState
 from harness.world.world import World
 

@@ -2,17 +2,18 @@
 
 from dataclasses import replace
 
+import former
 import pytest
 from msgspec import structs
 
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
 from harness.world.reference import drive
-from harness.world.scenarios.blind_merge import RAMP_M, SCENARIO, Parameters, layout, road
+from harness.world.scenarios.blind_merge import RAMP_M, SCENARIO, layout, road
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import World
 
-P = Parameters()
+P = former.scenes("blind-merge").parameters
 LAYOUTS = {seed: layout(seed, P) for seed in range(200)}
 EGO = VehicleState("v1", "car", "ego", -50.0, RAMP_M, 0.0, 14.0, "ramp", "merge", False)
 TRUCK = VehicleState("v2", "truck", "helper", -95.0, -4.0, 0.0, 14.0, "main left", "straight", False)

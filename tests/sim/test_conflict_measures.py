@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from former import SCENARIO
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiers import QUICK
@@ -9,7 +10,6 @@ from tiers import QUICK
 from harness.core.arrays import Floats
 from harness.world import lockstep, scenarios
 from harness.world.conflict_measures import HORIZON_S, Conflicts, columns, observe, times_to_collision
-from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import separation_m
 from harness.world.world import World
 

@@ -14,6 +14,7 @@ from zipfile import ZipFile
 import msgspec
 import pytest
 from evaluating import scenes_of
+from former import SCENARIO
 
 from harness.core.errors import UserError
 from harness.core.files import canonical_json, sha256_bytes
@@ -23,7 +24,6 @@ from harness.dataset.load import find, load
 from harness.dataset.verify import check
 from harness.world.perception.graph import scene_graph
 from harness.world.reference import finish
-from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 
 FIRST_SEED = 178

@@ -1,11 +1,11 @@
 """Reference drivers in the simulator."""
 
 import pytest
+from former import SCENARIO
 
 from harness.world.drivers import DRIVERS
 from harness.world.outcome import Outcome
 from harness.world.reference import check, drive_all, summary
-from harness.world.scenarios.occluded_intersection import SCENARIO
 
 
 def test_the_full_view_driver_clears_what_a_cruising_one_runs_into():

@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 
+import former
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -14,13 +15,12 @@ from harness.world.scenarios.parking_exit import (
     PULL_OUT_M,
     SCENARIO,
     VANS_M,
-    Parameters,
     layout,
     road,
 )
 from harness.world.state import SIZES_M, VehicleState, WorldState
 
-P = Parameters()
+P = former.scenes("parking-exit").parameters
 LAYOUTS = {seed: layout(seed, P) for seed in range(200)}
 EGO = VehicleState("v1", "car", "ego", -14.0, KERB_M, 0.0, 4.0, "own", "pull-out", False)
 VAN = VehicleState("v5", "van", "other", -21.0, VANS_M, 0.0, 0.0, "kerb", "parked", False)

@@ -5,12 +5,12 @@ import math
 
 import numpy as np
 import pytest
+from former import SCENARIO
 from msgspec.structs import replace
 
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.perception.rays import RAYS, blocked_by, sweep
 from harness.world.perception.sensors import detect, detections
-from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.scene_graph import Arrival, EgoArrival, Point, Sector
 from harness.world.state import Building, VehicleState, WorldState
 from harness.world.world import World

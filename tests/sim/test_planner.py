@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from former import SCENARIO
 from msgspec import structs
 
 from harness.world import planner, scenarios
@@ -21,7 +22,6 @@ from harness.world.planner import (
     predicted,
 )
 from harness.world.reference import drive
-from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import SIZES_M, VehicleState, WorldState
 from harness.world.world import World
 

@@ -4,17 +4,18 @@ import math
 from dataclasses import replace
 from functools import cache
 
+import former
 import pytest
 from msgspec import structs
 
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
 from harness.world.reference import drive
-from harness.world.scenarios.roundabout_entry import RING_M, SCENARIO, Parameters, layout, road
+from harness.world.scenarios.roundabout_entry import RING_M, SCENARIO, layout, road
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import World
 
-P = Parameters()
+P = former.scenes("roundabout-entry").parameters
 LAYOUTS = {seed: layout(seed, P) for seed in range(300)}
 
 

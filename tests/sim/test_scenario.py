@@ -3,16 +3,17 @@
 from collections import Counter
 from dataclasses import replace
 
+import former
 import numpy as np
 import pytest
 
 from harness.core.errors import UserError
 from harness.world import scenarios
 from harness.world.crossroads import SECTORS, road
-from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, Parameters, behind_truck_s, layout
+from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, behind_truck_s, layout
 from harness.world.world import World
 
-P = Parameters()
+P = former.SCENARIO.parameters
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import gymnasium
 import msgspec
 import numpy as np
 import pytest
+from former import SCENARIO
 from highway_env.envs.intersection_env import IntersectionEnv
 from highway_env.road.road import Road
 from highway_env.vehicle.behavior import IDMVehicle
@@ -19,7 +20,6 @@ from harness.core.files import digest
 from harness.world import simulator
 from harness.world.outcome import Outcome, outline
 from harness.world.reference import drive
-from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import Snapshot, WorldState
 from harness.world.world import World
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
+from former import SCENARIO
 from starlette.requests import Request
 from starlette.testclient import TestClient
 from viewing import configure, names, said
@@ -20,7 +21,6 @@ from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.report.view import pages
 from harness.report.view.app import WAY_BACK, View
-from harness.world.scenarios.occluded_intersection import SCENARIO
 
 
 def test_the_list_tells_finished_unfinished_and_broken_runs_apart(browser: TestClient, reports: Path) -> None:
