@@ -171,7 +171,7 @@ def _base(
     folder = Path(text or "")
     ours = (cards.DISTILLED, "model.safetensors", "tokenizer.json")
     if text and not lora and all((folder / name).is_file() for name in ours):
-        text, start = None, folder
+        start: Path | None = folder
     elif text:
         return cards.resolve(text, "transformers"), adapt
     else:
