@@ -119,6 +119,7 @@ READ: dict[str, tuple[str, ...]] = {
     "networks/mine.toml": (*QUICK, "--condition", "cloud:round_trip=mine"),
     "devices/mine.toml": ("model", "device", "show", "mine"),
     "schedules/mine.toml": (*QUICK, "--condition", "6g:schedule=mine"),
+    "calibrations/mine.toml": (*QUICK, "--condition", "6g:calibration=mine"),
     "models/mine.toml": ("model", "list"),
     "models/folder/config.json": (*QUICK, "--model", "models/folder"),
     "models/mine.gguf": (*QUICK, "--model", "models/mine.gguf"),

@@ -30,6 +30,7 @@ COMMANDS = {
     "model pull": "model:pull",
     "model check": "model:check",
     "model parity": "model:parity",
+    "model calibrate": "calibrate",
     "model distill": "distill",
     "model doctor": "doctor",
     "model device list": "device:list_devices",

@@ -26,7 +26,13 @@ from harness.radio.wrapped import AtLoss
 
 OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a field of the channel
 UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")  # settings of a roadside unit with a place
-ALONE = ("fallback", "round_trip", "round_trip_s", "window_s")  # settings of an ego that asks nobody
+ALONE = (
+    "calibration",
+    "fallback",
+    "round_trip",
+    "round_trip_s",
+    "window_s",
+)  # settings of an ego that asks nobody
 WEIGHING = ("weight_cap", "min_distance_m", "ego_distance_m")  # settings of the weights by distance
 # Settings of helpers' intents: how they are fused, and when a helper's model is asked.
 OF_INTENTS = ("consensus", *WEIGHING, "on_demand", "helper_rounds")
@@ -85,6 +91,10 @@ class OperatingPoint:
         if self.cloud.round_trip and self.has_fusion_call:
             twice = f"consensus is {EGO_PROMPT}" if self.content == CONTENTS[INTENT] else holds
             raise wrong("round_trip", self.cloud.round_trip, f"left out where {twice}, which asks twice")
+        if self.ask.calibration and self.has_fusion_call:
+            twice = f"consensus is {EGO_PROMPT}" if self.content == CONTENTS[INTENT] else holds
+            allowed = f"left out where {twice}: the second question has no fit"
+            raise wrong("calibration", self.ask.calibration, allowed)
         if self.content.graph == TRUTH and self.ask.messages == "shuffled":
             raise wrong("messages", "shuffled", f"own or blind where {holds}")
         if self.content.asks_again and self.radio.edge == FUSION:

@@ -9,6 +9,7 @@ from typing import Annotated, get_type_hints
 from msgspec import Meta, Struct, ValidationError, convert, structs
 
 from harness.coordination.attacks import attacks_of
+from harness.coordination.calibrations import calibration
 from harness.coordination.contents import CONTENTS, INTENT
 from harness.coordination.encodings import ENCODINGS, JSON
 from harness.coordination.rules import EGO_PROMPT, RULES, names
@@ -78,12 +79,17 @@ class Ask(Part, frozen=True, kw_only=True):
     # that are shown nothing (`blind`). A gain that remains under a control is not from what helpers see.
     messages: Text = "own"
     content: Text = INTENT  # what a message holds (`harness.coordination.contents`)
+    # What every answer is corrected by before anything is made of it, a name of
+    # `harness.coordination.calibrations`; empty for nothing.
+    calibration: Text = ""
 
     def check(self) -> None:
         if self.messages not in MESSAGES:
             raise unknown("messages", self.messages, MESSAGES)
         if self.content not in CONTENTS:
             raise unknown("content", self.content, CONTENTS)
+        if self.calibration:
+            calibration(self.calibration)
         if self.schedule == ORACLE:
             raise ValueError(
                 f"schedule {ORACLE} looks at how scenes end; `harness study schedule compare` plays it, and "

@@ -5,6 +5,7 @@ from pathlib import Path
 import msgspec
 
 from harness.backends import cards
+from harness.coordination.calibrations import FOLDER, file_of
 from harness.coordination.schedules import SCHEDULES
 from harness.core import resources
 from harness.core.files import bytes_of
@@ -37,6 +38,8 @@ def sources(spec: Spec) -> dict[str, bytes]:
         if point.network:
             file = f"{point.cloud.round_trip}.toml"
             paths[f"networks/{file}"] = resources.find("networks", file)
+        if name := point.ask.calibration:
+            paths[f"{FOLDER}/{name}.toml"] = file_of(name)
         paths[f"schedules/{point.ask.schedule}.toml"] = SCHEDULES.file(point.ask.schedule)
     device = spec.device_profile
     if device and device.name in resources.names("devices") and devices.load(device.name) == device:

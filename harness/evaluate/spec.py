@@ -10,10 +10,12 @@ from harness.backends.base import BARE
 from harness.backends.card import Card
 from harness.backends.cards import argument
 from harness.backends.registry import ENGINES
+from harness.coordination import calibrations
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError, printable
+from harness.core.files import sha256_file
 from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.device import rows_of
@@ -237,6 +239,8 @@ class Spec:
         shown, ego = f"condition {printable(point.name)}", self.ego
         if point.ask.messages == "shuffled" and self.source.kind != "frozen":
             raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
+        if point.ask.calibration:
+            self._check_calibration(shown, point)
         if point.has_fusion_call and point.content.graph and ego.can.language_model:
             self._check_shows_objects(shown)
         if point.has_fusion_call and point.rewrites.shuffled and self.device_profile:
@@ -254,6 +258,16 @@ class Spec:
             reason = f"{printable(ego.card.name)} is no language model and cannot fuse messages"
         if reason:
             raise UserError(f"{shown}: {reason}")
+
+    def _check_calibration(self, shown: str, point: OperatingPoint) -> None:
+        name = point.ask.calibration
+        fitted = calibrations.calibration(name)
+        what = f"{shown}: calibration {printable(name)}"
+        for agent in self.agents:
+            if obstacle := fitted.obstacle(agent.settings(), self.scenario.name):
+                raise UserError(f"{what} {obstacle}; fit one with `harness model calibrate`")
+        if point.asks and fitted.helper is None and not self.ego_alone:
+            raise UserError(f"{what} was fitted on no helper's answer; fit one on a run with --ask all")
 
     def _check_shows_objects(self, shown: str) -> None:
         """Raise UserError if the ego's prompt is the same whatever is around; it is tried on some scenes."""
@@ -337,6 +351,11 @@ class Spec:
                 name: sha256
                 for name in (point.ask.schedule for point in self.points)
                 if (sha256 := SCHEDULES.file_sha256(name))
+            },
+            "calibrations": {
+                name: sha256_file(calibrations.file_of(name))
+                for point in self.points
+                if (name := point.ask.calibration)
             },
             "seeds": list(self.seeds),
             "ask": self.ask,

@@ -30,6 +30,7 @@ SETTINGS: Mapping[str, Added] = {
     "channels": Added("2026-11-23", {}, "channel profiles became files; older runs used those that ship"),
     "networks": Added("2026-11-23", {}, "a cloud behind a measured network"),
     "schedules": Added("2026-11-23", {}, "learnt schedules, by the digest of their file"),
+    "calibrations": Added("2026-11-27", {}, "corrected probabilities, by the digest of their file"),
     "helpers": Added("2026-11-23", (), "agents of their own for helpers; the ego's answered for all"),
     "temperature": Added("2026-11-23", 0.0, "sampling; all answers were greedy"),
     "sampling_seed": Added("2026-11-23", 0, "sampling"),
@@ -66,6 +67,7 @@ CONDITION: Mapping[str, Added] = {
     "defence": Added("2026-11-23", "", "guarded fusion prompts"),
     "content": Added("2026-11-27", "intent", "messages that hold objects; all held intents"),
     "encoding": Added("2026-11-27", "json", "the standards' sizes of messages; all were JSON"),
+    "calibration": Added("2026-11-27", "", "corrected probabilities; all were as they were answered"),
     "weight_cap": Added("2026-11-23", 1.0, "a cap on one helper's weight"),
 }
 # Of `versions`, in run.json and in the record that a run begins with.

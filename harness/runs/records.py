@@ -382,6 +382,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     channels: dict[str, ChannelRecord]
     networks: dict[str, dict[str, Any]]
     schedules: dict[str, str]
+    calibrations: dict[str, str] = {}
     seeds: tuple[int, ...]
     ask: Literal["used", "all"]
     ties: Literal["drawn", "first"]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from harness.coordination import calibrations
 from harness.coordination.attacks import ATTACKS
 from harness.coordination.contents import CONTENTS
 from harness.coordination.operating_point import POINTS, SETTINGS, SHORT, OperatingPoint, setting_of
@@ -19,7 +20,7 @@ from harness.radio.profiles import CHANNELS
 MOST_POINTS = 1000
 CORE = "core"  # the panel that compares operating points
 CROSS = " × "  # between axes that are crossed
-NONE = "none"  # of attacks
+NONE = "none"  # of attacks and calibrations
 # The usual attacks: each alone, and a false place and several voices with a lie; at a point those it allows.
 USUAL_ATTACKS = (
     "liar", "liar+spoof", "liar:says=permuted", "brake", "brake+spoof", "random", "stuck", "stale", "replay",
@@ -49,7 +50,8 @@ class Axis:
             return point.of_radio({self.field: value if isinstance(value, str) else f"{value:.10g}"})
         setting: object
         if isinstance(value, str):
-            setting = "" if self.field == "attack" and value == NONE else setting_of(self.field, value)
+            left_out = value == NONE and self.field in ("attack", "calibration")
+            setting = "" if left_out else setting_of(self.field, value)
         else:
             setting = scaled = value * self.scale
             if isinstance(point.setting(self.field), int) and scaled == int(scaled):
@@ -97,7 +99,10 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
         raise UserError(f"--over {axis.name}: no grid is usual; give its values with --grid")
     parts = [part.strip() for part in (text or axis.usual).split(",")]
     if axis.worded:
-        known = {"consensus": names(), "schedule": SCHEDULES, "attack": (NONE, *ATTACKS)}.get(axis.name)
+        known = {
+            "consensus": names(), "schedule": SCHEDULES, "attack": (NONE, *ATTACKS),
+            "calibration": (NONE, *calibrations.names()),
+        }.get(axis.name)  # fmt: skip
         for name in (part for text in parts for part in text.split("+")):
             if known and (first := name.partition(":")[0]) not in known:
                 raise unknown("--grid", first, known)

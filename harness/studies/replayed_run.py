@@ -18,6 +18,7 @@ from harness.backends.card import Card
 from harness.backends.cards import find_own
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
+from harness.coordination.calibrations import file_of
 from harness.coordination.exchange import Exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
@@ -26,7 +27,7 @@ from harness.coordination.scheduling import chosen
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import alone, canonical_json
+from harness.core.files import alone, canonical_json, sha256_file
 from harness.core.formats import SOURCES
 from harness.core.progress import Progress
 from harness.dataset.load import Scene
@@ -107,6 +108,7 @@ class ReplayedRun:
         stated: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
             "channel profile": (manifest.channels, CHANNELS.unchanged),
             "network": (manifest.networks, lambda name, then: same(asdict(network(name)), then)),
+            "calibration": (manifest.calibrations, lambda name, then: same(sha256_file(file_of(name)), then)),
             "schedule": (manifest.schedules, lambda name, then: same(SCHEDULES.file_sha256(name), then)),
         }
         for what, (by_name, unchanged) in stated.items():

@@ -1,0 +1,120 @@
+"""Correct the probabilities of answers by what was fitted on tune layouts: files `calibrations/*.toml`.
+
+`harness model calibrate` writes one. What it holds is frozen, for one model and one question: the weights,
+the prompt, the answer mode, the scenario and the role. It may hold two things. A prior, the mean answer over
+tune questions, is divided out (Zhou and others 2023, "batch calibration"): it needs no tree. A temperature
+sharpens or flattens what is left (Guo and others 2017): its likelihood of the optimal actions is the best.
+Both leave an answer that could not be read as it is.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from msgspec import Meta
+
+from harness.coordination.intents import Intents
+from harness.core import resources
+from harness.core.arrays import Floats
+from harness.core.config import convert, toml
+from harness.core.errors import UserError, printable, unknown
+from harness.core.files import read_once
+from harness.core.seeds import purposes, stated
+
+FOLDER = "calibrations"
+COOLEST, HOTTEST = 0.05, 20.0  # temperatures
+OF_MODEL = ("name", "engine", "weights", "file", "revision", "sha256", "quantisation")
+OF_QUESTION = ("answer", "letters", "image", "sums", "thinking")
+Level = Literal["L0", "L1", "L0+L1"]
+ONLY_TUNE = "calibration is fitted on tune seeds"
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What is done to the answers of one role."""
+
+    answers: int  # how many it was fitted on
+    # the exponent is 1 / temperature; 1 changes nothing
+    temperature: Annotated[float, Meta(ge=COOLEST, le=HOTTEST)] = 1.0
+    # the mean answer, a probability an action; empty where none is divided out
+    prior: tuple[Annotated[float, Meta(gt=0, le=1)], ...] = ()
+
+    def of(self, p: Floats) -> Floats:
+        """Return intents `(..., A)` corrected; NaN stays."""
+        powers = (p / np.array(self.prior or 1.0)) ** (1.0 / self.temperature)
+        total = powers.sum(axis=-1, keepdims=True)
+        return np.where(total > 0, powers / np.where(total > 0, total, 1.0), p)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The content of a file of `calibrations/`."""
+
+    level: Level  # L0 divides a prior out, L1 has a temperature, L0+L1 both
+    command: str  # the command that made the file
+    fitted_on: str  # the run, with its layouts
+    first_seed: int  # of the layouts
+    last_seed: int
+    scenario: str
+    actions: tuple[str, ...]
+    question: dict[str, str]  # what answers: model, prompt and answer mode (`question_of`)
+    ego: Correction
+    helper: Correction | None = None  # None where no helper answered
+
+    def obstacle(self, agent: Mapping[str, Any], scenario: str) -> str | None:
+        """Return why it does not fit an agent's settings (`question_of`) in a scenario; None if it does."""
+        now = {**question_of(agent), "scenario": scenario}
+        for name, value in {**self.question, "scenario": self.scenario}.items():
+            if now.get(name) != value:
+                return f"was fitted with {name} {printable(value, 40)}, not {printable(now.get(name), 40)}"
+        return None
+
+    def of(self, intents: Intents) -> Intents:
+        """Return intents corrected."""
+        helpers = self.helper.of(intents.helpers) if self.helper else intents.helpers
+        return replace(intents, own=self.ego.of(intents.own), helpers=helpers)
+
+
+def question_of(agent: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a calibration is frozen by, of an agent's settings as `run.json` has them."""
+    model, prompt = agent["model"], agent["prompt"]
+    return {
+        **{f"model.{key}": str(model[key]) for key in OF_MODEL if model.get(key) is not None},
+        **{f"prompt.{key}": str(prompt[key]) for key in ("version", "sha256")},
+        **{key: str(agent[key]) for key in OF_QUESTION},
+    }
+
+
+def names() -> list[str]:
+    """Return the names of all calibrations, with a project's."""
+    return resources.names(FOLDER)
+
+
+def file_of(name: str) -> Any:
+    """Return the path of a calibration's file. Raises UserError if it is unknown."""
+    if name not in names():
+        raise unknown("calibration", name, names(), "; `harness model calibrate` makes one")
+    return resources.find(FOLDER, f"{name}.toml")
+
+
+def calibration(name: str) -> Calibration:
+    """Load a calibration by name. Raises UserError if it is unknown or its file is wrong."""
+    return _read(file_of(name))
+
+
+@read_once
+def _read(path: Any) -> Calibration:
+    where = f"calibration file {printable(path)}"
+    found = convert(toml(path, where), Calibration, where)
+    check_seeds(where, found.first_seed, found.last_seed)
+    for correction in filter(None, (found.ego, found.helper)):
+        if len(correction.prior) not in (0, len(found.actions)):
+            raise UserError(f"{where}: prior has {len(correction.prior)} values; give one an action, or none")
+    return found
+
+
+def check_seeds(what: str, first: int, last: int) -> None:
+    """Raise UserError unless layout seeds are all for tuning."""
+    if not 0 <= first <= last or purposes(first, last - first + 1) != ["tune"]:
+        raise UserError(f"{what}: {ONLY_TUNE}, and these are {stated(first, max(last - first, 0) + 1)}")

@@ -1,0 +1,115 @@
+"""`harness model calibrate`: fit what corrects a model's probabilities, on a run on tune layouts."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from harness.coordination.calibrations import (
+    COOLEST,
+    HOTTEST,
+    Calibration,
+    Correction,
+    Level,
+    check_seeds,
+    question_of,
+)
+from harness.core.arrays import Bools, Floats
+from harness.core.errors import UserError, printable
+from harness.core.files import write_whole
+from harness.core.seeds import stated
+from harness.dataset.forest import Forest
+from harness.runs.folder import Run, dataset_of, read
+from harness.runs.records import FrozenScenes
+from harness.runs.reliability import likelihood_nats
+
+TEMPERATURES = np.geomspace(COOLEST, HOTTEST, 241)  # that are tried: 2.5 % apart, and 1 among them
+LEAST_PRIOR = 1e-4  # a prior below counts as that
+DIGITS = 6  # of a prior
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What the answers of one role were corrected to, on the layouts that it was fitted on."""
+
+    role: str
+    correction: Correction
+    before_nats: float  # mean negative log-likelihood of the optimal actions, where any action is optimal
+    after_nats: float
+
+
+def fit(p: Floats, optimal: Bools, level: Level) -> Correction:
+    """Fit a correction on answers and the actions that are optimal there, both (n, A).
+
+    The prior is the mean of all answers. Of the temperatures that do best, it has the one nearest to 1.
+    """
+    prior: tuple[float, ...] = ()
+    if "L0" in level:
+        prior = tuple(np.maximum(p.mean(axis=0), LEAST_PRIOR).round(DIGITS).tolist())
+    if "L1" not in level:
+        return Correction(len(p), prior=prior)
+    known = optimal.any(axis=1)
+    if not known.any():
+        raise UserError("no action is optimal in any of its decision points; give a run with more layouts")
+    tried = TEMPERATURES[np.argsort(np.abs(np.log(TEMPERATURES)), kind="stable")].round(4)
+    nats = [nats_of(Correction(len(p), t, prior).of(p[known]), optimal[known]) for t in tried.tolist()]
+    return Correction(len(p), float(tried[int(np.argmin(np.round(nats, 9)))]), prior)
+
+
+def nats_of(p: Floats, optimal: Bools) -> float:
+    """Return the mean negative log-likelihood of the optimal actions, over answers (n, A) where any is."""
+    return float(np.nanmean(likelihood_nats(p, optimal))) if optimal.any() else float("nan")
+
+
+def calibrate(
+    folder: Path, level: Level, dataset: Path | None, command: str
+) -> tuple[Calibration, list[Fitted]]:
+    """Fit a calibration on the answers of a finished run on tune layouts.
+
+    Raises UserError for layouts of another purpose, several models, sampled answers, or none at all.
+    """
+    run, name = read(folder), printable(folder)
+    manifest = run.manifest
+    if not isinstance(manifest.world, FrozenScenes):
+        raise UserError(f"{name} was driven, and no tree says what follows; give a run of `harness eval`")
+    if manifest.helpers or manifest.temperature:
+        reason = "its helpers have a model of their own" if manifest.helpers else "its answers are sampled"
+        raise UserError(f"{name}: {reason}; give a run with one model, whose answers are greedy")
+    data = dataset_of(run, dataset).of_episodes(run.grid.episodes)
+    forest = data.forest
+    first, last = int(forest.seeds.min()), int(forest.seeds.max())
+    check_seeds(name, first, last)
+    fitted = [each for role in ("ego", "helper") if (each := _of_role(run, role, forest, level))]
+    if not fitted or fitted[0].role != "ego":
+        raise UserError(f"{name}: no answer of the ego could be read, so there is nothing to fit")
+    corrections = {each.role: each.correction for each in fitted}
+    seeds = stated(first, last - first + 1)
+    found = Calibration(
+        level, command,
+        f"{manifest.variant.model} on {manifest.world.name}, {seeds}, {len(forest.seeds)} layouts",
+        first, last, data.scenario.name, tuple(run.actions), question_of(manifest.agent(0)),
+        corrections["ego"], corrections.get("helper"),
+    )  # fmt: skip
+    return found, fitted
+
+
+def _of_role(run: Run, role: str, forest: Forest, level: Level) -> Fitted | None:
+    read_answers = [a for a in run.answers if a.role == role and a.intent]
+    if not read_answers:
+        return None
+    p = np.array([a.intent for a in read_answers], dtype=float)
+    optimal = forest.safe[[forest.place[a.scene] for a in read_answers]]
+    correction = fit(p, optimal, level)
+    return Fitted(role, correction, nats_of(p, optimal), nats_of(correction.of(p), optimal))
+
+
+def write(found: Calibration, out: Path) -> None:
+    """Write the file of a calibration: TOML, whose strings and lists are JSON's."""
+    fields = asdict(found)
+    tables = {name: fields.pop(name) for name in ("question", "ego", "helper")}
+    lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]
+    for name, table in tables.items():
+        if table is not None:
+            lines += ["", f"[{name}]", *(f"{json.dumps(k)} = {json.dumps(v)}" for k, v in table.items())]
+    write_whole(out, "\n".join([*lines, ""]))
