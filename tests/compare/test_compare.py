@@ -25,7 +25,8 @@ from harness.report.compare.pair import pair
 from harness.runs.metrics import BALANCED, METRICS
 
 Said = tuple[int, str, str]
-BY_DANGER = {name for name, metric in METRICS.items() if metric.half}
+WITNESSED = {name for name in METRICS if name.startswith("success_dangerous_rate_")}
+BY_DANGER = {name for name, metric in METRICS.items() if metric.half} - WITNESSED
 CONFLICTS = {"least_ttc_s", "short_ttc_rate", "short_ttc_decision_rate", "least_pet_s", "short_pet_rate"}
 # Which not every episode has.
 SOME = {
