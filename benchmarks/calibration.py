@@ -49,7 +49,6 @@ class Row(NamedTuple):
     prompt: str
     answer: str = "json"
     letters: str = ""  # where it answers by letters
-    layouts: int | None = None  # how many it is asked on, of tune and of report layouts; None for all
 
     @property
     def name(self) -> str:
@@ -61,8 +60,6 @@ ROWS = (
     Row("sparrow-general", "v4", "decision"),
     Row("swarm-tiny-six", "v4", "readout", "raw"),
     Row("swarm-tiny-six", "v4", "readout", "cyclic"),
-    Row("smollm2-135m", "v10", "readout", "raw", 20),
-    Row("smollm2-135m", "v10", "readout", "cyclic", 12),
 )
 
 
@@ -113,7 +110,6 @@ def evaluate(row: Row, purpose: str, conditions: Sequence[str]) -> None:
         harness(
             "eval", "--model", row.model, "--prompt", row.prompt, "--answer", row.answer,
             *(("--letters", row.letters) if row.letters else ()),
-            *(("--limit", str(row.layouts)) if row.layouts else ()),
             "--dataset", "tune" if purpose == "tune" else REPORT, "--seeds", SEEDS, "--ties", "drawn",
             "--ask", "all", "--latency", "paper", "--quiet", "--out", str(out),
             *(word for condition in conditions for word in ("--condition", condition)),
