@@ -68,7 +68,7 @@ def command(
     threads: int | None = typer.Option(None, help="Number of CPU threads. Default: PyTorch's choice."),
     workers: options.Workers = "2",
 ) -> None:
-    """Train a small Qwen3, or a published model, to imitate the planner in some scenarios.
+    """Train a small Qwen3, or a published model, in some scenarios.
 
     With an image prompt the small one is a Qwen3-VL, which takes pictures and text. If the training is
     stopped, the same command continues it.
