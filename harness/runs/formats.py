@@ -50,7 +50,6 @@ AGENT: Mapping[str, Added] = {
 MODEL: Mapping[str, Added] = {
     "vision": Added("2026-11-23", None, "models that take pictures"),
     "projector": Added("2026-11-23", None, "the file that turns pictures into tokens"),
-    "adapter": Added("2026-11-27", None, "LoRA adapters; the weights were as they are"),
     "system": Added("2026-11-25", None, "chat templates without a place for the system text"),
 }
 CONDITION: Mapping[str, Added] = {
