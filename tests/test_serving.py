@@ -211,6 +211,10 @@ def choice(options: int = 2, **changes: Any) -> dict[str, Any]:
     return {**CHOICE, "criteria": dict.fromkeys(map(str, range(options))), **changes}
 
 
+def nested(depth: int) -> Any:
+    return [nested(depth - 1)] if depth else "s"
+
+
 PNG = f"data:image/png;base64,{b64encode(Image(np.zeros((2, 2, 3), dtype=np.uint8)).png()).decode()}"
 
 
@@ -232,6 +236,10 @@ PNG = f"data:image/png;base64,{b64encode(Image(np.zeros((2, 2, 3), dtype=np.uint
         ("systemone", {"state": "s", "questions": {"a": choice()}, "images": [PNG]}, "reads texts alone"),
         ("systemone", {"state": "s", "questions": {"a": choice()}, "images": ["file:///etc/passwd"]},
          "reads texts alone"),
+        ("systemone", {"state": nested(33), "questions": {"a": choice()}}, "nested more than 32 deep"),
+        ("systemone", {"state": [" " * 300_000], "questions": {"a": choice()}}, "give 262144 at most"),
+        ("decisions", {"input": [{"role": "user", "content": [{"type": "input_json", "data": nested(33)}]}],
+                       "questions": [{"type": "predicate", "instructions": "i"}]}, "32 deep"),
         ("decisions", {"input": "s", "questions": []}, "length >= 1"),
         ("decisions", {"input": [{"role": "system", "content": "s"}], "questions": [{
             "type": "predicate", "instructions": "i"}]}, "another role than user"),

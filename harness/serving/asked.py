@@ -11,6 +11,7 @@ from harness.prompts.decision import Question
 
 MOST_QUESTIONS = 64  # of one request
 MOST_OPTIONS = 255  # of one question, as other servers of the class
+MOST_DEPTH = 32  # of data: each level indents all below it, so that a small request could fill the memory
 
 
 class Refusal(Exception):
@@ -32,6 +33,13 @@ class Asked:
     @property
     def options(self) -> tuple[str, ...]:
         return tuple(self.question.meanings)
+
+    @property
+    def length(self) -> int:
+        """How many characters its texts have."""
+        meanings = self.question.meanings
+        texts = (self.question.state, self.question.instructions, *meanings, *meanings.values())
+        return sum(len(text or "") for text in texts)
 
 
 @dataclass(frozen=True)
@@ -70,8 +78,20 @@ class Answered:
 
 
 def text_of(content: Any) -> str:
-    """Return content as the model reads it: text as it is, anything else as JSON."""
+    """Return content as the model reads it: text as it is, anything else as JSON.
+
+    Raises Refusal if it is nested too deep.
+    """
+    _check_depth(content, MOST_DEPTH)
     return content if isinstance(content, str) else json.dumps(content, indent=2, ensure_ascii=False)
+
+
+def _check_depth(content: Any, left: int) -> None:
+    if isinstance(content, dict | list):
+        if not left:
+            raise Refusal(f"data is nested more than {MOST_DEPTH} deep; give it flatter", code="depth")
+        for inner in content.values() if isinstance(content, dict) else content:
+            _check_depth(inner, left - 1)
 
 
 def asked(name: str | None, question: Question, options: Sequence[tuple[Any, str | None]]) -> Asked:

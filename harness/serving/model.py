@@ -76,15 +76,14 @@ class ServedModel:
                 f"{printable(self.name)} answers by a letter each, and takes {len(LETTERS)} at most",
                 code="options",
             )
+        if asked.length > MOST_CHARACTERS:  # before each order of the letters has a copy
+            raise Refusal(
+                f"a question and its state have {asked.length} characters; give {MOST_CHARACTERS} at most",
+                code="context_length_exceeded",
+            )
         turn = {"role": "user", **({"image": "camera"} if image else {})}
         chats = self._agent.in_orders(
             asked.options, lambda order: decision.asked(asked.question, (turn,), order)
         )
-        length = sum(len(message["content"]) for message in chats["messages"])
-        if length > MOST_CHARACTERS:
-            raise Refusal(
-                f"a question and its state have {length} characters; give {MOST_CHARACTERS} at most",
-                code="context_length_exceeded",
-            )
         blank = self._agent.blank("ego", asked.options)
         return blank.alike(id=f"{next(self._numbers)}/asked", question=asked.question, image=image, **chats)
