@@ -1,7 +1,9 @@
 """Layouts that may be learnt from, and their trees: built once, kept on disk, never of report seeds."""
 
+import operator
 import re
 from collections.abc import Callable
+from typing import Any
 
 from harness.core import kept
 from harness.core.errors import UserError, printable, unknown
@@ -24,11 +26,20 @@ def seeds(which: str | int, layouts: int) -> range:
     """
     if isinstance(which, str) and which not in FIRST:
         raise unknown("seeds", which, [name for name in FIRST if name != "report"], "; or the first seed")
-    first = FIRST[which] if isinstance(which, str) else which
+    first = FIRST[which] if isinstance(which, str) else whole("seeds", which)
+    layouts = whole("layouts", layouts)
     if not 0 <= first <= LAST_SEED - layouts or layouts < 1:
         raise UserError(f"seeds {first}, layouts {layouts}: give a seed from 0 on, and 1 layout or more")
     refuse(purpose(first, layouts), f"seeds={which!r}")
     return range(first, first + layouts)
+
+
+def whole(what: str, number: Any) -> int:
+    """Return a whole number as a plain one. Raises UserError if it is none."""
+    try:
+        return operator.index(number)
+    except TypeError:
+        raise UserError(f"{what} {printable(str(number), 40)}: give a whole number") from None
 
 
 def refuse(kind: Purpose, what: str) -> None:
@@ -41,9 +52,12 @@ def refuse(kind: Purpose, what: str) -> None:
 
 
 def stored(dataset: str) -> Dataset:
-    """Read a dataset, by its folder or name. Raises UserError for none, or one of report seeds."""
+    """Read a dataset, by its folder or name. Raises UserError for none, or one of report seeds.
+
+    The seeds count, and not what its manifest says that they are for.
+    """
     data = load(find(dataset))
-    refuse(data.manifest.purpose, f"dataset {printable(dataset)}")
+    refuse(purpose(data.manifest.seed, data.manifest.episodes), f"dataset {printable(dataset)}")
     return data
 
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, unknown
-from harness.core.seeds import purpose
+from harness.core.seeds import LAST_SEED, purpose
 from harness.dataset.freeze import edges, record_of
 from harness.dataset.load import Dataset, Scene
-from harness.learning.layouts import refuse
+from harness.learning.layouts import refuse, whole
 from harness.learning.values import BEST, Values
 from harness.world.drivers import DRIVERS, PRIVILEGED
 from harness.world.outcome import Outcome
@@ -80,6 +80,7 @@ class Trees:
         return Values.of(self.dataset.forest, self.then)
 
     def begin(self, seed: int) -> "TreeTrip":
+        seed = whole("layout seed", seed)
         if seed not in self.seeds:
             raise UserError(f"layout seed {seed} has no tree here; give one of {_range(self.seeds)}")
         return TreeTrip(self, int(self.dataset.forest.root[self.seeds.index(seed)]))
@@ -123,6 +124,9 @@ class Roads:
             raise unknown("then", str(self.then), DRIVERS, "; only trees know more than drivers do")
 
     def begin(self, seed: int) -> "RoadTrip":
+        seed = whole("layout seed", seed)
+        if not 0 <= seed <= LAST_SEED:
+            raise UserError(f"layout seed {seed}: give 0 to {LAST_SEED}")
         refuse(purpose(seed, 1), f"layout seed {seed}")
         return RoadTrip(self, World.start(self.scenario, seed))
 
