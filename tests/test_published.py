@@ -15,6 +15,7 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 import tiny_llama
 import torch
 from msgspec import structs
+from safetensors.torch import save_file
 from teaching import drawn_once
 from typer.testing import CliRunner
 
@@ -143,6 +144,9 @@ def test_an_adapter_of_another_model_is_refused_in_one_line(engine: str, llama: 
         ({"use_dora": True}, "its adapter has use_dora; allowed: plain LoRA of linear layers"),
         ({"peft_type": "IA3"}, "its adapter has peft_type IA3, r 3, bias none"),
         ({"r": "many"}, "cannot be read"),
+        ({"r": float("inf")}, "cannot be read"),
+        ({"lora_alpha": float("nan")}, "lora_alpha is nan"),
+        ({"alora_invocation_tokens": [7]}, "its adapter has alora_invocation_tokens"),
         (
             {"base_model_name_or_path": "replay:."},
             "is an adapter of 'replay:.', which is no model with weights",
@@ -163,6 +167,32 @@ def test_what_is_no_plain_adapter_is_refused_in_one_line(
         cards.resolve(str(folder))
     assert said in str(told.value)
     assert "\n" not in str(told.value)
+
+
+NORM, HEAD = f"{adapters.PREFIX}model.norm", f"{adapters.PREFIX}lm_head"
+DOWN = f"{adapters.PREFIX}model.layers.0.mlp.down_proj"
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "columns", "fill", "said"),
+    [
+        (DOWN, 96, 320, float("nan"), "holds numbers that are none, or too large"),
+        (NORM, 96, 1, 1.0, "is (96, 1), and (96,) in the model"),
+        (HEAD, 4096, 96, 1.0, "lm_head shares its weights, and both uses would change"),
+    ],
+)
+def test_an_adapter_that_would_spoil_its_model_is_refused(
+    name: str, rows: int, columns: int, fill: float, said: str, tmp_path: Path
+) -> None:
+    matrices = {adapters.A: torch.full((3, columns), fill), adapters.B: torch.ones(rows, 3)}
+    save_file({name + end: matrix for end, matrix in matrices.items()}, tmp_path / adapters.TENSORS)
+    config = {"r": 3, "lora_alpha": 6.0, "peft_type": "LORA"}
+    for rank, words in ((3, said), (64, said if name == HEAD else "has rank 3, and r is 64")):
+        (tmp_path / adapters.CONFIG).write_text(json.dumps({**config, "r": rank}))
+        with pytest.raises(UserError) as told:
+            open_backend(replace(BASE, adapter=str(tmp_path)), device="cpu")
+        assert words in str(told.value)
+        assert "\n" not in str(told.value)
 
 
 def test_a_card_without_its_adapter_lacks_weights() -> None:

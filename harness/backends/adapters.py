@@ -5,6 +5,7 @@ when they are loaded, and for llama.cpp the same numbers as one GGUF file.
 """
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
 PREFIX = "base_model.model."  # of a tensor's name, before that of the module which it changes
 A, B = ".lora_A.weight", ".lora_B.weight"
 # Kinds of adapter that are more than W + alpha / r * B A, by their key in the config.
-_MORE = ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern", "modules_to_save", "fan_in_fan_out")
+_MORE = ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern", "modules_to_save", "fan_in_fan_out",
+         "alora_invocation_tokens")  # fmt: skip
 
 
 def read_config(folder: Path, shown: str) -> dict[str, Any]:
@@ -25,8 +27,9 @@ def read_config(folder: Path, shown: str) -> dict[str, Any]:
     try:
         config: dict[str, Any] = json.loads(text_of(folder / CONFIG, "record"))
         rank, kind = int(config["r"]), config["peft_type"]
-        float(config["lora_alpha"])
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        if not math.isfinite(float(config["lora_alpha"])):
+            raise ValueError(f"lora_alpha is {config['lora_alpha']}")
+    except (OSError, ValueError, OverflowError, LookupError, TypeError, RecursionError) as error:
         raise UserError(
             f"{shown}: {printable(folder / CONFIG)} cannot be read ({printable(repr(error), 120)}); give the "
             "folder of a LoRA adapter in peft's format"
@@ -92,7 +95,10 @@ def merge(card: Card, model: Any) -> None:
     from safetensors.torch import load_file
 
     config = read_config(file.parent, card.shown)
-    scale = float(config["lora_alpha"]) / int(config["r"])
+    rank = int(config["r"])
+    scale = float(config["lora_alpha"]) / rank
+    output = model.get_output_embeddings()
+    tied = output is not None and output.weight is model.get_input_embeddings().weight
     try:
         tensors = load_file(file)
         names = [name.removesuffix(A) for name in tensors if name.endswith(A)]
@@ -100,10 +106,16 @@ def merge(card: Card, model: Any) -> None:
             raise ValueError(f"{len(tensors)} tensors, of which {len(names)} are {A}")
         changes = {}
         for name in names:
-            weight = model.get_submodule(name.removeprefix(PREFIX)).weight
-            change = tensors[name + B].float() @ tensors[name + A].float()
+            module = model.get_submodule(name.removeprefix(PREFIX))
+            if tied and module in (output, model.get_input_embeddings()):
+                raise ValueError(f"{name} shares its weights, and both uses would change")
+            if len(tensors[name + A]) != rank:
+                raise ValueError(f"{name} has rank {len(tensors[name + A])}, and r is {rank}")
+            weight, change = module.weight, tensors[name + B].float() @ tensors[name + A].float()
             if change.shape != weight.shape:
                 raise ValueError(f"{name} is {tuple(change.shape)}, and {tuple(weight.shape)} in the model")
+            if not change.isfinite().all():
+                raise ValueError(f"{name} holds numbers that are none, or too large")
             changes[name] = weight, change
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
         raise UserError(
