@@ -146,6 +146,7 @@ def test_what_a_calibration_does_not_fit_is_refused(
     [
         ("last_seed = 103", "last_seed = 200001", "calibration is fitted on tune seeds"),
         ("prior = [", "prior = [0.5, ", "prior has 4 values"),
+        ("prior = [", "prior = [1e-320, ", "0.0001"),
         ('"temperature" = 1', '"temperature" = 99', "temperature"),
         ('level = "L0"', 'level = "L7"', "level"),
     ],

@@ -24,6 +24,7 @@ from harness.core.seeds import purposes, stated
 
 FOLDER = "calibrations"
 COOLEST, HOTTEST = 0.05, 20.0  # temperatures
+LEAST_PRIOR = 1e-4  # a prior below counts as that: less would let one answer in 10 000 decide all
 OF_MODEL = ("name", "engine", "weights", "file", "revision", "sha256", "quantisation")
 OF_QUESTION = ("answer", "letters", "image", "sums", "thinking")
 Level = Literal["L0", "L1", "L0+L1"]
@@ -38,7 +39,7 @@ class Correction:
     # the exponent is 1 / temperature; 1 changes nothing
     temperature: Annotated[float, Meta(ge=COOLEST, le=HOTTEST)] = 1.0
     # the mean answer, a probability an action; empty where none is divided out
-    prior: tuple[Annotated[float, Meta(gt=0, le=1)], ...] = ()
+    prior: tuple[Annotated[float, Meta(ge=LEAST_PRIOR, le=1)], ...] = ()
 
     def of(self, p: Floats) -> Floats:
         """Return intents `(..., A)` corrected; NaN stays."""

@@ -9,6 +9,7 @@ import numpy as np
 from harness.coordination.calibrations import (
     COOLEST,
     HOTTEST,
+    LEAST_PRIOR,
     Calibration,
     Correction,
     Level,
@@ -25,7 +26,6 @@ from harness.runs.records import FrozenScenes
 from harness.runs.reliability import likelihood_nats
 
 TEMPERATURES = np.geomspace(COOLEST, HOTTEST, 241)  # that are tried: 2.5 % apart, and 1 among them
-LEAST_PRIOR = 1e-4  # a prior below counts as that
 DIGITS = 6  # of a prior
 
 
