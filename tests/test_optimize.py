@@ -3,6 +3,8 @@
 import json
 import shutil
 import threading
+import time
+import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from harness.prompts import versions as prompts
 from harness.prompts.alternatives import counts, resolved
 from harness.studies.optimize.candidate import chosen, rewritten, space, systems
 from harness.studies.optimize.feedback import of_course, of_decision
+from harness.studies.optimize.search import looks
 from harness.studies.optimize.tuning import TIE, Decision, Played
 
 Said = tuple[int, str, str]
@@ -127,12 +130,50 @@ def test_a_mark_is_its_first_alternative_until_another_is_chosen() -> None:
             "2 and 3",
         ),
         ("{% order x %}1{% or %}2{% or %}3{% or %}4{% or %}5{% endorder %}", "5 parts"),
+        (
+            "".join(f"{{% either m{n} %}}a{{% or %}}b{{% endeither %}}" for n in range(65)),
+            "65 marks; give 64",
+        ),
         ("{% either examples %}a{% or %}b{% endeither %}", "another name"),
     ],
 )
 def test_a_mark_that_cannot_be_chosen_from_is_refused(text: str, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         counts([text])
+
+
+@pytest.mark.parametrize(
+    "text", ["{% either x %}" * 50_000, "{% either x %} {% endorder %}" * 50_000, ("{%" + " " * 999) * 1000]
+)
+def test_a_strangers_marks_take_one_pass(text: str) -> None:
+    begun_s = time.process_time()
+    assert resolved(text) == text
+    assert time.process_time() - begun_s < 5, "and not one from each that never ends"
+
+
+def test_an_order_of_long_parts_makes_no_more_than_one_of_them() -> None:
+    parts = ["w" * 10**6, "x", "y", "z"]
+    text = "{% order x %}" + "{% or %}".join(parts) + "{% endorder %}"
+    tracemalloc.start()
+    assert resolved(text, {"x": 23}) == "zyx" + parts[0]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * len(text)
+
+
+def test_a_strangers_history_is_read_or_counts_for_none(tmp_path: Path) -> None:
+    marked(tmp_path)
+    base = prompts.load("mine", tmp_path)
+    for text, expected in (
+        ('{"looks": 2}', 2),
+        ('{"looks": 1e999}', 0),
+        ('{"looks": -5}', 0),
+        ("[" * 10**5, 0),
+        ("\udcff", 0),
+        ("", 0),
+    ):
+        (tmp_path / "mine" / "history.json").write_bytes(text.encode(errors="surrogateescape"))
+        assert looks(base, tmp_path) == expected
 
 
 def test_what_is_chosen_is_an_ordinary_version(tmp_path: Path, small: Dataset) -> None:

@@ -7,24 +7,67 @@ prompt.
 """
 
 import re
-from collections.abc import Iterable, Mapping
-from itertools import permutations
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice, permutations
+from math import factorial
 from types import MappingProxyType
+from typing import NamedTuple
 
-MARK = re.compile(r"\{%\s*(either|order)\s+(\w+)\s*%\}(.*?)\{%\s*end\1\s*%\}", re.DOTALL)
+BEGIN = re.compile(r"\{%\s*(either|order)\s+(\w+)\s*%\}")
+END = {kind: re.compile(rf"\{{%\s*end{kind}\s*%\}}") for kind in ("either", "order")}
 OR = re.compile(r"\{%\s*or\s*%\}")
 MOST_PARTS = 4  # of an `order`, which has 24 orders
+MOST_MARKS = 64  # of a version: each round of a search tries every alternative of each
 EXAMPLES = "examples"  # names the choice among `example_sets` of prompt.toml
 FIRST: Mapping[str, int] = MappingProxyType({})  # the choice of the first alternative everywhere
 
 
+class Mark(NamedTuple):
+    """A mark in a template's text."""
+
+    start: int
+    end: int
+    order: bool  # whether its parts are ordered, and not chosen from
+    name: str
+    parts: list[str]
+
+    @property
+    def choices(self) -> int:
+        """How many alternatives it has."""
+        return factorial(len(self.parts)) if self.order else len(self.parts)
+
+    def alternative(self, number: int) -> str:
+        if not self.order:
+            return self.parts[number]
+        return "".join(next(islice(permutations(self.parts), number, None)))
+
+
+def _marks(text: str) -> Iterator[Mark]:
+    """Yield the marks of a text, in one pass; what never ends is none, which Jinja then refuses.
+
+    Raises ValueError for one of too many parts.
+    """
+    place, endless = 0, set[str]()
+    while begin := BEGIN.search(text, place):
+        kind, name, place = begin[1], begin[2], begin.end()
+        end = None if kind in endless else END[kind].search(text, place)
+        if end is None:
+            endless.add(kind)
+            continue
+        parts = OR.split(text[place : end.start()])
+        if kind == "order" and len(parts) > MOST_PARTS:
+            raise ValueError(f"mark {name} orders {len(parts)} parts; give {MOST_PARTS} at most")
+        place = end.end()
+        yield Mark(begin.start(), place, kind == "order", name, parts)
+
+
 def resolved(text: str, choice: Mapping[str, int] = FIRST) -> str:
     """Return a template's text with each mark replaced by the alternative of this number, from 0."""
-
-    def chosen(mark: re.Match[str]) -> str:
-        return _alternatives(mark)[choice.get(mark[2], 0)]
-
-    return MARK.sub(chosen, text)
+    pieces, place = [], 0
+    for mark in _marks(text):
+        pieces += [text[place : mark.start], mark.alternative(choice.get(mark.name, 0))]
+        place = mark.end
+    return "".join([*pieces, text[place:]])
 
 
 def counts(texts: Iterable[str]) -> dict[str, int]:
@@ -34,8 +77,8 @@ def counts(texts: Iterable[str]) -> dict[str, int]:
     """
     sizes: dict[str, int] = {}
     for text in texts:
-        for mark in MARK.finditer(text):
-            name, n = mark[2], len(_alternatives(mark))
+        for mark in _marks(text):
+            name, n = mark.name, mark.choices
             if name == EXAMPLES:
                 raise ValueError(f"a mark is named {EXAMPLES}, which example_sets are; give another name")
             if n < 2:
@@ -44,13 +87,6 @@ def counts(texts: Iterable[str]) -> dict[str, int]:
                 raise ValueError(
                     f"mark {name} has {sizes[name]} and {n} alternatives; give as many each time"
                 )
+    if len(sizes) > MOST_MARKS:
+        raise ValueError(f"{len(sizes)} marks; give {MOST_MARKS} at most")
     return sizes
-
-
-def _alternatives(mark: re.Match[str]) -> list[str]:
-    parts = OR.split(mark[3])
-    if mark[1] == "either":
-        return parts
-    if len(parts) > MOST_PARTS:
-        raise ValueError(f"mark {mark[2]} orders {len(parts)} parts; give {MOST_PARTS} at most")
-    return ["".join(order) for order in permutations(parts)]

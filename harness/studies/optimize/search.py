@@ -14,6 +14,7 @@ from harness.backends.swarm import open_each, together
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import POINTS, as_mapping, shown
+from harness.core.files import text_of
 from harness.core.progress import Progress
 from harness.core.seeds import FIRST, Purpose, purposes, stated
 from harness.core.statistics import Estimate, mean_of
@@ -138,9 +139,12 @@ def search(
 
 
 def looks(base: Prompt, where: Path) -> int:
-    """Return how often report layouts were read for the versions that a prompt comes from."""
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        return int(json.loads((where / base.version / HISTORY).read_text())["looks"])
+    """Return how often report layouts were read for the versions that a prompt comes from.
+
+    It is 0 where no history of this program says so.
+    """
+    with suppress(OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError):
+        return max(0, int(json.loads(text_of(where / base.version / HISTORY))["looks"]))
     return 0
 
 
