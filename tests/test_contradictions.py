@@ -53,6 +53,6 @@ def test_a_checkpoint_says_its_context_in_its_config(config: object, lines: int,
 
 
 def test_what_ships_is_not_at_odds() -> None:
-    for name in ("swarm-tiny", "swarm-tiny-six", "swarm-tiny-vl"):
+    for name in ("swarm-tiny", "swarm-tiny-six", "swarm-tiny-six-v2", "swarm-tiny-vl"):
         for card in cards.each_engine(name):
             assert list(contradictions(card)) == []

@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 import pyarrow.parquet as pq
 import pytest
+from former import DATASET
 from starlette.testclient import TestClient
 
 import harness as package
@@ -75,7 +76,7 @@ STUDIES = {
     "trust": "study trust {run} --attacks liar --rules median --share 1/3 --seeds 0 --no-model --quiet",
     "schedule": "study schedule compare {run} --schedule random --seeds 0 --quiet",
     "attribute": "study attribute {run} --sample 1 --quiet",
-    "replay": "eval --model replay:{run} {same} --quiet --out replayed",
+    "replay": f"eval --model replay:{{run}} --dataset {DATASET} {{same}} --quiet --out replayed",
 }
 SAME = {
     "356ad2b/proxy": "--limit 2 --seeds 0,1 --condition single-local --condition v2x --condition 6g",
@@ -98,7 +99,8 @@ def test_studies_read_frozen_runs(
 @pytest.mark.slow
 @pytest.mark.parametrize("run", ["356ad2b/proxy", "0103f23/attack"])
 def test_a_replay_decides_as_the_run_did(run: str, kept: Callable[[str], Path], harness: Typed) -> None:
-    harness(*f"eval --model replay:{kept(run)} {SAME[run]} --ties first --quiet --out again".split())
+    again = f"{SAME[run]} --dataset {DATASET} --ties first --quiet --out again"
+    harness("eval", "--model", f"replay:{kept(run)}", *again.split())
     old, new = (folder.read(path).decisions for path in (HERE / run, Path("again")))
     assert old.labels("action") == new.labels("action")
 
@@ -253,5 +255,5 @@ def test_a_run_whose_tables_cannot_be_read_is_made_again_from_its_answers(
     code, _, error = harness("report", run)
     assert code == 2
     assert f"--model replay:{run}" in error
-    again = "--limit 2 --seeds 0,1 --condition single-local --condition v2x --condition 6g --quiet"
+    again = f"{SAME['356ad2b/proxy']} --dataset {DATASET} --quiet"
     assert harness("eval", "--model", f"replay:{run}", *again.split(), "--out", "again")[0] == 0
