@@ -8,6 +8,7 @@ from harness.report.library import picture
 from harness.report.runs import Runs
 from harness.runs.folder import Run
 from harness.runs.metrics import entry
+from harness.runs.summary import judged_of
 
 HONEST = (
     "optimal_action_rate", "optimal_brier", "optimal_nll_nats", "calibration_error", "coverage_at_5_risk",
@@ -44,10 +45,12 @@ def probabilities(runs: Runs) -> list[dict[str, Any]]:
     lines = []
     for name, run in zip(runs.names, runs.runs, strict=True):
         flips = run.score("all", "flip_rate_ego")
-        for condition in run.conditions:
+        judged = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
+        for condition, decisions in zip(run.conditions, judged, strict=True):
             scores = [run.score(condition, metric) for metric in HONEST]
             if any(scores):
-                lines.append({"run": name, "condition": condition, "cells": [*scores, flips]})
+                cells = [*scores, flips]
+                lines.append({"run": name, "condition": condition, "n": len(decisions.sure), "cells": cells})
     return lines
 
 

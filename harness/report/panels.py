@@ -25,7 +25,7 @@ from harness.runs.summary import judged_of
 
 Table = list[dict[str, Any]]
 ENTROPY_NATS, TOKENS, ARRIVAL_MS = 0.1, 25, 10.0  # widths of bins
-Part = Literal["overview", "answers", "communication"]
+Part = Literal["overview", "probabilities", "answers", "communication"]
 ENTROPY = "entropy of the ego's own intent, nats"
 BUDGET = (200, 400)  # tokens of a prompt: the paper's
 
@@ -75,7 +75,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
         )  # fmt: skip
     if rows := joined(reliability):
         yield Panel(
-            "reliability", "answers", "Is the policy as often right as it is sure?",
+            "reliability", "probabilities", "Is the policy as often right as it is sure?",
             "Decisions are grouped by the probability of the likeliest action in the fused policy, in "
             f"{BINS} bins of equal mass; each point shows how often that action was optimal, so that success "
             "was still possible after it. The mean distance from the dashed line is the ECE; above the line "
@@ -97,7 +97,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
         )
     if rows := joined(errors):
         yield Panel(
-            "entropy-error", "answers", "Entropy against error",
+            "entropy-error", "probabilities", "Entropy against error",
             "Share of decisions whose action was unsafe, by the entropy of the ego's own intent before "
             "fusion. If high entropy predicts errors, the line of the condition without V2V rises to the "
             "right. How far the other lines lie below it is what the helpers correct. All seeds; 95 % "

@@ -201,12 +201,17 @@ def test_the_summary_has_every_condition_and_metric_with_interval_and_n(run, pag
 
 
 def test_the_page_says_how_honest_the_probabilities_are(run, page):
-    """A line a condition, beside the picture; figures that others have replaced stay off the page."""
+    """A line a condition, above the picture; figures that others have replaced stay off the page."""
+    loaded = read(run)
+    rows = loaded.decisions
+    open_rows = (rows.of_actions("safe") == 1.0).any(axis=1)
     table = page.text.split("How honest the probabilities are")[1].split("Layouts are resampled")[0]
     for condition in ("single-local", "v2x", "6g"):
         line = table.split(condition)[1]
+        here = rows.codes("condition", loaded.conditions) == loaded.conditions.index(condition)
+        assert line.split()[0] == str((open_rows & here).sum())
         for metric in contents.HONEST:
-            cell = shown(read(run).score(condition, metric))
+            cell = shown(loaded.score(condition, metric))
             assert f"{cell['value']} {cell['interval']}" in line
     assert "negative log likelihood" not in page.text
 
