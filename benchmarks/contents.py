@@ -72,6 +72,7 @@ ROWS = (
     Row("proxy", "v4", rule=True),
     Row("swarm-tiny", "v2", "readout", "occluded-intersection-v3"),
     Row("swarm-tiny-six", "v4", "readout"),
+    Row("swarm-tiny-six-v2", "v4", "readout"),
     Row("smollm2-135m", "v10", "readout", "occluded-intersection-v3", drives=False, panels=(BASE,)),
 )
 
