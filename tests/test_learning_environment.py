@@ -233,7 +233,7 @@ def test_what_is_no_action_is_one_line_and_moves_nobody(action: Any, make: Make)
     with pytest.raises(UserError, match="no episode is under way; call reset"):
         env.step(1)
     _, info = env.reset(seed=1)
-    with pytest.raises(UserError, match="give 0 to 2, one of SLOWER, IDLE, FASTER, or 3 probabilities"):
+    with pytest.raises(UserError, match="give an index, 0 to 2 for SLOWER, IDLE, FASTER, or 3 probabilities"):
         env.step(action)
     assert env.trip.scene.id == info["scene"]
 

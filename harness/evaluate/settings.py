@@ -87,7 +87,8 @@ class DriveSettings(
     scenario: Annotated[
         str | None,
         option(
-            "Scenario to drive; NAME:beacon_loss=0.3 changes its beacons. Default: occluded-intersection."
+            "Scenario to drive; NAME:beacon_loss=0.3 changes its beacons. Default: occluded-intersection, "
+            "with the scenes of occluded-intersection-v2."
         ),
     ] = None
     episodes: Annotated[

@@ -135,7 +135,7 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         except (TypeError, ValueError):
             pass
         raise UserError(
-            f"action {printable(str(action), 40)}: give 0 to {len(self.actions) - 1}, one of "
+            f"action {printable(str(action), 40)}: give an index, 0 to {len(self.actions) - 1} for "
             f"{', '.join(self.actions)}, or {len(self.actions)} probabilities"
         )
 
