@@ -12,7 +12,7 @@ from evaluating import run, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.coordination.calibrations import Correction
+from harness.coordination.calibrations import OF_QUESTION, Calibration, Correction, question_of
 from harness.core.resources import MARKER
 from harness.dataset.build import build
 from harness.runs.folder import read
@@ -197,3 +197,14 @@ def test_helpers_that_answered_nothing_are_not_corrected(
     code, _, error = evaluated(harness, two_path, "--condition", "6g:calibration=ego")
     assert code == 2
     assert "was fitted on no helper's answer" in error
+
+
+def test_a_calibration_of_a_model_without_an_adapter_does_not_fit_one_with() -> None:
+    model = {"name": "m", "engine": "e"}
+    agent: dict[str, Any] = {"model": model, "prompt": {"version": "v", "sha256": "s"}}
+    agent |= dict.fromkeys(OF_QUESTION, "x")
+    found = Calibration("L1", "c", "r", 0, 3, "here", ("a", "b"), question_of(agent), Correction(4))
+    assert found.obstacle(agent, "here") is None
+    for key in ("adapter", "sha256"):
+        other = {**agent, "model": {**model, key: "new"}}
+        assert found.obstacle(other, "here") == f"was fitted with model.{key} None, not new"

@@ -25,7 +25,7 @@ from harness.core.seeds import purposes, stated
 FOLDER = "calibrations"
 COOLEST, HOTTEST = 0.05, 20.0  # temperatures
 LEAST_PRIOR = 1e-4  # a prior below counts as that: less would let one answer in 10 000 decide all
-OF_MODEL = ("name", "engine", "weights", "file", "revision", "sha256", "quantisation")
+OF_MODEL = ("name", "engine", "weights", "file", "revision", "sha256", "quantisation", "adapter")
 OF_QUESTION = ("answer", "letters", "image", "sums", "thinking")
 Level = Literal["L0", "L1", "L0+L1"]
 ONLY_TUNE = "calibration is fitted on tune seeds"
@@ -66,9 +66,11 @@ class Calibration:
     def obstacle(self, agent: Mapping[str, Any], scenario: str) -> str | None:
         """Return why it does not fit an agent's settings (`question_of`) in a scenario; None if it does."""
         now = {**question_of(agent), "scenario": scenario}
-        for name, value in {**self.question, "scenario": self.scenario}.items():
-            if now.get(name) != value:
-                return f"was fitted with {name} {printable(value, 40)}, not {printable(now.get(name), 40)}"
+        then = {**self.question, "scenario": self.scenario}
+        for name in then | now:  # the model may have an adapter, or a pinned file, that it had not then
+            value, other = then.get(name), now.get(name)
+            if value != other:
+                return f"was fitted with {name} {printable(value, 40)}, not {printable(other, 40)}"
         return None
 
     def of(self, intents: Intents) -> Intents:
