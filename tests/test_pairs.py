@@ -12,7 +12,7 @@ from run_on_disk import Row, answers_of, change, configure, made_up, rows_of
 
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
-from harness.dataset.load import Dataset
+from harness.dataset.load import Dataset, find, load
 from harness.parsing.parse import parse
 from harness.parsing.status import Status
 from harness.prompts import versions as prompts
@@ -107,6 +107,19 @@ def test_layouts_that_numbers_are_of_become_no_training_data_silently(run: Path,
     assert err.endswith("or give --report-seeds-too\n")
     assert not Path("pairs.jsonl").exists()
     assert lines_of(run, harness, "--report-seeds-too")
+
+
+def test_report_layouts_that_a_run_calls_others_become_no_training_data(
+    tmp_path: Path, harness: Harness
+) -> None:
+    report = load(find("occluded-intersection-v3"), limit=1)
+    spec = spec_of(report, prompt="v3", points=(POINTS["single-local"],), seeds=(0,))
+    done = evaluate(spec, tmp_path / "run").out
+    change(done, episode=lambda row: row.update(layout_seed=row["layout_seed"] - 100_000))
+    code, _, err = harness("run", "export", done, "--sft", "pairs.jsonl")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "has layout seeds 200000 to 200000 (report)" in err
+    assert not (tmp_path / "pairs.jsonl").exists()
 
 
 @pytest.mark.parametrize(

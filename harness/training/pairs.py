@@ -5,7 +5,7 @@ The answer states the soft label of `harness.training.lessons`, with the outcome
 trees: the best action has most of it. Chats are messages, since a chat template is the model's own.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,17 +44,25 @@ def write(
             f"{option}: {printable(run.path)} was driven, and only frozen scenes know what each action leads "
             "to; give a run of `harness eval`"
         )
-    seeds = sorted({episode.layout_seed for episode in run.episodes})
-    first, count = seeds[0], seeds[-1] - seeds[0] + 1
-    if seeds[-1] >= FIRST["report"] and not report_seeds_too:
-        raise UserError(
-            f"{option} {printable(path)}: {printable(run.path)} has {stated(first, count)}, and a model that "
-            "learns from them can no longer be measured on them; make a run on a dataset of train seeds, "
-            f"`harness dataset build --seed {FIRST['train']}`, or give --report-seeds-too"
-        )
+    if not report_seeds_too:
+        what = f"{option} {printable(path)}: {printable(run.path)}"
+        _check_seeds(what, {episode.layout_seed for episode in run.episodes})
+        # What a run says of its layouts is a table that may be edited; its questions are the dataset's.
+        _check_seeds(what, dataset_of(run, dataset).of_episodes(run.grid.episodes).seeds)
     lines = pairs(run, dataset) if margin is None else preferences(run, margin, dataset)
     write_whole(path, msgspec.json.Encoder().encode_lines(lines))
     return path
+
+
+def _check_seeds(what: str, seeds: Collection[int]) -> None:
+    """Raise UserError if numbers are reported of any of some layout seeds."""
+    least, most = min(seeds), max(seeds)
+    if most >= FIRST["report"]:
+        raise UserError(
+            f"{what} has {stated(least, most - least + 1)}, and a model that "
+            "learns from them can no longer be measured on them; make a run on a dataset of train seeds, "
+            f"`harness dataset build --seed {FIRST['train']}`, or give --report-seeds-too"
+        )
 
 
 def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
