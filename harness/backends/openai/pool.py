@@ -89,7 +89,8 @@ class ServerPool:
         answering = {server: model for server, model in zip(self._servers, models, strict=True) if model}
         if not answering:
             raise Unanswered(
-                f"no server answers at {self._faults()}; start the server, or fix base_url in its card"
+                f"no server answers at {self._faults()}; start the server, or fix --server or the "
+                "card's base_url"
             )
         self._first, self.model = next(iter(answering.items()))
         for server, model in answering.items():
