@@ -227,6 +227,17 @@ def test_one_version_that_cannot_be_used_hides_no_other(harness: Harness, tmp_pa
         assert all(mark.format(version) in said.out for version in ("mine", "v1", "v3"))
 
 
+def test_a_version_whose_name_breaks_a_line_breaks_none(harness: Harness, tmp_path: Path) -> None:
+    harness("init", "mine")
+    os.chdir("mine")
+    Path("prompts/mine").rename("prompts/a\nb")
+    said = harness("prompt", "list")
+    assert (said.code, said.err.count("\n")) == (2, 1)
+    assert "prompt a\\nb has a name of more than plain signs; rename its folder" in said.err
+    assert len(said.out.splitlines()) == len(versions.names())
+    assert harness("prompt", "show", "a\nb", "--scene", "00000-0").err.count("\n") == 1
+
+
 def test_the_version_is_printed(harness: Harness) -> None:
     assert harness("--version") == Said(0, f"harness {__version__}\n", "")
 

@@ -59,7 +59,7 @@ def list_prompts(as_json: options.Json = False) -> None:
         for row in rows:
             state = "wrong" if "error" in row else "released" if row["released"] else "draft"
             about = printable(row.get("description", "cannot be used: see below"), 57)
-            typer.echo(f"{row['version']:<12} {state:<9} {about}")
+            typer.echo(f"{printable(row['version']):<12} {state:<9} {about}")
     if wrong := [row["error"] for row in rows if "error" in row]:
         raise UserError("; ".join(wrong))
 

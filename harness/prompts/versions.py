@@ -258,6 +258,8 @@ def load(version: str, where: Path | None = None) -> Prompt:
     """
     if version not in names(where):
         raise unknown("prompt", version, names(where))
+    if not version.isprintable():  # it is in many a line
+        raise UserError(f"prompt {printable(version)} has a name of more than plain signs; rename its folder")
     base = _base(version, where)
     optional = [name for name in (EXAMPLES, ANSWER) if os.path.lexists(base / version / name)]
     texts = {name: _text(base / version / name) for name in (*FILES, *optional)}
