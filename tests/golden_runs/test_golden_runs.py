@@ -13,6 +13,7 @@ import adapter
 import comparing
 import playing
 import pytest
+from former import DATASET
 
 DATA = Path(__file__).parent / "data"
 COMPLETIONS = DATA / "completions.jsonl"
@@ -29,25 +30,26 @@ def conditions(*names: str) -> list[str]:
     return [part for name in names for part in ("--condition", name)]
 
 
+EVAL = ("eval", "--dataset", DATASET)
 FROZEN = {
     "frozen-proxy": [
-        "eval", "--limit", "6", "--seeds", "0:3", *conditions(*PAPER, "6g:consensus=log-pool"),
+        *EVAL, "--limit", "6", "--seeds", "0:3", *conditions(*PAPER, "6g:consensus=log-pool"),
     ],
     "frozen-faulty": [
-        "eval", "--model", "proxy-faulty", "--limit", "5", "--seeds", "0,7",
+        *EVAL, "--model", "proxy-faulty", "--limit", "5", "--seeds", "0,7",
         *conditions(
             "single-local:fallback=brake", "6g:on_demand=true", "6g:max_helpers=2,density_coupled=true",
             "v2x:helper_rounds=true", "v2x:edge=relay,window_s=0.3",
         ),
     ],
     "frozen-local-view": [
-        "eval", "--model", "local-view", "--limit", "6", "--seeds", "0:2", *conditions(*PAPER),
+        *EVAL, "--model", "local-view", "--limit", "6", "--seeds", "0:2", *conditions(*PAPER),
     ],
     "frozen-tiny-json": [
-        "eval", *PLAYED, "--limit", "4", "--seeds", "0:2", *conditions(*PAPER, EGO_PROMPT),
+        *EVAL, *PLAYED, "--limit", "4", "--seeds", "0:2", *conditions(*PAPER, EGO_PROMPT),
     ],
     "frozen-tiny-readout": [
-        "eval", *PLAYED, "--limit", "4", "--seeds", "0:2", "--answer", "readout", "--letters", "raw",
+        *EVAL, *PLAYED, "--limit", "4", "--seeds", "0:2", "--answer", "readout", "--letters", "raw",
         *conditions(*PAPER),
     ],
 }  # fmt: skip
