@@ -59,7 +59,7 @@ def test_a_line_fits_eighty_columns_and_tells_all(label: str, grows: bool) -> No
 TYPED = """
 import sys, time
 from harness.cli import progress
-progress.LINE_S, progress.SETTLE_S = 0.2, 0.01
+progress.LINE_S, progress.SETTLE_S = 0.2, 0.1
 with progress.bar("asking", 30, quiet="quiet" in sys.argv) as bar:
     bar(10)
     bar.more(10)
