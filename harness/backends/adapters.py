@@ -11,7 +11,7 @@ from typing import Any
 
 from harness.backends.card import Card
 from harness.core.errors import UserError, one_line, printable
-from harness.core.files import text_of
+from harness.core.files import bytes_of, text_of
 from harness.core.resources import find
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
@@ -92,7 +92,7 @@ def merge(card: Card, model: Any) -> None:
     if (file := find_tensors(card)) is None:
         return
     import torch
-    from safetensors.torch import load_file
+    from safetensors.torch import load
 
     config = read_config(file.parent, card.shown)
     rank = int(config["r"])
@@ -100,7 +100,7 @@ def merge(card: Card, model: Any) -> None:
     output = model.get_output_embeddings()
     tied = output is not None and output.weight is model.get_input_embeddings().weight
     try:
-        tensors = load_file(file)
+        tensors = load(bytes_of(file, "weights"))
         names = [name.removesuffix(A) for name in tensors if name.endswith(A)]
         if not names or 2 * len(names) != len(tensors):
             raise ValueError(f"{len(tensors)} tensors, of which {len(names)} are {A}")

@@ -276,7 +276,7 @@ def test_what_was_read_in_a_recovered_answer_is_marked(opened, report, index):
 
 def test_the_matrix_is_sorted_by_a_click_on_a_head(opened, report):
     page = opened(report, "#matrix")
-    table = page.locator("table.sortable")
+    table = page.locator("#matrix table.sortable")
 
     def column():
         cells = table.locator("tbody tr td:nth-child(6)")

@@ -104,7 +104,7 @@ def test_the_same_seed_is_the_same_episode_whatever_ran_before_in_the_process():
     finally:
         IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN = defaults
     code = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
+        f"import sys; sys.path[:0] = {[str(folder) for folder in Path(__file__).parents[:2]]!r}; "
         "from harness.core.files import digest; import test_world as t; "
         "print(digest(t.trajectory(t.ONCOMING)))"
     )
