@@ -92,10 +92,6 @@ NOT_RUN = {
     "harness model distill occluded-intersection:witnesses=each,radio_share=0.25,limits=2,perception=2"
     " --base smollm2-135m --lora --prompt v9 --samples 0,20000,0,0 --out models/driver": "needs weights",
     "harness eval --model models/driver --engine transformers --prompt v9 --answer readout": "needs them",
-    "harness model distill $S --base smollm2-135m --lora --prompt v9 --samples 0,96000,12800,0 --batch 128"
-    " --report 3 --device cuda --dtype bfloat16 --out models/adapted": "needs a GPU",
-    "harness model distill $S --base smollm2-135m --prompt v9 --samples 0,64000,0,0 --batch 128 --report 3"
-    " --device cuda --dtype bfloat16 --out models/whole": "needs a GPU",
     "harness model check qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b": "needs those weights",
     "harness eval --model my-served --server http://gpu-1:8000/v1 --server http://gpu-2:8000/v1"
