@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
-from pages import harness, write_tables
+from pages import harness, markdown, write_tables
 
 from harness.coordination.contents import CONTENTS
 from harness.core.arrays import Bools, Floats
@@ -64,8 +64,7 @@ class Row(NamedTuple):
     @property
     def datasets(self) -> Sequence[str]:
         """The datasets of its families."""
-        named = suites.named(self.dataset)
-        return named.datasets if named else (self.dataset,)
+        return suites.datasets(self.dataset)
 
 
 ROWS = (
@@ -172,18 +171,14 @@ def written(row: Row, study: Study, driven: Mapping[str, Outcome]) -> str:
     counted = study.about[0].split(". ")[0]
     parts = [f"### {row.model} · {row.prompt} · {row.answer}", *study.headline, f"{counted}."]
     for table in (first, *tables[1:]):
-        parts += [f"**{table.title}**", markdown(table)]
+        parts += [f"**{table.title}**", in_markdown(table)]
     return "\n\n".join(parts)
 
 
-def markdown(table: Table) -> str:
+def in_markdown(table: Table) -> str:
     """Return a table of the study in Markdown."""
-
-    def line(cells: Sequence[str]) -> str:
-        plain = [cell.striptags() if isinstance(cell, Markup) else cell for cell in cells]
-        return f"| {' | '.join(plain)} |"
-
-    return "\n".join([line(table.heads), f"|---|{'--:|' * (len(table.heads) - 1)}", *map(line, table.rows)])
+    rows = ([cell.striptags() if isinstance(cell, Markup) else cell for cell in row] for row in table.rows)
+    return markdown(table.heads, rows)
 
 
 if __name__ == "__main__":

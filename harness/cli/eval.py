@@ -9,7 +9,7 @@ import typer
 
 from harness.cli import options, repeats, suite
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show
-from harness.cli.terminal import echo_json
+from harness.cli.terminal import echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
 from harness.core.seeds import stated
 from harness.evaluate.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
@@ -47,12 +47,7 @@ def command(
         help="Only render the prompts and count requests and tokens; write nothing.",
         rich_help_panel=OUTPUT,
     ),
-    tokenizer: Path | None = typer.Option(
-        None,
-        help="With --dry-run: tokenizer to count with: a tokenizer.json, its folder, or a GGUF file. "
-        "Default: the model's.",
-        rich_help_panel=OUTPUT,
-    ),
+    tokenizer: options.Tokenizer = None,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
 ) -> None:
@@ -66,7 +61,7 @@ def command(
 
     world: Any = settings.world
     named = suites.named(world.dataset)
-    sources = [resolve.frozen(world, name) for name in (named.datasets if named else (world.dataset,))]
+    sources = [resolve.frozen(world, name) for name in suites.datasets(world.dataset)]
     frozen = [source.dataset for source in sources]
     options.say_all(world.limit, frozen)
     specs = [resolve.spec(settings, source) for source in sources]
@@ -147,7 +142,4 @@ def _show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
         f"on the reference drivers' courses; would score {len(spec.points)} conditions × {len(spec.seeds)} "
         "channel seeds; no model was called"
     )
-    for role, s in (counted["prompt_tokens"] or {}).items():
-        typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
-    if not counted["prompt_tokens"]:
-        typer.echo("prompt tokens not counted: no tokenizer here; give --tokenizer (tokenizer.json or GGUF)")
+    echo_prompt_tokens(counted["prompt_tokens"])

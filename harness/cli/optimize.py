@@ -16,7 +16,7 @@ from msgspec import structs, to_builtins
 from harness.cli import options
 from harness.cli.progress import Bar, bar
 from harness.cli.show import finish
-from harness.cli.terminal import echo_json
+from harness.cli.terminal import echo_json, echo_prompt_tokens
 from harness.core import extras, resources, work
 from harness.core.errors import UserError, in_range, printable
 from harness.core.formats import WORK
@@ -65,12 +65,7 @@ def command(
         help="Only count requests and tokens; ask no model, and write nothing.",
         rich_help_panel=OUTPUT,
     ),
-    tokenizer: Path | None = typer.Option(
-        None,
-        help="With --dry-run: tokenizer to count with: a tokenizer.json, its folder, or a GGUF file. "
-        "Default: the model's.",
-        rich_help_panel=OUTPUT,
-    ),
+    tokenizer: options.Tokenizer = None,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
 ) -> None:
@@ -81,7 +76,7 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.backends.registry import open_backend
-    from harness.dataset import load
+    from harness.dataset import load, suites
     from harness.dataset.verify import read_manifest, scenario_of
     from harness.evaluate import resolve
     from harness.prompts import versions as prompts
@@ -91,7 +86,7 @@ def command(
     extras.need("harness prompt optimize", "matplotlib", *(() if tune else ("highway_env",)))
     extras.need("--reflect", *(("gepa",) if reflect else ()))
     settings = structs.replace(settings, condition=settings.condition or (CONDITION,))
-    names = _datasets(settings.world)
+    names = suites.datasets(settings.world.dataset)  # type: ignore[union-attr]
     manifests = [read_manifest(load.find(name)) for name in names]  # their layouts stay unread
     scenarios = [scenario_of(manifest) for manifest, _ in manifests]
     for name, (manifest, _) in zip(names, manifests, strict=True):
@@ -144,13 +139,6 @@ def command(
     if not silent and Path("prompts", out).is_dir():
         typer.echo(f"wrote prompts/{printable(out)}, sha256 {prompts.load(out).sha256}; a draft")
     work.tidy(where)
-
-
-def _datasets(world: Any) -> list[str]:
-    from harness.dataset import suites
-
-    named = suites.named(world.dataset)
-    return list(named.datasets) if named else [world.dataset]
 
 
 def _report(settings: Settings, names: Sequence[str]) -> "list[Spec]":
@@ -281,8 +269,5 @@ def _show_counted(counted: dict[str, Any], engine: str) -> None:
         f"certificate: up to {counted['certificate_questions']} questions on report layouts, both prompts"
     )
     for each in counted["prompt_tokens"]:
-        for role, s in (each or {}).items():
-            typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
-        if not each:
-            typer.echo("prompt tokens not counted: no tokenizer here; give --tokenizer")
+        echo_prompt_tokens(each)
     typer.echo("no model was called, and no report layout was read")

@@ -125,6 +125,14 @@ NoCache = Annotated[
         rich_help_panel=stated.ENGINE,
     ),
 ]
+Tokenizer = Annotated[
+    Path | None,
+    Option(
+        help="With --dry-run: tokenizer to count with: a tokenizer.json, its folder, or a GGUF file. "
+        "Default: the model's.",
+        rich_help_panel=stated.OUTPUT,
+    ),
+]
 Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
 _QUIET = "Print only errors, and the JSON of --json."
 Quiet = Annotated[bool, Option("--quiet", help=_QUIET)]

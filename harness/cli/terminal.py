@@ -31,6 +31,14 @@ def echo_wrong(name: str, error: UserError) -> None:
     typer.echo(f"{printable(name)} · wrong\n  {error}")
 
 
+def echo_prompt_tokens(counted: Mapping[str, Mapping[str, Any]] | None) -> None:
+    """Print what a dry run counted of prompts, by role, or that there was nothing to count with."""
+    for role, s in (counted or {}).items():
+        typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
+    if not counted:
+        typer.echo("prompt tokens not counted: no tokenizer here; give --tokenizer (tokenizer.json or GGUF)")
+
+
 def echo_each(
     things: Mapping[str, Thing | UserError], as_json: bool, plain: Callable[[Thing], dict[str, Any]],
     show: Callable[[str, Thing], None],

@@ -3,7 +3,7 @@
 `datasets/suites.toml` has one table for each suite: its description and the names of its datasets.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -56,6 +56,12 @@ def named(text: str) -> Suite | None:
     if not isinstance(table, Mapping):
         raise UserError(f"{where} is no table; give it a description and datasets")
     return convert(table, Suite, where, name=name)
+
+
+def datasets(text: str) -> Sequence[str]:
+    """Return the datasets that `--dataset` names: those of a suite, or one. Raises what `named` raises."""
+    suite = named(text)
+    return suite.datasets if suite else (text,)
 
 
 def _tables(file: Path) -> dict[str, Any]:
