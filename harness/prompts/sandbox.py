@@ -6,7 +6,7 @@ from typing import Any
 from jinja2 import nodes
 from jinja2.compiler import Frame, optimizeconst
 from jinja2.exceptions import SecurityError
-from jinja2.runtime import Context
+from jinja2.runtime import Context, LoopContext
 
 from harness.core import templates
 
@@ -23,6 +23,7 @@ SHORTENING = frozenset({
     "trim", "truncate", "upper",
 })  # fmt: skip
 NUMBERS = frozenset({"float", "int", "length"})  # filters that return one
+OF_A_LOOP = frozenset({"first", "index", "index0", "last"})  # what a loop says of its place
 LONGEST_CHAIN = 3  # filters one after another that need not pay
 
 
@@ -144,6 +145,8 @@ class Sandbox(templates.Sandbox):
 
     def call_binop(self, context: Context | None, operator: str, left: Any, right: Any) -> Any:
         """Allow products, powers and remainders of numbers only, and only small powers."""
+        if type(left) is float and operator in ("+", "-", "*") and type(right) in (float, int):
+            return self.binop_table[operator](left, right)  # costs nothing; the rest takes a microsecond
         if operator in ("*", "**", "%"):
             numbers = all(isinstance(side, int | float) for side in (left, right))
             if not numbers or (operator == "**" and not (abs(left) < 1e6 and abs(right) < 64)):
@@ -157,6 +160,8 @@ class Sandbox(templates.Sandbox):
         # Nearly all that a template reads is plain data, which needs no check of the sandbox.
         if type(obj) is dict and attribute in obj:
             return obj[attribute]
+        if type(obj) is LoopContext and attribute in OF_A_LOOP:
+            return getattr(obj, attribute)
         if isinstance(obj, str) and attribute in PADDING:
             return self.unsafe_undefined(obj, attribute)
         return super().getattr(obj, attribute)
