@@ -34,6 +34,7 @@ from harness.dataset import load
 from harness.evaluate import asking, run, walk
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.kept_answers import KeptAnswers
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.prompts.versions import Prompt
@@ -49,7 +50,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "parse": [(asking, "parse")],
     "coordinate": [(walk, "exchange"), (walk, "fuse")],
     "record": [
-        (asking, "_keep"), (run, "table"), (run, "_gather"),
+        (KeptAnswers, "append"), (run, "table"), (run, "_gather"),
         (folders, "part_files"), (folders, "write_part"),
     ],
 }  # fmt: skip
