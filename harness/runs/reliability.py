@@ -25,7 +25,7 @@ LEAST_P = 0.005  # least probability of the optimal actions that is counted in a
 BINS = 15  # of equal mass
 RISK = 0.05  # greatest share of decisions acted on whose action is not optimal
 RESAMPLES = 399  # of episodes
-AT_ONCE = 4_000_000  # how many numbers are in memory at once
+AT_ONCE = 1 << 17  # how many numbers of resamples are summed at once: they stay in a core's cache
 
 
 def mass(p: Floats, optimal: Bools) -> Floats:
@@ -118,7 +118,13 @@ def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
 
 def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
     """Return a figure of decisions in so many episodes, with its interval over these."""
-    return _estimate([figure(*sums) for sums in _sums(judged, episodes)], judged, episodes)
+    return estimates(judged, [figure], episodes)[0]
+
+
+def estimates(judged: Judged, figures: Sequence[Figure], episodes: int) -> list[Estimate]:
+    """Return some figures of the same decisions, as `estimate` does each; they share the resamples."""
+    values = [[figure(*sums) for figure in figures] for sums in _sums(judged, episodes)]
+    return [_estimate([part[n] for part in values], judged, episodes) for n in range(len(figures))]
 
 
 def difference(a: Judged, b: Judged, figure: Figure, episodes: int) -> tuple[float, float, Estimate]:
@@ -158,13 +164,14 @@ def _sums(judged: Judged, episodes: int) -> Iterator[tuple[Floats, Floats, Float
     starts = np.flatnonzero(np.diff(sure, prepend=np.inf))
     weights = resampled(generator("reliability", episodes), episodes, RESAMPLES)
     weights = weights[weights[:, np.unique(episode)].any(axis=1)]  # resamples that have any decision
-    parts = np.array_split(weights, math.ceil(len(weights) * len(sure) / AT_ONCE))
+    at_once = max(1, AT_ONCE // len(sure))
+    parts = np.split(weights.astype(float), range(at_once, len(weights), at_once))
 
     def by_level(values: Floats) -> Floats:
         return np.asarray(np.add.reduceat(values, starts, axis=1))
 
     for part in parts:
-        count = part[:, episode].astype(float)
+        count = part[:, episode]
         yield by_level(count), by_level(count * hits), by_level(count * sure)
 
 

@@ -44,7 +44,7 @@ from harness.runs.metrics import (
     sum_by_place,
 )
 from harness.runs.records import Answer, AnswerFacts, Episode, Score
-from harness.runs.reliability import Judged, estimate
+from harness.runs.reliability import Judged, estimates
 
 
 @dataclass(frozen=True)
@@ -142,11 +142,12 @@ def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
 
 def _of_judged(grid: Grid, judged: Sequence[Judged]) -> Iterator[Score]:
     """Yield each condition's figures of all decisions, where any is known."""
+    pooled = {metric.name: metric.pooled for metric in METRICS.values() if metric.pooled}
     for condition, decisions in zip(grid.conditions, judged, strict=True):
-        for metric in METRICS.values():
-            if metric.pooled and len(decisions.sure):
-                figure = in_range(metric.name, estimate(decisions, metric.pooled, len(grid.episodes)))
-                yield Score.of(condition, metric.name, figure, "episodes")
+        if len(decisions.sure):
+            figures = estimates(decisions, list(pooled.values()), len(grid.episodes))
+            for name, figure in zip(pooled, figures, strict=True):
+                yield Score.of(condition, name, in_range(name, figure), "episodes")
 
 
 def _gains(
