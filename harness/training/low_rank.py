@@ -34,7 +34,7 @@ class LowRank(torch.nn.Module):  # type: ignore[misc]
         self.b = torch.nn.Parameter(torch.zeros(rows, rank))
 
     def forward(self, x: Any) -> Any:
-        return self.kept(x) + SCALE * ((x @ self.a.T) @ self.b.T)
+        return self.kept(x) + (x @ self.a.T) @ (SCALE * self.b.T)
 
 
 def widen(model: Any, rank: int, seed: int) -> None:

@@ -46,6 +46,8 @@ class Published:
         where = checkpoint(card)
         hub, self.model = load(card, where, dtype="float32", device=device)
         self.card, self.hub = card, hub
+        if torch.device(device).type == "cpu":  # whose fused attention goes back more slowly than matrices do
+            self.model.set_attn_implementation("eager")
         self.sha256 = _digest(card, where)
         self.chat = Chat(card.name, HubTokenizer(hub), None, card.system)
         stops = self.chat.ends or (hub.eos_token_id,)

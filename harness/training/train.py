@@ -154,7 +154,8 @@ def _optimizers(model: Any, plan: Plan) -> tuple[list[Any], list[float]]:
 
 def learnt(model: Any) -> dict[str, Any]:
     """Return a model's state without the weights that do not learn."""
-    frozen = {name for name, p in model.named_parameters() if not p.requires_grad}
+    every = model.named_parameters(remove_duplicate=False)  # an output embedding may be the input's as well
+    frozen = {name for name, p in every if not p.requires_grad}
     return {name: value for name, value in model.state_dict().items() if name not in frozen}
 
 
