@@ -21,6 +21,7 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.seeds import Purpose, purposes, stated
+from harness.runs.success import Success, alike
 from harness.studies.choices import Choices, Choose, choices
 from harness.studies.replayed_run import ReplayedRun
 
@@ -115,12 +116,16 @@ def by_network(tree: Choices, point: OperatingPoint, network: Network, threshold
 def tuned(
     network: Network, tune: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]
 ) -> float:
-    """Return the threshold with the most success on tune layouts, averaged over runs; the highest such."""
+    """Return the threshold with the most success on tune layouts, as it counts, averaged over runs.
+
+    Of equals it is the highest.
+    """
     success = np.zeros(len(THRESHOLDS))
     looks = point.changed(schedule="coverage", threshold=None)
-    for stored in tune:
+    for stored, counting in zip(tune, alike([Success(run.dataset.dangerous) for run in tune]), strict=True):
         tree = choices(stored, point, stored.seeds, progress)
-        success += [tree.played(by_network(tree, looks, network, each))[0].mean() for each in THRESHOLDS]
+        rules = [by_network(tree, looks, network, each) for each in THRESHOLDS]
+        success += [counting.mean(tree.played(rule)[0]) for rule in rules]
     return THRESHOLDS[int(np.flatnonzero(np.isclose(success, success.max()))[-1])]
 
 

@@ -18,15 +18,16 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core import noise
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
-from harness.core.figures import shown
+from harness.core.figures import DASH, shown
 from harness.core.progress import Progress
-from harness.core.statistics import Estimate, resampled, resampled_estimate
+from harness.core.statistics import Estimate, resampled_estimate
 from harness.core.versions import versions
 from harness.report.document import Table
 from harness.report.drawing.colours import COLOURS, INK, MARKERS
-from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
+from harness.runs.leading import BALANCED
+from harness.runs.success import Success, alike
 from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.figures.points import Steps, fronts
 from harness.studies.learning import layouts
@@ -64,11 +65,20 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Play:
-    """The outcome of a candidate: success, (S, E), and `COSTS`, (S, E, C), of every episode."""
+    """The outcome of a candidate: success, (S, E), and `COSTS`, (S, E, C), of every episode.
+
+    Success counts as `counting` says; costs are means over all episodes.
+    """
 
     candidate: Candidate
     success: Floats
     costs: Floats
+    counting: Success
+
+    @property
+    def rate(self) -> float:
+        """Success, as it counts."""
+        return self.counting.mean(self.success)
 
     def of(self, cost: str) -> Floats:
         """Return one of `COSTS` of every episode, (S, E)."""
@@ -87,11 +97,13 @@ class Play:
         return {**means, "latency_ms": means["latency_ms"] / decisions}
 
 
-def plays(choices: Choices, point: OperatingPoint, candidates: Sequence[Candidate]) -> list[Play]:
+def plays(
+    choices: Choices, point: OperatingPoint, candidates: Sequence[Candidate], counting: Success
+) -> list[Play]:
     """Play candidates of one schedule; what asking is worth by it is worked out once."""
     worths = choices.worths(candidates[0].at(point))
     rules = [choices.scheduled(candidate.at(point), worths) for candidate in candidates]
-    return [Play(c, *choices.played(rule)) for c, rule in zip(candidates, rules, strict=True)]
+    return [Play(c, *choices.played(rule), counting) for c, rule in zip(candidates, rules, strict=True)]
 
 
 def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[Candidate]:
@@ -111,7 +123,8 @@ class Chosen:
     """A schedule's chosen candidate, and what it is worth."""
 
     play: Play  # it, and success and costs of every episode
-    success: Estimate  # of episodes
+    success: Estimate  # of episodes, as it counts
+    plain: Estimate  # the same over all episodes alike
     over_paper: Estimate  # success less that of the paper's schedule
     # of no such difference, by Holm's method for all schedules of the run; None without an interval, and for
     # the paper's own and the oracle
@@ -151,11 +164,15 @@ class Compared:
         threshold = self.point.ask.tau_nats if schedule == PAPER else SCHEDULES[schedule].threshold
         return Candidate(schedule, threshold, self.point.ask.max_helpers)
 
+    @property
+    def counting(self) -> Success:
+        """How success counts."""
+        return self.oracle.counting
+
     @cached_property
-    def weights(self) -> Floats:
-        """The weight of each episode, as played and in each resample, (1 + RESAMPLES, E)."""
-        n = self.oracle.success.shape[1]
-        return np.asarray(resampled(noise.generator("schedule", "episodes"), n, RESAMPLES) / n)
+    def counts(self) -> Ints:
+        """How often each episode counts, as played and in each resample, (1 + RESAMPLES, E)."""
+        return self.counting.resampled(noise.generator("schedule", "episodes"), RESAMPLES)
 
     def chosen(self, schedule: str) -> Play:
         """Return the play with the most success on tune layouts within the budget; of equals the cheapest.
@@ -167,7 +184,7 @@ class Compared:
         budget = self.budget * _at(self.tune[PAPER], self._untuned(PAPER)).messages.mean()
         cheapest = min(self.tune[schedule], key=lambda play: play.messages.mean())
         within = [play for play in self.tune[schedule] if play.messages.mean() <= budget] or [cheapest]
-        best = max(within, key=lambda play: (round(float(play.success.mean()), 9), -play.messages.mean()))
+        best = max(within, key=lambda play: (round(play.rate, 9), -play.messages.mean()))
         return _at(self.plays[schedule], best.candidate)
 
     @property
@@ -193,7 +210,7 @@ class Compared:
         """A schedule's plays, and never asking, each with its success on tune layouts, else its own."""
         every = [self.plays[NEVER][0], *(self.plays[schedule] if schedule != NEVER else ())]
         tuned = {play.candidate: play for of in self.tune.values() for play in of}
-        return [(play, float(tuned.get(play.candidate, play).success.mean())) for play in every]
+        return [(play, tuned.get(play.candidate, play).rate) for play in every]
 
     def oracle_front(self) -> list[Play]:
         """Return the oracle where a success may cost so many messages at most, from none on."""
@@ -201,14 +218,15 @@ class Compared:
         cheap = [bound.messages <= cap for cap in range(int(bound.messages.max()) + 1)]
         costs = [np.where(of[..., None], bound.costs, alone) for of in cheap]
         return [
-            Play(bound.candidate, bound.success * of, spent) for of, spent in zip(cheap, costs, strict=True)
+            Play(bound.candidate, bound.success * of, spent, bound.counting)
+            for of, spent in zip(cheap, costs, strict=True)
         ]
 
     def area(self, schedule: str, cost: str = "messages") -> Estimate:
         """Return success averaged over budgets beyond never asking, with a bootstrap over episodes."""
-        of_bound = [(play, float(play.success.mean())) for play in self.oracle_front()]
+        of_bound = [(play, play.rate) for play in self.oracle_front()]
         ranked = of_bound if schedule == ORACLE else self._ranked(schedule)
-        success = self._resampled([play.success for play, _ in ranked])
+        success = self._successes([play for play, _ in ranked])
         least = self._resampled([self.plays[NEVER][0].of(cost)])
         spent = self._resampled([play.of(cost) for play, _ in ranked]) - least
         most = self._resampled([self.everybody.of(cost)]) - least
@@ -216,31 +234,35 @@ class Compared:
         return self._interval(_area(success, np.clip(spent, 0.0, most), ranks, most[:, 0]))
 
     def _interval(self, values: Floats) -> Estimate:
-        return resampled_estimate(values, self.weights.shape[1])
+        return resampled_estimate(values, self.counts.shape[1])
 
     def _resampled(self, values: Sequence[Floats]) -> Floats:
         """Return means of values (S, E) in each resample, (1 + RESAMPLES, P)."""
-        return np.asarray(self.weights @ np.array([each.mean(axis=0) for each in values]).T)
+        return _means(self.counts / self.counts.shape[1], values)
+
+    def _successes(self, plays: Sequence[Play]) -> Floats:
+        """Return success of plays, as it counts, in each resample, (1 + RESAMPLES, P)."""
+        return _means(self.counting.weights(self.counts), [play.success for play in plays])
 
     @cached_property
     def regret(self) -> Estimate:
         """Success of the oracle less that of the paper's schedule."""
-        return difference(SUCCESS, self.oracle.success.T, self.paper.success.T)
+        return self.counting.difference(self.oracle.success, self.paper.success)
 
     @cached_property
     def rows(self) -> list[Chosen]:
         """The paper's schedule, the chosen candidate of every one, and last the oracle."""
         plays = [self.paper, *map(self.chosen, self.names), self.oracle]
-        raw = [p_value(SUCCESS, play.success.T, self.paper.success.T) for play in plays[1:-1]]
+        raw = [self.counting.p_value(play.success, self.paper.success) for play in plays[1:-1]]
         return [self._row(play, p) for play, p in zip(plays, [None, *corrected(raw), None], strict=True)]
 
     def _row(self, play: Play, p: float | None) -> Chosen:
-        success = self._resampled([play.success, self.paper.success, self.oracle.success])
+        counting, success = self.counting, self._successes([play, self.paper, self.oracle])
         messages = self._resampled([play.messages, self.paper.messages])
         return Chosen(
-            play, over_episodes(SUCCESS, play.success),
-            difference(SUCCESS, play.success.T, self.paper.success.T), p,
-            difference(SUCCESS, play.success.T, self.random_like(play).T),
+            play, counting.estimate(play.success), counting.plain.estimate(play.success),
+            counting.difference(play.success, self.paper.success), p,
+            counting.difference(play.success, self.random_like(play)),
             self._interval(_ratio(success[:, 0] - success[:, 1], success[:, 2] - success[:, 1])),
             self._interval(_ratio(messages[:, 0], messages[:, 1])), self.area(play.candidate.schedule),
             self.area(play.candidate.schedule, "energy_j"),
@@ -260,11 +282,17 @@ class Compared:
         return np.asarray((1 - part) * ladder[above - 1].success + part * ladder[above].success)
 
 
+def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:
+    """Return how success counts in runs that are read together."""
+    return dict(zip(runs, alike([Success(run.dataset.dangerous) for run in runs]), strict=True))
+
+
 def compare(
     stored: ReplayedRun, tune: ReplayedRun | None, point: OperatingPoint, names: Sequence[str],
-    seeds: Sequence[int], budget: float, progress: Callable[[int], None],
+    seeds: Sequence[int], budget: float, counting: Mapping[ReplayedRun, Success],
+    progress: Callable[[int], None],
 ) -> Compared:  # fmt: skip
-    """Play every schedule on a run, and on one on tune layouts.
+    """Play every schedule on a run, and on one on tune layouts; `counting` is how success counts in each.
 
     What is tried of a schedule follows from the run on tune layouts, where there is one. Candidates are
     chosen within `budget`, a share of the messages that the paper's schedule takes.
@@ -280,11 +308,11 @@ def compare(
     tune_plays: dict[str, list[Play]] = {}
     for name in dict.fromkeys((PAPER, NEVER, ALWAYS, RANDOM, *names)):
         tried = candidates(tune_run or run, point, name)
-        run_plays[name] = plays(run, point, tried)
-        if tune_run:
-            tune_plays[name] = plays(tune_run, point, tried)
+        run_plays[name] = plays(run, point, tried, counting[stored])
+        if tune and tune_run:
+            tune_plays[name] = plays(tune_run, point, tried, counting[tune])
         progress(1)
-    bound = Play(Candidate(ORACLE, None, point.ask.max_helpers), *run.oracle())
+    bound = Play(Candidate(ORACLE, None, point.ask.max_helpers), *run.oracle(), counting[stored])
     return Compared(stored.name, point, tuple(names), run_plays, tune_plays, bound, budget)
 
 
@@ -306,13 +334,19 @@ def run_schedules(
         "budget": budget, "seeds": list(seeds),
     })  # fmt: skip
     progress.more(sum(run.dataset.scenario.parameters.decisions for run in every) + len(runs) * len(names))
+    counting = counted(every)
     compared = [
-        compare(run, tune_run, point_of([run], condition), names, seeds, budget, progress)
+        compare(run, tune_run, point_of([run], condition), names, seeds, budget, counting, progress)
         for run, tune_run in zip_longest(runs, tune)
     ]
     for run in every:
         run.settle()
     return compared
+
+
+def _means(weights: Floats, values: Sequence[Floats]) -> Floats:
+    """Return means over seeds and, by weights (B, E), over episodes, of P values (S, E) each, (B, P)."""
+    return np.asarray(weights @ np.array([each.mean(axis=0) for each in values]).T)
 
 
 def _at(plays: Sequence[Play], candidate: Candidate) -> Play:
@@ -344,22 +378,24 @@ def _ratio(part: Floats, whole: Floats) -> Floats:
 SLACK = 1.1  # by which messages may exceed on these layouts what they were on tune layouts
 BUDGETS = {"messages": "messages per episode", "energy_j": "joules per episode"}
 HEADS = (
-    "schedule", "success %", "msgs", "J", "over paper's", "gap closed %", "p", "over random, points",
-    "messages, % of the paper's", "on air, ms", "latency, ms", "area, %", "area over joules, %",
+    "schedule", "balanced %", "success %", "msgs", "J", "over paper's", "gap closed %", "p",
+    "over random, points", "messages, % of the paper's", "on air, ms", "latency, ms", "area, %",
+    "area over joules, %",
 )  # fmt: skip
-JOULES = ("J", "area over joules, %")
+JOULES, IF_BALANCED = ("J", "area over joules, %"), ("balanced %",)
 
 
 def schedule_study(compared: Sequence[Compared], runs: Sequence[ReplayedRun], seeds: Sequence[int]) -> Study:
     """Declare the study of schedules on one or several runs; `runs` are these and those on tune layouts."""
     first, data = compared[0], tables(compared)
+    words = first.counting.words
     tuned = bool(first.tune)
     panels = [
         (f"{run.name}, {run.point.name}", BUDGETS[cost], list(_steps(run, cost)))
         for run in compared for cost in BUDGETS if cost == "messages" or run.energy
     ]  # fmt: skip
     chosen = (
-        "Both were chosen for the most success on tune layouts, within "
+        f"Both were chosen for the most {words} on tune layouts, within "
         f"{100 * first.budget:.0f} % of the paper's messages there."
         if tuned
         else "Both are the defaults of the condition and of the schedule; give a run on tune layouts to have "
@@ -383,7 +419,7 @@ def schedule_study(compared: Sequence[Compared], runs: Sequence[ReplayedRun], se
             "sources": [run.manifest() for run in runs], "condition": first.point.name,
             "schedules": first.names, "budget": first.budget, "seeds": list(seeds), "versions": versions(),
         },
-        data["schedules"], {"fronts": fronts(panels, "success")},
+        data["schedules"], {"fronts": fronts(panels, words)},
         [caveat for run in runs for caveat in run.caveats],
     )  # fmt: skip
 
@@ -395,18 +431,18 @@ def name_of(row: Chosen) -> str:
 
 def headline(compared: Compared) -> list[str]:
     """Say the paper's regret, and what the best schedule within half of its messages closes."""
-    regret, bound = compared.regret, compared.oracle.means["messages"]
+    regret, bound, words = compared.regret, compared.oracle.means["messages"], compared.counting.words
     sentences = [
-        f"{compared.name}, {compared.point.name}: the oracle succeeds {shown(regret)} points more often than "
-        f"entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} episodes), with {bound:.1f} instead "
-        f"of {compared.paper.means['messages']:.1f} messages per episode."
+        f"{compared.name}, {compared.point.name}: {words} of the oracle is {shown(regret)} points above that "
+        f"of entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} episodes), with {bound:.1f} "
+        f"instead of {compared.paper.means['messages']:.1f} messages per episode."
     ]
     within = [row for row in compared.rows[1:-1] if row.messages.value <= SLACK * compared.budget]
     if compared.tune and within:
         best = max(within, key=lambda row: row.success.value)
         sentences.append(
             f"Chosen on tune layouts within {100 * compared.budget:g} % of the paper's messages, "
-            f"{name_of(best)} succeeds most often, in {shown(best.success)} %, a difference of "
+            f"{name_of(best)} has the most {words}, {shown(best.success)} %, a difference of "
             f"{shown(best.over_paper)} points from the paper's schedule: it closes {shown(best.closed)} % "
             f"of that gap with {shown(best.messages)} % of the messages."
         )
@@ -417,7 +453,7 @@ def _steps(run: Compared, cost: str) -> Iterator[Steps]:
     """Yield the settings that are taken as the budget grows."""
 
     def steps(label: str, plays: Sequence[Play], **look: Any) -> Steps:
-        success = [100 * float(play.success.mean()) for play in plays]
+        success = [100 * play.rate for play in plays]
         return Steps(label, [play.means[cost] for play in plays], success, look)
 
     for n, name in enumerate(name for name in run.names if name != NEVER):
@@ -431,26 +467,32 @@ def _steps(run: Compared, cost: str) -> Iterator[Steps]:
 
 
 def _table(run: Compared) -> Table:
-    heads = [head for head in HEADS if run.energy or head not in JOULES]
+    words, balanced = run.counting.words, run.counting.metric == BALANCED
+    plain = "success %" if balanced else ""  # for which 80 columns have no room beside the other
+    hidden = (*(() if run.energy else JOULES), *(() if balanced else IF_BALANCED))
+    heads = [head for head in HEADS if head not in hidden]
     rows = []
     for n, row in enumerate(run.rows):
-        means = row.play.means
+        means, paper = row.play.means, n == 0  # which is not compared with itself
+        over, closed, share = (
+            DASH if paper else shown(e) for e in (row.over_paper, row.closed, row.messages)
+        )
         cells = (
-            name_of(row) + " (the paper's)" * (n == 0), shown(row.success), f"{means['messages']:.1f}",
-            f"{means['energy_j']:.1f}", shown(row.over_paper), shown(row.closed), p_cell(row.p),
-            shown(row.over_random), shown(row.messages), f"{means['airtime_ms']:.3f}",
-            f"{means['latency_ms']:.1f}", shown(row.area), shown(row.area_j),
+            name_of(row) + " (the paper's)" * paper, shown(row.success), shown(row.plain),
+            f"{means['messages']:.1f}", f"{means['energy_j']:.1f}", over, closed, p_cell(row.p),
+            shown(row.over_random), share, f"{means['airtime_ms']:.3f}", f"{means['latency_ms']:.1f}",
+            shown(row.area), shown(row.area_j),
         )  # fmt: skip
         rows.append([cell for head, cell in zip(HEADS, cells, strict=True) if head in heads])
     return Table(
         f"{run.name}, {run.point.name}", heads, rows,
         "Messages, milliseconds on air and joules are per episode, latency is per decision. Over paper's: "
-        "success less that of the paper's schedule, in points; over random: less that of the schedule "
-        "random with as many messages. Gap: from the paper's schedule to the oracle. Area: success "
-        "averaged over budgets from no message to always asking all; over joules, from the joules of "
-        "asking nobody. p comes from the interval and is corrected by Holm's method for all schedules of "
-        "the table; bold: 0.05 or less. All settings are in "
-        "settings.csv.", terminal=range(heads.index("p")),
+        f"{words} less that of the paper's schedule, in points; over random: less that of the schedule "
+        "random with as many messages. Gap: from the paper's schedule to the oracle. Area: "
+        f"{words} averaged over budgets from no message to always asking all; over joules, from the joules "
+        "of asking nobody. p comes from the interval and is corrected by Holm's method for all schedules of "
+        "the table; bold: 0.05 or less. All settings are in settings.csv.",
+        terminal=[n for n, head in enumerate(heads[: heads.index("p")]) if head != plain],
     )  # fmt: skip
 
 
@@ -468,7 +510,9 @@ def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
 
     schedules = [
         {
-            **place(run, row.play), **ends("success", row.success), "n": row.success.n, **row.play.means,
+            **place(run, row.play), "lead": run.counting.metric, **ends("success", row.plain),
+            **(ends("balanced_success", row.success) if run.counting.metric == BALANCED else {}),
+            "n": row.success.n, **row.play.means,
             **ends("over_paper", row.over_paper), "p_holm": row.p, **ends("over_random", row.over_random),
             **ends("gap_closed", row.closed), **ends("messages_share", row.messages),
             **ends("area", row.area), **ends("area_j", row.area_j),
@@ -477,8 +521,7 @@ def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
     ]  # fmt: skip
     settings = [
         {
-            **place(run, play), "success": float(play.success.mean()), **play.means,
-            "success_on_tune": _on_tune(run, play),
+            **place(run, play), **_rates(play), **play.means, **_on_tune(run, play),
             "on_front": any(play is taken for taken in run.front(play.candidate.schedule)),
         }
         for run in compared for plays in run.plays.values() for play in plays
@@ -486,6 +529,12 @@ def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
     return {"schedules": pd.DataFrame(schedules), "settings": pd.DataFrame(settings)}
 
 
-def _on_tune(run: Compared, play: Play) -> float | None:
+def _rates(play: Play) -> dict[str, float]:
+    balanced = {"balanced_success": play.rate} if play.counting.metric == BALANCED else {}
+    return {"success": float(play.success.mean()), **balanced}
+
+
+def _on_tune(run: Compared, play: Play) -> dict[str, float | None]:
     tuned = {of.candidate: of for of in run.tune.get(play.candidate.schedule, ())}
-    return float(tuned[play.candidate].success.mean()) if tuned else None
+    rates = _rates(tuned[play.candidate]) if tuned else {"success": None}
+    return {f"{name}_on_tune": rate for name, rate in rates.items()}

@@ -27,11 +27,12 @@ from harness.evaluate.walk import walk
 from harness.runs import devices
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, of_decisions
+from harness.runs.success import Success
 from harness.studies import axes
 from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.learning import fit, layouts
 from harness.studies.replayed_run import ReplayedRun
-from harness.studies.schedules import Candidate, Compared, Play, _area, compare
+from harness.studies.schedules import Candidate, Compared, Play, _area, compare, counted
 from harness.world import scenarios
 
 SEED = 100  # of the first layout of `small`
@@ -130,11 +131,16 @@ def test_frozen_and_driven_ask_alike(small: Dataset, tmp_path: Path):
 # -- fronts and areas, by hand -----------------------------------------------------------------------------
 
 
-def play(schedule: str, most: int, threshold: float | None, success: Any, messages: Any) -> Play:
+PLAIN = Success(np.zeros(4, dtype=bool))
+
+
+def play(
+    schedule: str, most: int, threshold: float | None, success: Any, messages: Any, counting: Success = PLAIN
+) -> Play:
     """One seed. An episode takes 10 J, and 5 J a message."""
     n, joules = len(success), 10.0 + 5.0 * np.array(messages)
     costs = np.array([messages, [0.1] * n, [150.0] * n, [1.0] * n, joules]).T
-    return Play(Candidate(schedule, threshold, most), np.array([success], dtype=float), costs[None])
+    return Play(Candidate(schedule, threshold, most), np.array([success], dtype=float), costs[None], counting)
 
 
 def by_hand(tune: bool = True) -> Compared:
@@ -164,6 +170,40 @@ def test_a_setting_is_chosen_on_tune_layouts_within_the_budget():
     assert compared.chosen("entropy").candidate.most == 1
     assert compared.chosen("always").candidate.most == 1, "none is within the budget: the cheapest"
     assert by_hand(tune=False).chosen("entropy").candidate.most == 2, "the point's own"
+
+
+def balanced() -> Compared:
+    """One episode of four has a danger. Entropy with two helpers wins more often, with one where it counts.
+
+    Balanced, two helpers have 1/2 (1 + 0) and one has 1/2 (1/3 + 1).
+    """
+    counting, once = Success(np.array([True, False, False, False])), by_hand()
+    plays = {name: [replace(p, counting=counting) for p in of] for name, of in once.plays.items()}
+    plays["entropy"] = [
+        play("entropy", 2, 0.7, [0, 1, 1, 1], [1] * 4, counting),
+        play("entropy", 1, 0.7, [1, 1, 0, 0], [1] * 4, counting),
+    ]
+    return replace(once, plays=plays, tune=plays, budget=1.0, oracle=replace(once.oracle, counting=counting))
+
+
+def test_balanced_success_chooses_ranks_and_is_averaged_over_budgets():
+    """Never has 1/2 (1 + 0), entropy with one helper 2/3, from 1 message of 4 on."""
+    compared = balanced()
+    assert compared.chosen("entropy").candidate.most == 1
+    assert [(p.candidate.schedule, p.candidate.most) for p in compared.front("entropy")] == [
+        ("never", 1), ("entropy", 1),
+    ]  # fmt: skip
+    assert compared.area("entropy").value == pytest.approx((1 / 2 + 3 * 2 / 3) / 4)
+    paper, one, bound = compared.rows
+    assert (paper.success.value, paper.plain.value) == (0.5, 0.75)
+    assert (one.success.value, one.plain.value) == (pytest.approx(2 / 3), 0.5)
+    assert one.over_paper.value == pytest.approx(1 / 6)
+    assert one.closed.value == pytest.approx((1 / 6) / (1 / 2))
+    assert (bound.success.value, compared.regret.value) == (1.0, 0.5)
+    plain = replace(
+        compared, tune={name: [replace(p, counting=PLAIN) for p in of] for name, of in compared.tune.items()}
+    )
+    assert plain.chosen("entropy").candidate.most == 2, "as plain success chooses"
 
 
 def test_the_front_takes_what_was_best_on_tune_layouts():
@@ -252,12 +292,16 @@ def test_schedules_are_compared_from_the_command_line(
     rows = json.loads(said)
     assert [row["schedule"] for row in rows] == ["entropy", "entropy", "coverage", "learnt", "oracle"]
     assert rows[-1]["gap_closed"] in (1.0, None)
-    assert all(row["success"] <= rows[-1]["success"] for row in rows)
+    assert {row["lead"] for row in rows} == {"balanced_success_rate"}
+    for success in ("success", "balanced_success"):
+        assert all(row[success] <= rows[-1][success] for row in rows)
+    assert "balanced %" in (tmp_path / "other/index.html").read_text()
 
 
 def test_the_same_twice(stored: ReplayedRun):
     once, twice = (
-        compare(stored, None, SIXG, ["random", "learnt"], (0, 1), 0.5, lambda n: None) for _ in range(2)
+        compare(stored, None, SIXG, ["random", "learnt"], (0, 1), 0.5, counted([stored]), lambda n: None)
+        for _ in range(2)
     )
     for name, plays in once.plays.items():
         assert [np.array_equal(a.costs, b.costs) for a, b in zip(plays, twice.plays[name], strict=True)]
