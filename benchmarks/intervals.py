@@ -6,7 +6,10 @@ is how alike the seeds, or the answers, of one episode are: their intraclass cor
 changes anything. `<` marks less than 94 %, `>` more than 96 %; with 2 000 runs a cell of exactly 95 % is
 measured within 1 point of it.
 
-    python benchmarks/intervals.py [--runs 2000] [--seed 0] [--twins]
+`--agree` has another table: what the interval is where two runs agree in all episodes, and how often it holds
+a gain that few episodes show, by all outcomes and not by simulation.
+
+    python benchmarks/intervals.py [--runs 2000] [--seed 0] [--twins | --agree]
 """
 
 import argparse
@@ -16,12 +19,14 @@ from dataclasses import asdict, dataclass
 from time import perf_counter
 
 import numpy as np
+from scipy.stats import binom, norm
 
 from harness.core.arrays import Floats
 from harness.core.statistics import (
     Estimate,
     known_mean,
     mean_of,
+    rate_difference,
     rate_interval,
     seed_interval,
     seed_rate_interval,
@@ -34,6 +39,12 @@ RATES = (0.54, 0.75, 0.9, 0.97, 0.99)
 PAIRS = ((0.54, 0.54), (0.54, 0.75), (0.75, 0.9), (0.9, 0.97), (0.97, 0.99), (0.97, 0.97))
 LOSSES = (0.012, 0.1, 0.5)
 ALONE = 0.7  # share of episodes that succeed without a message
+AGREE, SUCCEED = (
+    (20, 50, 100, 200, 600),
+    (1.0, 0.9, 0.5),
+)  # episodes, and the share in which both runs succeed
+COVERED, EXPECTED = (50, 100), np.arange(0.25, 6.1, 0.25).tolist()  # episodes; those that one run alone wins
+UNLIKELY = 1e-7  # an outcome that is not counted
 
 
 @dataclass(frozen=True)
@@ -224,13 +235,54 @@ def kinds() -> Iterator[tuple[str, str, Kind]]:
         yield "paired gain, mean over families", row, suite(of_pairs)
 
 
+def agreeing(n: int, share: float) -> float:
+    """Half of the interval where two runs agree in all of n episodes and succeed in a share."""
+    both = np.repeat([1.0, 0.0], [round(share * n), n - round(share * n)])
+    return rate_difference(both, both).high
+
+
+def coverage(n: int, both: float, gained: float) -> float:
+    """How often the interval holds a gain: n episodes, in which both runs succeed or one alone, or none."""
+    covered = 0.0
+    for alone in range(n + 1):
+        p_alone = binom.pmf(alone, n, gained)
+        chances = binom.pmf(np.arange(n - alone + 1), n - alone, both / (1 - gained)) * p_alone
+        for same in np.flatnonzero(chances > UNLIKELY).tolist():
+            first = np.repeat([1.0, 1.0, 0.0], [same, alone, n - same - alone])
+            second = np.repeat([1.0, 0.0], [same, n - same])
+            e = rate_difference(first, second)
+            covered += chances[same] * (e.low <= gained <= e.high)
+    return covered
+
+
+def agreement() -> None:
+    """Print the table of two runs that agree, and one line of JSON."""
+    z2 = float(norm.ppf(0.975)) ** 2
+    rows = {f"success in {share:.0%}": [agreeing(n, share) for n in AGREE] for share in SUCCEED}
+    rows["Tango's score interval"] = [z2 / (n + z2) for n in AGREE]
+    print(
+        f"{'all episodes agree: half of the interval, points':<52}"
+        + "".join(f"{f'E = {n}':>9}" for n in AGREE)
+    )
+    for name, halves in rows.items():
+        print(f"{name:<52}" + "".join(f"{100 * half:>9.1f}" for half in halves))
+    least = {n: min(coverage(n, SUCCEED[-1], k / n) for k in EXPECTED) for n in COVERED}
+    for n, share in least.items():
+        gains = f"gains in {EXPECTED[0]} to {EXPECTED[-1]} episodes"
+        print(f"E = {n}, success in half, {gains}: held in {100 * share:.1f} % at least")
+    print(json.dumps({"episodes": AGREE, "halves": rows, "least_coverage": least}))
+
+
 def main() -> None:
     """Print a table and one line of JSON."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--runs", type=int, default=2000)
     arguments.add_argument("--seed", type=int, default=0)
     arguments.add_argument("--twins", action="store_true", help="those of `harness study twins` alone")
+    arguments.add_argument("--agree", action="store_true", help="of two runs that agree alone")
     given = arguments.parse_args()
+    if given.agree:
+        return agreement()
     began, found, before = perf_counter(), list[Cell](), ""
     of = TWINS if given.twins else EPISODES
     for n, (heading, row, kind) in enumerate(twin_kinds() if given.twins else kinds()):

@@ -69,6 +69,9 @@ def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> Non
             assert (d.a, d.change.n, d.change.n_excluded) == (d.b, known, 4 - known)
         assert (of.gained, of.lost) == ((), ())
     assert c.conditions[0].test == SuccessTest("mcnemar", p_value=1.0)
+    of_all = SuccessTest("interval", low=-0.07, high=0.07)
+    said = words.success(replace(c.conditions[0], test=of_all), c.pair)
+    assert said.endswith("interval over episodes -7.0 to +7.0 points, since others may end differently")
 
 
 def test_the_means_are_those_of_the_runs_own_summary(runs: tuple[Path, Path]) -> None:

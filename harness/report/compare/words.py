@@ -20,6 +20,7 @@ from harness.runs.records import role_word
 BETTER, WORSE, HINT = "better", "worse", "hint"
 SIGNS = {BETTER: "✓", WORSE: "✗", HINT: "?", "": ""}
 HUNKS = 3  # changes of a prompt's text that are shown beside the numbers
+OTHERS = ", since others may end differently"  # than these, which all end alike
 SHOWN = 6  # metrics that are shown first
 
 
@@ -165,7 +166,7 @@ def success(c: InCondition, pair: Pair) -> str:
     if c.test.p_value is not None:
         return f"{text}; McNemar's exact test over episodes p {p_value(c.test.p_value)}"
     ends = " to ".join(f"{100 * (end or 0.0):+z.1f}" for end in (c.test.low, c.test.high))
-    return f"{text}; 95 % interval over episodes {ends} points"
+    return f"{text}; 95 % interval over episodes {ends} points{'' if gained or lost else OTHERS}"
 
 
 def many(comparison: Comparison) -> str:
