@@ -7,12 +7,10 @@ writes the table of the page between its marks. What is finished is read and not
 goes on with the same command.
 """
 
-import argparse
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 
 from families import Families, Row
-from pages import markdown, write_tables
+from pages import markdown, options, write_tables
 
 from harness.core.figures import shown
 from harness.core.statistics import Estimate
@@ -34,11 +32,7 @@ RULES = ("constant",)
 
 def main() -> None:
     """Make what is missing, and write the page's table."""
-    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    arguments.add_argument("--only", default="", help="only rows whose folder holds this text")
-    arguments.add_argument("--out", type=Path, default=Path("reports/answers"))
-    arguments.add_argument("--page", type=Path)
-    given = arguments.parse_args()
+    given = options(__doc__, "answers").parse_args()
     for row in (asked._replace(answer=mode) for asked, modes in ASKED.items() for mode in modes):
         if given.only in row.name:
             row.evaluate(given.out / row.name, *POINTS)

@@ -8,7 +8,6 @@ fit. All conditions share answers and draws, and differences are paired by layou
 the page between its marks. What is finished is read and not made again.
 """
 
-import argparse
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -16,7 +15,7 @@ from itertools import product
 from pathlib import Path
 from typing import NamedTuple, get_args
 
-from pages import harness, write_tables
+from pages import harness, markdown, options, write_tables
 
 from harness.coordination.calibrations import FOLDER, Level
 from harness.core.arrays import Floats
@@ -65,11 +64,7 @@ ROWS = (
 
 def main() -> None:
     """Make what is missing, and write the page's tables."""
-    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    arguments.add_argument("--only", default="", help="only rows whose name holds this text")
-    arguments.add_argument("--out", type=Path, default=Path("reports/calibration"))
-    arguments.add_argument("--page", type=Path)
-    given = arguments.parse_args()
+    given = options(__doc__, "calibration").parse_args()
     page = given.page and given.page.resolve()
     (given.out / FOLDER).mkdir(parents=True, exist_ok=True)
     (given.out / MARKER).touch()
@@ -122,11 +117,6 @@ def variants(row: Row, point: str) -> Iterator[tuple[str, str]]:
     yield from ((level, f"{point}:calibration={fit_of(row, level)}") for level in LEVELS)
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of Markdown."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
-
-
 def probabilities(runs: Sequence[tuple[Row, Run]]) -> str:
     """Return the table of how honest the ego's own answers are."""
     rows = []
@@ -143,7 +133,7 @@ def probabilities(runs: Sequence[tuple[Row, Run]]) -> str:
             rows.append([row.name, words, *texts, "–" if condition == ALONE else shown(change, POINTS)])
     head = ("alone", "calibration", "optimal action %", "Brier", "NLL nats", "ECE %", "coverage %",
             "entropy nats", "change of ECE, points")  # fmt: skip
-    return table(head, rows)
+    return markdown(head, rows)
 
 
 def cooperation(runs: Sequence[tuple[Row, Run]]) -> str:
@@ -161,7 +151,7 @@ def cooperation(runs: Sequence[tuple[Row, Run]]) -> str:
             rows.append([row.name, words, n, *texts, "–" if condition == HELPED else shown(change, POINTS)])
     head = (HELPED, "calibration", "layouts", "asks %", "kbit an episode", "latency ms", "balanced success %",
             "the same alone %", "change under 6g, points")  # fmt: skip
-    return table(head, rows)
+    return markdown(head, rows)
 
 
 def changed(values: Mapping[str, Floats], places: tuple[int, int], metric: str) -> Estimate:

@@ -38,10 +38,15 @@ class Row(NamedTuple):
 
     def evaluate(self, out: Path, *options: str) -> None:
         """Evaluate it on frozen scenes, unless that is done."""
-        if not any((out / name).exists() for name in ("suite.json", "run.json")):
+        if not finished(out):
             few = () if self.limit is None else ("--limit", str(self.limit))
             words = (*self.who, "--dataset", self.dataset, *few, *options)
             harness("eval", *words, "--out", str(out), "--quiet")
+
+
+def finished(out: Path) -> bool:
+    """Return whether a folder has a finished run or suite."""
+    return any((out / name).exists() for name in ("suite.json", "run.json"))
 
 
 class Families(NamedTuple):

@@ -1,10 +1,22 @@
 """What benchmarks share whose tables stand on a page of the documentation."""
 
+import argparse
 import re
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+
+def options(doc: str, out: str, picture: bool = False) -> argparse.ArgumentParser:
+    """Return the options that they share, with a folder under reports/ to write to."""
+    parser = argparse.ArgumentParser(description=doc.split("\n")[0])
+    parser.add_argument("--only", default="", help="only rows whose folder holds this text")
+    parser.add_argument("--out", type=Path, default=Path("reports", out))
+    parser.add_argument("--page", type=Path, help="page to write the tables to")
+    if picture:
+        parser.add_argument("--picture", type=Path, help="picture to write")
+    return parser
 
 
 def harness(*words: str) -> None:

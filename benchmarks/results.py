@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from matplotlib.figure import Figure
-from pages import harness, write_tables
+from pages import harness, options, write_tables
 
 from harness.core.figures import shown
 from harness.evaluate.trial import ROLES, Answers, described
@@ -71,15 +71,11 @@ ROWS = (*MODELS, *RULES)
 
 def main() -> None:
     """Make the runs that are missing, and write the page's tables and its picture."""
-    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments = options(__doc__, "results", picture=True)
     arguments.add_argument("--limit", type=int, help="layouts of each run of a published model")
     arguments.add_argument("--answers", type=Path, help="folder of such runs, whose answers are scored again")
     arguments.add_argument("--device", help="where published models run")
     arguments.add_argument("--batch-size", help="prompts of a published model in one batch")
-    arguments.add_argument("--only", default="", help="only rows whose folder holds this text")
-    arguments.add_argument("--out", type=Path, default=Path("reports/results"))
-    arguments.add_argument("--page", type=Path)
-    arguments.add_argument("--picture", type=Path)
     given = arguments.parse_args()
     for row in ROWS:
         if given.only in row.folder:

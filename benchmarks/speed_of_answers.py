@@ -11,12 +11,12 @@ action begins when its decision is ready. It writes the page's tables between it
 is finished is read and not made again; a stopped one goes on with the same command.
 """
 
-import argparse
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pages
 from families import Families, Row
 from matplotlib.figure import Figure
 from pages import harness, markdown, write_tables
@@ -44,12 +44,7 @@ DRIVEN, DRIVEN_MS = "occluded-intersection-v3", (145, 50, 5)
 
 def main() -> None:
     """Make what is missing, and write the page's tables and its picture."""
-    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    arguments.add_argument("--only", default="", help="only rows whose folder holds this text")
-    arguments.add_argument("--out", type=Path, default=Path("reports/speed"))
-    arguments.add_argument("--page", type=Path)
-    arguments.add_argument("--picture", type=Path)
-    given = arguments.parse_args()
+    given = pages.options(__doc__, "speed", picture=True).parse_args()
     for row in (row for row in ROWS if given.only in row.name):
         for ms in LATENCIES_MS:
             row.evaluate(given.out / row.name / f"frozen-{ms}", *options(ms))
