@@ -5,7 +5,6 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
-from math import prod
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ import typer
 from msgspec import structs, to_builtins
 
 from harness.cli import options
-from harness.cli.progress import Bar, bar
+from harness.cli.progress import bar
 from harness.cli.show import finish
 from harness.cli.terminal import echo_json, echo_prompt_tokens
 from harness.core import extras, resources, work
@@ -24,7 +23,6 @@ from harness.core.seeds import FIRST
 from harness.evaluate.settings import OUTPUT, FrozenSettings, Settings
 
 if TYPE_CHECKING:
-    from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.prompts.versions import Prompt
     from harness.studies.optimize.engines import Engine
@@ -81,7 +79,8 @@ def command(
     from harness.evaluate import resolve
     from harness.prompts import versions as prompts
     from harness.studies.optimize import engines
-    from harness.studies.optimize.search import Search, choices, only_for, search
+    from harness.studies.optimize.layouts import built, counted, given, only_for
+    from harness.studies.optimize.search import Search, choices, search
 
     extras.need("harness prompt optimize", "matplotlib", *(() if tune else ("highway_env",)))
     extras.need("--reflect", *(("gepa",) if reflect else ()))
@@ -94,29 +93,29 @@ def command(
     base = _base(settings, scenarios, budget)
     settings = structs.replace(settings, prompt=base.version)
     sizes = {} if reflect else choices(base)
-    given = _given(tune or (), scenarios) if tune else []
+    own = given(tune, scenarios) if tune else []
     in_range("--layouts", layouts, 2, FIRST["train"])
     only_for("tune", "--first-seed", str(first_seed), first_seed, layouts)
     silent, who = as_json or quiet, options.workers_of(workers)
     engine_name = f"GEPA with {reflect}" if reflect else "alternatives"
     if dry_run:
         with TemporaryDirectory() as place, bar("freezing a few tune layouts", quiet=silent) as progress:
-            few = given or _built(scenarios, Path(place), min(SAMPLE, layouts), first_seed, who, progress)
+            few = own or built(scenarios, Path(place), min(SAMPLE, layouts), first_seed, who, progress)
             specs = [resolve.spec(settings, source) for source in few]
             episodes = [min(manifest.episodes, settings.world.limit or manifest.episodes)  # type: ignore[union-attr]
                         for manifest, _ in manifests]  # fmt: skip
-            counted = _counted(specs, sizes, budget, 0 if given else layouts, episodes, tokenizer)
+            asks = counted(specs, sizes, budget, 0 if own else layouts, episodes, tokenizer)
         if as_json:
-            echo_json(counted)
+            echo_json(asks)
         elif not quiet:
-            _show_counted(counted, engine_name)
+            _show_counted(asks, engine_name)
         return
     where = folder or Path("reports", out)
     _check_name(out, (where / WORK).is_dir())
     begins = work.WorkStart(
         settings={
             "version": out, "budget": budget, "engine": engine_name, "prompt_sha256": base.sha256,
-            "tune": [source.dataset.sha256 for source in given] or [layouts, first_seed],
+            "tune": [source.dataset.sha256 for source in own] or [layouts, first_seed],
             "report": [sha256 for _, sha256 in manifests], "evaluation": to_builtins(settings),
         }
     )  # fmt: skip
@@ -127,7 +126,7 @@ def command(
         work.working(where, begun or begins) as place,
         bar(label, quiet=silent, grows=True) as progress,
     ):
-        sources = given or _built(scenarios, place, layouts, first_seed, who, progress)
+        sources = own or built(scenarios, place, layouts, first_seed, who, progress)
         specs = [resolve.spec(settings, source) for source in sources]
         plan = Search(
             base, specs, partial(_report, settings, names), budget, out, Path("prompts"), engine_name,
@@ -172,25 +171,6 @@ def _base(settings: Settings, scenarios: "Sequence[Scenario]", budget: int) -> "
     return ego.prompt
 
 
-def _given(names: Sequence[str], scenarios: "Sequence[Scenario]") -> "list[FrozenSource]":
-    """Return the datasets of --tune, one for each scenario."""
-    from harness.evaluate import resolve
-    from harness.studies.optimize.search import only_for
-
-    if len(names) != len(scenarios):
-        raise UserError(f"--tune: {len(names)} given for {len(scenarios)} datasets; give one each, in order")
-    sources = [resolve.frozen(FrozenSettings(), name) for name in names]
-    for name, source, scenario in zip(names, sources, scenarios, strict=True):
-        manifest = source.dataset.manifest
-        only_for("tune", "--tune", name, manifest.seed, manifest.episodes)
-        if source.scenario.name != scenario.name:
-            raise UserError(
-                f"--tune {printable(name)}: it is of {source.scenario.name}, and not of {scenario.name} as "
-                "--dataset is; give one of the same scenario"
-            )
-    return sources
-
-
 def _check_name(name: str, goes_on: bool) -> None:
     from harness.prompts import versions as prompts
 
@@ -205,24 +185,6 @@ def _check_name(name: str, goes_on: bool) -> None:
         raise UserError(f"--out {name}: a prompt of that name is there already; give a new name")
 
 
-def _built(
-    scenarios: "Sequence[Scenario]", place: Path, layouts: int, first_seed: int, who: Any, progress: Bar
-) -> "list[FrozenSource]":
-    """Return tune layouts of each scenario, which are frozen if they are not there."""
-    from harness.dataset import load
-    from harness.dataset.build import build
-    from harness.evaluate.frozen_world import FrozenSource
-
-    sources = []
-    for scenario in scenarios:
-        out = place / f"tune-{scenario.name}"
-        if not (out / "manifest.json").is_file() or (out / WORK).is_dir():
-            progress.more(layouts)
-            build(scenario, out, layouts, first_seed, who, progress, audits=False)
-        sources.append(FrozenSource(load.load(out)))
-    return sources
-
-
 def _reflecting(model: str, first: "Spec", place: Path, settings: Mapping[str, Any]) -> "Engine":
     from harness.backends.cards import resolve
     from harness.backends.registry import open_backend
@@ -232,26 +194,6 @@ def _reflecting(model: str, first: "Spec", place: Path, settings: Mapping[str, A
     backend = open_backend(resolve(model), device=first.device, dtype=first.dtype, batch_size=1)
     roles = ROLES if first.points[0].asks and not first.ego_alone else ROLES[:1]
     return Reflecting(asked_of(backend), place / "reflections.jsonl", settings, roles)
-
-
-def _counted(
-    specs: "Sequence[Spec]", sizes: Mapping[str, int], budget: int, layouts: int, episodes: Sequence[int],
-    tokenizer: Path | None,
-) -> dict[str, Any]:  # fmt: skip
-    """Return how many requests are to be expected, and the tokens of their prompts, from tune layouts."""
-    from harness.evaluate.dry_run import count
-
-    counted = [count(spec, spec.source.dataset, tokenizer) for spec in specs]  # type: ignore[attr-defined]
-    here = [len(list(spec.source.layout_seeds)) for spec in specs]
-    each = [c["requests"] / n for c, n in zip(counted, here, strict=True)]
-    return {
-        "choices": dict(sizes), "wordings": prod(sizes.values()) if sizes else None,
-        "wordings_in_a_round": 1 + sum(n - 1 for n in sizes.values()) if sizes else None,
-        "budget": budget,
-        "questions_a_wording": round(sum(q * (layouts or n) for q, n in zip(each, here, strict=True))),
-        "certificate_questions": 2 * round(sum(q * n for q, n in zip(each, episodes, strict=True))),
-        "prompt_tokens": [c["prompt_tokens"] for c in counted],
-    }  # fmt: skip
 
 
 def _show_counted(counted: dict[str, Any], engine: str) -> None:

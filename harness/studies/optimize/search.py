@@ -12,11 +12,11 @@ import numpy as np
 
 from harness.backends.swarm import open_each, together
 from harness.core.arrays import Floats
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError
 from harness.core.figures import POINTS, as_mapping, shown
 from harness.core.files import text_of
 from harness.core.progress import Progress
-from harness.core.seeds import FIRST, Purpose, purposes, stated
+from harness.core.seeds import stated
 from harness.core.statistics import Estimate, mean_of
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
@@ -50,16 +50,6 @@ class Search:
     prompts: Path  # the folder of versions that it is written to
     engine: str  # name of the engine, and of what it uses
     command: str  # the words that repeat it
-
-
-def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) -> None:
-    """Raise UserError unless all layout seeds of a dataset, `count` from `first` on, are for this purpose."""
-    if purposes(first, count) != [wanted]:
-        raise UserError(
-            f"{option} {printable(name)}: {stated(first, count)}; a prompt is searched on tune seeds "
-            f"({FIRST['tune']} to {FIRST['train'] - 1}) and certified on report "
-            f"seeds (from {FIRST['report']})"
-        )
 
 
 def choices(prompt: Prompt) -> dict[str, int]:

@@ -1,0 +1,80 @@
+"""The tune layouts that a search of wordings plays, and how many questions it asks there."""
+
+from collections.abc import Mapping, Sequence
+from math import prod
+from pathlib import Path
+from typing import Any
+
+from harness.core.errors import UserError, printable
+from harness.core.formats import WORK
+from harness.core.parallel import Workers
+from harness.core.progress import Progress
+from harness.core.seeds import FIRST, Purpose, purposes, stated
+from harness.dataset import load
+from harness.evaluate import resolve
+from harness.evaluate.dry_run import count
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.settings import FrozenSettings
+from harness.evaluate.spec import Spec
+from harness.world.scenario import Scenario
+
+
+def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) -> None:
+    """Raise UserError unless all layout seeds of a dataset, `count` from `first` on, are for this purpose."""
+    if purposes(first, count) != [wanted]:
+        raise UserError(
+            f"{option} {printable(name)}: {stated(first, count)}; a prompt is searched on tune seeds "
+            f"({FIRST['tune']} to {FIRST['train'] - 1}) and certified on report "
+            f"seeds (from {FIRST['report']})"
+        )
+
+
+def given(names: Sequence[str], scenarios: Sequence[Scenario]) -> list[FrozenSource]:
+    """Return datasets of tune layouts. Raises UserError unless there is one of each scenario, in order."""
+    if len(names) != len(scenarios):
+        raise UserError(f"--tune: {len(names)} given for {len(scenarios)} datasets; give one each, in order")
+    sources = [resolve.frozen(FrozenSettings(), name) for name in names]
+    for name, source, scenario in zip(names, sources, scenarios, strict=True):
+        manifest = source.dataset.manifest
+        only_for("tune", "--tune", name, manifest.seed, manifest.episodes)
+        if source.scenario.name != scenario.name:
+            raise UserError(
+                f"--tune {printable(name)}: it is of {source.scenario.name}, and not of {scenario.name} as "
+                "--dataset is; give one of the same scenario"
+            )
+    return sources
+
+
+def built(
+    scenarios: Sequence[Scenario], place: Path, layouts: int, first_seed: int, workers: Workers,
+    progress: Progress,
+) -> list[FrozenSource]:  # fmt: skip
+    """Return tune layouts of each scenario, which are frozen if they are not there."""
+    from harness.dataset.build import build
+
+    sources = []
+    for scenario in scenarios:
+        out = place / f"tune-{scenario.name}"
+        if not (out / "manifest.json").is_file() or (out / WORK).is_dir():
+            progress.more(layouts)
+            build(scenario, out, layouts, first_seed, workers, progress, audits=False)
+        sources.append(FrozenSource(load.load(out)))
+    return sources
+
+
+def counted(
+    specs: Sequence[Spec], sizes: Mapping[str, int], budget: int, layouts: int, episodes: Sequence[int],
+    tokenizer: Path | None,
+) -> dict[str, Any]:  # fmt: skip
+    """Return how many requests are to be expected, and the tokens of their prompts, from tune layouts."""
+    of_family = [count(spec, spec.source.dataset, tokenizer) for spec in specs]  # type: ignore[attr-defined]
+    here = [len(list(spec.source.layout_seeds)) for spec in specs]
+    each = [c["requests"] / n for c, n in zip(of_family, here, strict=True)]
+    return {
+        "choices": dict(sizes), "wordings": prod(sizes.values()) if sizes else None,
+        "wordings_in_a_round": 1 + sum(n - 1 for n in sizes.values()) if sizes else None,
+        "budget": budget,
+        "questions_a_wording": round(sum(q * (layouts or n) for q, n in zip(each, here, strict=True))),
+        "certificate_questions": 2 * round(sum(q * n for q, n in zip(each, episodes, strict=True))),
+        "prompt_tokens": [c["prompt_tokens"] for c in of_family],
+    }  # fmt: skip
