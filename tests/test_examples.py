@@ -282,7 +282,8 @@ def test_the_command_draws_them_from_train_layouts(project: Path, harness: Harne
     drawing = ("prompt", "examples", "mine", "--scenario", scenarios.DEFAULT)
     code, out, _ = harness(*drawing)
     mine = prompts.load("mine")
-    assert (code, out) == (0, f"wrote {printable((project / EXAMPLES).absolute())}: {mine.examples}\n")
+    written = f"{printable((project / EXAMPLES).absolute())} of {scenarios.title(CROSSING)}"
+    assert (code, out) == (0, f"wrote {written}: {mine.examples}\n")
     assert [len(mine.examples.of(role)) for role in prompts.ROLES] == [2, 2]
     assert all(purpose(seed, 1) == "train" for seed in mine.examples.seeds)
     for role in prompts.ROLES:

@@ -1,14 +1,19 @@
 """What was made before scenes changed is read as what it was, whatever a scenario's bare name means now."""
 
+import shutil
 from pathlib import Path
 
 import former
 import pytest
 
+from harness.dataset import suites
 from harness.dataset.load import find, load
 from harness.evaluate import replay
+from harness.evaluate.live_world import LiveSource
+from harness.evaluate.settings import DriveSettings, Settings, read, text_of
 from harness.runs import folder
 from harness.world import scenarios
+from harness.world.parameters import SUITES
 from harness.world.scenarios import occluded_intersection
 
 RECORDS = Path(__file__).parent / "records"
@@ -40,3 +45,48 @@ def test_an_old_driven_run_is_replayed_in_its_own_scenes(commit: str) -> None:
     *_, last = replay.stills(replay.find(run.path, 0, "single-local", 0))
     [row] = [e for e in run.episodes if (e.episode, e.condition, e.seed) == (0, "single-local", 0)]
     assert last.outcome.startswith(f"{row.failure or 'cleared'} at {row.time_s:.1f} s")
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_a_title_says_whose_scenes_a_scenario_has(suite: str) -> None:
+    named = suites.named(f"suite:{suite}")
+    assert named is not None
+    for dataset in named.datasets:
+        scenario = load(find(dataset), 1).scenario
+        assert scenarios.title(scenario) == f"{scenario.name}, scenes of {suite}"
+        foggy = scenarios.get(f"{scenarios.argument(scenario)},ambient=fog")
+        assert scenarios.title(foggy) == f"{scenario.name}:ambient=fog, scenes of {suite}"
+    other = scenarios.get(f"{former.NAME},witnesses=0")
+    assert scenarios.title(other) == scenarios.argument(other)
+
+
+def test_an_argument_states_the_scenes_even_where_they_are_the_usual_ones() -> None:
+    usual = scenarios.argument(scenarios.get(scenarios.DEFAULT))
+    assert usual == f"{scenarios.DEFAULT}:limits=2,perception=2,witnesses=each,radio_share=0.25"
+    assert LiveSource(0, 1).settings().scenario == usual
+    assert scenarios.argument(scenarios.get("env:merge-v0")) == "env:merge-v0"
+
+
+@pytest.mark.parametrize(
+    ("typed", "scenario"),
+    [
+        ("occluded-intersection", former.NAME),
+        ("occluded-intersection:witnesses=0", f"{former.NAME},witnesses=0"),
+        (f"occluded-intersection:{LATER}", f"occluded-intersection:{LATER}"),
+        ("blind-merge", "blind-merge"),
+    ],
+)
+def test_an_old_runs_settings_drive_its_own_scenes(tmp_path: Path, typed: str, scenario: str) -> None:
+    """The first runs with a run.toml named a scenario as it was typed."""
+    shutil.copy(RECORDS / "0103f23/drive/run.json", tmp_path)
+    file = tmp_path / "run.toml"
+    file.write_text(text_of(Settings(world=DriveSettings(scenario=typed))))
+    for path in (file, tmp_path):
+        world = read(path, DriveSettings, {}).world
+        assert isinstance(world, DriveSettings)
+        assert world.scenario is not None
+        assert scenarios.get(world.scenario) == scenarios.get(scenario)
+    another = DriveSettings(scenario="parking-exit")
+    assert read(file, DriveSettings, {"scenario": another.scenario}).world == another
+    (tmp_path / "run.json").unlink()
+    assert read(file, DriveSettings, {}).world == DriveSettings(scenario=typed)

@@ -10,7 +10,7 @@ from harness.cli.run import file_name
 from harness.cli.show import finish
 from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import FIRST
-from harness.evaluate.settings import parse_seeds
+from harness.evaluate.settings import HELP, parse_seeds
 
 MOST_EPISODES = 1_000_000
 
@@ -50,6 +50,7 @@ def closed_loop(
     model: options.Model = "swarm-tiny",
     prompt: options.Prompt = "v2",
     answer: options.Answer = "json",
+    scenario: str | None = typer.Option(None, help=HELP["scenario"]),
     episodes: int = typer.Option(
         300, help="Number of layouts; each is driven at every grid point with every seed."
     ),
@@ -82,7 +83,8 @@ def closed_loop(
     from harness.studies.closed_loop import panels, run_closed_loop
     from harness.studies.study import refuse_taken
 
-    source = resolve.driven(DriveSettings(episodes=episodes, first_seed=first_seed))
+    named = scenario and options.typed_scenario(scenario)
+    source = resolve.driven(DriveSettings(episodes=episodes, first_seed=first_seed), named)
     who = options.workers_of(workers)
     points = {s.point.name: s.point for panel in panels().values() for s in panel}
     spec = Spec(

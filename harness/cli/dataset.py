@@ -56,6 +56,7 @@ def build(
             raise UserError(f"--lag {lag}: give seconds from 0 to below {period_s:g}, the decision period")
         scenario = replace(scenario, parameters=replace(scenario.parameters, decision_lag_s=lag))
     from harness.dataset.build import build as build_dataset
+    from harness.world import scenarios
 
     begun_s, part = time.monotonic(), options.shard_of(shard)
     mine = len(part.part(range(episodes))) if part else episodes
@@ -65,8 +66,8 @@ def build(
         options.say_shard(part, out, f"{mine} of {episodes} layouts")
         return
     typer.echo(
-        f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points, in "
-        f"{time.monotonic() - begun_s:.0f} s"
+        f"wrote {printable(out)} of {printable(scenarios.title(scenario))}: {manifest['episodes']} layouts, "
+        f"{manifest['nodes']} decision points, in {time.monotonic() - begun_s:.0f} s"
     )
 
 

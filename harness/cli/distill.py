@@ -105,12 +105,15 @@ def command(
     from harness.training.distill import distill as run
     from harness.training.published import Adapt
     from harness.training.train import STAGES, Objective, Plan
+    from harness.world import scenarios
 
     how = Adapt(*adapt) if isinstance(start, Card) else None
     samples_of = dict(zip(STAGES, counts, strict=True))
     plan = Plan(samples_of, batch=batch, seed=seed, adapt=how, objective=cast("Objective", objective))
     begun_s = time.monotonic()
     drawn = layouts * len(learnt)
+    for each in learnt:
+        typer.echo(printable(scenarios.title(each)))
     with bar("drawing layouts", drawn) as progress:
 
         def show(stage: str, seen: int, loss: float, *watched: float) -> None:

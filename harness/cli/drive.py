@@ -114,7 +114,7 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
         "gap: smallest distance to a vehicle; clear: time until the ego had cleared, if\n"
         "it did; both are means over episodes",
     )
-    show(done, f"closed loop · {world.scenario['name']}", COLUMNS, notes)
+    show(done, f"closed loop · {world.title}", COLUMNS, notes)
 
 
 def write_failures(run: Path, most: int, quiet: bool) -> list[Path]:

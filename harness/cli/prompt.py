@@ -148,11 +148,12 @@ def examples(
     if reason := prompts.unfit(draft, played):
         raise UserError(f"prompt {version} {reason}; give another --scenario, or another version")
     from harness.training import prompt_examples
+    from harness.world import scenarios
 
     with bar("drawing layouts", count) as progress:
         drawn = prompt_examples.examples(draft, played, count, first_seed, progress)
     write_whole(file, text_of(drawn))
-    typer.echo(f"wrote {printable(file)}: {drawn}")
+    typer.echo(f"wrote {printable(file)} of {printable(scenarios.title(played))}: {drawn}")
 
 
 def check(

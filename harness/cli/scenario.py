@@ -65,12 +65,14 @@ def drive(
     """
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     from harness.world import reference as live
+    from harness.world import scenarios
 
     with bar(f"driving {printable(name, 30)}", episodes) as progress:
         outcomes = live.check(scenario, episodes, seed, who, progress)
     if as_json:
         echo_json({"scenario": name, "episodes": episodes, "seed": seed, "drivers": outcomes})
     else:
+        typer.echo(printable(scenarios.title(scenario)))
         _table(episodes, seed, outcomes)
 
 
@@ -91,6 +93,7 @@ def audit(
             f"{printable(name)} is an environment without a known danger, so there is nothing to audit; "
             "give a scenario"
         )
+    from harness.world import scenarios
     from harness.world.audit import audit as run
 
     with bar(f"auditing {name}", layouts, as_json) as progress:
@@ -101,6 +104,7 @@ def audit(
             "worst": result.worst, "auc": result.auc, "told_by": result.told_by,
         })  # fmt: skip
     else:
+        typer.echo(printable(scenarios.title(scenario)))
         _print(result)
     if result.tells:
         raise typer.Exit(1)

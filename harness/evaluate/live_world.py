@@ -72,7 +72,7 @@ class LiveSource:
     def record(self) -> ClosedLoop:
         parameters = self.scenario.parameters.stated()
         return ClosedLoop(
-            scenario={"name": self.scenario_name, "parameters": parameters}, first_seed=self.first_seed,
+            scenario={"name": self.scenario.name, "parameters": parameters}, first_seed=self.first_seed,
             episodes=len(self.numbers),
             late_against="full-view driver, whose decisions act after decision_lag_s",
             selection={} if self.sample is None
@@ -81,7 +81,7 @@ class LiveSource:
 
     def settings(self) -> DriveSettings:
         return DriveSettings(
-            scenario=self.scenario_name, episodes=self.episodes, first_seed=self.first_seed,
+            scenario=scenarios.argument(self.scenario), episodes=self.episodes, first_seed=self.first_seed,
             sample=self.sample, sample_seed=0 if self.sample is None else self.sample_seed,
         )  # fmt: skip
 

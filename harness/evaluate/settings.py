@@ -444,7 +444,7 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
             f"{where}: there is no such file; give a {FILE} or the folder of a run that has one, which runs "
             "have since 0.3; for another, type the command in its run.json"
         )
-    settings = changed(convert(toml(file, where), Settings, where), given)
+    settings = changed(_as_driven(convert(toml(file, where), Settings, where), file.parent), given)
     if not isinstance(settings.world, world):
         raise UserError(f"{where} are of `harness {COMMANDS[kind_of(settings)]}`; type that")
     for name, models in {"model": settings.model, "helper_model": settings.helpers.model or ""}.items():
@@ -457,6 +457,28 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     if settings.server and "server" not in given:
         raise UserError(f"{where}: a file names no server to ask; give --server, or take the line out")
     return settings
+
+
+def _as_driven(settings: Settings, run: Path) -> Settings:
+    """Return settings whose scenario states the scenes that a run has, if it is the run's and does not.
+
+    The first runs with such a file name it barely, by a name that has come to mean other scenes.
+    """
+    from harness.runs.folder import read as run_of
+    from harness.runs.records import ClosedLoop
+    from harness.world import scenarios
+    from harness.world.parameters import SCENES
+
+    name, typed = scenarios.split(getattr(settings.world, "scenario", None) or "")
+    missing = [key for key in SCENES if f"{key}=" not in (typed or "")]
+    if not (missing and scenarios.is_here(name) and (run / "run.json").is_file()):
+        return settings
+    world = run_of(run).manifest.world
+    if not isinstance(world, ClosedLoop) or world.scenario["name"] != name:
+        return settings
+    then = scenarios.stated(name, world.scenario["parameters"]).parameters
+    scenes = [f"{key}={getattr(then, key)}" for key in missing]
+    return changed(settings, {"scenario": f"{name}:{','.join([*([typed] if typed else []), *scenes])}"})
 
 
 def _is_card(model: str) -> bool:

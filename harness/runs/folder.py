@@ -91,11 +91,7 @@ class Run:
     def source(self) -> str:
         """The dataset or scenario of the episodes, in words for people."""
         world = self.manifest.world
-        return (
-            world.name
-            if isinstance(world, FrozenScenes)
-            else f"{world.scenario['name']} (driven in closed loop)"
-        )
+        return world.name if isinstance(world, FrozenScenes) else f"{world.title} (driven in closed loop)"
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:

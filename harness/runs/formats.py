@@ -126,7 +126,8 @@ EPISODE: Mapping[str, Added] = {
 def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of run.json, or the settings that a run began with, as this version states them.
 
-    What is no table is left as it is, for the reader to refuse.
+    What is no table is left as it is, for the reader to refuse. 2026-11-27: a driven scenario is named
+    without the settings that were typed after its name, which are among its parameters.
     """
     settings = _agent(_with(SETTINGS, stated))
     if isinstance(model := settings.get("identity"), dict):
@@ -134,6 +135,13 @@ def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
     for name, upgrade in (("helpers", _agent), ("conditions", _condition)):
         if isinstance(tables := settings.get(name), list | tuple):
             settings[name] = [upgrade(table) if isinstance(table, dict) else table for table in tables]
+    match settings.get("world"):
+        case {"scenario": {"name": str(name)}}:
+            from harness.world import scenarios  # imports NumPy, which listing runs does not need
+
+            world = settings["world"]
+            driven = {**world["scenario"], "name": scenarios.split(name)[0]}
+            settings["world"] = {**world, "scenario": driven}
     return settings
 
 

@@ -1,5 +1,6 @@
 """Define the typed records of a run's files; docs/files.md has the meaning of each name."""
 
+from contextlib import suppress
 from typing import Any, Literal
 
 from msgspec import UNSET, Struct, UnsetType, defstruct, field
@@ -9,6 +10,7 @@ from harness.core.config import Seconds, convert
 from harness.core.errors import UserError
 from harness.core.statistics import Estimate
 from harness.runs.devices import Device, Speed
+from harness.world import scenarios
 
 Role = Literal["ego", "helper", "merge", "blind"]
 
@@ -346,6 +348,15 @@ class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_on
         name, parameters = self.scenario.get("name"), self.scenario.get("parameters")
         if not isinstance(name, str) or not isinstance(parameters, dict):
             raise ValueError("the scenario has no name, or no parameters")
+
+    @property
+    def title(self) -> str:
+        """The scenario for people; its name alone if this version has none with such parameters."""
+        name: str = self.scenario["name"]
+        with suppress(UserError):
+            if scenarios.is_here(name):
+                return scenarios.title(scenarios.stated(name, self.scenario["parameters"]))
+        return name
 
 
 class ChannelRecord(Struct, frozen=True, kw_only=True):

@@ -6,7 +6,7 @@ way (docs/decisions/0014), so a grid costs far less than its points one by one.
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from harness.evaluate.lifecycle import Evaluated, finished
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.radio.constant import density_coupled_loss
-from harness.runs.records import Score
+from harness.runs.records import ClosedLoop, Score
 from harness.studies.axes import AXES, CORE, Setting, described, grid
 from harness.studies.figures.bars import operating_points
 from harness.studies.figures.lines import along
@@ -65,12 +65,12 @@ def run_closed_loop(
     summary = _summary(done, grids)
     core, *sweeps = (summary[summary.panel == name] for name in grids)
     shown = tables(summary)
-    m = done.manifest
+    m, world = done.manifest, cast(ClosedLoop, done.manifest.world)
     return Study(
-        "closed-loop", f"The paper's panels, driven: {m.variant}",
+        "closed-loop", f"The paper's panels, driven: {m.variant} · {world.title}",
         [f"{table.title}: {in_a_sentence(table)}." for table in shown],
         [
-            f"Every grid point was driven in closed loop on the layouts of {spec.source.name} with "
+            f"Every grid point was driven in closed loop on the layouts of {world.title} with "
             f"channel seeds {', '.join(map(str, m.seeds))}; 95 % intervals are over episodes. "
             "conditions.csv has all figures with their n, and run/ the driven episodes."
         ],

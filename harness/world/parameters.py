@@ -154,6 +154,13 @@ def beacon_radio(text: str) -> Physical | None:
     return radio
 
 
+# Parameters in which the scenes of the suites of a scenario with lookouts differ.
+SCENES = ("witnesses", "radio_share", "limits", "perception")
+SUITES: dict[str, dict[str, Any]] = {
+    "v2v-safety": dict(zip(SCENES, ("any", 0.0, 1, 1), strict=True)),
+    "v2v-safety-2": dict(zip(SCENES, ("each", 0.25, 2, 2), strict=True)),
+}
+
 # Parameters that change neither the vehicles nor their driving, but only what is known of them.
 DIALS = tuple(
     field.name for field in fields(Parameters) if field.name.startswith(("beacon_", "perfect_", "ambient"))

@@ -33,9 +33,8 @@ def scenes_of(run: Run) -> Any:
     world = run.manifest.world
     if isinstance(world, FrozenScenes):
         return world.sha256
-    name, parameters = world.scenario["name"].partition(":")[0], world.scenario["parameters"]
-    dials = {key: value for key, value in parameters.items() if key not in DIALS}
-    return name, dials, world.first_seed
+    parameters = {k: v for k, v in world.scenario["parameters"].items() if k not in DIALS}
+    return world.scenario["name"], parameters, world.first_seed
 
 
 def where(run: Run) -> str:
@@ -43,7 +42,7 @@ def where(run: Run) -> str:
     world = run.manifest.world
     if isinstance(world, FrozenScenes):
         return f"{world.name} {world.sha256[:12]}"
-    return f"{world.scenario['name']} from layout seed {world.first_seed}"
+    return f"{world.title} from layout seed {world.first_seed}"
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ Other packages add theirs by an entry point of the group `swarmdrive.scenarios`;
 """
 
 import copyreg
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import fields, replace
 from functools import cache
 from importlib import import_module
@@ -16,7 +16,7 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json
 from harness.core.plugins import Plugins
 from harness.world.environments import environment
-from harness.world.parameters import LATER, Parameters
+from harness.world.parameters import LATER, SCENES, SUITES, Parameters
 from harness.world.scenario import Scenario
 
 PLUG_INS = Plugins[Scenario]("swarmdrive.scenarios", Scenario, {})
@@ -33,11 +33,7 @@ def get(text: str) -> Scenario:
 
     Raises UserError if there is no such scenario or setting, or a value is not allowed.
     """
-    if text.startswith(environment.PREFIX):
-        name, settings = environment.split(text)
-    else:
-        name, colon, of_name = text.partition(":")
-        settings = of_name if colon else None
+    name, settings = split(text)
     scenario = _named(name)
     if settings is None:
         return scenario
@@ -45,11 +41,46 @@ def get(text: str) -> Scenario:
     return replace(scenario, parameters=replace(scenario.parameters, **changed))
 
 
+def split(text: str) -> tuple[str, str | None]:
+    """Split what `get` takes into the bare name and the settings; None without any."""
+    if text.startswith(environment.PREFIX):
+        return environment.split(text)
+    name, colon, settings = text.partition(":")
+    return name, settings if colon else None
+
+
 def argument(scenario: Scenario) -> str:
-    """Return the text by which `get` finds a scenario again, with the settings that differ from its usual."""
+    """Return the text by which `get` finds a scenario again, whatever its bare name comes to mean.
+
+    It states the settings that differ from the usual, and those that differ between suites.
+    """
+    return _spelled(scenario, {*_changed(scenario), *_of_suites(scenario)})
+
+
+def title(scenario: Scenario) -> str:
+    """Return a scenario for people: its name, the settings that differ from its usual, and whose scenes."""
+    scenes = _of_suites(scenario)
+    suites = [suite for suite, of in SUITES.items() if of == scenes]
+    return (
+        f"{_spelled(scenario, _changed(scenario) - scenes.keys())}, scenes of {suites[0]}"
+        if suites
+        else argument(scenario)
+    )
+
+
+def _changed(scenario: Scenario) -> set[str]:
     usual, p = get(scenario.name).parameters, scenario.parameters
-    changed = {dial: getattr(p, dial) for dial in scenario.dials if getattr(p, dial) != getattr(usual, dial)}
-    settings = [f"{k}={v if isinstance(v, str) else canonical_json(v)}" for k, v in changed.items()]
+    return {dial for dial in scenario.dials if getattr(p, dial) != getattr(usual, dial)}
+
+
+def _of_suites(scenario: Scenario) -> dict[str, object]:
+    """Return what the scenes of suites differ in; nothing of a scenario that is in none."""
+    return {key: getattr(scenario.parameters, key) for key in SCENES if "witnesses" in scenario.dials}
+
+
+def _spelled(scenario: Scenario, stated: Collection[str]) -> str:
+    values = {dial: getattr(scenario.parameters, dial) for dial in scenario.dials if dial in stated}
+    settings = [f"{k}={v if isinstance(v, str) else canonical_json(v)}" for k, v in values.items()]
     return environment.joined(scenario.name, settings)
 
 
