@@ -18,7 +18,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Bools, Ints
 from harness.core.errors import Unanswered
-from harness.core.files import canonical_bytes, digest
+from harness.core.files import canonical_bytes, sha256_bytes
 from harness.dataset.load import Scene
 from harness.evaluate import flip, repair, servers
 from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of, source_of
@@ -40,6 +40,7 @@ CHUNK = 64  # fewest requests that are asked, and kept, together
 FIRST = 8  # fewest questions that a server is asked before it has answered any
 IN_A_ROW = CHUNK  # questions without an answer, one after the other, after which nothing more is asked
 EGO = (0,)
+_TEXTS = msgspec.json.Encoder(order="sorted")  # as `canonical_bytes`, where there is no number
 Places = Sequence[Collection[int]]  # of the viewers of each scene, the ego at 0
 
 
@@ -135,7 +136,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         first_token_s=completion.first_token_s, token_s=completion.token_s,
         letter_share=_or_unset(completion.letter_share),
         follows_letter=_or_unset(completion.follows_letter), flipped=_or_unset(completion.flipped),
-        prompt_sha256=digest(request.messages),
+        prompt_sha256=sha256_bytes(_TEXTS.encode(request.messages)),
         image_sha256=request.image_sha256 or UNSET,
         status=str(parsed.status), verdict=parsed.verdict,
         repairs=tuple(map(str, parsed.repairs)), intent=parsed.intent, mass=parsed.mass,
@@ -347,9 +348,7 @@ class Asker:
             distance_m, range_m = record.distance_m, record.range_m
             distances_m.append([distance_m[ego], *[distance_m[v] for v in helpers], *[math.nan] * absent])
             ranges_m.append([*[range_m[v] for v in helpers], *[math.nan] * absent])
-            xy_m = {v.id: (v.x_m, v.y_m) for v in scene.state.vehicles}
-            sent = zip(helpers, row[1:], strict=False)
-            bits.append([*[payload_bits(xy_m[v], a) if a else 0 for v, a in sent], *[0] * absent])
+            bits.append([_bits(scene, answer) if answer else 0 for answer in row[1:]])
             texts_b.append([len(_text(answer).encode()) for answer in row[1:]])
         intents = np.array(p, dtype=float)
         valid = ~np.isnan(intents[:, 1:]).any(axis=-1)
@@ -423,6 +422,11 @@ def _heard_sets(
 def _text(answer: Answer | None) -> str:
     """Return the words of a helper's message; none of a failed answer."""
     return str(answer.message.get("evidence") or "") if answer and answer.message else ""
+
+
+def _bits(scene: Scene, answer: Answer) -> int:
+    sender = scene.state.vehicle(answer.viewer)
+    return payload_bits((sender.x_m, sender.y_m), answer)
 
 
 def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:

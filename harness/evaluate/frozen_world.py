@@ -1,14 +1,16 @@
 """Walk frozen scenes: an episode is a walk through the decision tree of its layout."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from math import isfinite
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset, Scene, argument
+from harness.dataset.schema import Edge
 from harness.dataset.select import ALL, Selection
 from harness.evaluate.draws import channel_draws
 from harness.evaluate.settings import FrozenSettings
@@ -19,7 +21,7 @@ from harness.runs.metrics import BALANCED, World, entry
 from harness.runs.records import Episode, FrozenScenes
 from harness.world.lookouts import radios
 from harness.world.outcome import rating
-from harness.world.parameters import frames
+from harness.world.parameters import ROUNDING_FRAMES
 from harness.world.scenario import Scenario
 
 
@@ -82,6 +84,17 @@ class _Walks:
         self.at, self.last = np.tile(root, (seeds, 1)), np.full(shape, -1)
         self.edges: list[Ints] = []
         self.dropped = np.zeros(shape, dtype=bool)
+
+
+class _Layout(NamedTuple):
+    """What the episodes of a layout have in common under all conditions and seeds."""
+
+    episode: int  # the episode's number
+    seed: int  # seed of the layout
+    danger: str  # where the hidden danger comes from; `none` without one
+    earliest_s: float  # when the goal can be reached; inf for never
+    reference_s: float  # when the full-view driver reaches it; inf for never
+    radios: Mapping[str, Any]  # its columns of witnesses and radios
 
 
 class FrozenWorld(SceneWorld):
@@ -154,13 +167,13 @@ class FrozenWorld(SceneWorld):
         """Return as columns what each decision and every other action was worth, in decision order."""
         at, action, latency_s = map(np.concatenate, zip(*self._decided, strict=True))
         forest, p = self._forest, self.scenario.parameters
-        off_lag = [frames(seconds, p.simulation_hz) != p.lag_frames for seconds in np.nan_to_num(latency_s)]
+        taken = np.ceil(np.nan_to_num(latency_s) * p.simulation_hz - ROUNDING_FRAMES)  # as `frames`
         return {
             "value": forest.value[at], "safe": forest.safe[at, action],
             "regret": np.where(forest.value[at], ~forest.safe[at, action], np.nan),
             "delay_s": forest.delay_s[at, action],
             "miss": forest.miss[at, action], "false_alarm": forest.false_alarm[at, action],
-            "off_lag": np.where(np.isnan(latency_s), np.nan, off_lag),
+            "off_lag": np.where(np.isnan(latency_s), np.nan, taken != p.lag_frames),
             **{name: values[forest.edge[at, action]] for name, values in forest.conflicts.items()},
             **by_action("safe", forest.safe[at], forest.actions),
             **by_action("delay_s", forest.delay_s[at], forest.actions),
@@ -188,30 +201,47 @@ class FrozenWorld(SceneWorld):
         return known
 
     def episodes(self) -> list[Episode]:
+        forest = self._forest
+        seeds, earliest_s = forest.seeds.tolist(), forest.earliest_s[forest.root].min(axis=-1)
+        layouts = [
+            _Layout(
+                number, seed, danger or "none", earliest_s=earliest, reference_s=reference,
+                radios=radios(self.scenario, seed, danger),
+            )
+            for number, seed, danger, earliest, reference in zip(
+                forest.episodes.tolist(), seeds, forest.dangers, earliest_s.tolist(),
+                forest.reference_s.tolist(), strict=True,
+            )
+        ]  # fmt: skip
         return [
-            self._episode(point.name, walks, place)
+            self._episode(point.name, seed, layout, [forest.edges[n] for n in taken if n >= 0], success)
             for point, walks in self._walks.items()
-            for place in np.ndindex(*walks.at.shape)
+            for seed, taken_here, successes in zip(self._seeds.tolist(), *self._taken(walks), strict=True)
+            for layout, taken, success in zip(layouts, taken_here, successes, strict=True)
         ]
 
-    def _episode(self, condition: str, walks: _Walks, index: tuple[int, ...]) -> Episode:
-        seed, tree = index
-        forest, last = self._forest, int(walks.last[index])
-        edges = [forest.edges[taken[index]] for taken in walks.edges if taken[index] >= 0]
-        end, reference_s = forest.end(last), float(forest.reference_s[tree])
-        earliest_s = float(forest.earliest_s[forest.root[tree]].min())
+    def _taken(self, walks: _Walks) -> tuple[list[list[list[int]]], list[list[bool]]]:
+        """Return the edges that each walk took, (S, E, steps) with -1 after its end, and its success."""
+        success = self._forest.succeeds(walks.last, np.arange(len(self._forest.root)))
+        return np.stack(walks.edges, axis=-1).tolist(), success.tolist()
+
+    def _episode(
+        self, condition: str, seed: int, layout: _Layout, edges: Sequence[Edge], success: bool
+    ) -> Episode:
+        end = edges[-1].end
+        assert end is not None
         cleared = end.result == "cleared"
-        success = bool(forest.succeeds(np.array(last), np.array(tree)))
         failure = "" if success else "late" if cleared else end.result
+        reference_s = layout.reference_s
         return Episode(
-            condition=condition, seed=int(self._seeds[seed]), episode=int(forest.episodes[tree]),
-            layout_seed=int(forest.seeds[tree]), danger=forest.dangers[tree] or "none", success=success,
-            failure=failure, outcome=rating(failure, self.scenario.parameters),
-            time_lost_s=round(end.time_s - earliest_s, 3) if cleared else None,
-            delay_s=round(end.time_s - reference_s, 3) if cleared and np.isfinite(reference_s) else None,
+            condition=condition, seed=seed, episode=layout.episode, layout_seed=layout.seed,
+            danger=layout.danger, success=success, failure=failure,
+            outcome=rating(failure, self.scenario.parameters),
+            time_lost_s=round(end.time_s - layout.earliest_s, 3) if cleared else None,
+            delay_s=round(end.time_s - reference_s, 3) if cleared and isfinite(reference_s) else None,
             time_s=end.time_s, partner=end.partner, striker=end.striker, fault=end.fault,
-            least_gap_m=min(edge.least_gap_m for edge in edges),
-            hard_brakings=sum(edge.hard_brakings for edge in edges),
-            other_crashes=sum(edge.other_crashes for edge in edges),
-            **radios(self.scenario, int(forest.seeds[tree]), forest.dangers[tree]),
+            least_gap_m=min([edge.least_gap_m for edge in edges]),
+            hard_brakings=sum([edge.hard_brakings for edge in edges]),
+            other_crashes=sum([edge.other_crashes for edge in edges]),
+            **layout.radios,
         )  # fmt: skip

@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar, get_args, get_type_hints
@@ -441,9 +442,8 @@ def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | N
     writer = csv.writer(text, lineterminator="\n")
     variant_columns = asdict(variant) if variant else {}
     writer.writerow([*variant_columns, *kind.__struct_encode_fields__])
-    for record in records:
-        values = (getattr(record, name) for name in kind.__struct_fields__)
-        writer.writerow([*variant_columns.values(), *("" if value is None else value for value in values)])
+    values = attrgetter(*kind.__struct_fields__)
+    writer.writerows((*variant_columns.values(), *values(record)) for record in records)
     return text.getvalue()
 
 
