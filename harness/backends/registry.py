@@ -135,6 +135,11 @@ def capabilities(engine: str) -> Capabilities:
     return registration(engine).capabilities
 
 
+def reads_prompts(engine: str) -> bool:
+    """Return whether an engine's models read prompts; one that is unknown here may."""
+    return (known := ENGINES.get(engine)) is None or known.capabilities.language_model
+
+
 def open_backend(
     card: "Card", *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> Backend:

@@ -46,6 +46,7 @@ def command(
         rich_help_panel=OUTPUT,
     ),
     no_cache: options.NoCache = False,
+    full: options.FullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
 ) -> None:
@@ -86,7 +87,7 @@ def command(
     videos: list[Path] = []
 
     done, page = evaluate(
-        spec, where, cache=None if no_cache else default_file(), quiet=silent, workers=who,
+        spec, where, cache=None if no_cache else default_file(), quiet=silent, workers=who, full=full,
         then=lambda: videos.extend(write_failures(where, save_video, silent) if save_video else ()),
     )  # fmt: skip
     tell(done, as_json, quiet)

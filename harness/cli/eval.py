@@ -48,6 +48,7 @@ def command(
         rich_help_panel=OUTPUT,
     ),
     tokenizer: options.Tokenizer = None,
+    full: options.FullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
 ) -> None:
@@ -73,6 +74,8 @@ def command(
                 f"--repeats {repeat}: needs one dataset, and --dataset names a suite; give one of its "
                 "datasets"
             )
+        if full:
+            raise UserError("--full: repeats have a page without decisions; leave it out")
         repeats.check(specs[0], repeat)
     if dry_run:
         from harness.evaluate.dry_run import count
@@ -90,7 +93,7 @@ def command(
         _refuse_language_models(specs, workers)
     silent, cache = as_json or quiet, None if no_cache else default_file()
     who = options.workers_of(workers or "2")
-    evaluated = partial(evaluate, cache=cache, quiet=silent, workers=who)
+    evaluated = partial(evaluate, cache=cache, quiet=silent, workers=who, full=full)
     if repeat is not None:
         repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
         return

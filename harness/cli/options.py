@@ -108,6 +108,14 @@ PageWorkers = Annotated[
     str,
     Option(metavar="WHO", help=f"Number of worker processes, {_RAY} Used on more than 1536 scenes."),
 ]
+FullPage = Annotated[
+    bool,
+    Option(
+        "--full",
+        help="Write prompts that no model reads, and every decision's camera pictures, into the page too.",
+        rich_help_panel=stated.OUTPUT,
+    ),
+]
 Shard = Annotated[
     str | None,
     Option(

@@ -21,17 +21,18 @@ def command(
         None, help="File to write. Default: RUN/report.html; needed for several runs."
     ),
     dataset: options.RunsDataset = None,
+    full: options.FullPage = False,
     workers: options.PageWorkers = "2",
 ) -> None:
     """Write one HTML page about a run or suite, or about several. It works offline."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
-    typer.echo(f"wrote {write(runs, out, dataset=dataset, workers=options.workers_of(workers))}")
+    typer.echo(f"wrote {write(runs, out, dataset=dataset, workers=options.workers_of(workers), full=full)}")
 
 
 def write(
     runs: list[Path], out: Path | None = None, quiet: bool = False, dataset: "Dataset | Path | None" = None,
-    workers: "Workers" = 1,
+    workers: "Workers" = 1, full: bool = False,
 ) -> Path:  # fmt: skip
     """Write a report, with a progress bar; returns the file.
 
@@ -42,6 +43,8 @@ def write(
             raise UserError(
                 f"--dataset {printable(dataset)}: a suite has several; report its runs one by one"
             )
+        if full:
+            raise UserError("--full: a suite's page has no decisions; report its runs one by one")
         return _write_suites(runs, out, quiet)
     from harness.report.page import write_report
     from harness.report.runs import gather
@@ -49,7 +52,8 @@ def write(
     gathered = gather(runs, dataset)
     scenes = len({scene for run in gathered.runs for scene in run.decisions.scenes})
     with bar("packing decisions", scenes, quiet) as progress:
-        return write_report(gathered, out or runs[0] / "report.html", progress=progress, workers=workers)
+        page = out or runs[0] / "report.html"
+        return write_report(gathered, page, progress=progress, workers=workers, full=full)
 
 
 def _write_suites(folders: list[Path], out: Path | None, quiet: bool) -> Path:

@@ -67,9 +67,9 @@ def file_name(model: str) -> str:
 
 def evaluate(
     spec: "Spec", folder: Path, opens: "Opens | None" = None, *, cache: Path | None, quiet: bool,
-    workers: "Workers", then: "Callable[[], object]" = lambda: None,
+    workers: "Workers", full: bool = False, then: "Callable[[], object]" = lambda: None,
 ) -> "tuple[Evaluated, Path]":  # fmt: skip
-    """Evaluate, frozen or in closed loop, with a progress bar; write the run and its page.
+    """Evaluate, frozen or in closed loop, with a progress bar; write the run and its page, `full` or not.
 
     `then` adds files to the run; a run that is stopped there resumes there.
     """
@@ -86,7 +86,7 @@ def evaluate(
     with progress as done:
         run = evaluated(spec, folder, done, cache, done.more, workers, opens)
     with work.going_on(folder):
-        page = write([folder], quiet=quiet, dataset=dataset, workers=workers if dataset else 1)
+        page = write([folder], quiet=quiet, dataset=dataset, workers=workers if dataset else 1, full=full)
         then()
     work.tidy(folder)
     return run, page

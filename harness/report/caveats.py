@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from harness.backends.base import BARE
-from harness.backends.registry import ENGINES
+from harness.backends.registry import reads_prompts
 from harness.core.config import pairs
 from harness.core.errors import printable
 from harness.evaluate.examine import MOST_SHARE, recall_findings
@@ -217,7 +217,7 @@ def no_prompt(manifests: Iterable[Manifest]) -> list[str]:
     rules: dict[str, list[tuple[str, str]]] = {"by the scene graph": [], "without looking": []}
     for agent in (agent for manifest in manifests for agent in (manifest.agent(0), *manifest.helpers)):
         name, engine = str(agent["model"]["name"]), str(agent["model"].get("engine"))
-        if (known := ENGINES.get(engine)) and not known.capabilities.language_model:
+        if not reads_prompts(engine):
             how = "without looking" if engine == "driver" and name in BLIND else "by the scene graph"
             rules[how].append((printable(name, 30), printable(str(agent["prompt"]["version"]), 20)))
     return [_no_prompt(how, *zip(*of, strict=True)) for how, of in rules.items() if of]

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from harness.core.errors import UserError, printable
 from harness.dataset.load import Scene
 from harness.parsing.status import Status
 from harness.report.details import BLOCK, Details, Part, Prompts, prompts_of
@@ -26,8 +27,8 @@ class Decisions:
         index: what the list shows and filters by, for the page.
     """
 
-    def __init__(self, runs: Runs, prompts: Prompts = prompts_of) -> None:
-        self._runs = runs
+    def __init__(self, runs: Runs, prompts: Prompts = prompts_of, full: bool = False) -> None:
+        self._runs, self._full = runs, full
         places: dict[str, tuple[int, int, str | None]] = {}
         for run in reversed(runs.runs):
             episode, step = run.decisions.whole("episode"), run.decisions.whole("step")
@@ -43,7 +44,7 @@ class Decisions:
         self._not_replayed = 0
         self._replayed = {} if runs.dataset else self._played(failed)
         framed = self._telling()
-        self._details = Details(runs, self._replayed, framed, prompts)
+        self._details = Details(runs, self._replayed, framed, prompts, full)
         self.index = {
             "actions": runs.actions,
             "scenes": [[scene, *place] for scene, place in order],
@@ -56,26 +57,24 @@ class Decisions:
 
     def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
         """Return the telling decision points, replayed; none where this simulator differs from the run's."""
-        from harness.evaluate.replay import scene_of  # loads the simulator
-
         telling = dict.fromkeys(
             scene
             for run, of in zip(self._runs.runs, failed, strict=True)
-            for scene in pick(run, of, REPLAYED)
+            for scene in (run.decisions.scenes if self._full else pick(run, of, REPLAYED))
         )
-        self._not_replayed = len(telling)
-        replayed: dict[str, Scene] = {}
-        for name in telling:
-            # A run without helpers, such as a driver's, has fewer viewers.
-            here = [run for run in self._runs.runs if name in run.decisions.scenes]
-            scene = scene_of(max(here, key=lambda run: run.decisions.helpers), name)
-            if scene.id == name:
-                replayed[name] = scene
-        self._not_replayed -= len(replayed)
-        return replayed
+        scenes = {name: scene for name in telling if (scene := replayed(self._runs, name))}
+        self._not_replayed = len(telling) - len(scenes)
+        return scenes
 
     def _telling(self) -> frozenset[str]:
-        """Return decision points that have cameras' pictures: where episodes are lost, then a sample."""
+        """Return decision points that have cameras' pictures: where episodes are lost, then a sample.
+
+        Models that see were shown them; of others a page has them only if it is to be full.
+        """
+        if self._full:
+            return frozenset(self.ids)
+        if not any(answer.image_sha256 for run in self._runs.runs for answer in run.answers):
+            return frozenset()
         most = FRAMES // (1 + max(run.decisions.helpers for run in self._runs.runs))
         if self._runs.live:
             return frozenset(spread(list(self._replayed), most))
@@ -122,6 +121,28 @@ class Decisions:
 
     def parts(self) -> list[Part]:
         return [Part(self._details, self.ids[at : at + AT_ONCE]) for at in range(0, len(self.ids), AT_ONCE)]
+
+
+def replayed(runs: Runs, name: str) -> Scene | None:
+    """Return a decision point of closed-loop runs, played again; None where this simulator ends elsewhere."""
+    from harness.evaluate.replay import scene_of  # loads the simulator
+
+    # A run without helpers, such as a driver's, has fewer viewers.
+    here = [run for run in runs.runs if name in run.decisions.scenes]
+    scene = scene_of(max(here, key=lambda run: run.decisions.helpers), name)
+    return scene if scene.id == name else None
+
+
+def everything(runs: Runs, name: str) -> dict[str, Any]:
+    """Return what a full page has of one decision point. Raises UserError if no run has it."""
+    if not any(name in run.decisions.scenes for run in runs.runs):
+        raise UserError(f"no run here has a decision {printable(name, 40)}; see the list on its page")
+    scene = replayed(runs, name) if runs.live else None
+    details = Details(
+        runs.of_scenes([name]), {name: scene} if scene else {}, frozenset([name]), prompts_of, True
+    )
+    [[detail]] = details.blocks([name])
+    return detail
 
 
 def failures(run: Run) -> dict[str, int]:

@@ -11,6 +11,7 @@ from markupsafe import Markup
 from msgspec import UNSET
 
 from harness.backends.base import BARE
+from harness.backends.registry import reads_prompts
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.core.image import Image
@@ -91,6 +92,7 @@ class Details:
     replayed: Mapping[str, Scene]  # of closed-loop runs, the scenes that could be replayed
     framed: frozenset[str]  # scenes that have their cameras' pictures
     prompts: Prompts  # as in `harness.report.page.write_report`
+    full: bool  # whether prompts that a rule was given, and did not read, are among them
 
     def of_scenes(self, ids: Sequence[str]) -> "Details":
         """Return the same with no more of the runs than these scenes need."""
@@ -155,16 +157,18 @@ class Details:
                 if (v := getattr(answer, key)) is not None and v is not False and v is not UNSET and v != ()
             }
             shown |= {key: text(shown[key]) for key in ("error", "detail") if key in shown}
-            asked = None
+            asked: int | None = None  # place among the prompts; False for one that is left out
+            agent = run.agent(answer)
+            if not (self.full or reads_prompts(str(agent["model"]["engine"]))):
+                asked = False
             # Shuffled messages are in the details of another scene.
-            if scene and prompts and source_of(name, answer.heard) == name:
+            elif scene and prompts and source_of(name, answer.heard) == name:
                 heard = messages_of(by_viewer, answer.heard, run.actions)
                 messages = prompts(as_asked(self.runs.scenario, scene, answer), answer.viewer, heard)
                 key = digest(messages)
                 if answer.prompt_sha256 == key:
                     sent.setdefault(key, messages)
                     asked = list(sent).index(key)
-            agent = run.agent(answer)
             if answer.image_sha256:
                 shown["picture"] = "blank" if answer.role == "blind" else agent["image"]
             if run.manifest.helpers:

@@ -25,7 +25,7 @@ from harness.parsing.parse import Repair, Status
 from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
 from harness.report.constancy import ignores_input, tile
-from harness.report.decisions import Decisions
+from harness.report.decisions import Decisions, everything
 from harness.report.details import Part, Prompts, prompts_of
 from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
@@ -44,6 +44,7 @@ def write_report(
     prompts: Prompts = prompts_of,
     progress: Callable[[int], None] = lambda done: None,
     workers: Workers = 1,
+    full: bool = False,
 ) -> Path:
     """Write a report about one run, or about several on the same scenes.
 
@@ -54,6 +55,8 @@ def write_report(
             had heard; None where they are unknown. By default the run's own prompt version, if it is here.
         progress: called with the number of scenes just packed.
         workers: who packs the scenes of a report of many; `prompts` can be pickled then.
+        full: whether it also has the prompts that rules do not read, and the camera pictures of every
+            decision, not only those of models that see. `harness view` shows both of one decision at a time.
 
     Returns:
         The file written.
@@ -63,7 +66,7 @@ def write_report(
     """
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
-    decisions = Decisions(runs, prompts)
+    decisions = Decisions(runs, prompts, full)
     refuse_less(out, decisions.lacks(), "--out")
     save(_pieces(runs, decisions, progress, workers), out, "--out")
     return out
@@ -103,10 +106,19 @@ def save(pieces: Iterable[str], out: Path, option: str) -> None:
 
 @uncollected()
 def render(
-    runs: Runs, prompts: Prompts = prompts_of, progress: Callable[[int], None] = lambda done: None
-) -> str:
-    """Return the page."""
-    return "".join(_pieces(runs, Decisions(runs, prompts), progress, 1))
+    runs: Runs, prompts: Prompts = prompts_of, progress: Callable[[int], None] = lambda done: None,
+    full: bool = False,
+) -> str:  # fmt: skip
+    """Return the page, as `write_report` writes it."""
+    return "".join(_pieces(runs, Decisions(runs, prompts, full), progress, 1))
+
+
+def with_decision(page: str, runs: Runs, scene: str) -> str:
+    """Return the page of some runs with everything about one decision of theirs, prompts and pictures too."""
+    detail = library.packed({scene: everything(runs, scene)})
+    return page.replace(
+        "<script>", f'<script type="application/gzip" id="opened">{detail}</script>\n<script>', 1
+    )
 
 
 def _pieces(

@@ -47,7 +47,7 @@ def report(small_path, tmp_path_factory):
             "eval", "--model", model, "--prompt", prompt, "--dataset", small_path, "--out", folders[-1],
             "--seeds", "0:2", "--latency", "paper", "--quiet",
         )  # fmt: skip
-    typed("report", *folders, "--out", base / "report.html")
+    typed("report", *folders, "--full", "--out", base / "report.html")
     return base / "report.html"
 
 
@@ -169,6 +169,17 @@ def test_on_a_phone_nothing_is_wider_than_the_phone(opened, report, index, schem
     assert page.locator("#decision .verdict.bad").is_visible()
     assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
     picture(page, f"decision-390-{scheme}")
+
+
+def test_what_a_rules_page_leaves_out_is_said_in_one_line(opened, report, index):
+    page = opened(report.parent / "proxy-v2/report.html", f"#scene={index['scenes'][1][0]}")
+    assert page.get_by_text("Not in this page").inner_text() == (
+        "Not in this page: the camera pictures; the prompts, which the model does not read. harness view "
+        "shows them; harness report RUN --full writes a page that has them."
+    )
+    assert page.locator(".cameras, .answer details").count() == 0
+    assert page.get_by_text("its text is not available").count() == 0
+    picture(page, "decision-left-out")
 
 
 def test_filters_leave_the_decisions_that_have_what_is_asked(opened, report, index):

@@ -100,6 +100,21 @@ def test_a_report_works_in_its_sandbox(page, address):
     expect(said).to_have_text(re.compile(r"^[1-9]\d* of "))
 
 
+def test_a_decision_opens_with_what_its_page_leaves_out(page, address):
+    page.goto(address)
+    page.get_by_role("link", name="first").click()
+    wait(page)
+    page.locator("#list a[data-n]").nth(1).click()
+    page.get_by_role("link", name="Show them").click()
+    page.wait_for_url("**/run?path=first&scene=*#scene=*")
+    wait(page)
+    assert page.locator(".cameras .frame").count() == 4
+    assert page.locator(".answer details").count() > 0
+    assert page.get_by_text("Not in this page").count() == 0
+    page.get_by_role("link", name="next →").click()
+    expect(page.get_by_role("link", name="Show them")).to_be_visible()
+
+
 def test_links_lead_out_of_a_sandbox_and_the_token_stays_out_of_addresses(page, address):
     """A page in a sandbox is another site to its own server."""
     page.goto(address)

@@ -37,7 +37,7 @@ def driven(tmp_path_factory):
 
 
 def written(run):
-    return render(gather([run]))
+    return render(gather([run]), full=True)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from io import BytesIO
 import numpy as np
 import pytest
 from reading import details, packed
+from run_on_disk import change, configure
 
 from harness.core.resources import folder
 from harness.dataset.load import load
@@ -31,7 +32,7 @@ def pixels(address):
 
 @pytest.mark.slow
 def test_each_viewer_has_its_picture_and_boxes_around_what_its_sensors_list(run, dataset):
-    opened = details(render(gather([run])))
+    opened = details(render(gather([run]), full=True))
     boxes = 0
     for name, detail in opened.items():
         state = dataset.scene(name).state
@@ -48,8 +49,24 @@ def test_each_viewer_has_its_picture_and_boxes_around_what_its_sensors_list(run,
     assert boxes > len(opened)
 
 
+@pytest.fixture
+def seeing(run, tmp_path):
+    """The run, as if the ego had been shown its picture."""
+    copy = shutil.copytree(run, tmp_path / "run")
+    change(copy, answer=lambda a: a.update({"image_sha256": "0" * 64} if a["role"] == "ego" else {}))
+    return copy
+
+
+def test_only_the_page_of_models_that_see_has_pictures_unless_it_is_full(run, seeing):
+    page = render(gather([run]))
+    assert json.loads(packed(page, "index"))["framed"] == 0
+    assert not any(detail["cameras"] for detail in details(page).values())
+    assert all(detail["cameras"] for detail in details(render(gather([seeing]))).values())
+
+
 @pytest.mark.slow
-def test_where_an_episode_was_lost_comes_first_if_a_page_cannot_have_all(run, monkeypatch):
+def test_where_an_episode_was_lost_comes_first_if_a_page_cannot_have_all(seeing, monkeypatch):
+    run = seeing
     lost, every = decisions.lost(read(run)), list(read(run).decisions.scenes)
     assert 1 < len(lost) < len(every) - 1
     for room in (len(lost) - 1, len(lost) + 1):
@@ -62,16 +79,10 @@ def test_where_an_episode_was_lost_comes_first_if_a_page_cannot_have_all(run, mo
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["own", "blank", "another"])
-def test_an_answer_says_which_picture_its_prompt_had(run, tmp_path, mode):
+def test_an_answer_says_which_picture_its_prompt_had(seeing, mode):
     """By what the run recorded: here of the ego alone."""
-    copy = tmp_path / "run"
-    shutil.copytree(run, copy)
-    manifest = json.loads((copy / "run.json").read_text())
-    (copy / "run.json").write_text(json.dumps({**manifest, "image": mode}))
-    lines = map(json.loads, (copy / "answers.jsonl").read_text().splitlines())
-    seen = [{**a, "image_sha256": "0" * 64} if a["role"] == "ego" else a for a in lines]
-    (copy / "answers.jsonl").write_text("".join(json.dumps(a) + "\n" for a in seen))
-    for detail in details(render(gather([copy]))).values():
+    configure(seeing, image=mode)
+    for detail in details(render(gather([seeing]))).values():
         [of] = detail["runs"]
         assert {(a["role"], a.get("picture")) for a in of["answers"]} == {("ego", mode), ("helper", None)}
 

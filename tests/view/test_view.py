@@ -13,6 +13,7 @@ import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
 from former import SCENARIO
+from reading import packed
 from starlette.requests import Request
 from starlette.testclient import TestClient
 from viewing import configure, names, said
@@ -21,6 +22,7 @@ from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.report.view import pages
 from harness.report.view.app import WAY_BACK, View
+from harness.runs.folder import read
 
 
 def test_the_list_tells_finished_unfinished_and_broken_runs_apart(browser: TestClient, reports: Path) -> None:
@@ -88,6 +90,21 @@ def test_a_run_opens_with_its_report_unless_that_is_older(browser: TestClient, r
     assert report.read_text() == "an old one", "nothing is written"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("address", ["/run?path=first", "/run?path=second", "/report?path=first&path=second"])
+def test_one_decision_opens_with_what_its_page_leaves_out(
+    address: str, browser: TestClient, reports: Path
+) -> None:
+    scene = next(iter(read(reports / "first").decisions.scenes))
+    whole = browser.get(f"{address}&scene={scene}").text
+    assert browser.get(address).text == re.sub('<script [^>]*id="opened">.*?</script>\n', "", whole)
+    detail = json.loads(packed(whole, "opened"))[scene]
+    assert list(detail["cameras"]) == list(detail["world"]["viewers"])
+    assert all(detail["prompts"][a["prompt"]] for run in detail["runs"] if run for a in run["answers"])
+    refused = browser.get(f"{address}&scene=none")
+    assert (refused.status_code, "no run here has a decision none" in refused.text) == (400, True)
+
+
 def test_a_study_opens_with_its_page_or_its_pictures(browser: TestClient, reports: Path) -> None:
     page = browser.get("/run?path=first/sweep-tau").text
     pictures = re.findall(r'<img src="(/picture[^"]+)"', page)
@@ -126,7 +143,7 @@ def test_nothing_is_drawn_for_who_left_while_others_pages_were_drawn(
 ) -> None:
     drawn: list[int] = []
 
-    def draw(folders: list[Path]) -> str:
+    def draw(folders: list[Path], *_: object) -> str:
         drawn.append(len(folders))
         return "<body>"
 
@@ -192,7 +209,7 @@ def test_what_cannot_be_shown_is_one_readable_line(
 def test_a_bug_is_a_page_too_and_the_terminal_has_its_trace(
     browser: TestClient, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(pages, "report", lambda folders: 1 / 0)
+    monkeypatch.setattr(pages, "report", lambda *_: 1 / 0)
     answer = browser.get("/report?path=second")
     assert (answer.status_code, said(answer)) == (500, "this page cannot be made; the terminal says why")
     assert "ZeroDivisionError" in capsys.readouterr().err
@@ -241,7 +258,7 @@ def test_a_long_report_does_not_keep_the_list_waiting(
 ) -> None:
     begun, go_on = threading.Event(), threading.Event()
 
-    def slow(folders: list[Path]) -> str:
+    def slow(folders: list[Path], *_: object) -> str:
         begun.set()
         assert go_on.wait(60)
         return "slow"

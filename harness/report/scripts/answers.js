@@ -49,7 +49,7 @@ function answerSection(answer, detail, actions, meanings, leftOut) {
     answer.retries ? `${answer.retries} failed attempts before` : null,
     answer.cached ? "from the cache" : null,
   ].filter(Boolean).join("; ");
-  const sent = answer.prompt == null ? null : detail.prompts[answer.prompt];
+  const sent = detail.prompts[answer.prompt];
   const message = Object.entries(answer.message ?? {});
   return h("section", { class: "answer" },
     h("h4", {}, [who(answer), answer.agent].filter(Boolean).join(", "), [...(answer.faults ?? [answer.status]), ...(answer.repairs ?? [])].map((word) =>
@@ -70,5 +70,5 @@ function answerSection(answer, detail, actions, meanings, leftOut) {
       ? h("details", {},
         h("summary", {}, `prompt, ${sent.length} messages`),
         sent.map((m) => [h("small", {}, m.role), h("pre", {}, m.content)]))
-      : h("p", { class: "quiet" }, "prompt: its text is not available as it was sent"));
+      : answer.prompt == null && h("p", { class: "quiet" }, "prompt: its text is not available as it was sent"));
 }

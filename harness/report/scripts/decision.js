@@ -110,7 +110,8 @@ class DecisionPage {
       );
       return false;
     }
-    const detail = (await block(Math.floor(n / index.block)))[n % index.block];
+    this.everything = (await opened)[name];
+    const detail = this.everything ?? (await block(Math.floor(n / index.block)))[n % index.block];
     const record = detail.runs[state.run], decisions = (record?.decisions ?? []).filter((d) => d.seeds.includes(state.seed));
     const viewers = Object.keys(detail.world?.viewers ?? {}), viewer = params.get("viewer");
     Object.assign(this, { n, params, state, detail, record, decisions, viewers });
@@ -131,6 +132,7 @@ class DecisionPage {
           this.picture(),
           h("div", {}, this.came(), h("h3", {}, "Distributions before and after fusion"), policies)),
         this.cameras(),
+        this.leftOut(),
         h("h2", {}, "What was decided"),
         this.record ? this.decided() : null,
         this.messages(),
@@ -187,8 +189,9 @@ class DecisionPage {
   picture() {
     const { world } = this.detail, { ground } = this.about, [id] = this.index.scenes[this.n];
     if (!world) {
-      return h("p", { class: "picture" }, "No picture: the page has pictures of the most telling decision points only, and only "
-        + "of those that could be played again here. `harness run video` draws the whole episode.");
+      return h("p", { class: "picture" }, this.everything
+        ? "No picture: it could not be played again here."
+        : "No picture: the page has pictures of the most telling decision points only. `harness run video` draws the whole episode.");
     }
     const [drawing, said] = birdsEye(world, ground, this.viewer, this.chosen?.messages ?? [], this.params.get("zoom"));
     const save = (kind) => small(`Save as ${kind.toUpperCase()}`, () => saved(drawing, id, kind));
@@ -197,19 +200,30 @@ class DecisionPage {
   }
 
   cameras() {
-    const { world, cameras } = this.detail, { framed, scenes, live } = this.index;
-    if (!world) return null;
-    if (!cameras) {
-      const drawn = live ? "`harness run video` draws them" : "`harness dataset show --camera` draws any other";
-      return h("p", { class: "quiet" }, `This page has camera pictures of ${framed} of ${scenes.length} `
-        + `${live ? "decision points" : "decisions, those that lost an episode first"}; ${drawn}.`);
-    }
+    const { world, cameras } = this.detail;
+    if (!world || !cameras) return null;
     const boxes = h("input", { type: "checkbox", checked: this.boxes !== false, onchange: () => { this.boxes = boxes.checked; } });
     return h("section", { class: "cameras" },
       h("h3", {}, "What the cameras saw"),
       h("p", { class: "quiet" }, shownTo(this.record?.answers ?? [], this.viewers), " Front above rear, each 120° wide. ",
         h("label", {}, boxes, " boxes around what the sensors list")),
       h("div", { class: "frames" }, this.viewers.map((viewer) => cameraFrame(world, viewer, cameras[viewer]))));
+  }
+
+  // What is known of this decision and not in the page, and how to see it.
+  leftOut() {
+    const unread = this.record?.answers.some((answer) => answer.prompt === false), { world, cameras } = this.detail;
+    const left = [
+      !world && "the scene from above", !cameras && "the camera pictures", unread && "the prompts, which the model does not read",
+    ].filter(Boolean).join("; ");
+    if (!left || this.everything) return null;
+    if (!document.querySelector(".way-back")) {
+      return h("p", { class: "quiet" }, `Not in this page: ${left}. `, h("code", {}, "harness view"), " shows them; ",
+        h("code", {}, "harness report RUN --full"), " writes a page that has them.");
+    }
+    const query = new URLSearchParams(location.search);
+    query.set("scene", this.index.scenes[this.n][0]);
+    return h("p", { class: "quiet" }, `Not in this page: ${left}. `, h("a", { href: `?${query}${location.hash}` }, "Show them"));
   }
 
   came() {

@@ -40,6 +40,9 @@ function block(n) {
   return blocks.get(n);
 }
 
+// What `harness view` put into the page: all there is of some decisions, by scene.
+const opened = document.getElementById("opened") ? unpacked("opened").then(JSON.parse) : {};
+
 // The one way to write a number: with so many decimals and its unit; a dash where it is not known.
 const number = (value, digits, unit = "") =>
   value == null ? "–" : value.toFixed(digits) + (unit && ` ${unit}`);

@@ -34,7 +34,6 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from harness.core.errors import UserError, printable
-from harness.core.files import bytes_of
 from harness.report.view import pages
 from harness.report.view.access import Access
 from harness.report.view.folder import PICTURES, own_file, pictures, whole
@@ -124,9 +123,12 @@ class View:
         if run.kind not in pages.RUNS:
             return await run_in_threadpool(self._study, run)
         written, drawn = (own_file(self.folder, run.name, name) for name in ("report.html", "run.json"))
-        if written and drawn and written.stat().st_mtime >= drawn.stat().st_mtime:
+        scene = request.query_params.get("scene")
+        if not (written and drawn and written.stat().st_mtime >= drawn.stat().st_mtime):
+            written = None
+        if written and scene is None:
             return await run_in_threadpool(_shown, written)
-        return await self._drawn(request, partial(pages.report, self._whole([run])))
+        return await self._drawn(request, partial(pages.report, self._whole([run]), written, scene))
 
     def picture(self, request: Request) -> Response:
         [run] = self._listed([request.query_params.get("path", "")])
@@ -150,7 +152,8 @@ class View:
         picked = await run_in_threadpool(self._picked, request)
         if not picked:
             raise UserError("no run is picked; pick one or more for a report")
-        return await self._drawn(request, partial(pages.report, self._whole(picked)))
+        scene = request.query_params.get("scene")
+        return await self._drawn(request, partial(pages.report, self._whole(picked), None, scene))
 
     def wrong(self, request: Request, error: Exception) -> Response:
         """Return a page of one line about a request that cannot be answered."""
@@ -215,7 +218,7 @@ class View:
 
 
 def _shown(page: Path) -> Response:
-    return _with_way_back(bytes_of(page, "rows").decode("utf-8", "replace"))
+    return _with_way_back(pages.whole_text(page))
 
 
 def _with_way_back(page: str) -> Response:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-from harness.core.files import text_of
+from harness.core.files import bytes_of, text_of
 from harness.report import suite as suites
 from harness.report.compare import page as comparison
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
-from harness.report.page import environment, render
+from harness.report.page import environment, render, with_decision
 from harness.report.runs import gather
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD, Listed, runs
@@ -25,9 +25,16 @@ NEWEST = "-date"
 COLUMNS = ("name", "kind", "model", "prompt", "success", "date")
 
 
-def report(folders: Sequence[Path]) -> str:
-    """Return the report of one run or several."""
-    return render(gather(folders))
+def report(folders: Sequence[Path], written: Path | None = None, scene: str | None = None) -> str:
+    """Return the report of one run or several, `written` or new, with all there is of a scene's decision."""
+    runs = gather(folders)
+    page = render(runs) if written is None else whole_text(written)
+    return page if scene is None else with_decision(page, runs, scene)
+
+
+def whole_text(page: Path) -> str:
+    """Return the page that a run's folder holds."""
+    return bytes_of(page, "rows").decode("utf-8", "replace")
 
 
 def compared(folder: Path, a: Path, b: Path) -> str:
