@@ -52,29 +52,8 @@ check: .venv/dev
 docs: .venv/docs ## the documentation as a site: build/docs/index.html
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --nitpicky docs build/docs
 
-bench: .venv/dev ## the benchmarks; see benchmarks/README.md
-	$(BIN)/python benchmarks/commands.py
-	$(BIN)/python benchmarks/install.py
-	$(BIN)/python benchmarks/startup.py
-	$(BIN)/python benchmarks/own_time.py
-	$(BIN)/python benchmarks/coordinate.py
-	$(BIN)/python benchmarks/radio.py
-	$(BIN)/python benchmarks/rewards.py
-	$(BIN)/python benchmarks/study.py
-	$(BIN)/python benchmarks/ledger.py
-	$(BIN)/python benchmarks/answer_modes.py
-	$(BIN)/python benchmarks/worlds.py
-	$(BIN)/python benchmarks/drive.py
-	$(BIN)/python benchmarks/executors.py
-	$(BIN)/python benchmarks/report.py
-	$(BIN)/python benchmarks/growth.py
-	$(BIN)/python benchmarks/load.py
-	$(BIN)/python benchmarks/servers.py
-	$(BIN)/python benchmarks/camera.py
-	$(BIN)/python benchmarks/pictures.py
-	$(BIN)/python benchmarks/constants.py
-	$(BIN)/python benchmarks/asked.py
-	$(BIN)/python benchmarks/intervals.py
+bench: .venv/dev ## the table of benchmarks/README.md, in some ten minutes
+	$(BIN)/python benchmarks/table.py --page benchmarks/README.md
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

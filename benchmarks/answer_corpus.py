@@ -25,6 +25,8 @@ from harness.evaluate.live_world import LiveSource
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 
+SMALLEST = "swarm-tiny answers.jsonl --questions 1 --most 5 --tokens 8"
+NEEDS = "llama_cpp"
 FIRST_SEED = 40_000  # among the tune layouts
 SCENARIOS = ("occluded-intersection", "blind-merge", "roundabout-entry")
 DRAWS = ((0.0, 0), (0.5, 1), (0.5, 2), (1.0, 1), (1.0, 2))  # temperature and number of the answer

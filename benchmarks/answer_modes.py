@@ -17,7 +17,6 @@ weights, so it takes as long as the product of one row with each of them.
 """
 
 import argparse
-import json
 import os
 import tempfile
 import time
@@ -29,6 +28,7 @@ from statistics import median
 from typing import Any
 
 import shapes
+from rows import Row, finish
 
 from harness.backends import cards
 from harness.backends.base import Request
@@ -45,6 +45,9 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 
+SMALLEST = "--prompts 1 --batch-size 2 --modes json"
+TABLE = "--prompts 32 --batch-size 32"
+NEEDS = "torch llama_cpp"
 JSON_TOKENS = 43  # of a compact answer with three actions, in Qwen's vocabulary
 PLAIN, PEER = "a: generate, batch 1", "b: lm-evaluation-harness"
 MODES = ("json", "constrained", "readout", "cyclic")
@@ -102,8 +105,23 @@ def main() -> None:
         for size in (f"batch {n}" for n in dict.fromkeys((1, given.batch_size))):
             times = rates[f"readout, {size}"] / rates[f"cyclic, {size}"]
             print(f"cyclic, {size}: {times:.2f} times one pass, aim {CYCLIC_AIM}")
-    found = {"rates": rates, "limits": limits, "limits_at_one": limits_at_one}
-    print(json.dumps(found | vars(given), default=str))
+    peer = (
+        f"lm-evaluation-harness {rates[PEER]:.0f} /s"
+        if PEER in rates
+        else f"`generate` {rates[PLAIN]:.0f} /s"
+    )
+    rows = [
+        Row(
+            f"{mode} of {given.model}, batch {given.batch_size}, decisions a CPU second",
+            rates[f"{mode}, batch {given.batch_size}"],
+            "/s",
+            given.repeats,
+            limit,
+            peer,
+        )
+        for mode, (limit, *_) in limits.items()
+    ]
+    finish(rows, rates=rates, limits=limits, limits_at_one=limits_at_one, **vars(given))
 
 
 def asked_of(card: Card, mode: str, count: int, most: int | None) -> list[Request]:

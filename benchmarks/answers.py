@@ -1,6 +1,6 @@
 """What each answer mode scores: decision, read-out, constrained and json of the same models.
 
-    python benchmarks/answers.py [--only TEXT] [--out reports/answers] [--page docs/answers.md]
+    python benchmarks/answers.py [--only TEXT] [--layouts N] [--out reports/answers] [--page docs/answers.md]
 
 It evaluates each of `ASKED` in each of its modes on report layouts, alone and with helpers under `6g`, and
 writes the table of the page between its marks. What is finished is read and not made again; a stopped one
@@ -16,6 +16,7 @@ from harness.core.figures import shown
 from harness.core.statistics import Estimate
 from harness.runs.metrics import ALL, BALANCED, BASELINE, GAINS
 
+SMALLEST = "--only constant-v2 --layouts 1"
 MODES = ("json", "constrained", "readout", "decision")
 ONE = "occluded-intersection-v3"
 ASKED = {
@@ -33,11 +34,12 @@ RULES = ("constant",)
 def main() -> None:
     """Make what is missing, and write the page's table."""
     given = options(__doc__, "answers").parse_args()
-    for row in (asked._replace(answer=mode) for asked, modes in ASKED.items() for mode in modes):
+    wanted = {row.asked(given.layouts): modes for row, modes in ASKED.items()}
+    for row in (asked._replace(answer=mode) for asked, modes in wanted.items() for mode in modes):
         if given.only in row.name:
             row.evaluate(given.out / row.name, *POINTS)
     lines: list[list[str]] = []
-    for asked, modes in ASKED.items():
+    for asked, modes in wanted.items():
         found = {m: Families.read(given.out / asked._replace(answer=m).name) for m in modes}
         lines += written(asked, {mode: runs for mode, runs in found.items() if runs})
     heads = ("model · prompt · mode", "n", "alone", "6g", "6g over alone", "over read-out, alone",

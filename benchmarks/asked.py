@@ -1,6 +1,7 @@
 """Requests, prompt tokens and CPU time of whole runs: all helpers asked, or only those that are used.
 
-    python benchmarks/asked.py [--models proxy swarm-tiny smollm2-135m] [--episodes 10] [--seeds 0:5]
+    python benchmarks/asked.py [--models proxy swarm-tiny smollm2-135m] [--only TEXT]
+                               [--episodes 10] [--seeds 0:5]
 
 Each model evaluates the first layouts of the shipped dataset under `single-local` alone and under the usual
 conditions, and drives as many layouts under the usual conditions, with `--ask all` and `--ask used` in turn;
@@ -19,6 +20,7 @@ from commands import HERE, run
 from harness.evaluate.spec import ASKS
 from harness.runs import folder
 
+SMALLEST = "--models proxy --only closed --episodes 1 --seeds 0:1"
 WORLDS = {
     "frozen, single-local": ["eval", "--limit", "N", "--condition", "single-local"],
     "frozen": ["eval", "--limit", "N"],
@@ -30,6 +32,7 @@ def main() -> None:
     """Print a table and one line of JSON."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--models", nargs="+", default=["proxy", "swarm-tiny"])
+    arguments.add_argument("--only", default="", help="only worlds whose name has this text")
     arguments.add_argument("--episodes", type=int, default=10)
     arguments.add_argument("--seeds", default="0:5")
     given = arguments.parse_args()
@@ -40,6 +43,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as work:
         for model in given.models:
             for world, command in WORLDS.items():
+                if given.only not in world:
+                    continue
                 typed = [str(given.episodes) if part == "N" else part for part in command]
                 typed += ["--model", model, "--seeds", given.seeds, "--no-cache", "--quiet", "--out", "OUT"]
                 rows = {ask: _measured([*typed, "--ask", ask], Path(work) / ask) for ask in reversed(ASKS)}

@@ -1,6 +1,7 @@
 """What calibrating a model's answers does: probabilities, trigger, bits, latency and success.
 
-    python benchmarks/calibration.py [--only TEXT] [--out reports/calibration] [--page docs/calibration.md]
+    python benchmarks/calibration.py [--only TEXT] [--layouts N]
+                                     [--out reports/calibration] [--page docs/calibration.md]
 
 For each row of `ROWS` it evaluates the model on tune layouts of `SCENES`, fits L0, L1 and both there
 (`harness model calibrate`), and evaluates it on report layouts of the same scenes as it answers and by each
@@ -27,6 +28,7 @@ from harness.runs.folder import Run, read
 from harness.runs.metrics import BALANCED, by_episode, entry, halved, metrics_of
 from harness.runs.summary import judged_of
 
+SMALLEST = "--only proxy --layouts 2"
 SCENES = "occluded-intersection:witnesses=each,radio_share=0.25,limits=2,perception=2"
 REPORT = "occluded-intersection-v3"  # report layouts of the same scenes
 TUNE_LAYOUTS = 60
@@ -70,8 +72,9 @@ def main() -> None:
     (given.out / MARKER).touch()
     os.chdir(given.out)  # a project, whose calibrations are found
     if not Path("tune/manifest.json").exists():
-        harness("dataset", "build", SCENES, "--episodes", str(TUNE_LAYOUTS), "--no-audit", "--out", "tune")
-    runs = [(row, evaluated(row)) for row in ROWS if given.only in row.name]
+        harness("dataset", "build", SCENES, "--episodes", str(given.layouts or TUNE_LAYOUTS), "--no-audit",
+                "--out", "tune")  # fmt: skip
+    runs = [(row, evaluated(row, given.layouts)) for row in ROWS if given.only in row.name]
     text = "\n\n".join([probabilities(runs), cooperation(runs)])
     print(text)
     if page:
@@ -83,10 +86,10 @@ def fit_of(row: Row, level: str) -> str:
     return f"{row.name}-{level.lower().replace('+', '-')}"
 
 
-def evaluated(row: Row) -> Run:
+def evaluated(row: Row, layouts: int | None) -> Run:
     """Return a row's run on report layouts, made if it is missing."""
     if not Path(row.name, "report/run.json").exists():
-        evaluate(row, "tune", POINTS_PLAYED)
+        evaluate(row, "tune", POINTS_PLAYED, layouts)
         for level in LEVELS:
             file = Path(FOLDER, f"{fit_of(row, level)}.toml")
             if not file.exists():
@@ -94,17 +97,18 @@ def evaluated(row: Row) -> Run:
                 harness("model", "calibrate", run, "--dataset", "tune", "--level", level, "--out", str(file))
         corrected = [f"{point}:calibration={fit_of(row, level)}"
                      for level, point in product(LEVELS, POINTS_PLAYED)]  # fmt: skip
-        evaluate(row, "report", [*POINTS_PLAYED, *corrected])
+        evaluate(row, "report", [*POINTS_PLAYED, *corrected], layouts)
     return read(Path(row.name, "report"))
 
 
-def evaluate(row: Row, purpose: str, conditions: Sequence[str]) -> None:
+def evaluate(row: Row, purpose: str, conditions: Sequence[str], layouts: int | None) -> None:
     """Evaluate a row's model on layouts for a purpose, unless it is done; every helper answers."""
     out = Path(row.name, purpose)
     if not (out / "run.json").exists():
         harness(
             "eval", "--model", row.model, "--prompt", row.prompt, "--answer", row.answer,
             *(("--letters", row.letters) if row.letters else ()),
+            *(("--limit", str(layouts)) if layouts else ()),
             "--dataset", "tune" if purpose == "tune" else REPORT, "--seeds", SEEDS, "--ties", "drawn",
             "--ask", "all", "--latency", "paper", "--quiet", "--out", str(out),
             *(word for condition in conditions for word in ("--condition", condition)),

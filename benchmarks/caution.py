@@ -1,12 +1,14 @@
 """What one needless SLOWER costs in layouts without a danger, from which `harmless_allowance_s` follows.
 
-`python benchmarks/caution.py [LAYOUTS [SCENES]]` drives full-view through those of 200 tune layouts of each
-scenario, as SCENES has them drawn and judged.
-At each decision at which it does not slow down, an ego takes SLOWER instead and then drives as full-view
-does. The table has by how much later it reaches the goal, and how often that is more than is allowed.
+    python benchmarks/caution.py [--layouts 200] [--scenes SCENES] [--scenarios NAME ...]
+
+It drives full-view through those of so many tune layouts of each scenario, as SCENES has them drawn and
+judged. At each decision at which it does not slow down, an ego takes SLOWER instead and then drives as
+full-view does. The table has by how much later it reaches the goal, and how often that is more than is
+allowed.
 """
 
-import sys
+import argparse
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,7 +22,7 @@ from harness.world.outcome import ROUNDING_S, Outcome
 from harness.world.scenario import Scenario
 from harness.world.world import World
 
-LAYOUTS = 200
+SMALLEST = "--layouts 4 --scenarios blind-merge"
 SCENES = "limits=2,witnesses=any,radio_share=0,perception=1"
 SLOWER = ALWAYS["brake"]
 
@@ -61,11 +63,15 @@ def _goal_s(outcome: Outcome) -> float:
 
 def main() -> None:
     """Measure and print."""
-    layouts = int(sys.argv[1]) if len(sys.argv) > 1 else LAYOUTS
-    scenes = sys.argv[2] if len(sys.argv) > 2 else SCENES
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("--layouts", type=int, default=200)
+    arguments.add_argument("--scenes", default=SCENES)
+    arguments.add_argument("--scenarios", nargs="+", default=sorted(scenarios.names()))
+    given = arguments.parse_args()
+    layouts, scenes = given.layouts, given.scenes
     print(f"harmless layouts of {layouts} each, {stated(FIRST['tune'], layouts)}, {scenes}; seconds later")
     print(f"{'scenario':22} decision    n   0 %    5 %   50 %  100 %   late, % [95 % interval]")
-    for name in sorted(scenarios.names()):
+    for name in given.scenarios:
         scenario = scenarios.get(f"{name}:{scenes}")
         seeds = range(FIRST["tune"], FIRST["tune"] + layouts)
         harmless = [s for s in seeds if scenario.layout(s, scenario.parameters).danger is None]

@@ -1,12 +1,14 @@
 """How many tune layouts of each scenario an ego clears that always takes one action.
 
-`python benchmarks/constants.py` drives 240 layouts of each, as they are drawn and judged under either version
-of the limits, in some minutes. It prints what each action clears, and writes `harness/world/constants.csv`,
-from which the driver `constant` takes its action.
+    python benchmarks/constants.py [--layouts 240] [--scenarios NAME ...]
+
+It drives so many layouts of each, as they are drawn and judged under either version of the limits, in some
+minutes. It prints what each action clears; without options it writes `harness/world/constants.csv`, from
+which the driver `constant` takes its action.
 """
 
+import argparse
 import csv
-import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -19,7 +21,8 @@ from harness.world.drivers import CONSTANTS, PRIVILEGED
 from harness.world.scenario import Scenario
 from harness.world.world import World
 
-LAYOUTS = 240
+SMALLEST = "--layouts 1 --scenarios blind-merge"
+LAYOUTS, ALL = 240, sorted(scenarios.names())
 # How layouts are drawn that are judged by each version.
 VERSIONS = {
     1: "limits=1,witnesses=any,radio_share=0,perception=1",
@@ -60,12 +63,16 @@ def measured(name: str, limits: int, layouts: int) -> Iterator[tuple[object, ...
 
 def main() -> None:
     """Measure, print and write."""
-    layouts = int(sys.argv[1]) if len(sys.argv) > 1 else LAYOUTS
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("--layouts", type=int, default=LAYOUTS)
+    arguments.add_argument("--scenarios", nargs="+", default=ALL)
+    given = arguments.parse_args()
+    layouts = given.layouts
     print(f"success % [95 % interval] of {layouts} layouts each, {stated(FIRST['tune'], layouts)}")
     print(f"{'scenario':22} limits  action   of all, balanced over dangerous and harmless, of each")
-    names = [(limits, name) for limits in VERSIONS for name in sorted(scenarios.names())]
+    names = [(limits, name) for limits in VERSIONS for name in given.scenarios]
     rows = [row for limits, name in names for row in measured(name, limits, layouts)]
-    if layouts == LAYOUTS:
+    if (layouts, given.scenarios) == (LAYOUTS, ALL):
         with CONSTANTS.open("w", encoding="utf-8", newline="") as file:
             table = csv.writer(file, lineterminator="\n")
             table.writerow(HEADS)

@@ -1,7 +1,7 @@
 """Intent or objects? What each content of messages is worth to a planner and to models, and at what cost.
 
-    python benchmarks/contents.py [--limit N] [--only TEXT] [--out reports/contents]
-                                  [--page docs/intent-or-objects.md]
+    python benchmarks/contents.py [--limit N] [--layouts N] [--dataset D] [--only TEXT]
+                                  [--out reports/contents] [--page docs/intent-or-objects.md]
 
 For each row of `ROWS` it evaluates the model on report layouts of the shipped datasets, plays
 `harness study contents` on the run, and drives the same layouts in closed loop, where the time of a second
@@ -36,6 +36,7 @@ from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, write_study
 from harness.world import scenarios
 
+SMALLEST = "--only proxy --layouts 1 --dataset blind-merge-v2"
 PLAYED = {NOTHING: "single-local", **{name: f"{BASE},content={name}" for name in CONTENTS}}
 
 
@@ -67,12 +68,14 @@ def main() -> None:
     """Make what is missing, and write the page's tables."""
     arguments = options(__doc__, "contents")
     arguments.add_argument("--limit", type=int, help="layouts of a family that language models get")
+    arguments.add_argument("--dataset", help="instead of each row's own")
     given = arguments.parse_args()
     points = ("--condition", "single-local", "--condition", BASE)
-    places = {asked: given.out / asked.row.name for asked in ROWS}
+    rows = [asked._replace(row=asked.row.asked(dataset=given.dataset)) for asked in ROWS]
+    places = {asked: given.out / asked.row.name for asked in rows}
     for asked, here in places.items():
         if given.only in here.name:
-            limit = None if asked.rule else given.limit
+            limit = given.layouts or (None if asked.rule else given.limit)
             asked.row._replace(limit=limit).evaluate(here / "frozen", *points)
             drive(asked, here, limit, play(asked, here))
     done = {asked: here for asked, here in places.items() if finished(here / "frozen")}

@@ -6,17 +6,19 @@ The limit is drawing the random numbers that such decisions need, with NumPy.
 """
 
 import argparse
-import json
 import statistics
 from time import process_time
 
 import numpy as np
+from rows import Row, finish
 
 from harness.coordination.coordinate import coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS
 from harness.radio.channel import Draws
 
+SMALLEST = "--decisions 100 --repeats 1"
+TABLE = ""
 AIM_S = 1.0
 HELPERS, ACTIONS = 3, 3
 
@@ -44,7 +46,12 @@ def main() -> None:
     print(f"CPU seconds for {n} decisions of {HELPERS} helpers, median of {given.repeats}; aim {AIM_S}")
     for name, median_s in medians.items():
         print(f"  {name:<14}{median_s:8.4f}   {median_s / medians['limit']:6.1f} of the limit")
-    print(json.dumps({"decisions": n, "repeats": given.repeats, "cpu_s": medians}))
+    limit, *points = [(name, 1000 * s) for name, s in medians.items()]
+    rows = [
+        Row(f"`coordinate` of {n} decisions, `{name}`, CPU", ms, "ms", given.repeats, limit[1])
+        for name, ms in points
+    ]
+    finish(rows, decisions=n, repeats=given.repeats, cpu_s=medians)
 
 
 def decisions(generator: np.random.Generator, n: int) -> Intents:

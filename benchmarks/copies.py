@@ -1,12 +1,16 @@
-"""A dataset many times over, for benchmarks: every copy has other episodes, and other prompts."""
+"""A dataset or a run many times over, for benchmarks: every copy has other episodes, and other prompts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from msgspec import structs
 
 from harness.dataset.load import Dataset, Scene, Trees
 from harness.dataset.schema import Branching, Tree
+from harness.runs import folder
+from harness.runs.decisions import Decisions, Labels
+from harness.runs.folder import Run
 
 
 @dataclass(frozen=True)
@@ -61,3 +65,27 @@ def shifted(scene: str, by: int) -> str:
     """A scene's id in an episode that much further."""
     episode, _, rest = scene.partition("-")
     return f"{int(episode) + by:05d}-{rest}"
+
+
+def repeated(run: Run, times: int, apart: int, out: Path) -> Run:
+    """A run n times, in a folder of its own: its episodes, each time so many numbers further."""
+    d, ids = run.decisions, list(run.decisions.scenes)
+    codes, shifts = d.codes("scene", ids), range(0, times * apart, apart)
+
+    def moved(by: int) -> Decisions:
+        scenes = Labels(codes, [shifted(scene, by) for scene in ids])
+        return d.replace(scene=scenes, episode=d.whole("episode") + by)
+
+    world = structs.replace(run.manifest.world, episodes=times * run.manifest.world.episodes)
+    folder.write(
+        out,
+        structs.replace(run.manifest, world=world),
+        Decisions.concat([moved(by) for by in shifts]),
+        [structs.replace(episode, episode=episode.episode + by) for episode in run.episodes for by in shifts],
+        (
+            folder.lines([structs.replace(a, scene=shifted(a.scene, by)) for a in run.answers])
+            for by in shifts
+        ),
+        run.scores,
+    )
+    return folder.read(out)

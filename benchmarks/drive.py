@@ -7,7 +7,6 @@ harness's own share is the largest it can be.
 """
 
 import argparse
-import json
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -17,6 +16,8 @@ from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 from unittest.mock import patch
+
+from rows import Row, finish
 
 from harness.backends import cards
 from harness.backends.proxy import Proxy
@@ -35,6 +36,8 @@ from harness.world import lockstep
 from harness.world import reference as live
 from harness.world.scenarios.occluded_intersection import SCENARIO
 
+SMALLEST = "--episodes 1 --seeds 1"
+TABLE = ""
 LATENCY = Latency("card", "the proxy's card", 0.145, 0.145, 0.145)
 FORMS = {"NumPy alone": 10**9}
 if find_spec("numba"):  # the first of these loads it
@@ -77,10 +80,15 @@ def main() -> None:
         print(f"  {workers} workers: {lives / seconds:7.1f} episodes/s")
     print("  one worker, CPU: " + ", ".join(f"{form} {seconds:.2f} s" for form, seconds in cpus.items()))
     print(f"  a second worker makes it {walls[1] / walls[2]:.2f} times as fast")
-    print(json.dumps({
-        "episodes": lives, "frames": frames,
-        "frames_lived": frames_lived, "parts_s": parts, "wall_s": walls, "cpu_s": cpus,
-    }))  # fmt: skip
+    rows = [
+        Row("closed loop, episodes a CPU second", lives / total, "/s", 1, aim="≥ 1000"),
+        Row("closed loop, own share of the CPU time", 100 * parts["own"] / total, "%", 1, aim="≤ 20"),
+        Row("closed loop, times as fast with 2 workers, wall", walls[1] / walls[2], "times", 2, 2.0),
+    ]
+    finish(
+        rows, episodes=lives, frames=frames, frames_lived=frames_lived, parts_s=parts, wall_s=walls,
+        cpu_s=cpus,
+    )  # fmt: skip
 
 
 def drive(spec: Spec, numbers: range) -> list[Episode]:

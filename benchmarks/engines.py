@@ -27,6 +27,8 @@ from harness.evaluate import questions
 from harness.evaluate.agent import Agent
 from harness.prompts import versions
 
+SMALLEST = "--model swarm-tiny --questions 1 --answers readout"
+NEEDS = "torch llama_cpp"
 AIMS = {"readout": 5.0, "json": 3.0}  # times fewer CPU seconds on transformers
 
 

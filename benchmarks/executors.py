@@ -3,18 +3,23 @@
 Chunks wait for a second, so that what else the machine does changes little, or do nothing. Ray is a cluster
 of two nodes of a core each, all here.
 
-    python benchmarks/executors.py [--chunks 20] [--seconds 1] [--empty 500] [--repeats 5]
+    python benchmarks/executors.py [--chunks 20] [--seconds 1] [--empty 500] [--repeats 5] [--only TEXT]
 """
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from time import perf_counter, sleep
 
+from rows import Row, finish
+
 from harness.core.parallel import Ray, Workers, spread
+
+SMALLEST = "--chunks 2 --seconds 0.01 --empty 2 --repeats 1 --only processes"
+TABLE = "--chunks 8 --repeats 1"
+EXECUTORS: dict[str, Workers] = {"2 processes": 2, "Ray, 2 nodes": Ray()}
 
 
 def main() -> None:
@@ -24,11 +29,16 @@ def main() -> None:
     arguments.add_argument("--seconds", type=float, default=1.0)
     arguments.add_argument("--empty", type=int, default=500)
     arguments.add_argument("--repeats", type=int, default=5)
+    arguments.add_argument("--only", default="", help="only executors whose name has this text")
     given = arguments.parse_args()
     alone = least_s(nap, [given.seconds] * given.chunks, 1, 1)
     found: dict[str, dict[str, float]] = {}
-    with cluster():
-        for name, workers in (("2 processes", 2), ("Ray, 2 nodes", Ray())):
+    with ExitStack() as stack:
+        for name, workers in EXECUTORS.items():
+            if given.only not in name:
+                continue
+            if isinstance(workers, Ray):
+                stack.enter_context(cluster())
             spread(nap, [0.0] * 4, workers, lambda done: None)  # pays for starts and imports
             took = least_s(nap, [given.seconds] * given.chunks, workers, given.repeats)
             empty = least_s(nap, [0.0] * given.empty, workers, given.repeats)
@@ -39,7 +49,14 @@ def main() -> None:
     for name, of in found.items():
         took, empty = alone / of["speed_up"], of["empty_ms"]
         print(f"  {name:<14}{took:6.2f} s, {of['speed_up']:.2f} times as fast; an empty chunk {empty:.2f} ms")
-    print(json.dumps({"chunks": given.chunks, "seconds": given.seconds, "alone_s": alone, **found}))
+    rows = [
+        Row(f"{name}, times as fast as one process", of["speed_up"], "times", given.repeats, 2.0)
+        for name, of in found.items()
+    ]
+    rows += [
+        Row(f"{name}, an empty chunk", of["empty_ms"], "ms", given.repeats) for name, of in found.items()
+    ]
+    finish(rows, chunks=given.chunks, seconds=given.seconds, alone_s=alone, executors=found)
 
 
 def nap(seconds: float) -> float:

@@ -36,6 +36,10 @@ class Row(NamedTuple):
         """The options that name it."""
         return "--model", self.model, "--prompt", self.prompt, "--answer", self.answer
 
+    def asked(self, layouts: int | None = None, dataset: str | None = None) -> "Row":
+        """Return it on so many layouts of each family, or on other scenes, where these are given."""
+        return self._replace(limit=layouts or self.limit, dataset=dataset or self.dataset)
+
     def evaluate(self, out: Path, *options: str) -> None:
         """Evaluate it on frozen scenes, unless that is done."""
         if not finished(out):

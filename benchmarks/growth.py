@@ -9,7 +9,8 @@ Workers: chunks that wait for a second, four a worker, so that any number of the
 here; the limit is those four seconds.
 
     python benchmarks/growth.py [--decisions 1000 10000 100000 1000000 10000000]
-                                [--workers 1 2 4 8 16 32 64] [--picture growth.svg]
+                                [--workers 1 2 4 8 16 32 64] [--seconds 1] [--first 20]
+                                [--picture growth.svg]
 """
 
 import argparse
@@ -30,6 +31,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from playwright.sync_api import sync_playwright
 from report import FLAGS, times
+from rows import Row as Figures
+from rows import finish
 
 from harness.backends import cards
 from harness.backends.registry import open_backend
@@ -45,8 +48,10 @@ from harness.report.drawing.colours import BAD, GREY, INK
 from harness.report.drawing.pictures import save, styled
 from harness.runs import folder
 
+SMALLEST = "--decisions 10 --workers 1 2 --seconds 0.01 --first 1"
+TABLE = "--decisions 1000 10000 100000 --workers 1 2 4 8"
+NEEDS = "matplotlib playwright"
 MOST = 1_000_000  # decisions under five seeds: ten times as many layouts would be 80 GB
-FIRST = 20  # layouts that tell how many decisions a layout has, and how long an answer takes
 A_WORKER = 4
 AIM_MB = 2000
 HOLDS = """
@@ -65,25 +70,37 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--decisions", type=int, nargs="*", default=[10**n for n in range(3, 8)])
     arguments.add_argument("--workers", type=int, nargs="*", default=[1, 2, 4, 8, 16, 32, 64])
+    arguments.add_argument("--seconds", type=float, default=1.0, help="that a chunk waits")
+    arguments.add_argument("--first", type=int, default=20, help="layouts that tell how much a layout is")
     arguments.add_argument("--picture", type=Path)
     given = arguments.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        decisions = of_decisions(given.decisions, Path(scratch))
-    workers = [of_workers(n) for n in given.workers]
+        decisions = of_decisions(given.decisions, given.first, Path(scratch))
+    workers = [of_workers(n, given.seconds) for n in given.workers]
     for rows in filter(None, (decisions, workers)):
         print("".join(f"{name:>12}" for name in rows[0]))
         for row in rows:
             print("".join(f"{value:12.0f}" if value >= 100 else f"{value:12.2f}" for value in row.values()))
     if given.picture:
         save(drawn(decisions, workers), given.picture, "svg")
-    print(json.dumps({"decisions": decisions, "workers": workers}))
+    figures = []
+    for row in decisions:
+        what = f"{row['decisions']:.0f} decisions with their page"
+        figures += [
+            Figures(f"{what}, CPU", row["cpu_s"], "s", 1, row["limit_s"]),
+            Figures(f"{what}, peak memory", row["peak_mb"], "MB", 1, row["limit_mb"]),
+        ]
+    for row in workers:
+        took, what = row["wall_s"] - row["start_s"], f"{row['workers']} workers that wait, after the start"
+        figures.append(Figures(what, took, "s", 1, row["limit_s"]))
+    finish(figures, decisions=decisions, workers=workers)
 
 
-def of_decisions(sizes: Sequence[int], scratch: Path) -> list[Row]:
+def of_decisions(sizes: Sequence[int], first: int, scratch: Path) -> list[Row]:
     """Runs of about so many decisions: what each took, and its limits."""
     shipped = load(find(DATASET))
-    each = len(evaluated(["--limit", str(FIRST)], scratch)[0].decisions) / FIRST
-    answer_s = of_an_answer()
+    each = len(evaluated(["--limit", str(first)], scratch)[0].decisions) / first
+    answer_s = of_an_answer(first)
     rows: list[Row] = []
     for size in sizes:
         again = math.ceil(size / MOST)
@@ -124,9 +141,9 @@ def opened(run: Path) -> float:
         return min(times(browser, run / "report.html", "body[data-drawn]")[1] for _ in range(3))
 
 
-def of_an_answer() -> float:
+def of_an_answer(layouts: int) -> float:
     """CPU seconds that the proxy takes to answer."""
-    dataset, card = load(find(DATASET), FIRST), cards.resolve("proxy")
+    dataset, card = load(find(DATASET), layouts), cards.resolve("proxy")
     spec = Spec(Agent(card, prompts.load("v2")), FrozenSource(dataset), (), (0,))
     asked = list(requests(spec, dataset.scenes(dataset.courses())))
     backend = open_backend(card)
@@ -135,15 +152,15 @@ def of_an_answer() -> float:
     return (process_time() - start) / len(asked)
 
 
-def of_workers(workers: int) -> Row:
+def of_workers(workers: int, seconds: float) -> Row:
     """Wall time of four chunks a worker, after one each that pays for the start."""
-    both = [[0.0] * workers + [1.0] * (A_WORKER * workers), [0.0] * workers]
+    both = [[0.0] * workers + [seconds] * (A_WORKER * workers), [0.0] * workers]
     took = []
     for chunks in both:
         start = perf_counter()
         spread(nap, chunks, workers, lambda done: None, repeatable=False)
         took.append(perf_counter() - start)
-    return {"workers": workers, "wall_s": took[0], "start_s": took[1], "limit_s": float(A_WORKER)}
+    return {"workers": workers, "wall_s": took[0], "start_s": took[1], "limit_s": A_WORKER * seconds}
 
 
 @styled

@@ -33,6 +33,7 @@ from harness.core.statistics import (
 )
 from harness.runs.metrics import SUCCESS, difference, over_episodes, over_seeds
 
+SMALLEST = "--runs 2"
 EPISODES, SEEDS, ANSWERS = (20, 60, 240), 5, (3, 9)  # an episode has so many answers, at least and at most
 TWINS = (12, 24, 40)  # episodes of `harness study twins`
 RATES = (0.54, 0.75, 0.9, 0.97, 0.99)

@@ -35,6 +35,7 @@ from harness.world.audit import numbers
 from harness.world.scenario import Scenario
 from harness.world.world import World
 
+SMALLEST = "blind-merge-v1 --models proxy --layouts 1 --nearest 3"
 DATASETS = (
     "blind-merge-v1",
     "hard-brake-ahead-v1",

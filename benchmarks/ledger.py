@@ -23,6 +23,7 @@ from harness.studies.ledger import tally
 from harness.studies.paper import panels
 from harness.studies.play import over_own_episodes
 
+SMALLEST = "--sets 1 --coverage 1"
 SEEDS = 5  # of a set
 # Of the sweeps; other grid points have another's success, or lie between two of these.
 POINTS = {"size": (1, 2, 4, 8), "loss": (0.1, 0.4), "tau": (0.5, 0.8)}

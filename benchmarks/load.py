@@ -1,6 +1,6 @@
 """How long `harness.load` takes to read a run of a million decisions, and how much memory.
 
-    python benchmarks/load.py [RUN] [--decisions 1000000] [--repeats 5]
+    python benchmarks/load.py [RUN] [--decisions 1000000] [--repeats 5] [--layouts N]
 
 The run is made of a real one, by default of the shipped dataset: its decisions, answers and episodes stand in
 it again and again under new numbers of episodes. It is read in a process of its own. The limit is what
@@ -8,19 +8,19 @@ nobody can do without: imports of pandas and pyarrow, and the same Parquet file 
 """
 
 import argparse
-import json
 import statistics
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-import msgspec
-import pyarrow as pa
+from copies import repeated
+from rows import Row, finish
 
 from harness.runs import folder
-from harness.runs.decisions import Decisions
 
+SMALLEST = "--decisions 100 --repeats 1 --layouts 1"
+TABLE = "--repeats 1"
 AIMS = {"decisions_s": 3.0, "decisions_mb": 2000.0}
 
 # Each ends by printing wall seconds, CPU seconds and peak memory in MB of its own process.
@@ -46,10 +46,13 @@ def main() -> None:
     arguments.add_argument("run", nargs="?", type=Path)
     arguments.add_argument("--decisions", type=int, default=1_000_000)
     arguments.add_argument("--repeats", type=int, default=5)
+    arguments.add_argument("--layouts", type=int, help="of the shipped dataset in the real run; else all")
     given = arguments.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        source = given.run or evaluated(Path(scratch) / "real")
-        large = repeated(folder.read(source), given.decisions, Path(scratch) / "large")
+        source = given.run or evaluated(Path(scratch) / "real", given.layouts)
+        run = folder.read(source)
+        times = -(-given.decisions // len(run.decisions))
+        large = repeated(run, times, max(run.grid.episodes) + 1, Path(scratch) / "large").path
         size = {file.name: round(file.stat().st_size / 1e6, 1) for file in large.iterdir()}
         found: dict[str, float] = {}
         for name, program in PROGRAMS.items():
@@ -61,33 +64,21 @@ def main() -> None:
         print(f"{name:<16}{value:9.2f}{aim}")
     ratio = found["decisions_s"] / found["limit_s"]
     print(f"{ratio:.2f} of the limit; medians of {given.repeats}; files in MB: {size}")
-    print(json.dumps({**found, "over_limit": ratio, "repeats": given.repeats, "files_mb": size}))
+    what, n = f"{given.decisions} decisions as a table", given.repeats
+    rows = [
+        Row(
+            f"{what}, wall", found["decisions_s"], "s", n, found["limit_s"], aim=f"≤ {AIMS['decisions_s']:g}"
+        ),
+        Row(f"{what}, peak memory", found["decisions_mb"], "MB", n, found["limit_mb"]),
+    ]
+    finish(rows, **found, over_limit=ratio, repeats=given.repeats, files_mb=size)
 
 
-def evaluated(out: Path) -> Path:
+def evaluated(out: Path, layouts: int | None) -> Path:
     """A run of the proxy on the shipped dataset."""
     command = [sys.executable, "-m", "harness", "eval", "--model", "proxy", "--no-cache", "--quiet"]
-    subprocess.run([*command, "--out", out], check=True, capture_output=True)
-    return out
-
-
-def repeated(run: folder.Run, decisions: int, out: Path) -> Path:
-    """A run of at least so many decisions: this one's, again and again."""
-    times = -(-decisions // len(run.decisions))
-    table, apart = run.decisions.table, max(run.grid.episodes) + 1
-    names = table["scene"].combine_chunks()
-    parts, episodes, answers = [], [], []
-    for n in range(times):
-        scenes = pa.DictionaryArray.from_arrays(
-            names.indices, pa.array([f"{n}-{scene}" for scene in names.dictionary.to_pylist()])
-        )
-        numbers = pa.array(run.decisions.whole("episode") + n * apart)
-        part = table.set_column(table.schema.get_field_index("scene"), table.schema.field("scene"), scenes)
-        part = part.set_column(part.schema.get_field_index("episode"), "episode", numbers)
-        parts.append(Decisions(part, run.actions, run.decisions.helpers))
-        episodes += [msgspec.structs.replace(e, episode=e.episode + n * apart) for e in run.episodes]
-        answers += [msgspec.structs.replace(a, scene=f"{n}-{a.scene}") for a in run.answers]
-    folder.write(out, run.manifest, Decisions.concat(parts), episodes, [folder.lines(answers)], run.scores)
+    few = ["--limit", str(layouts)] if layouts else []
+    subprocess.run([*command, *few, "--out", out], check=True, capture_output=True)
     return out
 
 

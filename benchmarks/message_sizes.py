@@ -23,6 +23,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+UNTESTED = "it needs pycrate and modules of the standards, which do not ship here"
 # Containers of our own, of elements that CDD and J2735 have. They stand where an MCM or an MSCM would.
 OWN = """
 Own DEFINITIONS AUTOMATIC TAGS ::= BEGIN

@@ -5,7 +5,8 @@ under three conditions and five seeds. Sizes are copies of the dataset. Own time
 less what `backend.complete` takes, and less what making the copies takes. Loading the dataset is apart, since
 it is done once.
 
-    python benchmarks/own_time.py [DATASET] [--sizes 1 5] [--repeats 3] [--prompt v2]
+    python benchmarks/own_time.py [DATASET] [--layouts N] [--sizes 1 5] [--repeats 3]
+                                  [--prompt v2]
 """
 
 import argparse
@@ -23,6 +24,7 @@ from typing import Any
 from unittest.mock import patch
 
 import copies
+from rows import Row, finish
 
 from harness.backends import cards
 from harness.backends.proxy import Proxy
@@ -41,6 +43,8 @@ from harness.prompts.versions import Prompt
 from harness.runs import folder as folders
 from harness.runs.folder import read
 
+SMALLEST = "--layouts 1 --sizes 1 2 --repeats 1"
+TABLE = "--sizes 1 2"
 AIM_MS = 0.2
 # Functions whose time makes up a part; what the backend and the copies take is no part of the harness.
 PARTS: dict[str, list[tuple[Any, str]]] = {
@@ -62,6 +66,7 @@ def main() -> None:
     """Print the slopes as a table and as one line of JSON."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("dataset", nargs="?", default=DATASET)
+    arguments.add_argument("--layouts", type=int, help="of the dataset; else all")
     arguments.add_argument("--sizes", nargs=2, type=int, default=[1, 5])
     arguments.add_argument("--repeats", type=int, default=3)
     arguments.add_argument("--prompt", default="v2")
@@ -70,7 +75,7 @@ def main() -> None:
     gc.set_threshold(COLLECT_AFTER, 10, 10)  # as a command has it
     load.load(load.find(given.dataset), limit=1)  # pays for imports
     start = process_time()
-    dataset = load.load(load.find(given.dataset))
+    dataset = load.load(load.find(given.dataset), limit=given.layouts)
     loading_ms = (process_time() - start) * 1000 / len(dataset.forest.ids)
     agent = Agent(cards.resolve("proxy"), prompts.load(given.prompt))
     specs = [
@@ -98,7 +103,13 @@ def main() -> None:
     print(f"limit         {total[LIMIT]:8.3f}   own is {own_ms / total[LIMIT]:.2f} of it")
     print(f"proxy         {total['proxy']:8.3f}")
     print(f"loading       {loading_ms:8.3f}")
-    print(json.dumps(result))
+    n = given.repeats
+    rows = [
+        Row("own time a decision, CPU", own_ms, "ms", n, total[LIMIT], aim=f"≤ {AIM_MS}"),
+        Row("own time a request, CPU", own_ms / requests, "ms", n),
+        Row("reading the dataset, a decision point, CPU", loading_ms, "ms", 1),
+    ]
+    finish(rows, **result)
 
 
 def slopes(specs: list[Spec], parts: Sequence[str], repeats: int) -> dict[str, float]:

@@ -7,7 +7,6 @@ the same. The limit is the same prompt without its picture.
 """
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from time import process_time
 from typing import Any, cast
 
 import torch
+from rows import Row, finish
 
 from harness.backends import cards
 from harness.backends.base import Backend, Request
@@ -29,6 +29,9 @@ from harness.prompts import versions
 from harness.training.model import new_model, save_tokenizer, train_tokenizer
 from harness.world.perception import camera
 
+SMALLEST = "--decisions 1"
+TABLE = ""
+NEEDS = "torch"
 DATASET = "occluded-intersection-v2"
 ASKED = (("v7", "none"), ("v7", "own"), ("v8", "own"))
 
@@ -55,7 +58,15 @@ def main() -> None:
             ratio = row["decisions_per_s"] / rows[0]["decisions_per_s"]
             print(f"{f'{version}, image {image}':<22}{row['decisions_per_s']:>12.2f}{ratio:>8.2f}"
                   f"{row['drawing']:>9.0%}{row['encoding']:>10.0%}{given.decisions:>5}")  # fmt: skip
-    print(json.dumps(rows))
+    plain, *others = rows
+    n, limit = given.decisions, 1000 / plain["decisions_per_s"]
+    figures = [
+        Row(
+            f"a decision with pictures, `{row['prompt']}`, CPU", 1000 / row["decisions_per_s"], "ms", n, limit
+        )
+        for row in others
+    ]
+    finish(figures, prompts=rows)
 
 
 def questions(folder: Path, version: str, image: ImageMode, decisions: int) -> list[Request]:

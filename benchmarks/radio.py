@@ -7,13 +7,13 @@ trip is a part of its own, since every model has the same. `first` is what a new
 """
 
 import argparse
-import json
 import statistics
 from collections.abc import Callable
 from dataclasses import replace
 from time import process_time
 
 import numpy as np
+from rows import Row, finish
 
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Links, Site
 from harness.radio.fading import Trips
@@ -21,6 +21,8 @@ from harness.radio.its_g5 import ItsG5
 from harness.radio.lte_mode4 import LteMode4
 from harness.radio.nr_mode2 import NrMode2
 
+SMALLEST = "--links 30 --repeats 1"
+TABLE = "--repeats 3"
 MODELS: dict[str, LteMode4 | NrMode2 | ItsG5] = {
     "lte-v2x-mode4": LteMode4(density_per_km=200.0),
     "nr-v2x-mode2": NrMode2(density_per_km=200.0),
@@ -61,7 +63,11 @@ def main() -> None:
     print(f"CPU seconds for {n * HELPERS} links, median of {given.repeats}; aim {AIM_S}")
     for name, median_s in medians.items():
         print(f"  {name:<26}{median_s:8.4f}   {median_s / medians['limit']:6.1f} of the limit")
-    print(json.dumps({"links": n * HELPERS, "repeats": given.repeats, "cpu_s": medians}))
+    rows = [
+        Row(f"{n * HELPERS} links, {name}, CPU", medians[name], "s", given.repeats, medians["limit"])
+        for name in ("shadowing", *(f"{model}: deliver" for model in MODELS))
+    ]
+    finish(rows, links=n * HELPERS, repeats=given.repeats, cpu_s=medians)
 
 
 def made_up(generator: np.random.Generator, n: int) -> tuple[Links, Site, Trips]:

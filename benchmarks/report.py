@@ -4,11 +4,10 @@ The proxy's run on the shipped dataset; for more decisions all its scenes are re
 A page is *readable* at its first contentful paint, *ready* when every decision can be filtered and opened,
 *drawn* when the last chart is. The limit is a page of the same bytes whose script is taken out.
 
-    python benchmarks/report.py [--decisions 1440 20160] [--repeats 5]
+    python benchmarks/report.py [--layouts N] [--decisions 1440 20160] [--repeats 5]
 """
 
 import argparse
-import json
 import shutil
 import tempfile
 from dataclasses import replace
@@ -17,9 +16,9 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
-from copies import copies, shifted
-from msgspec import structs
+from copies import copies, repeated
 from playwright.sync_api import Browser, sync_playwright
+from rows import Row, finish
 
 from harness.backends import cards
 from harness.coordination.operating_point import POINTS
@@ -32,9 +31,10 @@ from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.report.page import render
 from harness.report.runs import Runs, gather
-from harness.runs import folder
-from harness.runs.decisions import Decisions, Labels
 
+SMALLEST = "--layouts 1 --decisions 1 --repeats 1"
+TABLE = "--decisions 1440 --repeats 3"
+NEEDS = "playwright"
 FLAGS = ["--no-sandbox", "--disable-gpu"]
 READY = "() => document.body.dataset.ready ?? document.readyState === 'complete'"
 PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? 0"
@@ -43,6 +43,7 @@ PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startT
 def main() -> None:
     """Print a table and one line of JSON."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("--layouts", type=int, help="of the shipped dataset; else all")
     arguments.add_argument("--decisions", type=int, nargs="+", default=[1440, 20160])
     arguments.add_argument("--repeats", type=int, default=5)
     given = arguments.parse_args()
@@ -54,7 +55,7 @@ def main() -> None:
         base = Path(scratch)
         spec = Spec(
             Agent(cards.resolve("proxy"), prompts.load("v2")),
-            FrozenSource(load(find(DATASET))),
+            FrozenSource(load(find(DATASET), given.layouts)),
             tuple(POINTS.values()),
             tuple(range(5)),
         )
@@ -62,44 +63,37 @@ def main() -> None:
         runs = gather([base / "run"])
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         for n in given.decisions:
-            many = repeated(runs, n, base / str(n))
+            many = many_times(runs, n, base / str(n))
             found.append(measured(many, base / f"{n}.html", browser, given.repeats))
         browser.close()
     names = list(found[0])
     for name in names:
         print(f"{name:<42}" + "".join(f"{one[name]:>12}" for one in found))
-    print(json.dumps(found))
+    rows = []
+    for one in found:
+        what = f"a report of {one['decisions (scenes)']} decision points"
+        rows += [
+            Row(f"{what}, written, wall", one["written, s"], "s", 1),
+            Row(f"{what}, size", one["size, MB"], "MB", 1),
+            Row(
+                f"{what}, ready, wall",
+                one["ready, s"],
+                "s",
+                given.repeats,
+                one["limit: same bytes without script, s"],
+            ),
+        ]
+    finish(rows, reports=found)
 
 
-def repeated(runs: Runs, decisions: int, out: Path) -> Runs:
+def many_times(runs: Runs, decisions: int, out: Path) -> Runs:
     """The same run on at least so many scenes: those it has, again and again as other episodes."""
     [run], dataset = runs.runs, runs.dataset
     assert dataset is not None
-    d, ids = run.decisions, list(run.decisions.scenes)
-    codes, apart = d.codes("scene", ids), len(dataset.trees)
-    shifts = range(0, -(-decisions // len(ids)) * apart, apart)
-    folder.write(
-        out,
-        run.manifest,
-        Decisions.concat(
-            [
-                d.replace(
-                    scene=Labels(codes, [shifted(scene, by) for scene in ids]),
-                    episode=d.whole("episode") + by,
-                )
-                for by in shifts
-            ]
-        ),
-        [structs.replace(episode, episode=episode.episode + by) for episode in run.episodes for by in shifts],
-        [
-            folder.lines([structs.replace(answer, scene=shifted(answer.scene, by)) for answer in run.answers])
-            for by in shifts
-        ],
-        run.scores,
-    )
-    many = folder.read(out)
+    times = -(-decisions // len(run.decisions.scenes))
+    many = repeated(run, times, len(dataset.trees), out)
     _ = many.decisions, many.answers, many.scores  # reading is not timed
-    return replace(runs, runs=(many,), dataset=copies(dataset, len(shifts)))
+    return replace(runs, runs=(many,), dataset=copies(dataset, times))
 
 
 def measured(runs: Runs, out: Path, browser: Browser, repeats: int) -> dict[str, Any]:

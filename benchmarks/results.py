@@ -1,6 +1,6 @@
 """What models do in the paper's scenario: prompts, answer modes and conditions, with n and intervals.
 
-    python benchmarks/results.py [--limit N] [--device D] [--only TEXT] [--out reports/results]
+    python benchmarks/results.py [--limit N] [--layouts N] [--device D] [--only TEXT] [--out reports/results]
                                  [--page docs/results.md] [--picture docs/pictures/results.svg]
 
 It evaluates each row of `ROWS` on the report layouts of `DATASET`, one run a row, and writes the
@@ -26,6 +26,7 @@ from harness.report.drawing.pictures import save, styled
 from harness.runs.folder import Run, read
 from harness.runs.records import Score
 
+SMALLEST = "--only proxy --layouts 1"
 DATASET = "occluded-intersection-v2"  # all rows are of it; published models take hours
 CONDITIONS_SHOWN = ("single-local", "v2x", "6g", "6g:messages=shuffled")
 HEADS = ("alone", "v2x", "6g", "6g, shuffled")
@@ -105,6 +106,8 @@ def make(row: Row, given: argparse.Namespace) -> None:
         for option in ("limit", "device", "batch_size"):
             if value := getattr(given, option):
                 words += [f"--{option.replace('_', '-')}", str(value)]
+    if given.layouts:
+        words += ["--limit", str(given.layouts)]
     harness(*words, *ARGUMENTS)
 
 

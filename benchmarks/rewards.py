@@ -8,15 +8,17 @@ step is one of the environment, with its chat. Each figure is the best of five p
 """
 
 import argparse
-import json
 from collections.abc import Callable
 from itertools import cycle
 from time import process_time
 
 import numpy as np
+from rows import Row, finish
 
 import harness
 
+SMALLEST = "--layouts 1 --batch 2"
+TABLE = ""
 STATED = '{"action_distribution":{%s}}'
 
 
@@ -73,7 +75,8 @@ def main() -> None:
     print(f"{points}, {len(rows)} rows\n\n| rewards | a CPU second |\n|---|---|")
     for what, rate in rates.items():
         print(f"| {what} | {rate} |")
-    print(json.dumps({"scenario": args.scenario, "layouts": args.layouts, "a_second": rates}))
+    figures = [Row(f"rewards a CPU second: {what}", rate, "/s", 5) for what, rate in rates.items()]
+    finish(figures, scenario=args.scenario, layouts=args.layouts, a_second=rates)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,10 @@ from dataclasses import replace
 from itertools import cycle, islice
 from pathlib import Path
 from time import perf_counter, process_time
+from typing import Any
 from urllib.parse import urlsplit
+
+from rows import Row, finish
 
 from harness.backends import cards
 from harness.backends.base import Backend, Request
@@ -40,6 +43,9 @@ from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 
+SMALLEST = "--requests 40 --repeats 1 --seconds 0.005"
+TABLE = "--requests 1000 --repeats 3"
+NEEDS = "aiohttp"
 AIMS = {"of_ideal": 0.95, "cpu_ms": 0.3}
 TEXT = '{"action_distribution":{"SLOWER":0.20,"IDLE":0.70,"FASTER":0.10}}'
 LISTED = {"data": [{"id": "m", "owned_by": "benchmark"}]}
@@ -86,7 +92,7 @@ def main() -> None:
                 found.setdefault(name, []).append(measured(way))
         answered = [stats(url)["answered"] for url in urls]
         connections = [stats(url)["connections"] for url in urls]
-    result: dict[str, object] = {
+    result: dict[str, Any] = {
         "servers": given.servers, "requests": given.requests, "repeats": given.repeats,
         "seconds": given.seconds, "at_once": given.at_once, "batch_size": batch_size,
         "ideal_per_s": given.requests / ideal_s,
@@ -108,7 +114,13 @@ def main() -> None:
             f"{cpu_ms:8.3f} ms of CPU a request{aim}"
         )
     print(f"answered by each: {answered}; connections: {connections}")
-    print(json.dumps(result))
+    limit, asking = result["sockets"], result["ask"]
+    what = f"asking servers of {given.seconds * 1000:g} ms × {given.at_once}"
+    rows = [
+        Row(f"{what}, of ideal, wall", 100 * asking["of_ideal"], "%", given.repeats, 100 * limit["of_ideal"]),
+        Row(f"{what}, a request, CPU", asking["cpu_ms"], "ms", given.repeats, limit["cpu_ms"]),
+    ]
+    finish(rows, **result)
 
 
 def questions(count: int) -> list[Request]:

@@ -28,6 +28,8 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 
+SMALLEST = "--prompts 6"
+NEEDS = "llama_cpp"
 DATASETS = (
     "occluded-intersection-v2", "blind-merge-v1", "do-not-pass-v1", "hard-brake-ahead-v1", "parking-exit-v1",
     "roundabout-entry-v1",

@@ -1,6 +1,6 @@
 """What does it bring to answer faster? The same answers at several latencies, under several conditions.
 
-    python benchmarks/speed_of_answers.py [--only TEXT] [--out reports/speed]
+    python benchmarks/speed_of_answers.py [--only TEXT] [--layouts N] [--dataset D] [--out reports/speed]
                                           [--page docs/speed-of-answers.md]
                                           [--picture docs/pictures/speed-of-answers.svg]
 
@@ -28,6 +28,7 @@ from harness.report.drawing.pictures import save, styled
 from harness.runs.metrics import BALANCED, BASELINE, GAINS
 from harness.world import scenarios
 
+SMALLEST = "--only proxy --layouts 1 --dataset blind-merge-v2"
 LATENCIES_MS = (145, 50, 26, 16, 5)
 ASKING = ("v2x", "6g", "mode2", "cloud")
 SHOWN = ("v2x", "6g", "mode2")  # conditions in which helpers are asked, in the picture
@@ -38,21 +39,24 @@ ROWS = (
     Row("swarm-tiny-six", "v4", "readout", limit=20),
     Row("sparrow-general", "v9", "decision", limit=60),
 )
-DRIVES = ROWS[:1]
+DRIVES = "proxy"
 DRIVEN, DRIVEN_MS = "occluded-intersection-v3", (145, 50, 5)
 
 
 def main() -> None:
     """Make what is missing, and write the page's tables and its picture."""
-    given = pages.options(__doc__, "speed", picture=True).parse_args()
-    for row in (row for row in ROWS if given.only in row.name):
+    arguments = pages.options(__doc__, "speed", picture=True)
+    arguments.add_argument("--dataset", help="instead of each row's own")
+    given = arguments.parse_args()
+    rows = [row.asked(given.layouts, given.dataset) for row in ROWS]
+    for row in (row for row in rows if given.only in row.name):
         for ms in LATENCIES_MS:
             row.evaluate(given.out / row.name / f"frozen-{ms}", *options(ms))
-        for ms in DRIVEN_MS if row in DRIVES else ():
+        for ms in DRIVEN_MS if row.model == DRIVES else ():
             drive(row, ms, given.out / row.name / f"driven-{ms}")
     done = {
         f"{row}{how}": timed
-        for row in ROWS
+        for row in rows
         for kind, how in (("frozen", ""), ("driven", ", driven in one family"))
         if (timed := timed_of(given.out / row.name, kind))
     }
@@ -75,7 +79,7 @@ def drive(row: Row, ms: int, out: Path) -> None:
     if not (out / "run.json").exists():
         data = load(find(DRIVEN))
         scenario = ("--scenario", scenarios.argument(data.scenario), "--seeds", "0:2")
-        layouts = ("--episodes", str(len(data.episodes)), "--first-seed", str(data.seeds[0]))
+        layouts = ("--episodes", str(row.limit or len(data.episodes)), "--first-seed", str(data.seeds[0]))
         harness("drive", *row.who, *scenario, *layouts, *options(ms), "--out", str(out), "--quiet")
 
 

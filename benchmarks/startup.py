@@ -1,4 +1,4 @@
-"""CPU seconds from the start of a process to the first `complete`, and for `harness --help`.
+"""CPU seconds from the start of a process to the first `complete`, of `harness --help` and of lists.
 
 And wall seconds from typing `harness eval --model swarm-tiny` to its first decision, one ego and three
 helpers answered by llama.cpp: that works in a process of its own.
@@ -10,7 +10,6 @@ Jinja2 and typer.
 """
 
 import argparse
-import json
 import statistics
 import subprocess
 import sys
@@ -18,16 +17,25 @@ import tempfile
 import time
 from pathlib import Path
 
+from rows import Row, finish
+
 from harness.core.resources import DATASET
 from harness.dataset import load
 
-AIMS_S = {"help": 0.15, "first_call": 0.7, "first_decision_wall": 2.0}
+SMALLEST = "--repeats 1"
+TABLE = "--repeats 3"
+NEEDS = "llama_cpp"
+LISTS = ("model list", "prompt list", "dataset scenario list")
+AIMS_S = {
+    "help": 0.12, **dict.fromkeys(LISTS, 0.12), "first_call": 0.45,
+    "first_decision_wall": 2.0,
+}  # fmt: skip
 
 # Each ends by printing the CPU seconds of its own process; CPU time starts with the process.
-HELP = """
+TYPED = """
 import sys, time
 from harness.cli import main
-sys.argv = ["harness", "--help"]
+sys.argv[0] = "harness"
 try:
     main()
 finally:
@@ -63,6 +71,11 @@ Child.complete = answer_first
 sys.argv = ["harness", "eval", "--model", "swarm-tiny", "--no-cache", *sys.argv[1:]]
 main()
 """
+WHAT = {
+    "help": "`harness --help`, CPU",
+    "first_call": "from the start to the first model call, CPU",
+    "first_decision_wall": "from typing to the first decision of `swarm-tiny`, wall",
+}
 LIMIT = "import time, numpy, jinja2.sandbox, typer; print(time.process_time())"
 
 
@@ -74,7 +87,7 @@ def main() -> None:
     given = arguments.parse_args()
     dataset = str(load.find(given.dataset).resolve())
 
-    names = ("help", "first_call", "first_call_one_episode", "first_decision_wall", "limit")
+    names = (*AIMS_S, "first_call_one_episode", "limit")
     found: dict[str, list[float]] = {name: [] for name in names}
     for _ in range(given.repeats):
         with tempfile.TemporaryDirectory() as folder:
@@ -82,7 +95,9 @@ def main() -> None:
                 ["--dataset", dataset, "--out", str(Path(folder) / name), *options]
                 for name, options in (("all", []), ("one", ["--limit", "1"]), ("first", []))
             )
-            found["help"].append(cpu_s(HELP))
+            found["help"].append(cpu_s(TYPED, "--help"))
+            for name in LISTS:
+                found[name].append(cpu_s(TYPED, *name.split()))
             found["first_call"].append(cpu_s(FIRST_CALL, *run))
             found["first_call_one_episode"].append(cpu_s(FIRST_CALL, *short))
             found["first_decision_wall"].append(wall_s(FIRST_DECISION, *first))
@@ -93,7 +108,19 @@ def main() -> None:
         print(f"{name:<24}{median_s:7.3f} s{aim}")
     ratio = medians["first_call"] / medians["limit"]
     print(f"to the first call is {ratio:.2f} of the limit; medians of {given.repeats}")
-    print(json.dumps({**medians, "first_call_over_limit": ratio, "repeats": given.repeats}))
+    n, limit_s = given.repeats, medians["limit"]
+    rows = [
+        Row(
+            WHAT.get(name, f"`harness {name}`, CPU"),
+            medians[name],
+            "s",
+            n,
+            None if "wall" in name else limit_s,
+            aim=f"≤ {aim:g}",
+        )
+        for name, aim in AIMS_S.items()
+    ]
+    finish(rows, **medians, first_call_over_limit=ratio, repeats=n)
 
 
 def cpu_s(program: str, *arguments: str) -> float:

@@ -1,4 +1,4 @@
-"""What a study costs: the paper's campaign, a sweep over a stored run, and ten million decisions.
+"""What playing decisions costs: the grid points of the paper's campaign, its figures, and ten million.
 
 The limit is drawing the random numbers that each grid point's decisions need, with NumPy.
 
@@ -6,22 +6,17 @@ The limit is drawing the random numbers that each grid point's decisions need, w
 """
 
 import argparse
-import json
 import resource
-import subprocess
-import sys
-import tempfile
 from collections.abc import Sequence
 from io import BytesIO
-from pathlib import Path
-from time import perf_counter, process_time
+from time import process_time
 
 import numpy as np
 import pandas as pd
+from rows import Row, finish
 
 from harness.coordination.operating_point import POINTS
 from harness.report.drawing.pictures import FORMATS, save
-from harness.runs.folder import read
 from harness.studies.axes import Setting
 from harness.studies.calibrated import STEPS, Calibrated
 from harness.studies.figures.bars import operating_points
@@ -30,8 +25,9 @@ from harness.studies.paper import panels
 from harness.studies.play import play
 from harness.studies.study import lay_out
 
+SMALLEST = "--decisions 1000"
+TABLE = "--decisions 1000000"
 SEEDS = range(5)
-HARNESS = [sys.executable, "-m", "harness"]
 
 
 def main() -> None:
@@ -39,18 +35,21 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--decisions", type=int, default=10_000_000)
     most = arguments.parse_args().decisions
-    found = {**campaign(), **sweep(), **linear(most)}
-    aims = {"campaign_wall_s": 3, "play_over_draw": 5, "sweep_wall_s": 5, "peak_mb": 1000}
+    found = {**campaign(), **linear(most)}
+    aims = {"play_over_draw": 5, "peak_mb": 1000}
     for name, value in found.items():
         aim = f"   aim {aims[name]}" if name in aims else ""
         print(f"{name:<28}{value:>10.2f}{aim}")
-    print(json.dumps(found))
+    a_million = f"a million decisions of one grid point, of {most}, CPU"
+    rows = [
+        Row("the campaign's decisions played, CPU", found["play_cpu_s"], "s", 1, found["draw_cpu_s"]),
+        Row(a_million, found["large_s_per_million"], "s", 1, found["small_s_per_million"]),
+    ]
+    finish(rows, **found)
 
 
 def campaign() -> dict[str, float]:
-    """The whole command, and its grid points against drawing what they need."""
-    with tempfile.TemporaryDirectory() as folder:
-        wall_s = timed([*HARNESS, "campaign", "paper", "--out", f"{folder}/paper"])
+    """Its grid points against drawing what they need."""
     start, decisions = process_time(), 0
     sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels()}
     played = [play(sources[p.episodes], p.name, p.settings, SEEDS, lambda done: None) for p in panels()]
@@ -63,7 +62,7 @@ def campaign() -> dict[str, float]:
                 decisions += panel.episodes * STEPS
     draw_s = process_time() - start
     return {
-        "campaign_wall_s": wall_s, "campaign_decisions": decisions,
+        "campaign_decisions": decisions,
         "play_cpu_s": play_s, "draw_cpu_s": draw_s,
         "play_over_draw": play_s / draw_s, **pictures([part.summary for part in played]),
     }  # fmt: skip
@@ -93,16 +92,6 @@ def draw(generator: np.random.Generator, episodes: int, helpers: int) -> None:
     generator.random((episodes * STEPS, 1 + 2 * helpers))
 
 
-def sweep() -> dict[str, float]:
-    """100 grid points over a stored run of 200 episodes, 1 200 scenes, five seeds each."""
-    with tempfile.TemporaryDirectory() as folder:
-        run = f"{folder}/run"
-        timed([*HARNESS, "eval", "--model", "proxy", "--limit", "200", "--out", run])
-        wall_s = timed([*HARNESS, "sweep", run, "--over", "tau", "--grid", "0.1:1.09:0.01"])
-        scenes = len(read(Path(run)).decisions.scenes)
-    return {"sweep_wall_s": wall_s, "sweep_points": 100, "sweep_scenes": scenes}
-
-
 def linear(most: int) -> dict[str, float]:
     """Seconds per million decisions of one grid point with five seeds, small and large; peak memory."""
     found = {}
@@ -114,13 +103,6 @@ def linear(most: int) -> dict[str, float]:
     found["large_decisions"] = most
     found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return found
-
-
-def timed(command: list[str]) -> float:
-    """Wall seconds of a command in a process of its own."""
-    start = perf_counter()
-    subprocess.run(command, check=True, capture_output=True)
-    return perf_counter() - start
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """What a search over marked wordings gains: SmolLM2 with `v9`, and swarm-tiny-six with `v4`, both read out.
 
-    python benchmarks/wordings.py [--only TEXT] [--out reports/wordings]
+    python benchmarks/wordings.py [--only TEXT] [--out reports/wordings] [OPTION ...]
 
 It makes a project in the folder, marks alternatives in copies of the two prompts, and types `harness prompt
-optimize` for each row of `ROWS`. What is finished stays; a stopped search goes on with the same command.
-SmolLM2 asks its weights of `harness model pull smollm2-135m`.
+optimize` for each row of `ROWS`, with further options if any are given. What is finished stays; a stopped
+search goes on with the same command. SmolLM2 asks its weights of `harness model pull smollm2-135m`.
 """
 
 import argparse
@@ -17,6 +17,8 @@ from pages import harness
 
 from harness.core.resources import MARKER, folder
 
+SMALLEST = "--only six --layouts 2 --budget 20"
+NEEDS = "torch"
 DATASET = "blind-merge-v2"
 
 
@@ -93,7 +95,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="", help="rows whose name contains this")
     parser.add_argument("--out", type=Path, default=Path("reports/wordings"))
-    options = parser.parse_args()
+    options, others = parser.parse_known_args()
     project: Path = options.out
     project.mkdir(parents=True, exist_ok=True)
     (project / MARKER).touch()
@@ -103,7 +105,7 @@ def main() -> None:
             base = mark(row, Path("prompts"))
             harness(
                 "prompt", "optimize", "--model", row.model, "--prompt", base, "--answer", "readout",
-                "--dataset", DATASET, "--out", name, *row.options.split(),
+                "--dataset", DATASET, "--out", name, *row.options.split(), *others,
             )  # fmt: skip
 
 

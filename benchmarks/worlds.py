@@ -4,12 +4,13 @@ Plain means that highway-env's own `act`, `step` and `Road.step` run in the plac
 lead to the same trajectories; alone, together with NumPy and together compiled are compared to the last bit.
 The compiled frame needs the extra `fast`. EnvPool is no dependency: name a Python that has it.
 
-    python benchmarks/worlds.py [--layouts 500] [--worlds 128] [--envpool PYTHON]
+    python benchmarks/worlds.py [--layouts 500] [--worlds 128] [--scenarios NAME ...]
+                                [--sizes 16 64 128 512] [--frozen 2] [--envpool PYTHON]
+                                [--loading]
     python benchmarks/worlds.py --trees     # only what a decision point costs that is frozen, together
 """
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -24,16 +25,18 @@ import numpy as np
 from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
+from rows import Row, finish
 
 from harness.dataset.freeze import freeze
 from harness.world import lockstep, scenarios, simulator
 from harness.world.scenario import Scenario
 from harness.world.world import World
 
+SMALLEST = "--scenarios blind-merge --layouts 2 --worlds 2 --sizes 1 2 --frozen 1"
+TABLE = "--layouts 64"
+NEEDS = "highway_env"
 FIRST_SEED = 2000  # (tune)
 FRAMES = 25  # before anybody meets: a fleet does not stop by itself where an episode ends
-TREES = 2  # layouts of each scenario that are frozen
-SIZES = (16, 64, 128, 512)  # worlds at once
 NUMPY, COMPILED = "numpy", "compiled"
 FORMS = (NUMPY, COMPILED) if lockstep.compiled_fleet() else (NUMPY,)
 LOADING = """
@@ -61,16 +64,26 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--layouts", type=int, default=500)
     arguments.add_argument("--worlds", type=int, default=128)
+    arguments.add_argument("--scenarios", nargs="+", default=scenarios.names())
+    arguments.add_argument("--sizes", type=int, nargs="+", default=[16, 64, 128, 512], help="worlds at once")
     arguments.add_argument("--envpool", help="a Python interpreter that has EnvPool")
+    arguments.add_argument("--frozen", type=int, default=2, help="layouts of each scenario that are frozen")
+    arguments.add_argument("--loading", action="store_true", help="also how long the compiled form loads")
     arguments.add_argument("--trees", action="store_true", help="measure only freezing, together")
     given = arguments.parse_args()
     if given.trees:
-        for name in scenarios.names():
-            trees = ", ".join(f"{form} {tree_ms(scenarios.get(name), form):.1f}" for form in FORMS)
+        for name in given.scenarios:
+            trees = ", ".join(
+                f"{form} {tree_ms(scenarios.get(name), form, given.frozen):.1f}" for form in FORMS
+            )
             print(f"{name:<24}freezing, ms a decision point: {trees}")
         return
-    loading = loading_s() if COMPILED in FORMS else None
-    rows = {name: row(scenarios.get(name), given.layouts, given.worlds) for name in scenarios.names()}
+    loading = loading_s() if given.loading and COMPILED in FORMS else None
+    sizes = given.sizes
+    rows = {
+        name: row(scenarios.get(name), given.layouts, given.worlds, sizes, given.frozen)
+        for name in given.scenarios
+    }
     columns = ["plain", "alone", *(f"{form}: {what}" for form in FORMS for what in ("together", "frame"))]
     print(f"{'CPU µs a frame':<24}" + "".join(f"{c:>20}" for c in columns) + "   plain / last")
     for name, r in rows.items():
@@ -80,9 +93,9 @@ def main() -> None:
             *(u for f in FORMS for u in (r["together_us"][f], r["frame_us"][f])),
         ]
         print(f"{name:<24}" + "".join(f"{us:20.2f}" for us in figures) + f"{figures[0] / figures[-1]:15.0f}")
-    print(f"\n{'CPU µs a frame of':<24}" + "".join(f"{f'{n} {form}':>16}" for n in SIZES for form in FORMS))
+    print(f"\n{'CPU µs a frame of':<24}" + "".join(f"{f'{n} {form}':>16}" for n in sizes for form in FORMS))
     for name, r in rows.items():
-        print(f"{name:<24}" + "".join(f"{r['sizes_us'][f][n]:16.2f}" for n in SIZES for f in FORMS))
+        print(f"{name:<24}" + "".join(f"{r['sizes_us'][f][n]:16.2f}" for n in sizes for f in FORMS))
     print(f"\n{'the same to the last bit':<24}{'frames':>8}{'differ':>8}   freezing, ms a decision point")
     for name, r in rows.items():
         trees = ", ".join(f"{form} {ms:.1f}" for form, ms in r["tree_ms"].items())
@@ -98,22 +111,38 @@ def main() -> None:
         made = subprocess.run([given.envpool, "-c", ENVPOOL], capture_output=True, text=True, check=True)
         envpool_us = float(made.stdout.split()[-1])
         print(f"\nEnvPool's Intersection-v0, 64 at once on one thread: {envpool_us:.1f} µs a frame")
-    print(json.dumps({"rows": rows, "loading_s": loading, "envpool_us": envpool_us}))
+    at_once = f"a world's frame, {given.worlds} at once"
+    figures = [
+        Row(
+            f"{at_once}, `{name}`, {form}, CPU",
+            r["frame_us"][form],
+            "µs",
+            3,
+            peer=f"highway-env {r['plain_us']:.0f} µs",
+        )
+        for name, r in rows.items()
+        for form in FORMS
+    ]
+    figures += [
+        Row(f"freezing a decision point, `{name}`, CPU", r["tree_ms"][FORMS[-1]], "ms", given.frozen)
+        for name, r in rows.items()
+    ]
+    finish(figures, worlds=rows, loading_s=loading, envpool_us=envpool_us)
 
 
-def row(scenario: Scenario, layouts: int, at_once: int) -> dict[str, Any]:
+def row(scenario: Scenario, layouts: int, at_once: int, sizes: Sequence[int], trees: int) -> dict[str, Any]:
     """What a scenario's frames and trees cost in each way, and in how many worlds any two ways differ."""
     same = [frames_of(scenario, range(n, min(n + at_once, layouts))) for n in range(0, layouts, at_once)]
     alone_s, *together_s, frames, differ = np.sum(same, axis=0).tolist()
-    still = [World.start(scenario, FIRST_SEED + n) for n in range(max(at_once, *SIZES))]
+    still = [World.start(scenario, FIRST_SEED + n) for n in range(max(at_once, *sizes))]
     return {
         "plain_us": plain_us(scenario), "alone_us": alone_s * 1e6 / frames,
         "together_us": {form: s * 1e6 / frames for form, s in zip(FORMS, together_s, strict=True)},
         "frame_us": {form: step_us(scenario, form, still[:at_once]) for form in FORMS},
-        "sizes_us": {form: {n: step_us(scenario, form, still[:n]) for n in SIZES} for form in FORMS},
+        "sizes_us": {form: {n: step_us(scenario, form, still[:n]) for n in sizes} for form in FORMS},
         "frames": int(frames), "differ": int(differ),
-        "tree_ms": {"alone": tree_ms(scenario, NUMPY, lockstep_from=10**9)}
-        | {form: tree_ms(scenario, form) for form in FORMS},
+        "tree_ms": {"alone": tree_ms(scenario, NUMPY, trees, lockstep_from=10**9)}
+        | {form: tree_ms(scenario, form, trees) for form in FORMS},
     }  # fmt: skip
 
 
@@ -198,11 +227,11 @@ def plain_us(scenario: Scenario) -> float:
         return (process_time() - start) * 1e6 / sum(world.frame for world in worlds)
 
 
-def tree_ms(scenario: Scenario, form: str, lockstep_from: int = lockstep.ALONE) -> float:
+def tree_ms(scenario: Scenario, form: str, trees: int, lockstep_from: int = lockstep.ALONE) -> float:
     """CPU time of a decision point that is frozen."""
     with simulated_by(form), patch.object(lockstep, "ALONE", lockstep_from):
         start = process_time()
-        frozen = [freeze(scenario, FIRST_SEED + n, n) for n in range(TREES)]
+        frozen = [freeze(scenario, FIRST_SEED + n, n) for n in range(trees)]
         points = sum(len(level) for _, scenes in frozen for level in scenes)
         return (process_time() - start) * 1e3 / points
 
