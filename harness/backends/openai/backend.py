@@ -12,6 +12,8 @@ from functools import partial
 from threading import Thread, current_thread
 from typing import Any, TypeVar
 
+from msgspec import structs
+
 from harness.backends.base import Completion, Request, Served, failed, per_token_s
 from harness.backends.card import Card
 from harness.backends.openai.http import Client, Reply
@@ -187,7 +189,7 @@ class OpenAIBackend:
             return reply
         self._streams = False
         plain = await self._pool.post(decision, json_body)
-        return replace(plain, retries=reply.retries + 1 + plain.retries, begun_s=reply.begun_s)
+        return structs.replace(plain, retries=reply.retries + 1 + plain.retries, begun_s=reply.begun_s)
 
 
 def _over_orders(request: Request, completions: Sequence[Completion]) -> Completion:

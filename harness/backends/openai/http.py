@@ -7,13 +7,13 @@ import asyncio
 import json
 import math
 import time
-from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
 from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import getproxies, proxy_bypass
 
 import aiohttp
+from msgspec import Struct
 from yarl import URL
 
 from harness.backends.openai.faults import error_words, fault_in, may_pass, plain_text
@@ -31,8 +31,7 @@ _HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
 _UNREACHED = (aiohttp.ClientConnectorError, aiohttp.ConnectionTimeoutError, aiohttp.InvalidURL, UnicodeError)
 
 
-@dataclass(frozen=True)
-class Reply:
+class Reply(Struct, frozen=True):
     """Result of one request."""
 
     payload: Any = None  # the JSON value; None on a fault

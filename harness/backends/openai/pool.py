@@ -6,15 +6,16 @@ whose queue is empty takes requests from the end of the longest queue, so that n
 """
 
 import asyncio
-import json
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import blake2b
 from time import perf_counter
 from typing import Any
+
+import msgspec
 
 from harness.backends.openai.http import Client, Reply
 from harness.backends.openai.statements import Model, read_statement
@@ -179,9 +180,9 @@ class ServerPool:
             server.sent += 1
             nth, first = server.sent, server.busy == 1
             pending.begun_s = perf_counter() if pending.begun_s is None else pending.begun_s
-            reply = await self._client.post(server.url, self._path, json.dumps(pending.body()).encode())
+            reply = await self._client.post(server.url, self._path, msgspec.json.encode(pending.body()))
             alone = first and server.sent == nth
-            reply = replace(
+            reply = msgspec.structs.replace(
                 reply, retries=pending.failed[server], begun_s=pending.begun_s, alone=alone, url=server.url
             )
             if not reply.again:
