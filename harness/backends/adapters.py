@@ -1,7 +1,7 @@
 """LoRA adapters beside a card's weights: a folder in the format of the package peft.
 
 It holds `adapter_config.json` and `adapter_model.safetensors`, by which a checkpoint's weights are changed
-when they are loaded, and for llama.cpp the same numbers as one GGUF file.
+when they are loaded; for llama.cpp the same numbers become a GGUF file (`llama_cpp.adapter`).
 """
 
 import json
@@ -63,25 +63,19 @@ def find_adapter(card: Card) -> Path | None:
     return folder
 
 
-def find_tensors(card: Card) -> Path | None:
-    """Return the adapter's safetensors file; None without an adapter."""
-    return _file(card, TENSORS)
+def find_tensors(folder: Path, shown: str) -> Path:
+    """Return the safetensors file of an adapter's folder. Raises UserError if there is none."""
+    if not (file := folder / TENSORS).is_file():
+        raise UserError(f"{shown}: its adapter in {printable(folder)} has no file {TENSORS}")
+    return file
 
 
-def find_adapter_gguf(card: Card) -> Path | None:
-    """Return the adapter's GGUF file; None without an adapter."""
-    return _file(card, "*.gguf")
-
-
-def _file(card: Card, pattern: str) -> Path | None:
-    if (folder := find_adapter(card)) is None:
-        return None
-    files = sorted(folder.glob(pattern))
-    if len(files) != 1:
-        raise UserError(
-            f"{card.shown}: its adapter in {printable(folder)} has {len(files)} files {pattern}; allowed: one"
-        )
-    return files[0]
+def foreign(shown: str, file: Path, reason: str) -> UserError:
+    """Return the refusal of an adapter that does not fit its model."""
+    return UserError(
+        f"{shown}: {printable(file)} is no adapter of this model: {reason}; give the adapter that was "
+        "trained on it"
+    )
 
 
 def merge(card: Card, model: Any) -> None:
@@ -89,12 +83,12 @@ def merge(card: Card, model: Any) -> None:
 
     Raises UserError if the adapter is of another model, or its file is not whole.
     """
-    if (file := find_tensors(card)) is None:
+    if (folder := find_adapter(card)) is None:
         return
     import torch
     from safetensors.torch import load
 
-    config = read_config(file.parent, card.shown)
+    file, config = find_tensors(folder, card.shown), read_config(folder, card.shown)
     rank = int(config["r"])
     scale = float(config["lora_alpha"]) / rank
     output = model.get_output_embeddings()
@@ -118,10 +112,7 @@ def merge(card: Card, model: Any) -> None:
                 raise ValueError(f"{name} holds numbers that are none, or too large")
             changes[name] = weight, change
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
-        raise UserError(
-            f"{card.shown}: {printable(file)} is no adapter of this model: {one_line(error)}; give the "
-            "adapter that was trained on it"
-        ) from None
+        raise foreign(card.shown, file, one_line(error)) from None
     with torch.no_grad():
         for weight, change in changes.values():
             weight.copy_(weight.float() + scale * change.to(weight.device))

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import llama_cpp as c
 import numpy as np
 
-from harness.backends.adapters import find_adapter_gguf
 from harness.backends.card import Card
 from harness.backends.chat import Chat
 from harness.backends.engine import Session, check_logits, common_beginning, common_length, group_by_beginning
 from harness.backends.language_model import LanguageModel
+from harness.backends.llama_cpp.adapter import find_adapter_gguf
 from harness.backends.llama_cpp.context import LlamaContext, Logits
 from harness.backends.llama_cpp.model import LlamaModel
 from harness.backends.llama_cpp.projector import Projector
@@ -36,7 +36,7 @@ def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> La
     most = c.llama_max_parallel_sequences() - BEGINNINGS
     if batch_size > most:
         raise UserError(f"batch size {batch_size}; llama.cpp takes {most} at most")
-    model = LlamaModel(card.name, file, device, find_adapter_gguf(card))
+    model = LlamaModel(card.name, file, device, find_adapter_gguf(card, file))
     projector = None
     if card.vision and card.projector:
         projector = Projector(card.name, file.with_name(card.projector), model, card.vision)

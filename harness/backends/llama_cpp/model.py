@@ -8,6 +8,7 @@ from typing import Any
 import llama_cpp as c
 import numpy as np
 
+from harness.backends.adapters import foreign
 from harness.core.errors import UserError, printable
 
 _ERROR = 4  # ggml's log level of errors
@@ -49,10 +50,7 @@ class LlamaModel:
         self.adapter_file = adapter
         self._adapter = adapter and c.llama_adapter_lora_init(self.pointer, bytes(adapter))
         if adapter and not self._adapter:
-            raise UserError(
-                f"{shown}: {printable(adapter)} is no adapter of this model: {last_error()}; give the "
-                "adapter that was trained on it"
-            )
+            raise foreign(shown, adapter, last_error())
         self._vocab = c.llama_model_get_vocab(self.pointer)
         self.vocabulary: int = c.llama_vocab_n_tokens(self._vocab)
         if not self.vocabulary or c.llama_vocab_type(self._vocab) == c.LLAMA_VOCAB_TYPE_NONE:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 from warnings import catch_warnings, simplefilter
 
-from harness.backends.adapters import find_tensors, merge
+from harness.backends.adapters import TENSORS, find_adapter, merge
 from harness.backends.card import Card, Dtype
 from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.engine import Session
@@ -149,7 +149,7 @@ class TransformersEngine:
         from harness.backends.transformers.session import Reader
 
         self.card, self.where, self.model = card, where, model
-        self.adapter = find_tensors(card)
+        self.adapter = find_adapter(card)
         self.eyes = Eyes(card.name, where, card.vision, tokenizer, model) if card.vision else None
         image_token = self.eyes.image_token if self.eyes else None
         self.chat = Chat(card.name, HubTokenizer(tokenizer), image_token, card.system)
@@ -185,7 +185,7 @@ class TransformersEngine:
             "device": str(self.model.device),
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
             **({"gguf_sha256": self._gguf_sha256} if is_gguf(self.card) else {}),
-            **({"adapter_sha256": sha256_file(self.adapter)} if self.adapter else {}),
+            **({"adapter_sha256": sha256_file(self.adapter / TENSORS)} if self.adapter else {}),
             **({"system": self.chat.system} if self.chat.system else {}),
         }
 
