@@ -7,12 +7,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-import uvicorn
-
 from harness.backends import cards
 from harness.backends.base import Backend
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
+from harness.core import web
 from harness.serving.app import Service
 from harness.serving.model import ServedModel, served
 
@@ -24,11 +23,7 @@ def answering(
     """The base URL of a model's server, up to and including /v1."""
     agent = served(cards.load(model) if isinstance(model, str) else model, letters)
     service = Service(ServedModel(agent, backend or open_backend(agent.card, batch_size=1)), **how)
-    config = uvicorn.Config(
-        service.app(), log_level="critical", access_log=False, lifespan="off", ws="none",
-        timeout_graceful_shutdown=1,
-    )  # fmt: skip
-    server = uvicorn.Server(config)
+    server = web.server_of(service.app())
     with socket.socket(proto=socket.IPPROTO_TCP) as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen()

@@ -15,7 +15,9 @@ from contextlib import suppress
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from time import monotonic, sleep
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
 import numpy as np
@@ -30,6 +32,7 @@ from harness.backends import cards
 from harness.backends.base import Completion, Request
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import named_point
+from harness.core import web
 from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.dataset.load import Dataset, find, load
@@ -406,6 +409,53 @@ def test_a_full_queue_is_said_with_when_to_come_again() -> None:
         said = post(there, "systemone", {"state": "s", "questions": {"a": CHOICE, "b": CHOICE}})
     assert (said.status_code, said.json()["error"]["type"]) == (429, "rate_limit_error")
     assert said.headers["retry-after"] == "1"
+
+
+def closed_after(url: str, send: Callable[[socket.socket, int], None]) -> tuple[float, bytes]:
+    """When the server closes a connection on which something is sent every 50 ms, and what it said."""
+    address = urlsplit(url)
+    with socket.create_connection((address.hostname, address.port), timeout=0.05) as one:
+        began_s = monotonic()
+        for n in range(100):
+            said = b""
+            try:
+                send(one, n)
+                while part := one.recv(4096):
+                    said += part
+                return monotonic() - began_s, said
+            except TimeoutError:
+                if said:
+                    return monotonic() - began_s, said
+            except ConnectionError:
+                return monotonic() - began_s, said
+    raise AssertionError("it stays open")
+
+
+def test_a_head_that_does_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is sent; a byte every 50 ms; the same on a connection that has asked before."""
+    monkeypatch.setattr(web, "HEAD_S", 0.4)
+    head = b"GET /v1/models HTTP/1.1\r\nHost: localhost\r\n"
+    whole = head + b"\r\n"
+
+    def after_one(one: socket.socket, n: int) -> None:
+        one.sendall(head[n - 1 : n] if n else whole)
+        if not n:
+            assert one.recv(4096).startswith(b"HTTP/1.1 200 OK")
+
+    with answering("sparrow-robot", Patient()) as there:
+        drip = (lambda one, n: None, lambda one, n: one.sendall(head[n : n + 1]), after_one)
+        for send in drip:
+            after_s, said = closed_after(there, send)
+            assert 0.35 < after_s < 3, send
+            assert said == b""
+        with socket.create_connection(("127.0.0.1", urlsplit(there).port), timeout=5) as slow:
+            slow.sendall(head)
+            sleep(0.1)
+            slow.sendall(b"\r\n")
+            assert slow.recv(4096).startswith(b"HTTP/1.1 200 OK"), "in time"
+            sleep(0.6)
+            slow.sendall(whole)
+            assert slow.recv(4096).startswith(b"HTTP/1.1 200 OK"), "between requests uvicorn's time holds"
 
 
 def test_who_waits_too_long_is_told_so_and_is_not_asked_about_later() -> None:

@@ -1,19 +1,58 @@
 """Serve an application by HTTP at one address, until Ctrl-C."""
 
+import asyncio
 import errno
 import socket
 from collections.abc import Callable
 from ipaddress import ip_address
 from typing import Any
 
+import h11
 import uvicorn
 from starlette.types import ASGIApp
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from harness.core.errors import UserError, printable
 
 LOOPBACK = "127.0.0.1"
 BACKLOG = 512  # connections that wait to be taken
 NAMES = (LOOPBACK, "localhost", "::1")  # of this machine, as who is on it writes them
+HEAD_S = 10.0  # within which a request's head, its line and headers, must have come
+
+
+class HeadInTime(H11Protocol):
+    """HTTP that closes a connection on which a request's head takes longer than `HEAD_S`.
+
+    uvicorn waits for a head for ever, however slowly it drips. Between requests its own, shorter time holds.
+    """
+
+    _late: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for the first head."""
+        super().connection_made(transport)
+        self._watch()
+
+    def data_received(self, data: bytes) -> None:
+        """Take what has come."""
+        super().data_received(data)
+        self._watch()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait for nothing more."""
+        super().connection_lost(exc)
+        self._relax()
+
+    def _watch(self) -> None:
+        if self.conn.their_state is not h11.IDLE:
+            self._relax()
+        elif self._late is None:
+            self._late = self.loop.call_later(HEAD_S, self.transport.close)
+
+    def _relax(self) -> None:
+        if self._late is not None:
+            self._late.cancel()
+            self._late = None
 
 
 def is_loopback(host: str) -> bool:
@@ -22,6 +61,15 @@ def is_loopback(host: str) -> bool:
         return ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def server_of(app: ASGIApp, **limits: Any) -> uvicorn.Server:
+    """Return the server of an application, with further settings of uvicorn."""
+    config = uvicorn.Config(
+        app, log_level="critical", access_log=False, lifespan="off", ws="none", proxy_headers=False,
+        server_header=False, timeout_graceful_shutdown=1, http=HeadInTime, **limits,
+    )  # fmt: skip
+    return uvicorn.Server(config)
 
 
 def serve(app: ASGIApp, host: str, port: int, listening: Callable[[str], None], **limits: Any) -> None:
@@ -55,8 +103,4 @@ def serve(app: ASGIApp, host: str, port: int, listening: Callable[[str], None], 
             raise UserError(f"--port {port} {what}; give another, or 0 for a free one") from None
         name = f"[{host}]" if ":" in host else host
         listening(f"http://{name}:{listener.getsockname()[1]}")
-        config = uvicorn.Config(
-            app, log_level="critical", access_log=False, lifespan="off", ws="none", proxy_headers=False,
-            server_header=False, timeout_graceful_shutdown=1, **limits,
-        )  # fmt: skip
-        uvicorn.Server(config).run(sockets=[listener])
+        server_of(app, **limits).run(sockets=[listener])
