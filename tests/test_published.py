@@ -332,6 +332,11 @@ def test_all_weights_of_a_base_can_learn(tmp_path: Path) -> None:
         (["--base", "swarm-tiny", "--report", "-1"], "--report -1: give 0 to 512"),
         (["--base", "swarm-tiny", "--dtype", "int8"], "unknown --dtype 'int8'"),
         (["--base", "no-such"], "unknown model 'no-such'"),
+        (
+            ["--base", "proxy"],
+            "--base proxy: it runs on proxy alone and has no weights that can be taught; give",
+        ),
+        (["--base", "sparrow-robot", "--lora"], "it runs on sparrow alone and has no weights"),
         (["--base", "swarm-tiny-vl", "--prompt", "v9"], "takes pictures; give a plain model of texts"),
         (["--base", "swarm-tiny", "--prompt", "v8"], "is taught texts alone; leave image prompts out"),
         (["--objective", "value"], "unknown --objective 'value'; did you mean 'values'?"),

@@ -176,9 +176,23 @@ def _base(
     if text and not lora and all((folder / name).is_file() for name in ours):
         start: Path | None = folder
     elif text:
-        return cards.resolve(text, "transformers"), adapt
+        return _published(text), adapt
     else:
         start = None
     if lora or rate or dtype != DTYPES[0] or report is not None:
         raise UserError("--lora, --rate, --dtype and --report go with --base, a published model")
     return start, adapt
+
+
+def _published(text: str) -> "Card":
+    """Return the card of a model whose weights can be taught. Raises UserError if there are none."""
+    from harness.backends import cards
+
+    engine = cards.resolve(text).engine
+    try:
+        return cards.resolve(text, "transformers")
+    except UserError:
+        raise UserError(
+            f"--base {printable(text)}: it runs on {engine} alone and has no weights that can be taught; "
+            "give a model that runs on transformers, such as smollm2-135m (`harness model list`)"
+        ) from None
