@@ -11,6 +11,8 @@ from evaluating import same_files
 
 from harness.core.resources import DATASET
 from harness.dataset import load
+from harness.runs.folder import read
+from harness.runs.metrics import BALANCED, GAINS, SUCCESS, written
 
 Said = tuple[int, str, str]
 
@@ -32,6 +34,27 @@ def test_it_prints_a_table_and_where_the_report_is(harness: Callable[..., Said],
         "summary.csv",
         "report.html",
     }
+    assert "gain, points" in out, "and of balanced success there is none: both layouts have a danger"
+
+
+@pytest.mark.slow
+def test_the_gain_is_of_what_leads(harness: Callable[..., Said], small_path: Path) -> None:
+    code, out, _ = harness("eval", "--dataset", small_path, "--seeds", "0", "--out", "run")
+    assert code == 0
+    lines = out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "gain, points" not in out
+    [head] = [n for n, line in enumerate(lines) if line.split() == ["balanced", "gain,", "in"]]
+    [row] = [line for line in lines[head:] if line.startswith("6g ")]
+    done = read(Path("run"))
+    gain, plain = (done.score("6g", GAINS[of]) for of in (BALANCED, SUCCESS))
+    assert gain is not None
+    assert plain is not None
+    assert gain.value != plain.value
+    assert written(gain) in row
+    _, out, _ = harness("eval", "--dataset", small_path, "--seeds", "0", "--condition", "6g", "--out", "6g")
+    assert "balanced success" in out
+    assert "gain" not in out, "there is no condition to gain over"
 
 
 @pytest.mark.slow

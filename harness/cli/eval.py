@@ -13,13 +13,19 @@ from harness.cli.terminal import echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
 from harness.core.seeds import stated
 from harness.evaluate.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
+from harness.runs import leading
 
 if TYPE_CHECKING:
     from harness.evaluate.spec import Spec
 
+SUCCESS = Column("success % [95 % CI]", leading.SUCCESS, interval=True)
+GAINS = {  # of what leads
+    leading.SUCCESS: Column("gain, points", "success_gain_over_single-local", interval=True),
+    leading.BALANCED: Column(
+        "balanced gain, in points", "balanced_success_gain_over_single-local", interval=True
+    ),
+}
 COLUMNS = (
-    Column("success % [95 % CI]", "success_rate", interval=True),
-    Column("gain, points", "success_gain_over_single-local", interval=True),
     Column("latency", "latency_proxy_ms"),
     Column("trigger", "trigger_rate"),
     Column("msgs", "messages_per_episode"),
@@ -110,15 +116,16 @@ def command(
     selected = bool(sources[0].selection.given)
     seeds_of = frozen[0].manifest.episodes if selected else len(frozen[0].episodes)
     references = in_trees(frozen[0])
+    gain = [of for of in [GAINS[leading.lead_of(done)]] if any(s.metric == of.metric for s in done.scores)]
     beside = {name: references[name] for name in BESIDE if name in references}
     notes = (
         f"n = {len(frozen[0].episodes)} episodes × {len(specs[0].seeds)} channel seeds; "
         f"{'of ' if selected else ''}{stated(frozen[0].manifest.seed, seeds_of)};",
-        "95 % intervals over episodes; msgs: per episode; gain: over single-local, paired",
+        "95 % intervals over episodes; msgs: per episode" + "; gain: over single-local, paired" * bool(gain),
         *map(meaning, beside),
     )
     rows = {label(name, frozen[0].scenario): scores for name, scores in beside.items()}
-    show(done, frozen[0].name, COLUMNS, notes, rows)
+    show(done, frozen[0].name, (SUCCESS, *gain, *COLUMNS), notes, rows)
     typer.echo(f"wrote {page}")
 
 

@@ -14,6 +14,7 @@ from harness.cli.terminal import console, table
 from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.formats import WORK
+from harness.runs import leading
 
 if TYPE_CHECKING:
     from harness.core.parallel import Workers
@@ -206,7 +207,7 @@ def show(
     }
     rows |= beside or {}
     halves = [rows[names[0]][column.metric] for column in BALANCED[1:]]
-    tables = (BALANCED, columns) if all(halves) else (columns,)
+    tables = (BALANCED, columns) if leading.lead_of(done) == leading.BALANCED else (columns,)
     for shown in tables:
         table(
             ("condition", *(column.head for column in shown)),
