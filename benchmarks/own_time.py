@@ -35,13 +35,15 @@ from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.evaluate import asking, run, walk
 from harness.evaluate.agent import Agent
+from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.kept_answers import KeptAnswers
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
-from harness.prompts.versions import Prompt
+from harness.prompts.template import Template
 from harness.runs import folder as folders
 from harness.runs.folder import read
+from harness.world.scene_graph import SceneGraph
 
 SMALLEST = "--layouts 1 --sizes 1 2 --repeats 1"
 TABLE = "--sizes 1 2"
@@ -50,13 +52,14 @@ AIM_MS = 0.2
 PARTS: dict[str, list[tuple[Any, str]]] = {
     "proxy": [(Proxy, "complete")],
     "copies": [(copies.Copies, "scenes"), (copies, "_tree")],
-    "prompt": [(Prompt, "render")],
-    "parse": [(asking, "parse")],
+    "graph": [(SceneGraph, "plain")],
+    "template": [(Template, "render")],
+    "answer": [(asking, "answer_of")],
+    "lay out": [(Asker, "laid_out")],
     "coordinate": [(walk, "exchange"), (walk, "fuse")],
-    "record": [
-        (KeptAnswers, "append"), (run, "table"), (run, "_gather"),
-        (folders, "part_files"), (folders, "write_part"),
-    ],
+    "keep": [(KeptAnswers, "append")],
+    "table": [(run, "table"), (folders, "part_files"), (folders, "write_part")],
+    "score": [(run, "_gather")],
 }  # fmt: skip
 OTHERS = ("proxy", "copies")
 LIMIT = "limit"
