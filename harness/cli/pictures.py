@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
     from harness.backends.card import Card
     from harness.backends.vision import Vision
-    from harness.core.image import Image, Pixels
+    from harness.core.arrays import Pixels
+    from harness.core.image import Image
     from harness.prompts.versions import Prompt
 
 MODEL = "qwen3-vl-2b"  # unasked

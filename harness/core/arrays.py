@@ -9,6 +9,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 Texts = NDArray[np.str_]
+Pixels = NDArray[np.uint8]  # of a picture, (height, width, 3) red, green and blue
 
 
 def summed(values: Floats, axis: int) -> Floats:

@@ -3,23 +3,22 @@
 import zlib
 from functools import cached_property
 from struct import pack
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from harness.core.files import sha256_bytes
 
-Pixels = NDArray[np.uint8]
+if TYPE_CHECKING:
+    from harness.core.arrays import Pixels
 
 
 class Image:
     """A picture as `pixels`, (height, width, 3) red, green and blue."""
 
-    def __init__(self, pixels: Pixels) -> None:
+    def __init__(self, pixels: "Pixels") -> None:
         self._pixels = pixels
 
     @property
-    def pixels(self) -> Pixels:
+    def pixels(self) -> "Pixels":
         return self._pixels
 
     @cached_property
@@ -28,6 +27,8 @@ class Image:
         return sha256_bytes(repr(self.pixels.shape).encode() + self.pixels.tobytes())
 
     def png(self) -> bytes:
+        import numpy as np
+
         height, width, _ = self.pixels.shape
         # Every line begins with 0, which means no filter: pictures with few colours are smallest so.
         lines = np.pad(self.pixels.reshape(height, -1), ((0, 0), (1, 0)))

@@ -15,20 +15,10 @@ from msgspec import UNSET, Meta, UnsetType
 
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, Purpose
 from harness.world.conflict_measures import HORIZON_S
+from harness.world.fields import Closed, Count, Number, Seed, VehicleId
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import Conflict, Node, SceneGraph, Sector
-from harness.world.state import (
-    ActionsTaken,
-    Closed,
-    Count,
-    Number,
-    Seed,
-    Snapshot,
-    VehicleId,
-    VehicleState,
-    WorldState,
-    indicator,
-)
+from harness.world.state import ActionsTaken, Snapshot, VehicleState, WorldState, indicator
 
 FILE_NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"  # names of a dataset and its files; never a path
 LAYOUTS = "layouts.zip"

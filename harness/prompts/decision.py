@@ -6,10 +6,12 @@ chat model answers the same question by a read-out of letters (`harness.prompts.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from harness.prompts import readout
-from harness.world.scene_graph import SceneGraph
+
+if TYPE_CHECKING:
+    from harness.world.scene_graph import SceneGraph
 
 # `choice` between options; `score`, of levels named by their place from 0, the lowest first; `noul`, how
 # probable `true` is and how probable `false`.
@@ -49,7 +51,10 @@ class Question:
 
 
 def question(
-    messages: Sequence[Mapping[str, str]], graph: SceneGraph, actions: Sequence[str], words: Mapping[str, str]
+    messages: Sequence[Mapping[str, str]],
+    graph: "SceneGraph",
+    actions: Sequence[str],
+    words: Mapping[str, str],
 ) -> Question:
     """Return what a scene graph's viewer is asked; the state is the last message of a prompt's chat about it.
 

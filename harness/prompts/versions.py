@@ -6,15 +6,15 @@ and `prompt.toml`; it may have examples, `examples.json`, and further members of
 Released versions are pinned by digest in `prompts/released.toml`: a changed text is a new version.
 """
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 from jinja2 import TemplateSyntaxError
 
 from harness.core.config import Count, convert, loads
@@ -30,8 +30,10 @@ from harness.prompts.examples import read as read_examples
 from harness.prompts.extension import ANSWER
 from harness.prompts.extension import read as read_extension
 from harness.prompts.template import Template
-from harness.world.scenario import Scenario
-from harness.world.scene_graph import Conflict, SceneGraph
+
+if TYPE_CHECKING:
+    from harness.world.scenario import Scenario
+    from harness.world.scene_graph import Conflict, SceneGraph
 
 _compiled = lru_cache(maxsize=64)(Template)  # a process may load a version many times
 FILES = ("ego.j2", "helper.j2", "prompt.toml")
@@ -131,7 +133,7 @@ class Prompt:
 
     def render(
         self,
-        graph: SceneGraph,
+        graph: "SceneGraph",
         actions: tuple[str, ...],
         messages: Sequence[Mapping[str, Any]] = (),
         words: Mapping[str, str] = NO_WORDS,
@@ -173,7 +175,7 @@ class Prompt:
         return {}
 
     def _render_graph(
-        self, graph: SceneGraph, actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]],
+        self, graph: "SceneGraph", actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]],
         words: Mapping[str, str], letter: bool, *blocks: str,
     ) -> list[str]:  # fmt: skip
         """Render some blocks of a template for a scene graph, the last of which ends with the question."""
@@ -217,17 +219,17 @@ class Prompt:
             ) from None
 
 
-def listed(graph: SceneGraph, most: int) -> list[int]:
+def listed(graph: "SceneGraph", most: int) -> list[int]:
     """Return the indices of the nodes that a prompt lists: those in conflict first, then the nearest."""
     meets = {conflict.vehicle for conflict in graph.conflicts}
     order = [(node.id not in meets, node.forward_m**2 + node.left_m**2) for node in graph.nodes]
     return sorted(range(len(order)), key=order.__getitem__)[:most]
 
 
-def soonest(conflicts: Sequence[Conflict]) -> list[int]:
+def soonest(conflicts: Sequence["Conflict"]) -> list[int]:
     """Return the indices of conflicts, the soonest first; those that the ego never reaches are last."""
     order = [
-        (np.inf if c.ego.time_s is None else c.ego.time_s, c.ego.arc_m + c.other.arc_m) for c in conflicts
+        (math.inf if c.ego.time_s is None else c.ego.time_s, c.ego.arc_m + c.other.arc_m) for c in conflicts
     ]
     return sorted(range(len(order)), key=order.__getitem__)
 
@@ -238,7 +240,7 @@ def names(where: Path | None = None) -> list[str]:
     return sorted({file.parent.name for file in files})
 
 
-def unfit(prompt: Prompt, scenario: Scenario) -> str | None:
+def unfit(prompt: Prompt, scenario: "Scenario") -> str | None:
     """Return why a version may not be used in a scenario; None if it may."""
     if prompt.version in OF_A_CROSSING and scenario.prompt not in OF_A_CROSSING:
         return f"speaks of a crossing, which {scenario.name} is not"

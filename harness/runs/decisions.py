@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness.core.arrays import Bools, Floats, Ints
@@ -198,7 +197,7 @@ class Decisions:
     def infinite(self) -> str | None:
         """Return the name of a column with an infinite number, or None."""
         numbers = [column.name for column in self.table.schema if column.type == NUMBER]
-        return next((name for name in numbers if pc.any(pc.is_inf(self.table[name])).as_py()), None)
+        return next((name for name in numbers if np.isinf(self.table[name].to_numpy()).any()), None)
 
     def take(self, which: Any) -> "Decisions":
         places = _of_buffer(np.asarray(which, dtype=np.int64), None, WHOLE)

@@ -18,8 +18,8 @@ import shapely
 from shapely import LineString, intersection
 
 from harness.core.arrays import Floats
+from harness.world.fields import Side
 
-Side = Literal["own", "left", "right"]  # of the ego's ways, from the one that it is on
 PathKey = tuple[str, str]  # approach and route
 Lane = tuple[str, str, int]  # highway-env's lane index: two nodes, and a number from the left
 STEP_M = 0.25  # distance between the points of a path

@@ -10,8 +10,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType, field
 
-from harness.world.road import Side
-from harness.world.state import Closed, Count, Kind, Number, VehicleId
+from harness.world.fields import Closed, Count, Kind, Number, Side, VehicleId
 
 WholeNumber = Annotated[int, Meta(ge=-1_000_000, le=1_000_000)]
 Role = Literal["ego", "helper"]

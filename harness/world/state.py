@@ -1,23 +1,16 @@
 """Records of a scene: vehicles, buildings, beacons, and the state of the whole world at one time."""
 
 from functools import lru_cache
-from typing import Annotated, Any, Literal
-from warnings import warn
+from typing import Annotated
 
 import numpy as np
-from msgspec import UNSET, Meta, Struct
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from harness.core.arrays import Floats
-from harness.core.seeds import LAST_EPISODE, LAST_SEED
-
-Kind = Literal["car", "van", "truck"]
-Part = Literal["ego", "helper", "other"]
-# No metre, second or share comes near these bounds, and infinity and huge integers do not pass them.
-Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
-Count = Annotated[int, Meta(ge=0, le=1_000_000)]
-Seed = Annotated[int, Meta(ge=0, le=LAST_SEED + LAST_EPISODE)]
-VehicleId = Annotated[str, Meta(pattern="^v[1-9][0-9]?$")]
+from harness.world.fields import Closed, Count, Number, Seed, VehicleId
+from harness.world.fields import Kind as Kind
+from harness.world.fields import Part as Part
 
 # Length and width; a van has those of SUMO's delivery van.
 SIZES_M: dict[str, tuple[float, float]] = {"car": (5.0, 2.0), "van": (6.5, 2.16), "truck": (10.0, 2.6)}
@@ -27,18 +20,6 @@ HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
 def indicator(route: str) -> str:
     """Return what the turn indicator of a vehicle on a route shows."""
     return route if route in ("left", "right") else "off"
-
-
-class Closed(Struct, frozen=True, forbid_unknown_fields=True):
-    """A record with these members and no other; its bounds hold where it is read."""
-
-    def __getitem__(self, key: str) -> Any:
-        """Return a member by its name in a file: how plug-ins of 0.2 read it, until 0.4.0, with a warning."""
-        names = dict(zip(self.__struct_encode_fields__, self.__struct_fields__, strict=True))
-        if key not in names or (value := getattr(self, names[key])) is UNSET:
-            raise KeyError(key)
-        warn(f"[{key!r}] is now .{names[key]}; it works until 0.4.0", FutureWarning, stacklevel=2)
-        return value
 
 
 class VehicleState(Closed, frozen=True, omit_defaults=True):

@@ -4,12 +4,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from harness.backends.base import Completion, Request, failed
 from harness.backends.card import Card
-from harness.backends.decisions.wires import asked_of, questions, read_systemone
 from harness.backends.registry import BUILT_IN
 from harness.core.errors import UserError, one_line, printable, unknown
 from harness.core.files import canonical_json, sha256_file
@@ -22,14 +22,15 @@ def find(card: Card) -> Path:
 
     Raises UserError if there is none.
     """
-    import sparrow_decider
-
     weights = card.weights or ""
     if (own := Path(weights).expanduser()).suffix == SUFFIX:
         if not own.is_file():
             raise UserError(f"{card.shown}: weights {printable(weights)} is no file; give one that is there")
         return own
-    folder = Path(sparrow_decider.__file__).parent / "models"
+    package = find_spec("sparrow_decider")  # an import would take NumPy, and lists only look for weights
+    assert package
+    assert package.origin
+    folder = Path(package.origin).parent / "models"
     shipped = {file.stem: file for file in sorted(folder.glob(f"*{SUFFIX}"))}
     if weights not in shipped:
         raise unknown(f"weights of {card.shown}", weights, shipped, f"; or the path of a {SUFFIX} file")
@@ -62,6 +63,8 @@ class Sparrow:
         return [self._answer(request) for request in requests]
 
     def _answer(self, request: Request) -> Completion:
+        from harness.backends.decisions.wires import asked_of, questions, read_systemone
+
         start_s = time.perf_counter()
         try:
             answers = self._model.ask(asked_of(request).state, questions(request))
@@ -73,6 +76,8 @@ class Sparrow:
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         """Return what each request asks, as JSON."""
+        from harness.backends.decisions.wires import asked_of, questions
+
         return [canonical_json({"state": asked_of(r).state, "questions": questions(r)}) for r in requests]
 
     def identity(self) -> dict[str, Any]:

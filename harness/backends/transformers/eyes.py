@@ -16,8 +16,9 @@ from harness.backends.card import Card
 from harness.backends.pictures import KEPT, Pictures, pictures_in
 from harness.backends.vision import Vision
 from harness.backends.weights import find_checkpoint
+from harness.core.arrays import Pixels
 from harness.core.errors import UserError, one_line
-from harness.core.image import Image, Pixels
+from harness.core.image import Image
 
 
 class Processor:

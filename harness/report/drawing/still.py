@@ -16,9 +16,8 @@ from matplotlib.patches import PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.textpath import TextPath
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Pixels
 from harness.core.errors import printable
-from harness.core.image import Pixels
 from harness.evaluate.replay import ReplayedEpisode, Still
 from harness.report.drawing.artists import body, named, roads, scale_m, shade, sight, walls
 from harness.report.drawing.colours import BAD, BUILDING_NAME, GOOD, GREY, INK, LATE, LIGHT, ROLES

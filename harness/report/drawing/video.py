@@ -13,9 +13,9 @@ from pathlib import Path
 from PIL import Image
 
 from harness.core import extras
+from harness.core.arrays import Pixels
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing, write_whole
-from harness.core.image import Pixels
 from harness.evaluate.replay import ReplayedEpisode, Still, stills
 from harness.report.drawing.geometry import View, shape_of, spots, views
 from harness.report.drawing.pictures import styled

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from shapely.ops import substring
 
 from harness.core import noise
-from harness.core.arrays import Floats
-from harness.core.image import Image, Pixels
+from harness.core.arrays import Floats, Pixels
+from harness.core.image import Image
 from harness.world.ambient import AMBIENTS, DAY, Ambient, Colour, sun_rad
 from harness.world.perception.rays import meetings, turned
 from harness.world.perception.sensors import HALF_FIELD_RAD, detect
