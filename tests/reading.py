@@ -55,6 +55,11 @@ def unpacked(decisions):
 
 def by_workers(runs, base, monkeypatch):
     """The page of some runs as one process writes it, and as two do, of a few scenes each."""
-    for name, scenes in (("details.BLOCK", 2), ("decisions.BLOCK", 2), ("decisions.AT_ONCE", 4)):
+    for name, scenes in (
+        ("details.BLOCK", 2),
+        ("decisions.BLOCK", 2),
+        ("decisions.AT_ONCE", 4),
+        ("page.PARTS_SHARED", 2),
+    ):
         monkeypatch.setattr(f"harness.report.{name}", scenes)
     return [write_report(runs, base / f"{workers}.html", workers=workers).read_text() for workers in (1, 2)]

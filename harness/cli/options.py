@@ -100,13 +100,13 @@ RuleWorkers = Annotated[
     Option(
         metavar="WHO",
         help=f"Number of worker processes, {_RAY} For rules such as proxy only; used on more than 256 "
-        "layouts, and for the report of more than 1536 scenes. Default: 2.",
+        "layouts, and for the report of more than 5376 scenes. Default: 2.",
         rich_help_panel=stated.ENGINE,
     ),
 ]
 PageWorkers = Annotated[
     str,
-    Option(metavar="WHO", help=f"Number of worker processes, {_RAY} Used on more than 1536 scenes."),
+    Option(metavar="WHO", help=f"Number of worker processes, {_RAY} Used on more than 5376 scenes."),
 ]
 FullPage = Annotated[
     bool,

@@ -156,6 +156,8 @@ class Dataset:
         )
 
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
+        if len(numbers) == len(self.episodes) and set(numbers) == set(self.episodes):
+            return self
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
         return replace(self, trees=trees)
 

@@ -13,7 +13,7 @@ from harness.report.runs import Runs
 from harness.runs.folder import Run, check_scenes
 from harness.runs.sources import lacking
 
-AT_ONCE = 64 * BLOCK  # scenes of a part, which are in memory together
+AT_ONCE = 32 * BLOCK  # scenes of a part, which are in memory together
 FRAMES = 400  # cameras' pictures in a page, each some 3.5 kB of it
 REPLAYED = 60  # decision points of a closed-loop run that are replayed, for their picture and prompts
 ABSENT = "-"

@@ -12,6 +12,7 @@ from msgspec import UNSET
 
 from harness.backends.base import BARE
 from harness.backends.registry import reads_prompts
+from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.core.image import Image
@@ -27,14 +28,14 @@ from harness.prompts.versions import Prompt
 from harness.report.drawing.geometry import conflict_points, spots, view_of
 from harness.report.library import packed, picture
 from harness.report.runs import Runs
+from harness.runs.decisions import Decisions
 from harness.runs.folder import Run, check_scenes
-from harness.runs.records import Answer, Decision, Episode
+from harness.runs.records import Answer, Episode
 from harness.runs.sources import prompt_of
 from harness.world import scenarios
 from harness.world.perception.camera import frame
 from harness.world.scenario import Scenario
-from harness.world.scene_graph import SceneGraph
-from harness.world.state import WorldState
+from harness.world.scene_graph import Conflict
 
 BLOCK = 24  # scenes that are compressed and read together
 
@@ -51,8 +52,13 @@ ENDING = (
     "condition", "seed", "partner", "striker", "fault", "time_s", "delay_s", "least_gap_m", "hard_brakings",
     "other_crashes", "least_ttc_s", "least_pet_s",
 )  # fmt: skip
-# The same for all decisions of a scene, or known from its outcomes.
-LEFT_OUT = ("scene", "episode", "step", "danger", "seed", "safe", "delay_s")
+# Of a decision, besides its policy and its messages.
+SHOWN = (
+    "condition", "action", "entropy_nats", "triggered", "own_failed", "own_weight", "latency_ms", "fusion_ms",
+    "deadline_missed",
+)  # fmt: skip
+OF_DRIVEN = ("acts_at_s", "acted")  # known in the closed loop only
+OF_MESSAGE = ("delivered", "on_time", "arrival_ms", "weight", "trust", "attacker")
 
 
 def prompts_of(run: Run) -> Sent | None:
@@ -123,6 +129,15 @@ class Details:
         return [_ends(run) for run in self.runs.runs]
 
     @cached_property
+    def _rows(self) -> list[Decisions]:
+        """The decisions of each run, with the columns that a page shows."""
+        return [run.decisions.selected(_columns(run.decisions)) for run in self.runs.runs]
+
+    @cached_property
+    def _episodes(self) -> list[Ints]:
+        return [run.decisions.whole("episode") for run in self.runs.runs]
+
+    @cached_property
     def _left_out(self) -> list[dict[str, list[dict[str, Any]]]]:
         return [_left_out(run) for run in self.runs.runs]
 
@@ -180,14 +195,14 @@ class Details:
             spans_read = _read_in(answer, run) if answer.repairs else []
             answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
         decisions: dict[str, dict[str, Any]] = {}  # seeds with the same decision share an entry
-        for row, d in enumerate(run.decisions.records(rows.start, rows.stop), rows.start):
-            shown = {**_shown(d), "end": str(self.ends[n][row])}
-            decisions.setdefault(repr(shown), {**shown, "seeds": []})["seeds"].append(d.seed)
-        episode = int(run.decisions.whole("episode")[rows.start])
-        detail = {
-            "answers": answers, "decisions": list(decisions.values()),
-            "ends": [_end(end) for end in run.episodes_of(episode)],
-        }  # fmt: skip
+        for row in rows:
+            shown = {**_shown(self._rows[n], row), "end": str(self.ends[n][row])}
+            seed = self._rows[n].row(row)["seed"]
+            decisions.setdefault(repr(shown), {**shown, "seeds": []})["seeds"].append(seed)
+        detail: dict[str, Any] = {"answers": answers, "decisions": list(decisions.values())}
+        if self.runs.live:  # in frozen scenes each action has its outcome
+            ended = run.episodes_of(int(self._episodes[n][rows.start]))
+            detail["ends"] = [_end(end) for end in ended]
         if left_out := self._left_out[n].get(name):
             detail |= {"left_out": left_out}
         return detail
@@ -210,9 +225,23 @@ class Part:
         return [packed(block) for block in self.details.blocks(self.ids)]
 
 
-def _shown(d: Decision) -> dict[str, Any]:
-    unknown = [key for key in ("acts_at_s", "acted") if getattr(d, key) is None]
-    return {k: v for k, v in msgspec.to_builtins(d).items() if k not in (*LEFT_OUT, *unknown)}
+def _columns(d: Decisions) -> list[str]:
+    of_messages = [f"{name}_{n}" for n in range(1, d.helpers + 1) for name in ("helper", *OF_MESSAGE)]
+    return ["seed", *SHOWN, *OF_DRIVEN, *(f"fused_{action}" for action in d.actions), *of_messages]
+
+
+def _shown(d: Decisions, index: int) -> dict[str, Any]:
+    row = d.row(index)
+    return {
+        **{name: row[name] for name in SHOWN},
+        **{name: row[name] for name in OF_DRIVEN if row[name] is not None},
+        "fused": [row[f"fused_{action}"] for action in d.actions],
+        "messages": [
+            {"from": helper, **{name: row[f"{name}_{n}"] for name in OF_MESSAGE}}
+            for n in range(1, d.helpers + 1)
+            if (helper := row[f"helper_{n}"]) is not None
+        ],
+    }
 
 
 def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
@@ -277,13 +306,14 @@ def _world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) -
                 "role": graph.role,
                 "seen": [*graph.seen],
                 "occluded": [*graph.occluded],
-                "conflicts": _conflicts(state, graph),
+                "conflicts": _conflicts(*crossed),
                 "views": {
                     " ".join(ids): [round(view.west_m, 1), round(view.south_m, 1), round(view.width_m, 1)]
-                    for ids in heard for view in [view_of(spots(state, zone_m, graph, (danger, *ids)))]
+                    for ids in heard
+                    for view in [view_of(spots(state, zone_m, graph, (danger, *ids), crossed))]
                 },
             }
-            for viewer, graph in scene.graphs.items()
+            for viewer, graph in scene.graphs.items() for crossed in [conflict_points(state, graph)]
         },
     }  # fmt: skip
 
@@ -302,8 +332,7 @@ def cameras(scenario: Scenario, scene: Scene) -> dict[str, Any]:
     return shown
 
 
-def _conflicts(state: WorldState, graph: SceneGraph) -> list[dict[str, Any]]:
-    conflicts, points = conflict_points(state, graph)
+def _conflicts(conflicts: Sequence[Conflict], points: Floats) -> list[dict[str, Any]]:
     return [
         {"x": x, "y": y, "with": c.vehicle, "ego": c.ego.time_s, "other": c.other.time_s}
         for c, (x, y) in zip(conflicts, points.round(1).tolist(), strict=True)

@@ -34,6 +34,7 @@ from harness.report.runs import Runs
 from harness.runs.leading import IN_WORDS
 
 TEMPLATES = Path(__file__).parent / "templates"
+PARTS_SHARED = 8  # fewest parts for which starting workers takes less time than they save
 HEAD = 1 << 14  # bytes of a page within which it states what it lacks
 
 
@@ -167,7 +168,7 @@ def _pieces(
 
 
 def _packed(parts: Sequence[Part], progress: Callable[[int], None], workers: Workers) -> Iterator[Markup]:
-    if workers == 1 or len(parts) == 1:
+    if workers == 1 or len(parts) < PARTS_SHARED:
         for part in parts:
             for block in part.details.blocks(part.ids):
                 yield library.packed(block)

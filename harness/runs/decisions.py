@@ -175,9 +175,13 @@ class Decisions:
         return ranges
 
     def records(self, start: int, stop: int) -> list[Decision]:
-        return [self._record(self._row(index)) for index in range(start, stop)]
+        return [self._record(self.row(index)) for index in range(start, stop)]
 
-    def _row(self, index: int) -> Mapping[str, Any]:
+    def selected(self, names: Sequence[str]) -> "Decisions":
+        return Decisions(self.table.select(names), self.actions, self.helpers)
+
+    def row(self, index: int) -> Mapping[str, Any]:
+        """Return a decision by column, None where unknown; rows are fastest in order."""
         chunk, offset = divmod(index, ROWS)
         if chunk not in self._rows:  # only the last is kept, since rows are read in order
             self._rows.clear()

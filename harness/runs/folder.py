@@ -154,7 +154,14 @@ class Run:
 
     def agent(self, answer: Answer) -> dict[str, Any]:
         """Return the agent of an answer: its model, prompt, answer mode and thinking (`Manifest.agent`)."""
-        return self.manifest.agent(self._viewer_place(answer))
+        place = self._viewer_place(answer)
+        if place not in self._agents:
+            self._agents[place] = self.manifest.agent(place)
+        return self._agents[place]
+
+    @cached_property
+    def _agents(self) -> dict[int, dict[str, Any]]:
+        return {}
 
     def speed(self, answer: Answer) -> Speed:
         """Return the speed of an answer's agent; only for a run with a device profile."""

@@ -104,8 +104,9 @@ class View:
 
 
 def spots(
-    state: WorldState, zone_m: tuple[float, float], graph: SceneGraph | None, who: Collection[str | None]
-) -> Floats:
+    state: WorldState, zone_m: tuple[float, float], graph: SceneGraph | None, who: Collection[str | None],
+    crossed: tuple[list[Conflict], Floats] | None = None,
+) -> Floats:  # fmt: skip
     """Return what a picture holds, (n, 2) m to the east and north, the ego first.
 
     Args:
@@ -113,8 +114,9 @@ def spots(
         zone_m: where paths cross, in the frame of `harness.world.road`.
         graph: of the vehicle whose sight is shown, for the conflicts that it sees; None for no more of them.
         who: ids of whom else it holds: the danger and the helpers that were asked.
+        crossed: the `conflict_points` of the graph, where they are known.
     """
-    conflicts, crossings = conflict_points(state, graph) if graph else ([], np.empty((0, 2)))
+    conflicts, crossings = crossed or (conflict_points(state, graph) if graph else ([], np.empty((0, 2))))
     wanted = {*who, state.ego.id, *(conflict.vehicle for conflict in conflicts)}
     wanted |= {graph.viewer} if graph else set()
     at = [(v.x_m, v.y_m) for v in state.vehicles if v.id in wanted]
@@ -128,12 +130,15 @@ def view_of(held: Floats, shape: float = 1.0) -> View:
 
     Its height is `shape` times its width.
     """
-    low, high = held.min(axis=0), held.max(axis=0)
-    shapes = np.array([1.0, shape])
-    size = shapes * max(LEAST_M, float(((high - low + 2 * MARGIN_M) / shapes).max()))
-    room = np.maximum(VIEW_M - size / 2, 0.0)
-    middle = ((low + high) / 2).clip(-room, room).clip(high + MARGIN_M - size / 2, low - MARGIN_M + size / 2)
-    return View(*map(float, (*(middle - size / 2), *size)))
+    (west, south), (east, north) = held.min(axis=0).tolist(), held.max(axis=0).tolist()
+    width = max(LEAST_M, east - west + 2 * MARGIN_M, (north - south + 2 * MARGIN_M) / shape)
+
+    def start(low: float, high: float, size: float) -> float:
+        room = max(VIEW_M - size / 2, 0.0)
+        middle = min(max((low + high) / 2, -room), room)
+        return min(max(middle, high + MARGIN_M - size / 2), low - MARGIN_M + size / 2) - size / 2
+
+    return View(start(west, east, width), start(south, north, shape * width), width, shape * width)
 
 
 def views(held: Sequence[Floats], parts: Sequence[int], shape: float = 1.0) -> list[View]:
