@@ -200,8 +200,10 @@ class Decisions:
 
     def infinite(self) -> str | None:
         """Return the name of a column with an infinite number, or None."""
-        numbers = [column.name for column in self.table.schema if column.type == NUMBER]
-        return next((name for name in numbers if np.isinf(self.table[name].to_numpy()).any()), None)
+        for column in self.table.schema:
+            if column.type == NUMBER and np.isinf(_values(self.table[column.name], np.nan, np.float64)).any():
+                return str(column.name)
+        return None
 
     def take(self, which: Any) -> "Decisions":
         places = _of_buffer(np.asarray(which, dtype=np.int64), None, WHOLE)
