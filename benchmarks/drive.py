@@ -1,4 +1,4 @@
-"""Live driving: where time goes, and what a second worker and compiled frames add.
+"""Live driving: where time goes, and what a second worker adds.
 
 The parts are measured in one process with the proxy, whose answers cost next to nothing, so that the
 harness's own share is the largest it can be.
@@ -11,7 +11,6 @@ import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -39,9 +38,6 @@ from harness.world.scenarios.occluded_intersection import SCENARIO
 SMALLEST = "--episodes 1 --seeds 1"
 TABLE = ""
 LATENCY = Latency("card", "the proxy's card", 0.145, 0.145, 0.145)
-FORMS = {"NumPy alone": 10**9}
-if find_spec("numba"):  # the first of these loads it
-    FORMS |= {"as it is": lockstep.COMPILED_AFTER, "compiled from the first frame": 0}
 # Functions whose time makes up a part: the simulator, what is seen, and who drives. The rest is our own.
 PARTS: dict[str, tuple[Any, str]] = {
     "frames": (lockstep, "advance"),
@@ -64,8 +60,8 @@ def main() -> None:
     lives = given.episodes * len(spec.points) * len(spec.seeds)
 
     drive(spec, range(1))  # pays for imports and compiled templates
-    cpu_s(replace(spec, source=LiveSource(0, 1)), 10**9)
-    cpus = {form: cpu_s(spec, after) for form, after in FORMS.items()}
+    cpu_s(replace(spec, source=LiveSource(0, 1)))
+    cpu = cpu_s(spec)
     parts, frames, frames_lived = shares(spec, range(given.episodes))
     walls = {workers: wall_s(spec, workers, 2) for workers in (1, 2)}
     total = sum(parts.values())
@@ -78,7 +74,7 @@ def main() -> None:
     print(f"  {lives / total:.0f} episodes a second of that CPU time")
     for workers, seconds in walls.items():
         print(f"  {workers} workers: {lives / seconds:7.1f} episodes/s")
-    print("  one worker, CPU: " + ", ".join(f"{form} {seconds:.2f} s" for form, seconds in cpus.items()))
+    print(f"  one worker, CPU: {cpu:.2f} s")
     print(f"  a second worker makes it {walls[1] / walls[2]:.2f} times as fast")
     rows = [
         Row("closed loop, episodes a CPU second", lives / total, "/s", 1, aim="≥ 1000"),
@@ -87,7 +83,7 @@ def main() -> None:
     ]
     finish(
         rows, episodes=lives, frames=frames, frames_lived=frames_lived, parts_s=parts, wall_s=walls,
-        cpu_s=cpus,
+        cpu_s=cpu,
     )  # fmt: skip
 
 
@@ -130,10 +126,9 @@ def shares(spec: Spec, numbers: range) -> tuple[dict[str, float], int, int]:
     return {**spent, "own": total - sum(spent.values())}, simulated, lived
 
 
-def cpu_s(spec: Spec, compiled_after: int) -> float:
-    """CPU time of a whole run in one process, which loads what numba compiled after so many frames."""
-    with patch.object(lockstep, "COMPILED_AFTER", compiled_after), tempfile.TemporaryDirectory() as folder:
-        lockstep._frames.clear()
+def cpu_s(spec: Spec) -> float:
+    """CPU time of a whole run in one process."""
+    with tempfile.TemporaryDirectory() as folder:
         start = process_time()
         evaluate(spec, Path(folder) / "run", lambda done: None, workers=1)
         return process_time() - start

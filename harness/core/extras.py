@@ -17,7 +17,6 @@ OPTIONAL = {
     "inspect_ai": ("inspect-ai", "inspect"),
     "imageio_ffmpeg": ("imageio-ffmpeg", "video"),
     "ray": ("ray", "ray"),
-    "numba": ("numba", "fast"),
     "llama_cpp": ("llama-cpp-python", "llama-cpp"),
     "sparrow_decider": ("sparrow-decider", "sparrow"),
     "torch": ("torch", "transformers"),

@@ -1,7 +1,8 @@
 """Build a dataset, for `harness dataset build`: freeze layouts in any number of processes, and resume.
 
-Each finished layout is a file under `.work/`; when all are finished, they become one `layouts.zip`. Its
-content depends only on the scenario, the seed, the number of episodes and the folder's name.
+Layouts are frozen some at a time. Each finished one is a file under `.work/`; when all are finished, they
+become one `layouts.zip`. Its content depends only on the scenario, the seed, the number of episodes and the
+folder's name.
 """
 
 import json
@@ -11,6 +12,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
 from io import BytesIO
+from math import ceil
 from pathlib import Path
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
@@ -39,11 +41,14 @@ from harness.dataset.schema import (
 from harness.dataset.verify import level_name, read_manifest, tree_name
 from harness.world import scenarios
 from harness.world.audit import Audit, audit
+from harness.world.drivers import DRIVERS
 from harness.world.environments import environment
 from harness.world.environments.examination import examine
 from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
 
+TOGETHER = 8  # the most layouts that are frozen together
+CHECKED_EVERY = 10  # layouts whose number this divides are driven in closed loop as well
 LEAST_AUDITED = 100  # fewest layouts that are audited; an audit of fewer says little
 
 
@@ -138,12 +143,17 @@ def _freeze_missing(
 ) -> None:  # fmt: skip
     todo = [e for e in episodes if not (place / part_of(e)).is_file()]
     progress(len(episodes) - len(todo))
+    size = TOGETHER
+    if isinstance(workers, int):  # no process may have nothing to do
+        size = max(1, min(size, ceil(len(todo) / workers)))
+    chunks = [todo[at : at + size] for at in range(0, len(todo), size)]
 
-    def keep(index: int, data: bytes) -> None:
-        write_whole(place / part_of(todo[index]), data)
-        progress(1)
+    def keep(index: int, layouts: list[bytes]) -> None:
+        for episode, data in zip(chunks[index], layouts, strict=True):
+            write_whole(place / part_of(episode), data)
+            progress(1)
 
-    each(partial(_freeze_layout, scenario, seed), todo, workers, keep, named)
+    each(partial(_freeze_layouts, scenario, seed), chunks, workers, keep, lambda chunk: _named(*chunk))
 
 
 def _write_dataset(
@@ -179,33 +189,43 @@ def _write_dataset(
     return manifest
 
 
-def _freeze_layout(scenario: Scenario, seed: int, episode: int) -> bytes:
-    levels, scenes = freeze(scenario, seed + episode, episode)
-    texts = [
-        "".join(canonical_json(msgspec.to_builtins(record)) + "\n" for record in level).encode()
-        for level in scenes
-    ]
-    for line in b"".join(texts).splitlines():
-        msgspec.json.decode(line, type=record_type(scenario))  # a record that breaks its own form is a bug
-    tree = Tree(episode, seed + episode, scenes[0][0].danger, levels, list(map(sha256_bytes, texts)))
-    _check(scenario, tree)
-    data = BytesIO()
-    with ZipFile(data, "w") as file:
-        file.writestr(_entry(tree_name(episode)), msgspec.json.encode(tree))
-        for step, text in enumerate(texts):
-            file.writestr(_entry(level_name(episode, step)), text)
-    return data.getvalue()
+def _freeze_layouts(scenario: Scenario, seed: int, episodes: Sequence[int]) -> list[bytes]:
+    """Return the file of each layout, and drive those that are checked."""
+    frozen = freeze(scenario, {episode: seed + episode for episode in episodes})
+    checked, files = [], []
+    for episode, (levels, scenes) in zip(episodes, frozen, strict=True):
+        texts = [
+            "".join(canonical_json(msgspec.to_builtins(record)) + "\n" for record in level).encode()
+            for level in scenes
+        ]
+        for line in b"".join(texts).splitlines():  # a record that breaks its own form is a bug
+            msgspec.json.decode(line, type=record_type(scenario))
+        tree = Tree(episode, seed + episode, scenes[0][0].danger, levels, list(map(sha256_bytes, texts)))
+        data = BytesIO()
+        with ZipFile(data, "w") as file:
+            file.writestr(_entry(tree_name(episode)), msgspec.json.encode(tree))
+            for step, text in enumerate(texts):
+                file.writestr(_entry(level_name(episode, step)), text)
+        files.append(data.getvalue())
+        if episode % CHECKED_EVERY == 0:
+            checked.append(tree)
+    if checked:
+        _check(scenario, checked)
+    return files
 
 
-def _check(scenario: Scenario, tree: Tree) -> None:
-    """Drive the layout in closed loop; a reference driver that ends otherwise than in the tree is a bug."""
-    forest = Forest.of([tree], scenario.actions, scenario.parameters)
-    [driven] = drive_all(scenario, [tree.episode_seed])
-    for driver, outcome in driven.items():
-        end = forest.end(int(forest.last_edge(forest.drivers[driver])[0]))
-        in_tree = bool(forest.driver_success(driver)[0]), end.time_s, end.partner, end.fault
-        if in_tree != (outcome.success, outcome.time_s, outcome.partner, outcome.fault):
-            raise RuntimeError(f"layout {tree.episode_seed}: {driver} drives to {outcome}, walks to {end}")
+def _check(scenario: Scenario, trees: Sequence[Tree]) -> None:
+    """Drive layouts in closed loop; a reference driver that ends otherwise than in the tree is a bug."""
+    forest = Forest.of(trees, scenario.actions, scenario.parameters)
+    driven = drive_all(scenario, forest.seeds.tolist())
+    for driver in DRIVERS:
+        last, success = forest.last_edge(forest.drivers[driver]).tolist(), forest.driver_success(driver)
+        for n, outcomes in enumerate(driven):
+            end, outcome = forest.end(last[n]), outcomes[driver]
+            in_tree = bool(success[n]), end.time_s, end.partner, end.fault
+            if in_tree != (outcome.success, outcome.time_s, outcome.partner, outcome.fault):
+                seed = trees[n].episode_seed
+                raise RuntimeError(f"layout {seed}: {driver} drives to {outcome}, walks to {end}")
 
 
 def _join_layouts(work: Path, episodes: int, layouts: Path) -> list[bytes]:
@@ -233,6 +253,10 @@ def part_of(episode: int) -> str:
 def named(episode: int) -> str:
     """Return a layout's name for people."""
     return f"layout {episode}"
+
+
+def _named(first: int, *others: int) -> str:
+    return f"layouts {first} to {others[-1]}" if others else named(first)
 
 
 def _pretty(value: Any) -> bytes:
@@ -268,7 +292,8 @@ Every course of {seeds} layouts of `{config["scenario"]}`, {stated(config["seed"
 Built by `{command}`.
 
 A decision acts {1000 * parameters["decision_lag_s"]:.0f} ms after its moment, everybody's. When this was
-built every reference driver drove every layout in closed loop too, and ended as in the trees.
+built every reference driver drove every {CHECKED_EVERY}th layout, from layout 0 on, in closed loop too, and
+ended as in the trees.
 
 {audit_text}
 

@@ -1,4 +1,4 @@
-"""Freeze a layout: compute its decision tree, with every course that the ego's decisions can take.
+"""Freeze layouts: compute the decision tree of each, with every course that the ego's decisions can take.
 
 From the first decision point on, every meta-action is taken one lag after it, and the decision points that
 follow are frozen. Those in the same state are one, whatever led there, and actions that set the same target
@@ -6,7 +6,8 @@ are one edge. So the tree of six decisions has some hundred decision points, and
 a decided episode.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -26,33 +27,45 @@ from harness.world.state import VehicleState, WorldState
 from harness.world.world import Target, World
 
 
-def freeze(scenario: Scenario, seed: int, episode: int) -> tuple[list[list[Branching]], list[list[Record]]]:
-    """Return a layout's decision tree and the scene of each of its decision points, both level by level."""
-    level = [World.start(scenario, seed)]
-    branchings, scenes = [], []
+class Frozen(NamedTuple):
+    """A layout's decision tree, and the scene of each of its decision points, both level by level."""
+
+    branchings: list[list[Branching]]
+    scenes: list[list[Record]]
+
+
+def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
+    """Return the decision trees of some layouts, whose seeds are by episode, in the order of the episodes."""
+    level = [(episode, World.start(scenario, seed)) for episode, seed in seeds.items()]
+    trees = {episode: Frozen([], []) for episode in seeds}
     facts = dict(scenario.road().facts)
     while level:
-        out_edges, following = edges(level, episode)
-        states = [world.state() for world in level]
+        episodes, worlds = zip(*level, strict=True)
+        out_edges, following = edges(worlds, episodes)
+        states = [world.state() for world in worlds]
         records = records_of([
             (world, state, episode, (state.ego, *state.helpers))
-            for world, state in zip(level, states, strict=True)
+            for world, state, episode in zip(worlds, states, episodes, strict=True)
         ])  # fmt: skip
         drivers = _drivers(scenario, states, [record.graphs[record.state.ego.id] for record in records])
-        branchings.append([
-            Branching(record.scene, actions, out)
-            for record, actions, out in zip(records, drivers, out_edges, strict=True)
-        ])  # fmt: skip
-        scenes.append([
-            replace(record, road=facts, snapshot=world.snapshot())
-            for world, record in zip(level, records, strict=True)
-        ])  # fmt: skip
+        for tree in (trees[episode] for episode in dict.fromkeys(episodes)):
+            tree.branchings.append([])
+            tree.scenes.append([])
+        for world, record, actions, out in zip(worlds, records, drivers, out_edges, strict=True):
+            tree = trees[record.episode]
+            tree.branchings[-1].append(Branching(record.scene, actions, out))
+            tree.scenes[-1].append(replace(record, road=facts, snapshot=world.snapshot()))
         level = following
-    return branchings, scenes
+    return list(trees.values())
 
 
-def edges(worlds: Sequence[World], episode: int) -> tuple[list[list[Edge]], list[World]]:
-    """Return where each action leads from the decision points of a step, and the points that follow."""
+def edges(
+    worlds: Sequence[World], episodes: Sequence[int]
+) -> tuple[list[list[Edge]], list[tuple[int, World]]]:
+    """Return where each action leads from the decision points of a step, and the points that follow.
+
+    The points that follow stand beside their episode; edges count those of their own episode.
+    """
     waiting = [world.branch() for world in worlds]
     p = worlds[0].scenario.parameters
     for world in waiting:
@@ -62,9 +75,12 @@ def edges(worlds: Sequence[World], episode: int) -> tuple[list[list[Edge]], list
     parts_of_world = [list(_branches(world)) for world in waiting]
     branches = [branch for parts in parts_of_world for _, branch in parts]
     lockstep.advance(branches, [p.due_frame(branch.step) for branch in branches])
-    following: dict[str, tuple[int, World]] = {}
-    out_edges = [[_edge(*part, episode, following) for part in parts] for parts in parts_of_world]
-    return out_edges, [world for _, world in following.values()]
+    following: dict[int, dict[str, tuple[int, World]]] = {episode: {} for episode in episodes}
+    out_edges = [
+        [_edge(*part, episode, following[episode]) for part in parts]
+        for parts, episode in zip(parts_of_world, episodes, strict=True)
+    ]
+    return out_edges, [(episode, world) for episode, of in following.items() for _, world in of.values()]
 
 
 def _branches(world: World) -> Iterator[tuple[list[str], World]]:

@@ -156,8 +156,8 @@ class RoadTrip:
         actions = self.of.scenario.actions
         values = np.full(len(actions), np.nan)
         if self.of.then:
-            [branches], worlds = edges([self.world], 0)
-            ends = finish(worlds, [self.of.then] * len(worlds))
+            [branches], led = edges([self.world], [0])
+            ends = finish([world for _, world in led], [self.of.then] * len(led))
             for edge in branches:
                 end = Outcome(edge.end.result, edge.end.time_s) if edge.end else ends[edge.to or 0]
                 values[[actions.index(action) for action in edge.actions]] = self._succeeded(end)

@@ -128,7 +128,8 @@ def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
         taken, left = 0, rng.permutation(len(level))[:MOST_TRIED].tolist()
         while left and taken < PER_LEVEL:
             tried, left = left[: PER_LEVEL - taken], left[PER_LEVEL - taken :]
-            branches, children = edges([level[n] for n in tried], number)
+            branches, led = edges([level[n] for n in tried], [number] * len(tried))
+            children = [child for _, child in led]
             outcomes = finish([child.branch() for child in children], [TEACHER] * len(children))
             for n, out in zip(tried, branches, strict=True):
                 world, state = level[n], level[n].state()

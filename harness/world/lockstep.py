@@ -1,69 +1,63 @@
-"""Simulate many worlds of one scenario together: a frame of all of them is one pass over arrays.
+"""Simulate worlds of one scenario together: a frame of all of them is one pass over arrays.
 
-The arithmetic is that of `simulator` and of highway-env, operation by operation, so worlds end up the same to
-the last bit: NumPy computes a number in an array as it does alone, and `vecdot` sums as `dot` does. Rare
-events (two vehicles touch, an episode ends) are left to highway-env and to `World`. A test drives both side
-by side. Where numba is installed, `compiled` has the same frame in less time.
+Other traffic keeps its route and speed; the ego follows its target within physical limits. The arithmetic is
+that of highway-env, operation by operation, with the rules of `simulator`, so worlds end up the same to the
+last bit: NumPy computes a number in an array as it does alone, and `vecdot` sums as `dot` does. A test drives
+both side by side. Environments, and two vehicles that touch, are left to highway-env, and how an episode ends
+to `World`.
 
 Arrays are (B, V): worlds, and the vehicles of each by number, the ego first. If a world has fewer vehicles,
 the other columns stand for vehicles in lanes of their own, which affect nobody.
 """
 
-import sys
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from importlib.util import find_spec
+from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from highway_env.road.lane import AbstractLane, CircularLane, StraightLane
 from highway_env.vehicle.controller import ControlledVehicle
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.errors import printable
 from harness.world.conflict_measures import observe
+from harness.world.gaps import least_gaps_m
 from harness.world.perception.rays import turned
 from harness.world.road import Lane, Road, lanes_of
 from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M, Traffic
 from harness.world.state import separation_m
-from harness.world.world import World, least_gaps_m
 
-ALONE = 2  # up to this many worlds are as fast one by one
+if TYPE_CHECKING:
+    from harness.world.world import World
+
 SLOW_MPS = 1e-2  # least speed to divide by, as in highway-env's `not_zero`
 AT_ONCE = 128  # more worlds do not fit into the processor's cache
-COMPILED_AFTER = 2000  # frames with NumPy: about those that loading the compiled form pays for
-
-_frames: Counter[type] = Counter()  # simulated in this process, by the class of their fleet
 
 
-def advance(worlds: Sequence[World], until_frames: Sequence[int]) -> None:
-    """Simulate some worlds of one scenario, each until its frame, exactly as `World.advance` would."""
+def advance(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
+    """Simulate some worlds of one scenario, each until its frame, or until its episode is decided."""
     going = [
         (world, until)
         for world, until in zip(worlds, until_frames, strict=True)
         if world.frame < until and not world.outcome.ended
     ]
-    scenario = worlds[0].scenario if worlds else None
-    lanes = _lanes(scenario.road) if scenario and not scenario.is_environment else None
-    if lanes is None or len(going) <= ALONE:
+    if going and going[0][0].scenario.is_environment:
         for world, until in going:
             world.advance(until)
         return
     # Worlds with similar numbers of frames are simulated together, so that arrays stay full.
     going.sort(key=lambda pair: pair[1] - pair[0].frame)
     bounds = [*range(0, len(going), AT_ONCE), len(going)]
-    for begin, end in pairwise(bounds):
-        _together(lanes, *zip(*going[begin:end], strict=True))
+    for begin, end in pairwise(bounds if going else ()):
+        _together(*zip(*going[begin:end], strict=True))
 
 
-def _together(lanes: "Lanes", worlds: Sequence[World], until_frames: Sequence[int]) -> None:
+def _together(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
     begun = np.array([world.frame for world in worlds])
     until = np.array(until_frames)
     speeds_mps = [float(world.vehicles[0].speed) for world in worlds]
-    fleet = _form()(lanes, worlds)
+    fleet = Fleet(worlds)
     sizes_m, there = fleet.size, fleet.there
     poses = np.full((len(worlds), int((until - begun).max()), *fleet.speed.shape[1:], 4), np.nan)
     going = np.arange(len(worlds))
@@ -84,7 +78,6 @@ def _together(lanes: "Lanes", worlds: Sequence[World], until_frames: Sequence[in
         if over.any():
             going = going[~over]
             fleet.keep(~over)
-    _frames[type(fleet)] += passed
     poses = poses[:, :passed]
     poses[..., :2] -= worlds[0].scenario.road().origin_m
     np.copyto(poses, np.nan, where=~there[:, None, :, None])
@@ -97,28 +90,9 @@ def _together(lanes: "Lanes", worlds: Sequence[World], until_frames: Sequence[in
         world.passed(frames[: world.frame - first, : len(world.vehicles)], speed_mps, gap_m, so_far)
 
 
-def _form() -> "type[Fleet]":
-    """Return the class that simulates faster from here on: loading the compiled one takes half a second."""
-    return compiled_fleet() or Fleet if _frames[Fleet] >= COMPILED_AFTER else Fleet
-
-
-@cache
-def compiled_fleet() -> "type[Fleet] | None":
-    """Return the class of fleets whose frames are compiled; None where numba is missing or does not work."""
-    if find_spec("numba") is None:
-        return None
-    try:
-        from harness.world.compiled import CompiledFleet
-    except Exception as error:  # whatever goes wrong in there, NumPy's numbers are the same
-        failed = f"frames are simulated without numba, which does not work here: {printable(error)}"
-        print(f"harness: {failed}", file=sys.stderr)
-        return None
-    return CompiledFleet
-
-
 @dataclass(frozen=True)
 class Lanes:
-    """The lanes of a network as arrays; each is a straight lane or an arc."""
+    """The lanes of a network as arrays; highway-env computes those that are neither straight nor an arc."""
 
     number: dict[Lane, int]  # number of each lane
     names: list[Lane]  # lane of each number
@@ -132,6 +106,7 @@ class Lanes:
     radius: Floats  # radius of an arc
     phase: Floats  # phase of an arc's beginning, rad
     sign: Floats  # 1 if an arc turns clockwise as pictures show it, else -1
+    others: dict[int, Any]  # highway-env's lane of each number that is neither
 
     def coordinates(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
         """Return the positions along and to the right of lanes (...), m, like `local_coordinates`."""
@@ -144,7 +119,14 @@ class Lanes:
             phi = phase + turned(np.arctan2(d[:, 1], d[:, 0]) - phase)
             along[arcs] = sign * (phi - phase) * radius
             lateral[arcs] = sign * (radius - np.sqrt(np.vecdot(d, d)))
+        for at in self._of_others(lane):
+            along[at], lateral[at] = self.others[int(lane[at])].local_coordinates(xy[at])
         return along, lateral
+
+    def _of_others(self, lane: Ints) -> Iterator[tuple[int, ...]]:
+        """Yield the places in an array where a lane is neither straight nor an arc."""
+        if self.others:
+            yield from zip(*np.nonzero(np.isin(lane, list(self.others))), strict=True)
 
     def heading_at(self, along: Floats, lane: Ints) -> Floats:
         """Return the heading of lanes (...) at positions along them, rad."""
@@ -154,40 +136,43 @@ class Lanes:
             k = lane[arcs]
             heading[arcs] = self.sign[k] * along[arcs] / self.radius[k] + self.phase[k]
             heading[arcs] += np.pi / 2 * self.sign[k]
+        for at in self._of_others(lane):
+            heading[at] = self.others[int(lane[at])].heading_at(along[at])
         return heading
 
 
 @lru_cache(maxsize=64)
-def _lanes(road: Callable[[], Road]) -> Lanes | None:
-    """Return the lanes of a road; None if some are neither straight nor arcs."""
+def _lanes(road: Callable[[], Road]) -> Lanes:
+    """Return the lanes of a road."""
     named = lanes_of(road().network())
     lanes = list(named.values())
-    if any(type(lane) not in (StraightLane, CircularLane) for lane in lanes):
-        return None
-    arc = np.array([type(lane) is CircularLane for lane in lanes])
+    kinds = [type(lane) for lane in lanes]
 
-    def each(name: str, blank: Any, arcs: bool) -> Floats:
-        has = (arc == arcs).tolist()
-        values = [getattr(lane, name) if its else blank for lane, its in zip(lanes, has, strict=True)]
+    def each(name: str, blank: Any, kind: type) -> Floats:
+        values = [
+            getattr(lane, name) if its is kind else blank for lane, its in zip(lanes, kinds, strict=True)
+        ]
         return np.array(values, dtype=float)
 
     nowhere = np.zeros(2)
     return Lanes(
         {name: n for n, name in enumerate(named)}, list(named),
-        each("start", nowhere, False) + each("center", nowhere, True),
-        each("direction", nowhere, False), each("direction_lateral", nowhere, False),
-        each("heading", 0.0, False), np.array([lane.length for lane in lanes], dtype=float),
-        np.array([lane.width for lane in lanes], dtype=float), arc,
-        each("radius", 1.0, True), each("start_phase", 0.0, True), each("direction", 1.0, True),
+        each("start", nowhere, StraightLane) + each("center", nowhere, CircularLane),
+        each("direction", nowhere, StraightLane), each("direction_lateral", nowhere, StraightLane),
+        each("heading", 0.0, StraightLane), np.array([lane.length for lane in lanes], dtype=float),
+        np.array([lane.width for lane in lanes], dtype=float), np.array([k is CircularLane for k in kinds]),
+        each("radius", 1.0, CircularLane), each("start_phase", 0.0, CircularLane),
+        each("direction", 1.0, CircularLane),
+        {n: lanes[n] for n, kind in enumerate(kinds) if kind not in (StraightLane, CircularLane)},
     )  # fmt: skip
 
 
 class Fleet:
     """The vehicles of some worlds, as arrays (B, V); positions and impacts are (B, V, 2)."""
 
-    def __init__(self, lanes: Lanes, worlds: Sequence[World]) -> None:
+    def __init__(self, worlds: "Sequence[World]") -> None:
         scenario = worlds[0].scenario
-        p = scenario.parameters
+        p, lanes = scenario.parameters, _lanes(scenario.road)
         self.lanes, self.scenario, self.dt = lanes, scenario, 1 / p.simulation_hz
         self.last_frame = round(p.time_limit_s * p.simulation_hz)
         self.worlds = list(worlds)
@@ -238,7 +223,7 @@ class Fleet:
             if isinstance(value, np.ndarray) and name != "ways":
                 setattr(self, name, value[rows])
 
-    def write(self, row: int, world: World) -> set[str]:
+    def write(self, row: int, world: "World") -> set[str]:
         """Write a row back to its world; return the ids of vehicles that had crashed before this frame."""
         world.frame = int(self.frame[row])
         names = self.lanes.names
@@ -271,7 +256,7 @@ class Fleet:
         return np.asarray(~on_road | cleared | crashes | self.crashed[:, 0] | (self.frame >= self.last_frame))
 
     def _act(self) -> None:
-        """Do what `_OnRoute.act` does: steer, and keep the target speed."""
+        """Steer, and keep the target speed, as `ControlledVehicle.act` does."""
         lanes = self.lanes
         along, lateral = lanes.coordinates(self.xy, self.lane)
         ends = along > lanes.length[self.lane] - AbstractLane.VEHICLE_LENGTH / 2
@@ -375,7 +360,7 @@ class Fleet:
         return np.stack([b, n, other], axis=-1)[apart_m <= moves_m]
 
     def _collide(self) -> None:
-        """Do what `_Road.step` does: highway-env checks the pairs that may touch."""
+        """Let highway-env check the pairs that may touch."""
         for row, first, second in self._near().tolist():
             vehicles = self.worlds[row].vehicles
             for k in (first, second):

@@ -1,21 +1,16 @@
-"""Simulate vehicles on highway-env's roads, without its environments.
+"""Vehicles on highway-env's roads, without its environments: what a world holds between two frames.
 
-Other traffic keeps its route and speed; the ego is highway-env's `MDPVehicle` with physical limits.
-
-The code repeats highway-env's computation of a frame faster and with the same last bit: the same NumPy
-functions in the same order, but Python's comparisons instead of `np.clip` and `np.linalg.norm`, whose calls
-cost more than all of its arithmetic. A test drives both side by side.
+Other traffic keeps its route and speed; the ego is highway-env's `MDPVehicle` with physical limits. Their
+`speed_control` says what `lockstep` simulates; highway-env's own frame of them is what it is compared with.
 """
 
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from itertools import combinations
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from highway_env import utils
 from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
@@ -32,97 +27,21 @@ BRAKES_OFF_HZ = 20.0  # rate at which a vehicle that brakes by itself releases t
 FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)  # above this speed highway-env limits acceleration
 
 
-class _Road(Road):  # type: ignore[misc]
-    """highway-env's road, which checks only vehicles for collisions that may touch within the frame."""
-
-    time_s = 0.0
-
-    def step(self, dt: float) -> None:
-        """Do what `Road.step` does; no scenario has objects other than vehicles."""
-        for vehicle in self.vehicles:
-            vehicle.step(dt)
-        placed = [(v, *v.position.tolist(), v.diagonal / 2) for v in self.vehicles]
-        for (v, x, y, reach), (other, other_x, other_y, other_reach) in combinations(placed, 2):
-            within = reach + other_reach + v.speed * dt + NEAR_M
-            dx, dy = other_x - x, other_y - y
-            if dx * dx + dy * dy < within * within and not _apart(v, other, dx, dy, dt):
-                v.handle_collisions(other, dt)
-
-
-def _apart(v: Vehicle, other: Vehicle, dx_m: float, dy_m: float, dt: float) -> bool:
-    """Return whether a separating axis keeps two outlines farther apart than both can move in `dt`."""
-    (cos, sin), (other_cos, other_sin) = v.direction.tolist(), other.direction.tolist()
-    dot, cross = abs(cos * other_cos + sin * other_sin), abs(cos * other_sin - sin * other_cos)
-    moves = (abs(v.speed) + abs(other.speed)) * dt + NEAR_M
-    for a, b, c, s in ((v, other, cos, sin), (other, v, other_cos, other_sin)):
-        along = abs(dx_m * c + dy_m * s) - (a.LENGTH + b.LENGTH * dot + b.WIDTH * cross) / 2
-        across = abs(dy_m * c - dx_m * s) - (a.WIDTH + b.LENGTH * cross + b.WIDTH * dot) / 2
-        if along > moves or across > moves:
-            return True
-    return False
-
-
 class _OnRoute:
     """A vehicle that knows its lane from its route, without highway-env's search over all lanes."""
 
     spawn: Spawn
     braking = False
-    towards: tuple[float, Any] = (np.nan, None)  # a heading and its direction, cached
 
     def on_state_update(self: Any) -> None:
         self.lane_index = self.target_lane_index
         self.lane = self.road.network.get_lane(self.lane_index)
-
-    def act(self: Any, action: str | None = None) -> None:
-        """Steer and keep the target speed; highway-env's own code handles a meta-action."""
-        if action is not None:
-            super().act(action)  # type: ignore[misc]
-            return
-        lane = self.road.network.get_lane(self.target_lane_index)
-        along, lateral = lane.local_coordinates(self.position)
-        if along > lane.length - lane.VEHICLE_LENGTH / 2:
-            self.follow_road()
-            lane = self.road.network.get_lane(self.target_lane_index)
-            along, lateral = lane.local_coordinates(self.position)
-        self.action = {
-            "steering": self._steering(lane, along, lateral),
-            "acceleration": self.speed_control(self.target_speed),
-        }
-        self.braking = self.action["acceleration"] < -LAMPS_MPS2
 
     def follow_road(self: Any) -> None:
         if self.road.network.get_lane(self.target_lane_index).after_end(self.position):
             rest = self.route[self.route.index(self.target_lane_index) + 1 :]
             if rest:
                 self.route, self.target_lane_index = rest, rest[0]
-
-    def _steering(self: Any, lane: Any, along: float, lateral: float) -> float:
-        """Do what `ControlledVehicle.steering_control` does, for a known place in the lane."""
-        speed = utils.not_zero(self.speed)
-        ahead = lane.heading_at(along + self.speed * self.TAU_PURSUIT)
-        turn = -self.KP_LATERAL * lateral / speed
-        if turn:  # for 0 the functions return 0
-            turn = _within(np.pi / 4, np.arcsin(_within(1.0, turn)))
-        rate = self.KP_HEADING * utils.wrap_to_pi(ahead + turn - self.heading)
-        slip = self.LENGTH / 2 / speed * rate
-        if slip:
-            slip = np.arctan(2 * np.tan(np.arcsin(_within(1.0, slip))))
-        return float(_within(self.MAX_STEERING_ANGLE, slip))
-
-    def step(self: Any, dt: float) -> None:
-        """Do what `Vehicle.step` does, faster for a vehicle that drives straight on, as most do."""
-        if self.action["steering"] or self.impact is not None or self.crashed or abs(self.speed) > FAST_MPS:
-            super().step(dt)  # type: ignore[misc]
-            return
-        if self.heading != self.towards[0]:
-            self.towards = self.heading, self.direction
-        self.position += self.speed * self.towards[1] * dt
-        self.speed += self.action["acceleration"] * dt
-        self.on_state_update()
-
-
-def _within(limit: float, value: float) -> float:
-    return min(max(value, -limit), limit)
 
 
 class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
@@ -216,7 +135,7 @@ def copied(road: Any) -> Any:
 
 def new_road(scenario: Scenario) -> Any:
     """Return highway-env's road without vehicles."""
-    return _Road(network=scenario.road().network(), np_random=NOBODY_DRAWS)
+    return Road(network=scenario.road().network(), np_random=NOBODY_DRAWS)
 
 
 def vehicle_on(

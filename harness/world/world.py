@@ -1,7 +1,6 @@
-"""One simulated episode, from its start to its outcome.
+"""One simulated episode, from its start to its outcome: what there is of it between two frames.
 
-Frames are stepped here and not by an environment's `step`, so that an episode ends in the very frame in which
-it is decided.
+`lockstep` simulates its frames, and those of other worlds with them.
 """
 
 import math
@@ -11,11 +10,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import shapely
 
-from harness.core.arrays import Floats, Ints
-from harness.world import beacons
-from harness.world.conflict_measures import Conflicts, observe
+from harness.core.arrays import Floats
+from harness.world import beacons, lockstep
+from harness.world.conflict_measures import Conflicts
 from harness.world.outcome import Outcome, fault, outline, striker
 from harness.world.scenario import Layout, Scenario
 from harness.world.simulator import copied, new_road, populated, spawn_of, state_of, vehicle_on
@@ -25,8 +23,6 @@ from harness.world.state import (
     Snapshot,
     VehicleState,
     WorldState,
-    rectangle,
-    separation_m,
 )
 
 Target = tuple[str, int]  # route, and index of the scenario's target speeds
@@ -169,17 +165,8 @@ class World:
         return target
 
     def advance(self, until_frame: int) -> None:
-        frames, speed_mps = [], float(self.vehicles[0].speed)
-        while self.frame < until_frame and not self.outcome.ended:
-            self._step()
-            frames.append(self._poses())
-        if frames:
-            poses = self._in_road_frame(frames)
-            sizes_m = np.array([[(v.LENGTH, v.WIDTH) for v in self.vehicles]])
-            [gap_m] = least_gaps_m(poses[None], sizes_m, np.array([self.outcome.least_gap_m])).tolist()
-            first, hz = np.array([self.frame + 1 - len(frames)]), self.scenario.parameters.simulation_hz
-            [conflicts] = observe([self.conflicts], poses[None], sizes_m, first, hz)
-            self.passed(poses, speed_mps, gap_m, conflicts)
+        """Simulate until a frame, or until the episode is decided."""
+        lockstep.advance([self], [until_frame])
 
     def passed(self, poses: Floats, speed_mps: float, gap_m: float, conflicts: Conflicts) -> None:
         """Record the last frames: beacons, the least gap so far, conflicts and hard braking.
@@ -220,11 +207,6 @@ class World:
             sent += beacons.announced(p, self.seed, self.beacons, sender, ids, poses[:, n], first_frame, loss)
         self.beacons = sent
 
-    def _move(self) -> None:
-        self.road.time_s = self.time_s
-        self.road.act()
-        self.road.step(1 / self.scenario.parameters.simulation_hz)
-
     def _collision(self, ego: Any, wrecks: Sequence[Any]) -> dict[str, str]:
         """Return whom the ego hit, and how; empty if it hit an object on the road."""
         mine = self._state_of(ego)
@@ -234,12 +216,6 @@ class World:
             return {}
         blamed = fault(mine, partner, self.scenario.road().paths)
         return {"partner": partner.id, "striker": striker(mine, partner), "fault": blamed}
-
-    def _step(self) -> None:
-        standing = {v.spawn.id for v in self.vehicles if v.crashed}
-        self._move()
-        self.frame += 1
-        self.judge(standing)
 
     def _cleared(self) -> bool:
         vehicles = self.vehicles
@@ -263,35 +239,3 @@ class World:
             self.outcome = self.outcome.ending("time_out", self.time_s)
         if crashed:
             self.outcome = replace(self.outcome, other_crashes=self.outcome.other_crashes + len(crashed))
-
-
-def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
-    """Return the least gap between the ego's outline and another's in each world, at most `least_m`, (W,).
-
-    `poses` are x, y and heading, (W, frames, vehicles, 3 or more), the ego first, NaN without a vehicle, and
-    `sizes_m` length and width, (W, vehicles, 2); `least_m` is the least gap before these frames.
-    """
-    centres_m = np.hypot(*np.moveaxis(poses[:, :, 1:, :2] - poses[:, :, :1, :2], -1, 0))
-    # Two centres are at least both half widths apart from touching, and at most both half diagonals.
-    farthest_m = np.hypot(*np.moveaxis(sizes_m, -1, 0))[:, None]
-    most_m = centres_m - (sizes_m[:, None, :1, 1] + sizes_m[:, None, 1:, 1]) / 2
-    bound_m = np.fmin(least_m, np.fmin.reduce(most_m, axis=(1, 2), initial=np.inf))
-    close = centres_m - (farthest_m[..., :1] + farthest_m[..., 1:]) / 2 <= bound_m[:, None, None]
-    worlds, frames, vehicles = np.nonzero(close)
-    mine, its = poses[worlds, frames, 0, :3], poses[worlds, frames, 1 + vehicles, :3]
-    sizes, its_sizes = sizes_m[worlds, 0], sizes_m[worlds, 1 + vehicles]
-    at_least_m = separation_m(mine, sizes, its, its_sizes)
-    gaps_m = least_m.copy()
-
-    def measure(pairs: Ints) -> None:
-        outlines = (
-            shapely.polygons(rectangle(*pose[pairs].T, *size[pairs].T))
-            for pose, size in ((mine, sizes), (its, its_sizes))
-        )
-        np.minimum.at(gaps_m, worlds[pairs], shapely.distance(*outlines))
-
-    # The pair with the smallest bound in each world is measured first; few others can then be nearer.
-    likely = np.lexsort((at_least_m, worlds))
-    measure(likely[np.diff(worlds[likely], prepend=-1) > 0])
-    measure(np.flatnonzero(at_least_m < gaps_m[worlds]))
-    return gaps_m

@@ -11,13 +11,13 @@ import msgspec
 import numpy as np
 import pytest
 from former import SCENARIO
+from frames import highway_envs_frame, poses
 from highway_env.envs.intersection_env import IntersectionEnv
-from highway_env.road.road import Road
 from highway_env.vehicle.behavior import IDMVehicle
 from msgspec import to_builtins
 
 from harness.core.files import digest
-from harness.world import simulator
+from harness.world.lockstep import Fleet
 from harness.world.outcome import Outcome, outline
 from harness.world.reference import drive
 from harness.world.state import Snapshot, WorldState
@@ -122,12 +122,17 @@ def test_a_world_leaves_highway_envs_classes_as_they_were():
 @pytest.mark.parametrize(
     "actions", [("IDLE",) * 6, ("SLOWER", "FASTER", "SLOWER", "SLOWER", "FASTER", "IDLE")]
 )
-def test_cheap_frames_are_highway_envs_to_the_last_bit(seed, actions, monkeypatch):
-    cheap = trajectory(seed, actions)
-    monkeypatch.setattr(simulator._Road, "step", Road.step)
-    monkeypatch.delattr(simulator._OnRoute, "act")
-    monkeypatch.delattr(simulator._OnRoute, "step")
-    assert trajectory(seed, actions) == cheap
+def test_frames_are_highway_envs_to_the_last_bit(seed, actions):
+    ours, theirs = World.start(SCENARIO, seed), World.start(SCENARIO, seed)
+    for frame in range(len(actions) * P.simulation_hz):
+        if frame % P.simulation_hz == 0 and not ours.outcome.ended:
+            ours.take(actions[frame // P.simulation_hz])
+            theirs.take(actions[frame // P.simulation_hz])
+        if not ours.outcome.ended:
+            advance(ours, 1)
+            highway_envs_frame(theirs)
+        assert poses(ours) == poses(theirs)
+        assert ours.outcome.result == theirs.outcome.result
 
 
 @pytest.mark.parametrize("seed", [FROM_RIGHT, FROM_LEFT, ONCOMING])
@@ -198,6 +203,7 @@ def test_running_into_the_car_ahead_is_the_egos_fault_and_its_partner_is_that_ca
     assert (world.outcome.partner, world.outcome.striker, world.outcome.fault) == ("v4", "ego", "ego")
 
 
+@pytest.mark.usefixtures("asleep_at_the_wheel")
 def test_a_crash_of_two_others_is_counted_apart_and_ends_nothing():
     world = World.start(SCENARIO, NO_DANGER)
     head_on(world, apart_m=6.0)
@@ -211,14 +217,18 @@ def head_on(world, apart_m):
     first, second = world.road.vehicles[1:3]
     first.position, first.heading, first.speed = np.array([-40.0, -2.0]), 0.0, 6.0
     second.position, second.heading, second.speed = np.array([-35.0 + apart_m, -2.0]), np.pi - 0.3, 5.0
-    asleep_at_the_wheel(world)
 
 
-def asleep_at_the_wheel(world):
+@pytest.fixture
+def asleep_at_the_wheel(monkeypatch):
     """The two helpers neither steer nor brake."""
-    for vehicle in world.road.vehicles[1:3]:
-        vehicle.speed_control = lambda target_speed: 0.0
-        vehicle._steering = lambda lane, along, lateral: 0.0
+    act = Fleet._act
+
+    def asleep(fleet):
+        act(fleet)
+        fleet.steering[:, 1:3] = fleet.acceleration[:, 1:3] = 0.0
+
+    monkeypatch.setattr(Fleet, "_act", asleep)
 
 
 def close(one, other):
@@ -266,13 +276,13 @@ def test_many_seeds_thaw_at_every_step_to_the_same_next_second():
             assert alike(thawed, world)
 
 
+@pytest.mark.usefixtures("asleep_at_the_wheel")
 @pytest.mark.parametrize("apart_m", [9.6, 9.7, 9.9, 10.0, 11.0])
 def test_wrecks_that_touch_when_frozen_are_pushed_apart_when_thawed(apart_m):
     world = World.start(SCENARIO, NO_DANGER)
     head_on(world, apart_m)
     world.act("IDLE")
     thawed = through_json(world)
-    asleep_at_the_wheel(thawed)
     world.act("IDLE")
     thawed.act("IDLE")
     assert alike(thawed, world)
