@@ -11,7 +11,7 @@ from typing import Any
 
 from harness.backends.card import Card
 from harness.core.errors import UserError, one_line, printable
-from harness.core.files import bytes_of, text_of
+from harness.core.files import BROKEN, bytes_of, text_of
 from harness.core.resources import find
 
 CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
@@ -29,7 +29,7 @@ def read_config(folder: Path, shown: str) -> dict[str, Any]:
         rank, kind = int(config["r"]), config["peft_type"]
         if not math.isfinite(float(config["lora_alpha"])):
             raise ValueError(f"lora_alpha is {config['lora_alpha']}")
-    except (OSError, ValueError, OverflowError, LookupError, TypeError, RecursionError) as error:
+    except BROKEN as error:
         raise UserError(
             f"{shown}: {printable(folder / CONFIG)} cannot be read ({printable(repr(error), 120)}); give the "
             "folder of a LoRA adapter in peft's format"

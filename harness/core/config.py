@@ -83,6 +83,14 @@ def loads(text: str, where: str) -> dict[str, Any]:
         raise UserError(f"{where} is no TOML: {printable(error)}; fix the file") from None
 
 
+def json_loads(text: str, where: str) -> Any:
+    """Parse a JSON text; `where` names it in messages. Raises UserError if it is not JSON."""
+    try:
+        return msgspec.json.decode(text)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{where} is no JSON: {printable(error)}; fix the file") from None
+
+
 def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: Any) -> Record:
     """Convert a TOML or JSON table to a record; `where` names it in messages.
 

@@ -35,6 +35,10 @@ def canonical_bytes(value: Any) -> bytes:
     return canonical_json(value).encode()
 
 
+# What reading a file and taking its values apart raises where it is not what it should be.
+BROKEN = (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError)
+
+
 class Refused(OSError):
     """A file that is not read: it is no regular file, or it is larger than the limit of its kind."""
 

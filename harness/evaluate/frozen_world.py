@@ -17,7 +17,7 @@ from harness.evaluate.settings import FrozenSettings
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
-from harness.runs.metrics import BALANCED, World, entry
+from harness.runs.metrics import World, by_danger
 from harness.runs.records import Episode, FrozenScenes
 from harness.world.lookouts import radios
 from harness.world.outcome import rating
@@ -196,9 +196,7 @@ class FrozenWorld(SceneWorld):
         ends = {"success_rate": success, "unsafe_rate": unsafe, "late_rate": cleared & ~success}
         known = {name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()}
         dangerous = np.array([danger is not None for danger in self._forest.dangers])
-        for name, of_half in zip(entry(BALANCED).halves, (dangerous, ~dangerous), strict=True):
-            known[name] = np.where(of_half, known["success_rate"], np.nan)
-        return known
+        return {**known, **by_danger(known["success_rate"], dangerous)}
 
     def episodes(self) -> list[Episode]:
         forest = self._forest

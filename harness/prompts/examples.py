@@ -10,8 +10,8 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from harness.core.config import convert
-from harness.core.errors import UserError, printable
+from harness.core.config import convert, json_loads
+from harness.core.errors import UserError
 from harness.core.files import sha256_bytes
 from harness.core.seeds import FIRST
 from harness.world.scene_graph import SceneGraph
@@ -65,10 +65,7 @@ def read(text: str, where: str) -> Examples:
 
     Raises UserError if it is no JSON or lacks something, or an example is of another role or no train seed.
     """
-    try:
-        table = msgspec.json.decode(text)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{where} is no JSON: {printable(error)}; fix the file") from None
+    table = json_loads(text, where)
     if not isinstance(table, dict):
         raise UserError(f"{where} is no object; give scenario, ego and helper")
     examples = convert(table, Examples, where)

@@ -11,8 +11,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-import msgspec
-
+from harness.core.config import json_loads
 from harness.core.errors import UserError, printable, unknown
 from harness.prompts.answer_schema import FIELDS, ROLES, closed, longest
 
@@ -38,10 +37,7 @@ def read(text: str, where: str) -> dict[str, str]:
 
     Raises UserError if the text is no JSON, or has something that cannot be constrained.
     """
-    try:
-        table = msgspec.json.decode(text)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{where} is no JSON: {printable(error)}; fix the file") from None
+    table = json_loads(text, where)
     if not isinstance(table, dict) or not table:
         raise UserError(f"{where} is no object with members; give ego, helper or both")
     extension = {}

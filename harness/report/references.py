@@ -2,15 +2,13 @@
 
 from collections.abc import Iterable, Mapping
 
-import numpy as np
-
 from harness.backends.registry import ENGINES
 from harness.core.arrays import Floats
 from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
 from harness.report.words import shown
 from harness.runs.folder import Run
-from harness.runs.metrics import BALANCED, SUCCESS, entry, halved, known_in
+from harness.runs.metrics import SUCCESS, by_danger, halved, known_in
 from harness.runs.records import Score
 from harness.world.drivers import CONSTANT, UNIFORM, constant
 from harness.world.scenario import Scenario
@@ -20,11 +18,9 @@ BESIDE = (CONSTANT, UNIFORM)  # rows beside a model's on the terminal, the best 
 
 def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
     """Return the success of each reference in a dataset's episodes, also balanced, by metric."""
-    dangerous, halves = dataset.dangerous, entry(BALANCED).halves
 
     def scores(reference: str, success: Floats) -> dict[str, Score]:
-        parts = (np.where(of_half, success, np.nan) for of_half in (dangerous, ~dangerous))
-        values = {SUCCESS: success, **dict(zip(halves, parts, strict=True))}
+        values = {SUCCESS: success, **by_danger(success, dataset.dangerous)}
         rates = {name: halved(name, lambda each: rate_interval(values[each])) for name in known_in(values)}
         return {name: Score.of(reference, name, rate, "episodes") for name, rate in rates.items()}
 

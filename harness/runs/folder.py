@@ -26,7 +26,7 @@ from msgspec.structs import asdict
 
 from harness.core import work
 from harness.core.errors import UserError, printable
-from harness.core.files import bytes_of, replacing, text_of, write_whole
+from harness.core.files import BROKEN, bytes_of, replacing, text_of, write_whole
 from harness.core.formats import SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
@@ -51,16 +51,8 @@ from harness.world.parameters import MOST_DECISIONS
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
-_BROKEN = (
-    OSError,
-    ValueError,
-    LookupError,
-    TypeError,
-    NotImplementedError,  # Arrow raises it for a column of another type
-    RecursionError,
-    OverflowError,
-    csv.Error,
-)
+# Arrow raises NotImplementedError for a column of another type.
+_BROKEN = (*BROKEN, NotImplementedError, csv.Error)
 NOBODY: Mapping[str, Sequence[str]] = MappingProxyType({})
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 _FACTS = msgspec.json.Decoder(AnswerFacts)

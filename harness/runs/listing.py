@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
-from harness.core.files import opened, text_of
+from harness.core.files import BROKEN, opened, text_of
 from harness.core.formats import CONFIG, SOURCES, SUITE, WORK
 from harness.runs import formats
 from harness.runs.leading import BALANCED, SUCCESS, leading
@@ -32,16 +32,7 @@ STUDIES = {
 }
 FAILED = "failed_rate_ego"
 UNREAD = 0.5  # share of failed answers from which a run's headline mentions them
-_BROKEN = (
-    OSError,
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    RecursionError,
-    OverflowError,
-    csv.Error,
-)
+_BROKEN = (*BROKEN, AttributeError, csv.Error)  # in what no type was given to
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import UNSET
 
 from harness.core import multiplicity
-from harness.core.arrays import Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, POINTS, Unit, shown
 from harness.core.plugins import Plugins
@@ -520,6 +520,12 @@ def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False)
     mean = mean_of([first, second])
     n, n_excluded = (first.n, first.n_excluded) if shared else (mean.n, (mean.n_excluded - mean.n) // 2)
     return replace(mean, n=n, n_excluded=max(n_excluded, 0))
+
+
+def by_danger(success: Floats, dangerous: Bools) -> dict[str, Floats]:
+    """Return success (..., E) with a danger and without, by metric; NaN in the other episodes."""
+    parts = (np.where(part, success, np.nan) for part in (dangerous, ~dangerous))
+    return dict(zip(entry(BALANCED).halves, parts, strict=True))
 
 
 def known_in(values: Mapping[str, Floats]) -> list[str]:

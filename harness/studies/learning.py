@@ -21,9 +21,8 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.seeds import Purpose, purposes, stated
-from harness.runs.success import Success, alike
 from harness.studies.choices import Choices, Choose, choices
-from harness.studies.replayed_run import ReplayedRun
+from harness.studies.replayed_run import ReplayedRun, counted
 
 UNITS = 12
 ROUNDS = 6
@@ -122,7 +121,7 @@ def tuned(
     """
     success = np.zeros(len(THRESHOLDS))
     looks = point.changed(schedule="coverage", threshold=None)
-    for stored, counting in zip(tune, alike([Success(run.dataset.dangerous) for run in tune]), strict=True):
+    for stored, counting in counted(tune).items():
         tree = choices(stored, point, stored.seeds, progress)
         rules = [by_network(tree, looks, network, each) for each in THRESHOLDS]
         success += [counting.mean(tree.played(rule)[0]) for rule in rules]

@@ -44,6 +44,7 @@ from harness.radio.profiles import CHANNELS
 from harness.runs.folder import dataset_of, read
 from harness.runs.records import Answer
 from harness.runs.sources import PROMPTS, prompt_of
+from harness.runs.success import Success, alike
 from harness.runs.unanswered import tally
 from harness.studies.axes import Setting
 from harness.studies.play import Read, WalkResult, metric_columns, walk_through
@@ -183,8 +184,8 @@ class ReplayedRun:
         for setting in settings:
             replace(self._asker.spec, points=(setting.point,))  # which checks that they go together
         at_once = max(1, WALKS // (len(seeds) * len(self.dataset.episodes)))
-        for vehicles, alike in groupby(settings, lambda setting: setting.vehicles):
-            points = [setting.point for setting in alike]
+        for vehicles, same in groupby(settings, lambda setting: setting.vehicles):
+            points = [setting.point for setting in same]
             for first in range(0, len(points), at_once):
                 yield from self._walked(points[first : first + at_once], vehicles, seeds, read)
 
@@ -385,3 +386,8 @@ class _Nearest:
 
     def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         return self._stored.fusion_call(scenes, codes, rewrites)
+
+
+def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:
+    """Return how success counts in runs that are read together."""
+    return dict(zip(runs, alike([Success(run.dataset.dangerous) for run in runs]), strict=True))

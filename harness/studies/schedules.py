@@ -27,11 +27,11 @@ from harness.core.versions import versions
 from harness.report.document import Table
 from harness.report.drawing.colours import COLOURS, INK, MARKERS
 from harness.runs.leading import BALANCED
-from harness.runs.success import Success, alike
+from harness.runs.success import Success
 from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.figures.points import Steps, fronts
 from harness.studies.learning import layouts
-from harness.studies.replayed_run import ReplayedRun
+from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.study import Study, corrected, p_cell, refuse_other
 from harness.studies.sweep import point_of
 
@@ -280,11 +280,6 @@ class Compared:
         above = int(np.clip(np.searchsorted(means, wanted), 1, len(ladder) - 1))
         part = (wanted - means[above - 1]) / max(means[above] - means[above - 1], 1e-12)
         return np.asarray((1 - part) * ladder[above - 1].success + part * ladder[above].success)
-
-
-def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:
-    """Return how success counts in runs that are read together."""
-    return dict(zip(runs, alike([Success(run.dataset.dangerous) for run in runs]), strict=True))
 
 
 def compare(

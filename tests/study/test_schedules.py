@@ -31,8 +31,8 @@ from harness.runs.success import Success
 from harness.studies import axes
 from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.learning import fit, layouts
-from harness.studies.replayed_run import ReplayedRun
-from harness.studies.schedules import Candidate, Compared, Play, _area, compare, counted
+from harness.studies.replayed_run import ReplayedRun, counted
+from harness.studies.schedules import Candidate, Compared, Play, _area, compare
 from harness.world import scenarios
 
 SEED = 100  # of the first layout of `small`

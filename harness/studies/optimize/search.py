@@ -14,7 +14,7 @@ from harness.backends.swarm import open_each, together
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.figures import POINTS, as_mapping, shown
-from harness.core.files import text_of
+from harness.core.files import BROKEN, text_of
 from harness.core.progress import Progress
 from harness.core.seeds import stated
 from harness.core.statistics import Estimate, mean_of
@@ -133,7 +133,7 @@ def looks(base: Prompt, where: Path) -> int:
 
     It is 0 where no history of this program says so.
     """
-    with suppress(OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError):
+    with suppress(*BROKEN):
         return max(0, int(json.loads(text_of(where / base.version / HISTORY))["looks"]))
     return 0
 
