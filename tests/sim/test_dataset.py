@@ -24,6 +24,7 @@ from harness.dataset.load import find, load
 from harness.dataset.verify import check
 from harness.world.perception.graph import scene_graph
 from harness.world.reference import finish
+from harness.world.scenarios import argument
 from harness.world.world import World
 
 FIRST_SEED = 178
@@ -205,7 +206,7 @@ def test_another_lag_is_another_dataset_and_everybody_has_it(small, tmp_path):
     assert small.scenario.parameters.lag_frames == 8  # 145 ms in frames of 20 ms
     assert data.trees[0].levels[0][0].scene == small.trees[0].levels[0][0].scene
     assert {b.scene for b in data.trees[0].levels[1]} != {b.scene for b in small.trees[0].levels[1]}
-    command = f"harness dataset build {SCENARIO.name} --episodes 1 --seed {FIRST_SEED} --lag 0"
+    command = f"harness dataset build {argument(SCENARIO)} --episodes 1 --seed {FIRST_SEED} --lag 0"
     assert f"Built by `{command}`." in (tmp_path / "at-once/README.md").read_text()
 
 
