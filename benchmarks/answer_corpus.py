@@ -28,6 +28,7 @@ from harness.prompts import versions as prompts
 SMALLEST = "swarm-tiny answers.jsonl --questions 1 --most 5 --tokens 8"
 NEEDS = "llama_cpp"
 FIRST_SEED = 40_000  # among the tune layouts
+SCENES = "witnesses=any,radio_share=0,limits=1,perception=1"
 SCENARIOS = ("occluded-intersection", "blind-merge", "roundabout-entry")
 DRAWS = ((0.0, 0), (0.5, 1), (0.5, 2), (1.0, 1), (1.0, 2))  # temperature and number of the answer
 
@@ -82,7 +83,7 @@ def questions(card: Card, count: int) -> Iterator[list[Request]]:
             if number % 5 and not prompt.examples:
                 continue
             scenario = SCENARIOS[0 if version in prompts.OF_A_CROSSING or prompt.examples else number % 3]
-            source = LiveSource(FIRST_SEED + number, 1, scenario_name=scenario)
+            source = LiveSource(FIRST_SEED + number, 1, f"{scenario}:{SCENES}")
             agent = Agent(card, prompt, image="none" if prompt.image else "own")
             spec = Spec(agent, source, tuple(POINTS.values()), (0,))
             asked = {one.role: one for one in requests(spec, [*source.trial(1, ego_alone=False)])}

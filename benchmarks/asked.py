@@ -21,10 +21,11 @@ from harness.evaluate.spec import ASKS
 from harness.runs import folder
 
 SMALLEST = "--models proxy --only closed --episodes 1 --seeds 0:1"
+SCENES = "occluded-intersection:witnesses=any,radio_share=0,limits=1,perception=1"
 WORLDS = {
     "frozen, single-local": ["eval", "--limit", "N", "--condition", "single-local"],
     "frozen": ["eval", "--limit", "N"],
-    "closed loop": ["drive", "--episodes", "N", "--workers", "1"],
+    "closed loop": ["drive", "--scenario", SCENES, "--episodes", "N", "--workers", "1"],
 }
 
 

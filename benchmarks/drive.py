@@ -31,12 +31,13 @@ from harness.evaluate.table import table
 from harness.evaluate.walk import walk
 from harness.prompts import versions as prompts
 from harness.runs.records import Episode, Latency
-from harness.world import lockstep
+from harness.world import lockstep, scenarios
 from harness.world import reference as live
-from harness.world.scenarios.occluded_intersection import SCENARIO
 
 SMALLEST = "--episodes 1 --seeds 1"
 TABLE = ""
+NAME = "occluded-intersection:witnesses=any,radio_share=0,limits=1,perception=1"
+SCENARIO = scenarios.get(NAME)
 LATENCY = Latency("card", "the proxy's card", 0.145, 0.145, 0.145)
 # Functions whose time makes up a part: the simulator, what is seen, and who drives. The rest is our own.
 PARTS: dict[str, tuple[Any, str]] = {
@@ -54,7 +55,7 @@ def main() -> None:
     arguments.add_argument("--seeds", type=int, default=5)
     given = arguments.parse_args()
     spec = Spec(
-        Agent(cards.resolve("proxy"), prompts.load("v2")), LiveSource(0, given.episodes),
+        Agent(cards.resolve("proxy"), prompts.load("v2")), LiveSource(0, given.episodes, NAME),
         tuple(POINTS.values()), tuple(range(given.seeds)),
     )  # fmt: skip
     lives = given.episodes * len(spec.points) * len(spec.seeds)

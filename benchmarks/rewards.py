@@ -4,7 +4,7 @@ Trees of train seeds, built at the first call and kept in the cache folder. Text
 write: a strict answer, one among other words, and one that cannot be read, a third each, all different. A
 step is one of the environment, with its chat. Each figure is the best of five passes.
 
-    python benchmarks/rewards.py [--scenario blind-merge] [--layouts 8] [--batch 256]
+    python benchmarks/rewards.py [--scenario NAME] [--layouts 8] [--batch 256]
 """
 
 import argparse
@@ -35,7 +35,7 @@ def a_second(count: int, work: Callable[[], object]) -> int:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--scenario", default="blind-merge")
+    parser.add_argument("--scenario", default="blind-merge:witnesses=any,radio_share=0,limits=1,perception=1")
     parser.add_argument("--layouts", type=int, default=8)
     parser.add_argument("--batch", type=int, default=256)
     args = parser.parse_args()

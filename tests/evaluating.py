@@ -7,6 +7,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import former
 import msgspec
 
 from harness.backends import cards
@@ -59,7 +60,7 @@ def live_spec_of(
 ) -> Spec:
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
     ego = Agent(cards.resolve(model), prompts.load(prompt))
-    return Spec(ego, LiveSource(first_seed, episodes), **options)
+    return Spec(ego, LiveSource(first_seed, episodes, former.NAME), **options)
 
 
 def run(spec: Spec, out: Path) -> Evaluated:

@@ -6,6 +6,7 @@ from harness.world.scenario import Scenario
 DATASET = "occluded-intersection-v2"
 SETTINGS = "witnesses=any,radio_share=0,limits=1,perception=1"
 NAME = f"{scenarios.DEFAULT}:{SETTINGS}"
+DRIVE = ("drive", "--scenario", NAME)  # words of a command
 
 
 def scenes(name: str = scenarios.DEFAULT) -> Scenario:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from evaluating import Scripted, sure
+from former import DRIVE
 
 from harness import cli
 from harness.backends.base import Completion, Request
@@ -134,7 +135,7 @@ def main(dataset: Path, folder: Path, names: Sequence[str]) -> None:
     shutil.copytree(dataset, base / "data")
     typed(("eval", "--dataset", "data", "--seeds", "0:1", *POINTS, "--out", RUN), base)
     typed(
-        ("drive", "--episodes", "4", "--first-seed", "100", "--seeds", "0:1", *POINTS, "--out", DRIVEN), base
+        (*DRIVE, "--episodes", "4", "--first-seed", "100", "--seeds", "0:1", *POINTS, "--out", DRIVEN), base
     )
     for name in names or COMMANDS:
         for kind in ("whole", "resumed"):

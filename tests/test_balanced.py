@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evaluating import run, spec_of
+from former import NAME
 from msgspec import structs
 from run_on_disk import Row, made_up
 
@@ -179,7 +180,7 @@ def test_frozen_and_driven_come_to_the_same_under_either_limits(
         parameters = {**small.manifest.parameters, "limits": limits}
         dataset = replace(small, manifest=structs.replace(small.manifest, parameters=parameters))
         frozen = spec_of(dataset, model, points=(ALONE,), seeds=(0,))
-        name = f"occluded-intersection:limits={limits}"
+        name = f"{NAME},limits={limits}"
         live = replace(frozen, source=LiveSource(small.manifest.seed, len(small.episodes), name))
         ends = [
             read(run(spec, tmp_path / f"{kind}{limits}").out).episodes

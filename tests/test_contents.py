@@ -20,6 +20,7 @@ from evaluating import (
     spec_of,
     walked,
 )
+from former import NAME
 from msgspec import structs
 
 from harness.backends.base import Completion, Request
@@ -116,7 +117,7 @@ NORTH = -math.pi / 2
 
 def test_the_more_precise_report_of_an_object_stands() -> None:
     """A car 110 m ahead: the ego has it by radar alone, a helper 20 m from it by LiDAR."""
-    scenario = scenarios.get("occluded-intersection:perfect_knowledge=true")
+    scenario = scenarios.get(f"{NAME},perfect_knowledge=true")
 
     def car(name: str, part: Part, y_m: float) -> VehicleState:
         return VehicleState(name, "car", part, 2.0, y_m, NORTH, 10.0, "own", "straight", False)

@@ -5,6 +5,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import former
 import msgspec
 import numpy as np
 import pytest
@@ -35,12 +36,11 @@ from harness.training.model import chat
 from harness.training.muon import Muon, orthogonal
 from harness.training.questions import Question, alone, excerpts, kl_nats, with_messages
 from harness.training.train import STAGES, Plan, Sample, _batches
-from harness.world import scenarios
 from harness.world.reference import drive, finish
 from harness.world.world import World
 
 PLAN = Plan({"excerpts": 128, "alone": 128, "messages": 128, "answers": 96}, batch=8)
-CROSSING, PASSING = scenarios.get("occluded-intersection"), scenarios.get("do-not-pass")
+CROSSING, PASSING = former.SCENARIO, former.scenes("do-not-pass")
 LEARNT = {CROSSING: (prompts.load("v1"), prompts.load("v2")), PASSING: (prompts.load("v4"),)}
 CURRICULUM = Curriculum(LEARNT, layouts=2, seed=100_000)
 

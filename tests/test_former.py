@@ -14,17 +14,9 @@ from harness.evaluate.settings import DriveSettings, Settings, read, text_of
 from harness.runs import folder
 from harness.world import scenarios
 from harness.world.parameters import SUITES
-from harness.world.scenarios import occluded_intersection
 
 RECORDS = Path(__file__).parent / "records"
 LATER = "witnesses=each,radio_share=0.25,limits=2,perception=2"
-
-
-@pytest.fixture(autouse=True)
-def _another_default(monkeypatch: pytest.MonkeyPatch) -> None:
-    changed = scenarios.get(f"{scenarios.DEFAULT}:{LATER}")
-    monkeypatch.setattr(occluded_intersection, "SCENARIO", changed)
-    assert scenarios.get(scenarios.DEFAULT).parameters.witnesses == "each"
 
 
 def test_an_old_dataset_has_the_scenes_that_it_was_built_of() -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import former
 import numpy as np
 import pytest
 
@@ -144,9 +145,7 @@ def test_driving_is_the_walk_through_the_tree(make: Make, small: Dataset) -> Non
     """The same actions lead to the same states, are worth the same and end the same, with no tree built."""
     seed = small.seeds[1]
     walked = make(then="local-view")
-    driven = package.environment(
-        "occluded-intersection", seeds=seed, layouts=1, driven=True, then="local-view"
-    )
+    driven = package.environment(former.NAME, seeds=seed, layouts=1, driven=True, then="local-view")
     assert small.scenario.parameters == driven.source.scenario.parameters
     (seen, a), (shown, b) = (env.reset(options={"layout_seed": seed}) for env in (walked, driven))
     over: Any = False

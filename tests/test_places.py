@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from evaluating import FILES
+from former import DRIVE
 from reading import packed
 
 from harness.report.compare.page import beside
@@ -73,7 +74,7 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     replay = f"replay:{here}/reports/one"
     typed("eval", "--model", replay, *EVAL, "--dataset", data, "--out", here / "reports/two")
     typed("eval", "--model", "proxy", *EVAL, "--dataset", "suite:two", "--out", here / "reports/suite")
-    typed("drive", "--model", "proxy", "--episodes", "1", "--first-seed", "100", "--seeds", "0", "--quiet",
+    typed(*DRIVE, "--model", "proxy", "--episodes", "1", "--first-seed", "100", "--seeds", "0", "--quiet",
           "--condition", "6g", "--condition", "single-local", "--out", here / "reports/driven")  # fmt: skip
     one, two = here / "reports/one", here / "reports/two"
     assert CANARY in (two / "run.json").read_text(), "the record has it"

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import former
 import numpy as np
 import pytest
 
@@ -34,7 +35,6 @@ from harness.training.distill import Curriculum, distill
 from harness.training.published import Adapt, Published
 from harness.training.questions import value
 from harness.training.train import Plan, fitting
-from harness.world import scenarios
 from harness.world.reference import drive, finish
 from harness.world.world import World
 
@@ -42,7 +42,7 @@ BASE = cards.resolve("swarm-tiny", "transformers")
 PLAN = Plan(
     {"excerpts": 0, "alone": 96, "messages": 0, "answers": 32}, batch=8, adapt=Adapt(rank=4, rate=2e-2)
 )
-CROSSING, PASSING = scenarios.get("occluded-intersection"), scenarios.get("do-not-pass")
+CROSSING, PASSING = former.SCENARIO, former.scenes("do-not-pass")
 LEARNT = dict.fromkeys((CROSSING, PASSING), (prompts.load("v9"),))  # three actions, and five
 CURRICULUM = Curriculum(LEARNT, layouts=2, seed=100_000, base=BASE)
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from evaluating import run, spec_of
+from former import NAME
 from msgspec import structs
 
 from harness.cli.run import BY_WITNESSES, by_witnesses
@@ -76,7 +77,7 @@ def test_the_table_of_three_conditions_fits_into_a_terminal(capsys: pytest.Captu
 def test_where_none_are_declared_nothing_is_said(
     small: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    done = driven(small, tmp_path / "run", "occluded-intersection", "single-local", episodes=2)
+    done = driven(small, tmp_path / "run", NAME, "single-local", episodes=2)
     assert {(e.witnesses, e.danger_radio) for e in done.episodes} == {(None, None)}
     assert not {*NAMES, *list(BY_WITNESSES.values())[1:]} & {score.metric for score in done.scores}
     by_witnesses({(s.condition, s.metric): s for s in done.scores}, ["single-local"])

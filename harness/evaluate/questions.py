@@ -21,7 +21,7 @@ from harness.world import scenarios
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
 
-SCENARIO = "occluded-intersection"
+SCENARIO = "occluded-intersection:witnesses=any,radio_share=0,limits=1,perception=1"
 # How much later than the ego the other vehicle arrives, in the two halves of a pair.
 SOON_S, LATE_S = 0.2, 5.0
 Fact = Literal["conflict", "gap", "danger", "number"]

@@ -88,7 +88,7 @@ class DriveSettings(
         str | None,
         option(
             "Scenario to drive; NAME:beacon_loss=0.3 changes its beacons. Default: occluded-intersection, "
-            "with the scenes of occluded-intersection-v2."
+            "with the scenes of occluded-intersection-v3."
         ),
     ] = None
     episodes: Annotated[

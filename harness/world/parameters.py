@@ -128,6 +128,16 @@ class Parameters:
         return round(due_s * self.simulation_hz)
 
 
+@dataclass(frozen=True)
+class Witnessed(Parameters):
+    """The parameters of a scenario with lookouts, by default as in `v2v-safety-2`: cooperation can fail."""
+
+    witnesses: str = "each"
+    radio_share: float = 0.25
+    limits: int = 2
+    perception: int = 2
+
+
 # Parameters that were added later, with the values of the earlier behaviour.
 LATER = (
     ("ambient", DAY), ("beacon_rule", "fixed"), ("beacon_channel", ""),

@@ -16,7 +16,7 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     assert out.splitlines()[-1] == f"wrote {tmp_path / 'run' / 'report.html'}"
     assert (tmp_path / "run" / "report.html").is_file()
     assert "…" not in out
-    assert " · closed loop · occluded-intersection, scenes of v2v-safety" in " ".join(out.split())
+    assert " · closed loop · occluded-intersection, scenes of v2v-safety-2" in " ".join(out.split())
     assert "n = 2 episodes × 2 channel seeds; layout seeds 5 to 6 (tune);" in out
     code, out, _ = harness("drive", "--model", "local-view", *options, "--out", tmp_path / "run2", "--json")
     found = json.loads(out)

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
+from former import DRIVE
 from typer.main import get_command
 
 from harness.cli import app
@@ -29,7 +30,7 @@ def made(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fidelity")
     for model in MODELS:
         evaluate(spec_of(small, model), folder / f"eval-{model}")
-        drive = ("drive", "--model", model, *LAYOUTS, "--quiet", "--out", str(folder / f"drive-{model}"))
+        drive = (*DRIVE, "--model", model, *LAYOUTS, "--quiet", "--out", str(folder / f"drive-{model}"))
         get_command(app)(drive, standalone_mode=False)
     return folder
 

@@ -8,17 +8,20 @@ both worlds have the same places, shadowing and packets.
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import former
 import numpy as np
 import pytest
 from evaluating import live_spec_of, run, spec_of
-from former import DATASET
 
 from harness.coordination.contents import CONTENTS, TEXT
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
+from harness.evaluate.live_world import LiveSource
 from harness.report.caveats import of_run
 from harness.runs import folder
 from harness.runs.folder import Run
@@ -68,13 +71,14 @@ def off_lag(of: Run) -> set[Place]:
 def test_what_the_tree_says_is_what_driving_gives(
     tmp_path: Path, model: str, points: Sequence[OperatingPoint], seeds: Sequence[int], least: float
 ) -> None:
-    """`least` is the share of episodes that is not left out, at least."""
+    """Both by default. `least` is the share of episodes that is not left out, at least."""
     spoken = points == (CONTENT[TEXT],)
     frozen = load(find(DATASET), LAYOUTS if model in DRIVERS else 3 if spoken else LAYOUTS // 2)
     how: dict[str, Any] = {"points": points, "seeds": seeds}
     if set(points) & {*CONTENT.values()}:  # the ego's second answer would come after the lag
         how |= {"latency": "ego=0.145,helper=0.145,fusion=0", "prompt": "v12" if spoken else "v2"}
-    driven = live_spec_of(model, len(frozen.episodes), frozen.manifest.seed, **how)
+    source = LiveSource(frozen.manifest.seed, len(frozen.episodes))
+    driven = replace(live_spec_of(model, **how), source=source)
     walked, drove = (
         folder.read(run(spec, tmp_path / name).out)
         for spec, name in ((spec_of(frozen, model, **how), "walked"), (driven, "drove"))
@@ -112,7 +116,7 @@ def test_conflicts_in_a_tree_are_those_of_driving(tmp_path: Path, small: Dataset
 
 
 def test_what_an_older_tree_does_not_hold_is_unknown_and_said(tmp_path: Path) -> None:
-    older = folder.read(run(spec_of(load(find(DATASET), 2), "cruise"), tmp_path / "older").out)
+    older = folder.read(run(spec_of(load(find(former.DATASET), 2), "cruise"), tmp_path / "older").out)
     assert {getattr(e, name) for e in older.episodes for name in CONFLICTS} == {None}
     assert np.isnan(older.decisions["short_ttc"]).all()
     assert not {s.metric for s in older.scores} & {"least_ttc_s", "short_ttc_rate", "short_ttc_decision_rate"}

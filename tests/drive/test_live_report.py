@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from driving import FROM_LEFT
 from evaluating import live_spec_of, run
+from former import NAME, SCENARIO
 from reading import Page, by_workers, details
 from run_on_disk import change, rows_of
 
@@ -67,7 +68,7 @@ def test_workers_change_no_byte_of_a_page(driven, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
     spec = live_spec_of(episodes=1, first_seed=FROM_LEFT)
-    name = "occluded-intersection:perfect_knowledge=true"
+    name = f"{NAME},perfect_knowledge=true"
     run(replace(spec, source=replace(spec.source, scenario_name=name)), tmp_path / "run")
     found = read(tmp_path / "run")
     assert isinstance(found.manifest.world, ClosedLoop)
@@ -99,7 +100,7 @@ def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
 @pytest.mark.slow
 def test_the_cameras_of_a_run_see_by_the_light_that_it_was_driven_in(tmp_path):
     spec = live_spec_of(episodes=1, first_seed=FROM_LEFT)
-    name = "occluded-intersection:ambient=night"
+    name = f"{NAME},ambient=night"
     run(replace(spec, source=replace(spec.source, scenario_name=name)), tmp_path / "run")
     found = read(tmp_path / "run")
     every = details(written(tmp_path / "run"))
@@ -107,7 +108,7 @@ def test_the_cameras_of_a_run_see_by_the_light_that_it_was_driven_in(tmp_path):
     for scene, detail in every.items():
         replayed = scene_of(found, scene)
         assert detail["cameras"] == plain(cameras(scenarios.get(name), replayed))
-        assert detail["cameras"] != plain(cameras(scenarios.get("occluded-intersection"), replayed))
+        assert detail["cameras"] != plain(cameras(SCENARIO, replayed))
 
 
 def plain(value):
@@ -122,7 +123,8 @@ def test_each_condition_is_shown_with_what_only_driving_shows(driven, page):
         assert f"{100 * score.value:.1f} % {100 * score.low:.1f} to {100 * score.high:.1f} %" in page.text
         gap = found.score(name, "least_gap_m")
         assert f"{gap.value:.1f} m" in page.text
-    assert "3 episodes of occluded-intersection driven in closed loop (layout seeds 6 to 8)" in page.text
+    assert "3 episodes of occluded-intersection, scenes of v2v-safety, driven in closed loop (" in page.text
+    assert "(layout seeds 6 to 8)" in page.text
     for metric in ("collision rate", "time to clear", "least gap", "hard brakings per episode"):
         assert metric in page.text
     assert "decision that leads to a collision" not in page.text  # a frozen run's unsafe rate

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from driving import FROM_LEFT
 from evaluating import live_spec_of, run
+from former import DRIVE
 from PIL import Image, ImageSequence
 from run_on_disk import made_up
 from typer.testing import CliRunner
@@ -116,7 +117,7 @@ def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, cap
     words = ("--model", "cruise", "--condition", "single-local", "--seeds", "0,1", "--workers", 1)
     layouts = ("--episodes", 4, "--first-seed", FROM_LEFT - 1)
     out = tmp_path / "run"
-    code, said, _ = typed(monkeypatch, capsys, "drive", *words, *layouts, "--save-video", 1, "--out", out)
+    code, said, _ = typed(monkeypatch, capsys, *DRIVE, *words, *layouts, "--save-video", 1, "--out", out)
     table = pd.read_csv(out / "episodes.csv")
     first = table[~table.success].episode.min()
     name = f"{first:05d}-seed0.mp4"

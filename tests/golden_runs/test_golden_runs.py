@@ -13,7 +13,7 @@ import adapter
 import comparing
 import playing
 import pytest
-from former import DATASET
+from former import DATASET, DRIVE, NAME
 
 DATA = Path(__file__).parent / "data"
 COMPLETIONS = DATA / "completions.jsonl"
@@ -55,18 +55,18 @@ FROZEN = {
 }  # fmt: skip
 CLOSED = {
     "closed-proxy": [
-        "drive", "--workers", "1", "--episodes", "4", "--seeds", "0:2", *conditions(*PAPER),
+        *DRIVE, "--workers", "1", "--episodes", "4", "--seeds", "0:2", *conditions(*PAPER),
     ],
     "closed-faulty": [
-        "drive", "--workers", "1", "--model", "proxy-faulty", "--episodes", "2", "--seeds", "0:2",
+        *DRIVE, "--workers", "1", "--model", "proxy-faulty", "--episodes", "2", "--seeds", "0:2",
         *conditions("single-local:fallback=brake", "v2x:window_s=0.4,consensus=log-pool"),
     ],
     "closed-full-view": [
-        "drive", "--workers", "1", "--model", "full-view", "--episodes", "3", "--seeds", "0,1",
+        *DRIVE, "--workers", "1", "--model", "full-view", "--episodes", "3", "--seeds", "0,1",
         *conditions("single-local", "6g"),
     ],
     "closed-tiny": [
-        "drive", "--workers", "1", *PLAYED, "--episodes", "2", "--seeds", "0:2",
+        *DRIVE, "--workers", "1", *PLAYED, "--episodes", "2", "--seeds", "0:2",
         *conditions("single-local", "v2x", "6g", EGO_PROMPT),
     ],
 }  # fmt: skip
@@ -87,7 +87,8 @@ STUDIES = {
     ],
     "paper": ["study", "paper", "--episodes", "10", "--sweep-episodes", "10"],
     "closed-loop": [
-        "study", "closed-loop", "--workers", "1", "--model", "proxy", "--episodes", "2", "--seeds", "0:2",
+        "study", "closed-loop", "--scenario", NAME, "--workers", "1", "--model", "proxy", "--episodes", "2",
+        "--seeds", "0:2",
     ],
     "fidelity": ["study", "fidelity", "{frozen-proxy}", "{closed-proxy}"],
 }  # fmt: skip

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from former import SCENARIO
+from former import NAME, SCENARIO
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
@@ -220,7 +220,7 @@ def test_a_scenario_may_be_named_with_other_beacons_that_are_allowed(text, says)
 
 @pytest.mark.parametrize("hz", [1.0, 3.0, 50.0])
 def test_any_rate_up_to_one_a_frame_has_everybody_heard_at_the_start(hz):
-    scenario = scenarios.get(f"occluded-intersection:beacon_hz={hz},beacon_delay_s=0.1,beacon_loss=0")
+    scenario = scenarios.get(f"{NAME},beacon_hz={hz},beacon_delay_s=0.1,beacon_loss=0")
     for seed in range(8):
         world = World.start(scenario, seed)
         for frame in (0, 1, 37):
@@ -280,7 +280,7 @@ def test_under_cam_a_lost_beacon_is_still_the_last_one_that_was_sent():
     """The next is measured from it, whoever heard it, so losses do not change when beacons are sent."""
 
     def times(loss):
-        world = World.start(scenarios.get(f"occluded-intersection:beacon_rule=cam,beacon_loss={loss}"), 0)
+        world = World.start(scenarios.get(f"{NAME},beacon_rule=cam,beacon_loss={loss}"), 0)
         world.take("SLOWER")
         found = set()
         for frame in range(1, 150):
@@ -299,7 +299,7 @@ def heard(dials, seeds=range(5)):
     """When what each has heard of the other was sent, at each of three decisions."""
     found = {}
     for seed in seeds:
-        world = World.start(scenarios.get(f"occluded-intersection:{dials}"), seed)
+        world = World.start(scenarios.get(f"{NAME},{dials}"), seed)
         for step in range(3):
             state = world.state()
             for helper in HELPERS:

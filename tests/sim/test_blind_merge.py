@@ -9,11 +9,12 @@ from msgspec import structs
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
 from harness.world.reference import drive
-from harness.world.scenarios.blind_merge import RAMP_M, SCENARIO, layout, road
+from harness.world.scenarios.blind_merge import RAMP_M, layout, road
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import World
 
-P = former.scenes("blind-merge").parameters
+SCENARIO = former.scenes("blind-merge")
+P = SCENARIO.parameters
 LAYOUTS = {seed: layout(seed, P) for seed in range(200)}
 EGO = VehicleState("v1", "car", "ego", -50.0, RAMP_M, 0.0, 14.0, "ramp", "merge", False)
 TRUCK = VehicleState("v2", "truck", "helper", -95.0, -4.0, 0.0, 14.0, "main left", "straight", False)

@@ -57,7 +57,7 @@ def test_a_scenario_check_states_rates_intervals_and_n(harness):
         "dataset", "scenario", "drive", NAME, "--episodes", 3, "--seed", 178, "--workers", 2
     )
     assert code == 0
-    assert out.startswith(f"{NAME}, scenes of v2v-safety")
+    assert out.startswith(f"{NAME}, scenes of v2v-safety-2")
     assert "n = 3 episodes, layout seeds 178 to 180 (tune)" in out
     assert max(map(len, out.splitlines())) <= 80
 
@@ -70,7 +70,7 @@ def test_a_dataset_is_built_checked_and_ranked(harness, tmp_path):
     )
     nodes = json.loads((out_folder / "manifest.json").read_text())["nodes"]
     assert (code, f": 2 layouts, {nodes} decision points, in " in out) == (0, True)
-    assert out.startswith(f"wrote {printable(out_folder)} of {NAME}, scenes of v2v-safety")
+    assert out.startswith(f"wrote {printable(out_folder)} of {NAME}, scenes of v2v-safety-2")
     code, out, _ = harness("dataset", "check", out_folder)
     assert (code, out.splitlines()[0]) == (0, f"two-v1 is sound: 2 layouts, {nodes} decision points")
     code, out, _ = harness("dataset", "rank", out_folder, "--workers", 1, "--json")

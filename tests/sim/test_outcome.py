@@ -55,8 +55,8 @@ def test_blame_goes_by_right_of_way_and_not_by_who_struck(hit):
 
 def test_an_ego_that_clears_within_the_allowance_of_the_full_view_driver_succeeds():
     reference = Outcome("cleared", 6.0)
-    assert Outcome("cleared", 7.0).judged(reference, None, Parameters()).success
-    assert Outcome("cleared", 5.0).judged(reference, None, Parameters()).success
+    assert Outcome("cleared", 7.0).judged(reference, None, Parameters(limits=1)).success
+    assert Outcome("cleared", 5.0).judged(reference, None, Parameters(limits=1)).success
 
 
 def test_an_ego_that_clears_one_frame_beyond_the_allowance_is_late():
@@ -86,4 +86,4 @@ def test_every_end_has_one_of_four_ratings():
     failures = ("", "late", "collision", "off_road", "time_out")
     ratings = [rating(failure, Parameters(limits=2)) for failure in failures]
     assert ratings == ["success", "late", "unsafe", "unsafe", "stuck"]
-    assert {rating(failure, Parameters()) for failure in failures} == {None}
+    assert {rating(failure, Parameters(limits=1)) for failure in failures} == {None}

@@ -13,14 +13,14 @@ from harness.world.reference import drive
 from harness.world.scenarios.parking_exit import (
     KERB_M,
     PULL_OUT_M,
-    SCENARIO,
     VANS_M,
     layout,
     road,
 )
 from harness.world.state import SIZES_M, VehicleState, WorldState
 
-P = former.scenes("parking-exit").parameters
+SCENARIO = former.scenes("parking-exit")
+P = SCENARIO.parameters
 LAYOUTS = {seed: layout(seed, P) for seed in range(200)}
 EGO = VehicleState("v1", "car", "ego", -14.0, KERB_M, 0.0, 4.0, "own", "pull-out", False)
 VAN = VehicleState("v5", "van", "other", -21.0, VANS_M, 0.0, 0.0, "kerb", "parked", False)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from former import SCENARIO
+from former import SCENARIO, SETTINGS
 from msgspec import structs
 
 from harness.world import planner, scenarios
@@ -118,7 +118,7 @@ def test_who_overtakes_plans_the_way_back_under_limits_2():
     """What comes late hinders one who does not: in all that it plays it stays on the wrong lane for good."""
     seeds = 200006, 201020, 202134  # no danger, and a car that comes long after
     for limits, results in ((1, ["time_out", "time_out", "collision"]), (2, ["cleared"] * 3)):
-        scenario = scenarios.get(f"do-not-pass:limits={limits}")
+        scenario = scenarios.get(f"do-not-pass:{SETTINGS},limits={limits}")
         assert [drive(scenario, "full-view", seed).result for seed in seeds] == results
 
 

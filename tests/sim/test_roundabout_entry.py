@@ -11,11 +11,12 @@ from msgspec import structs
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
 from harness.world.reference import drive
-from harness.world.scenarios.roundabout_entry import RING_M, SCENARIO, layout, road
+from harness.world.scenarios.roundabout_entry import RING_M, layout, road
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import World
 
-P = former.scenes("roundabout-entry").parameters
+SCENARIO = former.scenes("roundabout-entry")
+P = SCENARIO.parameters
 LAYOUTS = {seed: layout(seed, P) for seed in range(300)}
 
 

@@ -19,8 +19,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed, queue
-from harness.world.parameters import WITNESSED
-from harness.world.parameters import Parameters as Common
+from harness.world.parameters import WITNESSED, Witnessed
 from harness.world.road import Road, crossings, paths_along, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import Building, Kind, Part
@@ -38,7 +37,7 @@ SEATS_MPS = (3.0, 4.5)
 
 
 @dataclass(frozen=True)
-class Parameters(Common):
+class Parameters(Witnessed):
     """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
     ego_speed_mps: float = 14.0  # speed at the start: 50 km/h

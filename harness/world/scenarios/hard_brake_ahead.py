@@ -21,8 +21,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed, queue
-from harness.world.parameters import WITNESSED
-from harness.world.parameters import Parameters as Common
+from harness.world.parameters import WITNESSED, Witnessed
 from harness.world.road import Road, paths_along
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, Kind
@@ -39,7 +38,7 @@ SEATS_MPS = (3.0, 4.5)
 
 
 @dataclass(frozen=True)
-class Parameters(Common):
+class Parameters(Witnessed):
     """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 10.0, 20.0)  # 72 km/h, half of it, and standing

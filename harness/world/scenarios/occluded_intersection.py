@@ -18,8 +18,7 @@ import numpy as np
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.crossroads import JUNCTION_M, SECTORS, road
 from harness.world.lookouts import Draft, placed, queue
-from harness.world.parameters import WITNESSED
-from harness.world.parameters import Parameters as Common
+from harness.world.parameters import WITNESSED, Witnessed
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, Building, Kind
 
@@ -35,7 +34,7 @@ SPARE_S = 0.15  # more than rounding, between the truck's tail and a car that cr
 
 
 @dataclass(frozen=True)
-class Parameters(Common):
+class Parameters(Witnessed):
     """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
     time_limit_s: float = 10.0  # an ego that has not cleared the intersection by then never will

@@ -20,8 +20,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed
-from harness.world.parameters import WITNESSED
-from harness.world.parameters import Parameters as Common
+from harness.world.parameters import WITNESSED, Witnessed
 from harness.world.road import Road, crossings, paths_along, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, Kind, Part
@@ -39,7 +38,7 @@ SEATS_M = 6.0, 7.5  # blind seats: cars parked ahead of the van ahead, from cent
 
 
 @dataclass(frozen=True)
-class Parameters(Common):
+class Parameters(Witnessed):
     """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 2.0, 4.0)  # up to a driver's pace in a car park

@@ -22,8 +22,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed, queue
-from harness.world.parameters import WITNESSED
-from harness.world.parameters import Parameters as Common
+from harness.world.parameters import WITNESSED, Witnessed
 from harness.world.road import Lane, Path, PathKey, Road, crossings
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import Building
@@ -50,7 +49,7 @@ SEEN_AS = {"own": "south", "right": "east", "oncoming": "north", "left": "west"}
 
 
 @dataclass(frozen=True)
-class Parameters(Common):
+class Parameters(Witnessed):
     """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 4.0, 8.0)
