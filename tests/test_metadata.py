@@ -29,7 +29,7 @@ def test_the_citation_is_of_this_version() -> None:
 def test_code_dataset_and_weights_have_one_licence() -> None:
     licence = PROJECT["license"]
     assert "Apache License" in (ROOT / "LICENSE").read_text()
-    for model in ("swarm-tiny", "swarm-tiny-six", "swarm-tiny-six-v2", "swarm-tiny-vl"):
+    for model in ("swarm-tiny", "swarm-tiny-six", "swarm-tiny-six-v2", "swarm-tiny-vl", "swarm-smol"):
         assert cards.load(model).licence == licence
         assert f"Licence: {licence}" in (ROOT / "models" / model / "README.md").read_text()
     for manifest in (ROOT / "datasets").glob("*/manifest.json"):

@@ -72,7 +72,7 @@ def test_no_command_drives_layouts_for_two_purposes_together(harness, words, tmp
 def test_the_models_that_ship_learnt_from_train_seeds():
     data = json.loads((ROOT / "models/swarm-tiny/training.json").read_text())["dataset"]
     assert purpose(data["seed"], data["episodes"]) == "train"
-    for model in ("swarm-tiny-six", "swarm-tiny-six-v2", "swarm-tiny-vl"):
+    for model in ("swarm-tiny-six", "swarm-tiny-six-v2", "swarm-tiny-vl", "swarm-smol"):
         data = json.loads((ROOT / "models" / model / "training.json").read_text())
         assert purpose(data["first_seed"], data["layouts"]) == "train"
 
