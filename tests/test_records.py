@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import pyarrow.parquet as pq
 import pytest
-from former import DATASET
+from former import DATASET, NAME
 from starlette.testclient import TestClient
 
 import harness as package
@@ -169,11 +169,15 @@ BEGUN = "drive --model local-view --episodes 40 --seeds 0 --workers 1 --conditio
 @pytest.mark.slow
 @pytest.mark.parametrize("commit", ["8cccefb", "0103f23"])
 def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: Typed) -> None:
-    """The part that it had is taken as it is."""
+    """The part that it had is taken as it is. Its bare name has come to mean other scenes."""
     begun = kept(f"{commit}/begun")
     [part] = begun.glob(".work/episodes-*/answers.jsonl")
     answers = part.read_bytes()
-    code, _, error = harness(*BEGUN.split(), "--ask", "all", "--ties", "first", "--out", begun)
+    typed = (*BEGUN.split(), "--ask", "all", "--ties", "first", "--out", begun)
+    code, _, error = harness(*typed)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "with --scenario occluded-intersection:limits=2" in error
+    code, _, error = harness(*typed, "--scenario", NAME)
     assert (code, error) == (0, "")
     assert len(folder.read(begun).episodes) == 40
     assert (begun / "answers.jsonl").read_bytes().startswith(answers)

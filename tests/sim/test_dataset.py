@@ -42,7 +42,7 @@ def test_a_build_killed_half_way_and_continued_by_two_workers_has_the_bytes_of_a
     small_folder, tmp_path
 ):
     out = tmp_path / small_folder.name
-    command = [sys.executable, "-m", "harness", "dataset", "build", "occluded-intersection"]
+    command = [sys.executable, "-m", "harness", "dataset", "build", argument(SCENARIO)]
     command += ["--episodes", "6", "--seed", str(FIRST_SEED), "--workers", "2", "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True) as process:
         while process.poll() is None and len(list(out.glob(".work/0*.zip"))) < 2:
