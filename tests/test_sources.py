@@ -120,7 +120,7 @@ def test_a_mixed_swarm_keeps_the_prompts_of_all(project: Path, harness: Typed) -
 @pytest.mark.slow
 @pytest.mark.parametrize("gone", ["edited", "deleted"])
 def test_the_page_is_the_same_once_the_prompt_is_gone(gone: str, project: Path, harness: Typed) -> None:
-    assert harness("report", "reports/run")[0] == 0
+    assert harness("report", "reports/run", "--full")[0] == 0
     page = Path("reports/run/report.html")
     before, shown = page.read_bytes(), prompts_shown(page)
     assert any("Mind: " in text for text in shown)
@@ -128,7 +128,7 @@ def test_the_page_is_the_same_once_the_prompt_is_gone(gone: str, project: Path, 
         prompt("mine", "Do otherwise: ")
     else:
         shutil.rmtree("prompts")
-    assert harness("report", "reports/run")[0] == 0
+    assert harness("report", "reports/run", "--full")[0] == 0
     assert page.read_bytes() == before
 
 
