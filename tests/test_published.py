@@ -138,6 +138,14 @@ def test_an_adapter_of_another_model_is_refused_in_one_line(engine: str, llama: 
     assert "\n" not in str(told.value)
 
 
+def test_an_adapter_of_a_broken_base_is_refused_in_one_line(llama: Card, tmp_path: Path) -> None:
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    adapter(llama, tmp_path / "worn")
+    (tmp_path / "tiny.gguf").write_bytes(b"GGUF?")
+    with pytest.raises(UserError, match=r"tiny\.gguf does not load: .*; copy or download the file again"):
+        open_backend(cards.resolve(str(tmp_path / "worn"), "llama-cpp"), device="cpu")
+
+
 @pytest.mark.parametrize(
     ("config", "said"),
     [

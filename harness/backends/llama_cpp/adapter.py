@@ -37,12 +37,14 @@ def find_adapter_gguf(card: Card, base: Path) -> Path | None:
             has = f"its adapter in {printable(folder)} has {len(files)} files *.gguf"
             raise UserError(f"{card.shown}: {has}; allowed: one")
         return files[0]
-    tensors, config, values = (
-        find_tensors(folder, card.shown),
-        read_config(folder, card.shown),
-        read_metadata(base),
-    )
-    shape = [str(item) for item in values.items() if item[0].startswith(str(values["general.architecture"]))]
+    tensors, config = find_tensors(folder, card.shown), read_config(folder, card.shown)
+    try:
+        values = read_metadata(base)
+    except ValueError as error:
+        shown = f"{card.shown} in {printable(base)}"
+        raise UserError(f"{shown} does not load: {error}; copy or download the file again") from None
+    architecture = str(values.get("general.architecture"))
+    shape = [str(item) for item in values.items() if item[0].startswith(architecture)]
     made_by = kept.code_sha256("backends/llama_cpp/adapter.py")
     key = digest([sha256_file(tensors), json.dumps(config, sort_keys=True), shape, made_by])
     file = kept.folder() / "adapters" / f"{key[:16]}.gguf"
@@ -53,7 +55,7 @@ def find_adapter_gguf(card: Card, base: Path) -> Path | None:
             raise foreign(card.shown, tensors, one_line(error)) from None
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            _write(file, values["general.architecture"], float(config["lora_alpha"]), layers)
+            _write(file, architecture, float(config["lora_alpha"]), layers)
         except OSError as error:
             raise UserError(
                 f"{card.shown}: its adapter cannot be written: {printable(error)}; SWARMDRIVE_CACHE names "
