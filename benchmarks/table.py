@@ -43,7 +43,11 @@ def main() -> None:
     for script, stated in scripts().items():
         if "TABLE" not in stated or given.only not in script.stem:
             continue
-        options = shlex.split(stated["SMALLEST" if given.smallest else "TABLE"])
+        size = "SMALLEST" if given.smallest else "TABLE"
+        if size not in stated:
+            failed.append(f"`{script.name}` has no {size}.")
+            continue
+        options = shlex.split(stated[size])
         print(" ".join(["benchmarks/" + script.name, *options]), file=sys.stderr, flush=True)
         busy_s, began_s = busy(), perf_counter()
         done = subprocess.run([sys.executable, str(script), *options], stdout=subprocess.PIPE, text=True)

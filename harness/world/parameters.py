@@ -138,6 +138,17 @@ class Witnessed(Parameters):
     perception: int = 2
 
 
+@dataclass(frozen=True)
+class Shared(Parameters):
+    """The parameters of a scenario whose helpers have goals of their own (`Scenario.seats`)."""
+
+    # probability that a vehicle which could decide does so, the ego aside: 1 makes all of them agents. Which
+    # ones do belongs to the layout, and those of a lower share are among those of a higher one
+    agent_share: float = 0.0
+    limits: int = 2
+    perception: int = 2
+
+
 # Parameters that were added later, with the values of the earlier behaviour.
 LATER = (
     ("ambient", DAY), ("beacon_rule", "fixed"), ("beacon_channel", ""),
@@ -178,3 +189,4 @@ DIALS = tuple(
 # Further ones that a name may set: what counts, and where the scenario has lookouts, who has a radio.
 SETTABLE = (*DIALS, "limits", "perception")
 WITNESSED = (*SETTABLE, "witnesses", "radio_share")
+SHARED = (*SETTABLE, "agent_share")

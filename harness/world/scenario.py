@@ -9,7 +9,7 @@ from harness.core import noise
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world import parameters as _parameters
 from harness.world.parameters import SETTABLE, Parameters
-from harness.world.road import Road
+from harness.world.road import PathKey, Road
 from harness.world.state import Building, Kind, Part
 
 
@@ -75,6 +75,17 @@ class Layout:
 
 
 @dataclass(frozen=True)
+class Seat:
+    """The view of an agent that is not the ego: a scene in which it is, on the same network and in its frame.
+
+    The scenario has the same name, parameters and actions; road, goal and words are the agent's.
+    """
+
+    scenario: "Scenario"  # the scenario with the agent as its ego
+    names: Mapping[PathKey, PathKey]  # the name that each path of the shared road has on the seat's
+
+
+@dataclass(frozen=True)
 class Scenario:
     """One scenario. The registry pickles it as its name and its parameters."""
 
@@ -97,6 +108,9 @@ class Scenario:
     # why scenes with left and right swapped are not valid scenes; None if they are
     one_sided: str | None = "nothing says that a mirrored scene is one of it"
     dials: tuple[str, ...] = SETTABLE  # parameters that a name may set: `NAME:beacon_loss=0.3`
+    # returns the seats of vehicles with goals of their own, by the path that they begin on, always the same
+    # object; `cleared` of a seat's scenario is asked about its agent alone. None if only the ego has a goal
+    seats: Callable[[], Mapping[PathKey, Seat]] | None = None
     # subclass of `World` whose episodes an environment simulates; None for the harness's own simulator
     world: type[Any] | None = None
     # spelling of 0.2, until 0.4.0: what starts an episode of such a world, `(scenario, seed)`
