@@ -153,7 +153,7 @@ def frames_of(scenario: Scenario, layouts: Sequence[int]) -> list[float]:
 def everything(world: World) -> tuple[object, ...]:
     """What there is of a world, to the last bit."""
     poses = [(*v.position.tolist(), v.heading, v.speed, v.crashed, v.route) for v in world.vehicles]
-    return world.frame, world.outcome, world.hard_brakings, world.beacons, poses
+    return world.frame, world.outcome, world.journey.hard_brakings, world.beacons, poses
 
 
 def plain_us(scenario: Scenario) -> float:

@@ -19,7 +19,6 @@ from harness.world import lockstep
 from harness.world.beacons import known
 from harness.world.conflict_measures import rounded
 from harness.world.drivers import DRIVERS, choices
-from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
@@ -69,8 +68,7 @@ def edges(
     waiting = [world.branch() for world in worlds]
     p = worlds[0].scenario.parameters
     for world in waiting:
-        world.outcome, world.hard_brakings = Outcome(), 0  # count only what happens from here on
-        world.conflicts = world.conflicts.anew()
+        world.journeys = {agent: journey.anew() for agent, journey in world.journeys.items()}
     lockstep.advance(waiting, [p.due_frame(world.step) + p.lag_frames for world in waiting])
     parts_of_world = [list(_branches(world)) for world in waiting]
     branches = [branch for parts in parts_of_world for _, branch in parts]
@@ -87,7 +85,7 @@ def _branches(world: World) -> Iterator[tuple[list[str], World]]:
     """Yield the actions that set each target, with a world in which one of them is taken."""
     by_target: dict[Target, list[str]] = {}
     for action in world.actions:
-        target = world.target if world.outcome.ended else world.target_after(action)
+        target = world.target() if world.outcome.ended else world.target_after(action)
         by_target.setdefault(target, []).append(action)
     for remaining, actions in zip(reversed(range(len(by_target))), by_target.values(), strict=True):
         branch = world.branch() if remaining else world
@@ -106,8 +104,8 @@ def _edge(actions: list[str], branch: World, episode: int, following: dict[str, 
         # first. No tree that ships has such edges.
         child, _ = following.setdefault(scene_id(episode, branch.state()), (len(following), branch))
     gap_m = round(outcome.least_gap_m, 3)
-    conflicts_s = rounded(branch.conflicts.ttc_s), rounded(branch.conflicts.pet_s)
-    return Edge(actions, child, end, gap_m, branch.hard_brakings, outcome.other_crashes, *conflicts_s)
+    conflicts_s = rounded(branch.journey.conflicts.ttc_s), rounded(branch.journey.conflicts.pet_s)
+    return Edge(actions, child, end, gap_m, branch.journey.hard_brakings, outcome.other_crashes, *conflicts_s)
 
 
 def _drivers(

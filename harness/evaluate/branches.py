@@ -51,13 +51,14 @@ class Trajectory:
         """Add the world's conflicts to the last decision of each course, and begin them anew."""
         for decision in (course.last for course in self.courses):
             if decision:
-                decision.ttc_s = min(decision.ttc_s, self.world.conflicts.ttc_s)
-                decision.pet_s = min(decision.pet_s, self.world.conflicts.pet_s)
-        self.world.conflicts = self.world.conflicts.anew()
+                decision.ttc_s = min(decision.ttc_s, self.world.journey.conflicts.ttc_s)
+                decision.pet_s = min(decision.pet_s, self.world.journey.conflicts.pet_s)
+        journey = self.world.journey
+        journey.conflicts = journey.conflicts.anew()
 
     def act(self) -> list["Trajectory"]:
         """Let the decisions that are ready act; return one trajectory for each target the egos then have."""
-        target_now = self.world.target
+        target_now = self.world.target()
         worlds, courses = {target_now: self.world}, {target_now: list[Course]()}
         target_of: dict[str, Target] = {}
         for course in self.courses:

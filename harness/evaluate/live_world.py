@@ -213,7 +213,7 @@ def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) 
         danger=world.layout.danger or "none", success=outcome.success, failure=failure,
         outcome=rating(failure, world.scenario.parameters), delay_s=delay_s, time_s=outcome.time_s,
         partner=outcome.partner, striker=outcome.striker, fault=outcome.fault,
-        least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=world.hard_brakings,
+        least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=world.journey.hard_brakings,
         other_crashes=outcome.other_crashes, skipped=course.skipped,
         **radios(world.scenario, world.seed, world.layout.danger),
     )  # fmt: skip

@@ -101,15 +101,15 @@ def broadcast(
 
 
 def announced(
-    p: Parameters, seed: int, before: Sequence[Beacon], sender: str, receivers: Sequence[str], poses: Floats,
-    first_frame: int, loss: Callable[[int], Floats],
+    p: Parameters, seed: int, before: Sequence[Beacon], sender: str, receivers: Sequence[str],
+    target_mps: float | None, poses: Floats, first_frame: int, loss: Callable[[int], Floats],
 ) -> tuple[Beacon, ...]:  # fmt: skip
-    """Return the beacons that matter of one who does not help, with poses (F, 4): see `broadcast`.
+    """Return the beacons that matter of a sender whom all receivers hear, with poses (F, 4): see `broadcast`.
 
     `loss` gives the probability that a beacon is lost on the link to each receiver.
     """
-    every = slice(None)
-    return tuple(_after(p, seed, before, sender, tuple(receivers), None, poses, first_frame, loss, every))
+    every, heard_by = slice(None), tuple(receivers)
+    return tuple(_after(p, seed, before, sender, heard_by, target_mps, poses, first_frame, loss, every))
 
 
 def _after(

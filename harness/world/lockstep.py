@@ -25,6 +25,7 @@ from harness.world.conflict_measures import observe
 from harness.world.gaps import least_gaps_m
 from harness.world.perception.rays import turned
 from harness.world.road import Lane, Road, lanes_of
+from harness.world.seats import seats_of
 from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M, Traffic
 from harness.world.state import separation_m
 
@@ -40,7 +41,7 @@ def advance(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
     going = [
         (world, until)
         for world, until in zip(worlds, until_frames, strict=True)
-        if world.frame < until and not world.outcome.ended
+        if world.frame < until and not world.ended
     ]
     if going and going[0][0].scenario.is_environment:
         for world, until in going:
@@ -56,9 +57,9 @@ def advance(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
 def _together(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
     begun = np.array([world.frame for world in worlds])
     until = np.array(until_frames)
-    speeds_mps = [float(world.vehicles[0].speed) for world in worlds]
     fleet = Fleet(worlds)
-    sizes_m, there = fleet.size, fleet.there
+    sizes_m, there, pairs = fleet.size, fleet.there, fleet.agents
+    before_mps = fleet.speed[pairs]
     poses = np.full((len(worlds), int((until - begun).max()), *fleet.speed.shape[1:], 4), np.nan)
     going = np.arange(len(worlds))
     passed = 0
@@ -74,20 +75,43 @@ def _together(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
             standing = fleet.write(row, world)
             if happened[row]:
                 world.judge(standing)
-                over[row] |= world.outcome.ended
-        if over.any():
+                fleet.going[row, [n for n, j in world.journeys.items() if j.outcome.ended]] = False
+                over[row] |= world.ended
+        if happened.any() or over.any():
             going = going[~over]
             fleet.keep(~over)
     poses = poses[:, :passed]
     poses[..., :2] -= worlds[0].scenario.road().origin_m
     np.copyto(poses, np.nan, where=~there[:, None, :, None])
-    before_m = np.array([world.outcome.least_gap_m for world in worlds])
-    gaps_m = least_gaps_m(poses, sizes_m, before_m).tolist()
+    for world, frames, first in zip(worlds, poses, begun.tolist(), strict=True):
+        world.passed(frames[: world.frame - first, : len(world.vehicles)])
+    _measure(worlds, pairs, begun, poses, sizes_m, before_mps)
+
+
+def _measure(
+    worlds: "Sequence[World]", agents: tuple[Ints, ...], begun: Ints, poses: Floats, sizes_m: Floats,
+    before_mps: Floats,
+) -> None:  # fmt: skip
+    """Record what some frames were for each agent, (n,), that was under way when they began.
+
+    `poses` (B, F, V, 4) are of frames after `begun`, (B,); `before_mps` (n,) are the agents' speeds before.
+    """
+    rows, places = agents
     hz = worlds[0].scenario.parameters.simulation_hz
-    conflicts = observe([world.conflicts for world in worlds], poses, sizes_m, begun + 1, hz)
-    rows = zip(worlds, poses, begun.tolist(), speeds_mps, gaps_m, conflicts, strict=True)
-    for world, frames, first, speed_mps, gap_m, so_far in rows:
-        world.passed(frames[: world.frame - first, : len(world.vehicles)], speed_mps, gap_m, so_far)
+    journeys = [worlds[b].journeys[n] for b, n in zip(rows.tolist(), places.tolist(), strict=True)]
+    ends = np.array([worlds[b].frame for b in rows.tolist()]) - begun[rows]  # frames that count
+    if places.any():  # each agent comes first in its own
+        order = np.tile(np.arange(poses.shape[2]), (len(rows), 1))
+        order[np.arange(len(rows)), places], order[:, 0] = 0, places
+        poses, sizes_m = poses[rows[:, None], :, order].swapaxes(1, 2), sizes_m[rows[:, None], order]
+        ended_s = [np.inf if j.outcome.time_s is None else j.outcome.time_s for j in journeys]
+        ends = np.minimum(ends, np.rint(np.array(ended_s) * hz) - begun[rows]).astype(int)
+        np.copyto(poses, np.nan, where=(np.arange(poses.shape[1]) >= ends[:, None])[..., None, None])
+    gaps_m = least_gaps_m(poses, sizes_m, np.array([j.outcome.least_gap_m for j in journeys])).tolist()
+    conflicts = observe([j.conflicts for j in journeys], poses, sizes_m, begun[rows] + 1, hz)
+    speeds_mps = np.concatenate([before_mps[:, None], poses[:, :, 0, 3]], axis=1)
+    for n, journey in enumerate(journeys):
+        journey.passed(speeds_mps[n, : ends[n] + 1], gaps_m[n], conflicts[n], hz)
 
 
 @dataclass(frozen=True)
@@ -187,6 +211,7 @@ class Fleet:
         self.lane_now = np.tile(-1 - np.arange(most), (len(worlds), 1))  # lanes of no other vehicle
         self.xy, self.impact = np.zeros((*shape, 2)), np.zeros((*shape, 2))
         self.pushed, self.crashed, self.stood, self.braking = (np.zeros(shape, bool) for _ in range(4))
+        self.drives, self.going = (np.zeros(shape, bool) for _ in range(2))
         self.heading, self.speed, self.target = (np.zeros(shape) for _ in range(3))
         self.steering, self.acceleration = np.zeros(shape), np.zeros(shape)
         self.size = np.ones((*shape, 2))
@@ -196,11 +221,23 @@ class Fleet:
         longest = max(len(v.route) for world in worlds for v in world.vehicles)
         self.route = np.full((*shape, longest + 1), -1)
         self.section = np.zeros(shape, dtype=int)
+        self.seat = np.full(shape, -1)  # number of each agent's seat; -1 for an ego
+        seats = list(seats_of(scenario))
         for b, world in enumerate(worlds):
             for n, v in enumerate(world.vehicles):
                 self._read(b, n, v)
+            for n in world.journeys:
+                spawn = world.vehicles[n].spawn
+                self.drives[b, n] = True
+                self.seat[b, n] = seats.index((spawn.approach, spawn.route)) if n else -1
+            self.going[b, [n for n, journey in world.journeys.items() if not journey.outcome.ended]] = True
+        self._index()
         ego = worlds[0].vehicles[0]
         self.limits, self.most_steering = ego.limits_mps2, ego.MAX_STEERING_ANGLE
+
+    def _index(self) -> None:
+        """List who follows a target, and of these the agents that are under way: rows and places, (n,)."""
+        self.driven, self.agents = np.nonzero(self.drives), np.nonzero(self.going)
 
     def _read(self, b: int, n: int, v: Any) -> None:
         at, number = (b, n), self.lanes.number
@@ -218,10 +255,12 @@ class Fleet:
         self.section[at] = v.route.index(v.target_lane_index)
 
     def keep(self, rows: Bools) -> None:
+        """Keep some worlds."""
         self.worlds = [world for world, kept in zip(self.worlds, rows.tolist(), strict=True) if kept]
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray) and name != "ways":
                 setattr(self, name, value[rows])
+        self._index()
 
     def write(self, row: int, world: "World") -> set[str]:
         """Write a row back to its world; return the ids of vehicles that had crashed before this frame."""
@@ -247,13 +286,26 @@ class Fleet:
         self.stood = self.crashed.copy()
         self._act()
         self._move()
-        on_road = self._place_ego()
+        on_road = self._place_agents()
         self.frame = self.frame + 1
         self._collide()
-        xy = np.where(self.there[..., None], self.xy, np.nan)
-        cleared = self.scenario.cleared(xy, self.approach, self.scenario.parameters)
-        crashes = (self.crashed != self.stood).any(axis=1)
-        return np.asarray(~on_road | cleared | crashes | self.crashed[:, 0] | (self.frame >= self.last_frame))
+        happened = (self.crashed != self.stood).any(axis=1) | (self.frame >= self.last_frame)
+        happened[self.agents[0][~on_road | self._cleared() | self.crashed[self.agents]]] = True
+        return np.asarray(happened)
+
+    def _cleared(self) -> Bools:
+        """Return which agents that are under way have reached their goal, (n,)."""
+        p, seat = self.scenario.parameters, self.seat[self.agents]
+        cleared = np.zeros(len(seat), dtype=bool)
+        if (egos := seat < 0).any():
+            xy = np.where(self.there[..., None], self.xy, np.nan)
+            cleared[egos] = self.scenario.cleared(xy, self.approach, p)[self.agents[0][egos]]
+        for n, (key, its) in enumerate(seats_of(self.scenario).items()):
+            if (at := seat == n).any():
+                xy = self.xy[self.agents][at][:, None]
+                names = np.full(xy.shape[:2], its.names[key][0])
+                cleared[at] = its.scenario.cleared(xy, names, p)
+        return cleared
 
     def _act(self) -> None:
         """Steer, and keep the target speed, as `ControlledVehicle.act` does."""
@@ -303,8 +355,8 @@ class Fleet:
             acceleration = np.where(
                 by_itself, -np.minimum(self.brakes_mps2, above * BRAKES_OFF_HZ), acceleration
             )
-        ego = ControlledVehicle.KP_A * (self.target[:, 0] - self.speed[:, 0])
-        acceleration[:, 0] = np.clip(ego, *self.limits)
+        wanted = ControlledVehicle.KP_A * (self.target[self.driven] - self.speed[self.driven])
+        acceleration[self.driven] = np.clip(wanted, *self.limits)
         return acceleration
 
     def _move(self) -> None:
@@ -331,14 +383,14 @@ class Fleet:
         self.speed = self.speed + acceleration * self.dt
         self.lane_now = np.where(self.there, self.lane, self.lane_now)
 
-    def _place_ego(self) -> Bools:
-        """Set the ego's lane to the nearest of its ways; return whether the road is below it, (B,)."""
+    def _place_agents(self) -> Bools:
+        """Set the egos' lanes to the nearest of their ways; return which agents have road below, (n,)."""
         if self.ways.size:
             places = np.broadcast_to(self.xy[:, None, 0], (len(self.xy), len(self.ways), 2))
             _, off_m = self.lanes.coordinates(places, np.broadcast_to(self.ways, places.shape[:-1]))
             self.lane_now[:, 0] = self.ways[np.abs(off_m).argmin(axis=1)]
-        lane = self.lane_now[:, 0]
-        along, lateral = self.lanes.coordinates(self.xy[:, 0], lane)
+        lane = self.lane_now[self.agents]
+        along, lateral = self.lanes.coordinates(self.xy[self.agents], lane)
         room_m, length_m = AbstractLane.VEHICLE_LENGTH, self.lanes.length[lane]
         return np.asarray(
             (np.abs(lateral) <= self.lanes.width[lane] / 2) & (-room_m <= along) & (along < length_m + room_m)

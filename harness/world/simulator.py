@@ -4,7 +4,7 @@ Other traffic keeps its route and speed; the ego is highway-env's `MDPVehicle` w
 `speed_control` says what `lockstep` simulates; highway-env's own frame of them is what it is compared with.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from types import MappingProxyType
@@ -110,16 +110,18 @@ class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
         return float(min(max(super().speed_control(target_speed), least), most))
 
 
-def populated(scenario: Scenario, layout: Layout) -> Any:
-    """Return highway-env's road with a layout's vehicles on it, the ego first."""
+def populated(scenario: Scenario, layout: Layout, agents: Collection[int] = (0,)) -> Any:
+    """Return highway-env's road with a layout's vehicles on it, the ego first; agents by their place."""
     road, static = new_road(scenario), scenario.road()
-    for spawn in layout.spawns:
+    for n, spawn in enumerate(layout.spawns):
         path = static.paths[spawn.approach, spawn.route]
         section = path.section(spawn.arc_m)
         lane = road.network.get_lane(path.lanes[section])
         along = spawn.arc_m - (0.0, *path.ends_m)[section]
         road.vehicles.append(
-            vehicle_on(road, scenario, spawn, section, lane.position(along, 0.0), lane.heading_at(along))
+            vehicle_on(
+                road, scenario, spawn, section, lane.position(along, 0.0), lane.heading_at(along), n in agents
+            )
         )
     return road
 
@@ -139,17 +141,19 @@ def new_road(scenario: Scenario) -> Any:
 
 
 def vehicle_on(
-    road: Any, scenario: Scenario, spawn: Spawn, section: int, position: Sequence[float], heading: float
-) -> ControlledVehicle:
-    """Create a vehicle on a section of its path."""
+    road: Any, scenario: Scenario, spawn: Spawn, section: int, position: Sequence[float], heading: float,
+    agent: bool,
+) -> ControlledVehicle:  # fmt: skip
+    """Create a vehicle on a section of its path; an `agent` follows a target speed."""
     p, static = scenario.parameters, scenario.road()
     route = list(static.paths[spawn.approach, spawn.route].lanes)
     start = position, heading, spawn.speed_mps, route[section]
     vehicle: ControlledVehicle
-    if spawn.part == "ego":
+    if agent:
         vehicle = Ego(None, *start, target_speeds=p.target_speeds_mps, route=route)
         vehicle.limits_mps2 = (-p.braking_mps2, p.acceleration_mps2)
-        vehicle.ways = {static.paths[key].lanes[0]: key[1] for key in static.ways}
+        if spawn.part == "ego":
+            vehicle.ways = {static.paths[key].lanes[0]: key[1] for key in static.ways}
     else:
         vehicle = KINDS[spawn.kind](None, *start, route=route)
     vehicle.road = road  # only now: a vehicle that is created with a road searches all of its lanes

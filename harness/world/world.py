@@ -16,6 +16,7 @@ from harness.world import beacons, lockstep
 from harness.world.conflict_measures import Conflicts
 from harness.world.outcome import Outcome, fault, outline, striker
 from harness.world.scenario import Layout, Scenario
+from harness.world.seats import agents_of, seated, seats_of
 from harness.world.simulator import copied, new_road, populated, spawn_of, state_of, vehicle_on
 from harness.world.state import (
     ActionsTaken,
@@ -31,6 +32,29 @@ HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 
 @dataclass
+class Journey:
+    """What has become of one agent of an episode so far."""
+
+    outcome: Outcome = field(default_factory=Outcome)  # its `ended` says whether it is decided
+    hard_brakings: int = 0  # how often it began to brake harder than HARD_BRAKING_MPS2
+    braking_hard: bool = False  # whether it braked so hard in the last frame
+    conflicts: Conflicts = field(default_factory=Conflicts)  # how near others came to it in time
+
+    def anew(self) -> "Journey":
+        """Return the same at a decision, counting only what happens from here on."""
+        return replace(self, outcome=Outcome(), hard_brakings=0, conflicts=self.conflicts.anew())
+
+    def passed(self, speeds_mps: Floats, gap_m: float, conflicts: Conflicts, hz: int) -> None:
+        """Record some frames: its speed before the first and in each, its least gap so far, its conflicts."""
+        self.outcome = replace(self.outcome, least_gap_m=gap_m)
+        self.conflicts = conflicts.collided() if self.outcome.result == "collision" else conflicts
+        slows_mps2 = (speeds_mps[:-1] - speeds_mps[1:]) * hz
+        hard = [self.braking_hard, *(slows_mps2 > HARD_BRAKING_MPS2).tolist()]
+        self.hard_brakings += sum(now and not before for before, now in pairwise(hard))
+        self.braking_hard = hard[-1]
+
+
+@dataclass
 class World:
     """One episode in the simulator."""
 
@@ -40,11 +64,8 @@ class World:
     road: Any  # highway-env's road with its vehicles, the ego first
     step: int = 0  # number of decisions taken so far
     frame: int = 0  # number of frames simulated so far
-    # the outcome so far; its `ended` says whether the episode is decided
-    outcome: Outcome = field(default_factory=Outcome)
-    hard_brakings: int = 0  # how often the ego began to brake harder than HARD_BRAKING_MPS2
-    braking_hard: bool = False  # whether it braked so hard in the last frame
-    conflicts: Conflicts = field(default_factory=Conflicts)  # how near others came to the ego in time
+    # what has become of each agent, by its place among the vehicles; the ego is the first
+    journeys: dict[int, Journey] = field(default_factory=lambda: {0: Journey()})
     beacons: tuple[Beacon, ...] = ()  # the beacons that still matter (`WorldState.beacons`)
 
     @classmethod
@@ -54,8 +75,9 @@ class World:
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "World":
         """Start an episode in this kind of world."""
-        layout = scenario.layout(seed, scenario.parameters)
-        world = cls(scenario, seed, layout, populated(scenario, layout))
+        layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
+        road = populated(scenario, layout, agents)
+        world = cls(scenario, seed, layout, road, journeys={agent: Journey() for agent in agents})
         poses = beacons.lead_in(scenario.parameters, world._in_road_frame(world._poses()))
         world._broadcast(poses, 1 - len(poses))
         return world
@@ -75,8 +97,24 @@ class World:
         """Simulated time, counted in frames (highway-env's own clock drifts)."""
         return self.frame / self.scenario.parameters.simulation_hz
 
+    @property
+    def outcome(self) -> Outcome:
+        """The ego's outcome so far."""
+        return self.journeys[0].outcome
+
+    @property
+    def journey(self) -> Journey:
+        """What has become of the ego."""
+        return self.journeys[0]
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode is decided for all of its agents."""
+        return all(journey.outcome.ended for journey in self.journeys.values())
+
     def branch(self) -> "World":
-        return replace(self, road=copied(self.road))
+        journeys = {agent: replace(journey) for agent, journey in self.journeys.items()}
+        return replace(self, road=copied(self.road), journeys=journeys)
 
     def snapshot(self) -> Snapshot | ActionsTaken:
         """Return what `thaw` needs besides `state()` to continue exactly as this world would."""
@@ -101,7 +139,8 @@ class World:
         layout, road = scenario.layout(state.episode_seed, scenario.parameters), new_road(scenario)
         for v, section in zip(state.vehicles, snapshot.sections, strict=True):
             spawn = spawn_of(scenario, layout, v)
-            vehicle = vehicle_on(road, scenario, spawn, section, (v.x_m, v.y_m), v.heading_rad)
+            place, agent = (v.x_m, v.y_m), not road.vehicles
+            vehicle = vehicle_on(road, scenario, spawn, section, place, v.heading_rad, agent)
             vehicle.crashed, vehicle.braking = v.crashed, v.braking
             road.vehicles.append(vehicle)
         vehicles = road.vehicles
@@ -118,13 +157,14 @@ class World:
             scenario, state.episode_seed, layout, road, state.step, snapshot.frame, beacons=state.beacons
         )
 
-    def state(self) -> WorldState:
-        """Return the present state."""
+    def state(self, agent: int = 0) -> WorldState:
+        """Return the present state, as it is for an agent: in its own eyes it is the ego."""
         name, states = self.scenario.name, tuple(map(self._state_of, self.vehicles))
-        target_mps, buildings = float(self.vehicles[0].target_speed), self.layout.buildings
-        return WorldState(
+        target_mps, buildings = float(self.vehicles[agent].target_speed), self.layout.buildings
+        state = WorldState(
             name, self.seed, self.step, self.time_s, target_mps, states, buildings, self.beacons
         )
+        return seated(self.scenario, state, agent) if agent else state
 
     def _state_of(self, v: Any) -> VehicleState:
         return state_of(v, self.scenario.brake_lamps, self.scenario.road().origin_m)
@@ -145,43 +185,35 @@ class World:
             self.take(action)
         self.step += 1
 
-    def take(self, action: str) -> None:
-        """Set the ego's target by a meta-action. Nothing moves until the world advances."""
-        self.vehicles[0].act(action)
+    def take(self, action: str, agent: int = 0) -> None:
+        """Set an agent's target by a meta-action. Nothing moves until the world advances."""
+        self.vehicles[agent].act(action)
 
-    @property
-    def target(self) -> Target:
-        """The ego's route and target speed level."""
-        ego = self.vehicles[0]
-        return ego.spawn.route, int(ego.speed_index)
+    def target(self, agent: int = 0) -> Target:
+        """Return an agent's route and target speed level."""
+        vehicle = self.vehicles[agent]
+        return vehicle.spawn.route, int(vehicle.speed_index)
 
-    def target_after(self, action: str) -> Target:
-        """Return the target that the ego would have if it took an action now."""
-        ego = self.vehicles[0]
-        kept = dict(vars(ego))
-        self.take(action)
-        target = self.target
-        vars(ego).update(kept)
+    def target_after(self, action: str, agent: int = 0) -> Target:
+        """Return the target that an agent would have if it took an action now."""
+        vehicle = self.vehicles[agent]
+        kept = dict(vars(vehicle))
+        self.take(action, agent)
+        target = self.target(agent)
+        vars(vehicle).update(kept)
         return target
 
     def advance(self, until_frame: int) -> None:
         """Simulate until a frame, or until the episode is decided."""
         lockstep.advance([self], [until_frame])
 
-    def passed(self, poses: Floats, speed_mps: float, gap_m: float, conflicts: Conflicts) -> None:
-        """Record the last frames: beacons, the least gap so far, conflicts and hard braking.
+    def passed(self, poses: Floats) -> None:
+        """Record the beacons of the last frames.
 
         `poses` are x, y, heading and speed of each vehicle in each frame, (F, V, 4), from the origin of the
-        scenario's road; `speed_mps` is the ego's before these frames.
+        scenario's road.
         """
         self._broadcast(poses, self.frame + 1 - len(poses))
-        self.outcome = replace(self.outcome, least_gap_m=gap_m)
-        self.conflicts = conflicts.collided() if self.outcome.result == "collision" else conflicts
-        speeds_mps = np.concatenate([[speed_mps], poses[:, 0, 3]])
-        slows_mps2 = (speeds_mps[:-1] - speeds_mps[1:]) * self.scenario.parameters.simulation_hz
-        hard = [self.braking_hard, *(slows_mps2 > HARD_BRAKING_MPS2).tolist()]
-        self.hard_brakings += sum(now and not before for before, now in pairwise(hard))
-        self.braking_hard = hard[-1]
 
     def _poses(self) -> list[tuple[float, ...]]:
         """Return x, y, heading and speed of each vehicle, in highway-env's own frame."""
@@ -198,17 +230,26 @@ class World:
         p, target_mps = self.scenario.parameters, float(self.vehicles[0].target_speed)
         radios = [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"]
         ids = [self.vehicles[n].spawn.id for n in radios]
-        loss = beacons.losses(p, self.state, ids, poses)
-        sent = beacons.broadcast(
-            p, self.seed, self.beacons, ids, target_mps, poses[:, radios], first_frame, loss
-        )
-        for n, sender in [(n, v.spawn.id) for n, v in enumerate(self.vehicles) if v.spawn.radio]:
-            loss = beacons.losses(p, self.state, [sender, *ids], poses)
-            sent += beacons.announced(p, self.seed, self.beacons, sender, ids, poses[:, n], first_frame, loss)
+        announce, sent = [n for n, v in enumerate(self.vehicles) if v.spawn.radio], tuple[Beacon, ...]()
+        if len(self.journeys) > 1:  # everybody with a radio hears everybody
+            announce = [*radios, *announce]
+        else:
+            loss = beacons.losses(p, self.state, ids, poses)
+            sent = beacons.broadcast(
+                p, self.seed, self.beacons, ids, target_mps, poses[:, radios], first_frame, loss
+            )
+        for n in announce:
+            sender = self.vehicles[n].spawn.id
+            hearers = [id_ for id_ in ids if id_ != sender]
+            loss = beacons.losses(p, self.state, [sender, *hearers], poses)
+            aim_mps = float(self.vehicles[n].target_speed) if n in self.journeys else None
+            sent += beacons.announced(
+                p, self.seed, self.beacons, sender, hearers, aim_mps, poses[:, n], first_frame, loss
+            )
         self.beacons = sent
 
     def _collision(self, ego: Any, wrecks: Sequence[Any]) -> dict[str, str]:
-        """Return whom the ego hit, and how; empty if it hit an object on the road."""
+        """Return whom an agent hit, and how; empty if it hit an object on the road."""
         mine = self._state_of(ego)
         hit = [(float(outline(mine).distance(outline(v))), v) for v in map(self._state_of, wrecks)]
         apart_m, partner = min(hit, key=lambda pair: pair[0], default=(math.inf, mine))
@@ -217,25 +258,36 @@ class World:
         blamed = fault(mine, partner, self.scenario.road().paths)
         return {"partner": partner.id, "striker": striker(mine, partner), "fault": blamed}
 
-    def _cleared(self) -> bool:
-        vehicles = self.vehicles
-        xy_m, approaches = [v.position for v in vehicles], [v.spawn.approach for v in vehicles]
-        return bool(self.scenario.cleared(np.array(xy_m), np.array(approaches), self.scenario.parameters))
+    def _cleared(self, agent: int) -> bool:
+        """Return whether an agent has reached its goal."""
+        xy_m, names = np.array([v.position for v in self.vehicles]), [v.spawn.approach for v in self.vehicles]
+        if not agent:
+            return bool(self.scenario.cleared(xy_m, np.array(names), self.scenario.parameters))
+        spawn = self.vehicles[agent].spawn
+        seat = seats_of(self.scenario)[spawn.approach, spawn.route]
+        name, _ = seat.names[spawn.approach, spawn.route]
+        return bool(seat.scenario.cleared(xy_m[[agent]], np.array([name]), self.scenario.parameters))
 
     def judge(self, standing: Set[str]) -> None:
-        """Decide the episode if the last frame has decided it; `standing` had crashed before, by id."""
+        """Decide what the last frame has decided; `standing` had crashed before, by id."""
         p = self.scenario.parameters
-        ego, traffic = self.vehicles[0], self.vehicles[1:]
-        crashed = {v.spawn.id for v in traffic if v.crashed and v.spawn.id not in standing}
-        if ego.crashed:
-            how = self._collision(ego, [v for v in traffic if v.crashed])
-            crashed.discard(how.get("partner", ""))
-            self.outcome = self.outcome.ending("collision", self.time_s, **how)
-        elif not ego.on_road:
-            self.outcome = self.outcome.ending("off_road", self.time_s)
-        elif self._cleared():
-            self.outcome = self.outcome.ending("cleared", self.time_s)
-        elif self.frame >= round(p.time_limit_s * p.simulation_hz):
-            self.outcome = self.outcome.ending("time_out", self.time_s)
+        places = {n: v for n, v in enumerate(self.vehicles) if n not in self.journeys}
+        crashed = {v.spawn.id for v in places.values() if v.crashed and v.spawn.id not in standing}
+        for agent, journey in self.journeys.items():
+            vehicle = self.vehicles[agent]
+            if journey.outcome.ended:
+                continue
+            if vehicle.crashed:
+                wrecks = [v for v in self.vehicles if v.crashed and v is not vehicle]
+                how = self._collision(vehicle, wrecks)
+                crashed.discard(how.get("partner", ""))
+                journey.outcome = journey.outcome.ending("collision", self.time_s, **how)
+            elif not vehicle.on_road:
+                journey.outcome = journey.outcome.ending("off_road", self.time_s)
+            elif self._cleared(agent):
+                journey.outcome = journey.outcome.ending("cleared", self.time_s)
+            elif self.frame >= round(p.time_limit_s * p.simulation_hz):
+                journey.outcome = journey.outcome.ending("time_out", self.time_s)
         if crashed:
-            self.outcome = replace(self.outcome, other_crashes=self.outcome.other_crashes + len(crashed))
+            crashes = self.outcome.other_crashes + len(crashed)
+            self.journey.outcome = replace(self.outcome, other_crashes=crashes)

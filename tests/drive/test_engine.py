@@ -89,7 +89,7 @@ def test_a_decision_acts_in_its_frame_and_not_before():
     still.advance(8)
     advance([braking], 8)
     assert braking.world.state().vehicles == still.state().vehicles
-    assert (still.target[1], braking.world.target[1]) == (2, 1)
+    assert (still.target()[1], braking.world.target()[1]) == (2, 1)
     advance([braking], 9)
     still.advance(9)
     assert still.state().ego.speed_mps - braking.world.state().ego.speed_mps == pytest.approx(8.0 * 0.02)

@@ -220,7 +220,7 @@ def test_a_collision_has_no_time_left() -> None:
     while not world.outcome.ended:
         world.act("IDLE")
     assert world.outcome.result == "collision"
-    assert (world.conflicts.ttc_s, world.conflicts.pet_s) == (0.0, 0.0)
+    assert (world.journey.conflicts.ttc_s, world.journey.conflicts.pet_s) == (0.0, 0.0)
 
 
 def test_columns_tell_what_was_not_near_from_what_was_not_measured() -> None:
@@ -240,9 +240,9 @@ def test_a_scenarios_worlds_are_measured_as_a_search_finds(name: str) -> None:
     frames: list[list[Floats]] = [[] for _ in worlds]
     passed = World.passed
 
-    def recorded(world: World, poses: Floats, *rest: object) -> None:
+    def recorded(world: World, poses: Floats) -> None:
         frames[worlds.index(world)].append(poses)
-        passed(world, poses, *rest)  # type: ignore[arg-type]
+        passed(world, poses)
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(World, "passed", recorded)
@@ -254,5 +254,5 @@ def test_a_scenarios_worlds_are_measured_as_a_search_finds(name: str) -> None:
     for world, parts in zip(worlds, frames, strict=True):
         if world.outcome.result != "collision":
             sizes = np.array([(v.LENGTH, v.WIDTH) for v in world.vehicles])
-            found = world.conflicts.ttc_s, world.conflicts.pet_s
+            found = world.journey.conflicts.ttc_s, world.journey.conflicts.pet_s
             assert found == searched(np.concatenate(parts)[None], sizes, 50)

@@ -33,7 +33,7 @@ def car(x_m, y_m, speed_mps, heading_rad=0.0, way=("own", RIGHT), **more):
 
 def test_a_change_of_lane_takes_the_ego_over_and_one_where_there_is_no_lane_leaves_it_there() -> None:
     world = World.start(MOTORWAY, 2)
-    assert (world.target, world.target_after("LANE_RIGHT")) == ((RIGHT, 2), (RIGHT, 2))
+    assert (world.target(), world.target_after("LANE_RIGHT")) == ((RIGHT, 2), (RIGHT, 2))
     assert world.target_after("LANE_LEFT") == (LEFT, 2)
     for action in ("SLOWER", "LANE_LEFT", "FASTER"):  # falls behind the car beside it
         world.act(action)

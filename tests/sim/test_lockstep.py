@@ -18,9 +18,9 @@ def everything(world):
         world.frame,
         world.step,
         world.outcome,
-        world.hard_brakings,
-        world.braking_hard,
-        (world.conflicts.ttc_s, world.conflicts.pet_s),
+        world.journey.hard_brakings,
+        world.journey.braking_hard,
+        (world.journey.conflicts.ttc_s, world.journey.conflicts.pet_s),
         world.beacons,
         poses(world),
     )

@@ -144,14 +144,14 @@ def test_a_second_at_once_and_frame_by_frame_are_the_same_second(seed):
         frames.take(action)
         advance(frames, P.simulation_hz - P.lag_frames)
         assert frames.state().vehicles == whole.state().vehicles
-        assert (frames.outcome, frames.hard_brakings) == (whole.outcome, whole.hard_brakings)
+        assert (frames.outcome, frames.journey.hard_brakings) == (whole.outcome, whole.journey.hard_brakings)
 
 
 def test_braking_hard_is_counted_once_each_time_it_begins():
     world = World.start(SCENARIO, NO_DANGER)
     for action, so_far in (("IDLE", 0), ("SLOWER", 1), ("IDLE", 1), ("SLOWER", 2), ("FASTER", 2)):
         world.act(action)
-        assert world.hard_brakings == so_far
+        assert world.journey.hard_brakings == so_far
 
 
 def test_two_seeds_are_two_episodes():
@@ -255,7 +255,7 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(seed):
     for behaviour in ("IDLE", "SLOWER", "SLOWER", "FASTER"):
         for action in ACTIONS:
             thawed, original = through_json(world), world.branch()
-            original.outcome = Outcome()  # what happened before is not part of a frozen world
+            original.journey.outcome = Outcome()  # what happened before is not part of a frozen world
             for then in (action, "IDLE"):
                 thawed.act(then)
                 original.act(then)

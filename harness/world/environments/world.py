@@ -121,24 +121,23 @@ class EnvironmentWorld(World):
         """Return the actions so far, since equal actions from the start lead to equal worlds."""
         return ActionsTaken(self.frame, tuple(self.taken))
 
-    def take(self, action: str) -> None:
+    def take(self, action: str, agent: int = 0) -> None:
         kind = meta_actions(self.scenario.name, self.env)
         kind.act(kind.actions_indexes[action])
         self.action, self.taken = action, (*self.taken, (self.frame, action))
         self._place(self.everybody[0])
 
-    @property
-    def target(self) -> Target:
-        """The lane and the speed that the ego aims at."""
+    def target(self, agent: int = 0) -> Target:
+        """Return the lane and the speed that the ego aims at."""
         ego = self.everybody[0]
         aim = *lane_of(ego), round(float(ego.target_speed), DECIMALS)
         return " ".join(map(str, aim)), int(ego.speed_index)
 
-    def target_after(self, action: str) -> Target:
+    def target_after(self, action: str, agent: int = 0) -> Target:
         ego, kept = self.everybody[0], (self.action, self.taken)
         own = {name: list(value) if isinstance(value, list) else value for name, value in vars(ego).items()}
         self.take(action)
-        target = self.target
+        target = self.target()
         vars(ego).update(own)
         self.action, self.taken = kept
         return target
@@ -159,8 +158,10 @@ class EnvironmentWorld(World):
             sizes_m = np.array([[(v.LENGTH, v.WIDTH) for v in self.vehicles]])
             [gap_m] = least_gaps_m(poses[None], sizes_m, np.array([self.outcome.least_gap_m])).tolist()
             first, hz = np.array([self.frame + 1 - len(frames)]), self.scenario.parameters.simulation_hz
-            [conflicts] = observe([self.conflicts], poses[None], sizes_m, first, hz)
-            self.passed(poses, speed_mps, gap_m, conflicts)
+            [conflicts] = observe([self.journey.conflicts], poses[None], sizes_m, first, hz)
+            self.passed(poses)
+            speeds_mps = np.concatenate([[speed_mps], poses[:, 0, 3]])
+            self.journey.passed(speeds_mps, gap_m, conflicts, hz)
 
     def _recast(self) -> None:
         """Remove vehicles that have left, and add new ones."""
@@ -177,7 +178,7 @@ class EnvironmentWorld(World):
                 self._enter(v, "other")
         now = [places.get(id(v), -1) for v in self.everybody]
         if now != list(range(len(places))):
-            self.conflicts = self.conflicts.recast(now)
+            self.journey.conflicts = self.journey.conflicts.recast(now)
 
     def _move(self) -> None:
         self.constants.restore()
@@ -212,7 +213,7 @@ class EnvironmentWorld(World):
             else:
                 self.failed = True
 
-    def _cleared(self) -> bool:
+    def _cleared(self, agent: int) -> bool:
         return bool(self.everybody[0].to_go_m <= 0)
 
     def _step(self) -> None:
@@ -221,7 +222,7 @@ class EnvironmentWorld(World):
         self.frame += 1
         self.judge(standing)
         if self.failed and not self.outcome.ended:
-            self.outcome = self.outcome.ending("time_out", self.time_s)
+            self.journey.outcome = self.outcome.ending("time_out", self.time_s)
 
 
 def _reads_observations(env: Any) -> bool:

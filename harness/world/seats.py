@@ -1,0 +1,57 @@
+"""Seats: a scene as it is for one of its agents, in whose own eyes it is the ego.
+
+What an agent sees, is asked, aims at and is judged by is that of an ego, in the scenario of its seat. So with
+several agents nothing but the names of vehicles' parts and of paths differs between them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from msgspec.structs import replace as changed
+
+from harness.core import noise
+from harness.world.road import PathKey
+from harness.world.scenario import Layout, Scenario, Seat
+from harness.world.state import VehicleState, WorldState
+
+
+def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
+    """Return the seats of a scenario by the path that an agent is on; none if only the ego has a goal."""
+    return scenario.seats() if scenario.seats else {}
+
+
+def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tuple[int, ...]]:
+    """Return the places of a layout's agents, the ego's first, and the layout with those who are none.
+
+    With a share of 0, helpers decide nothing, but answer. With a greater one, whoever could be an agent and
+    is none is other traffic.
+    """
+    share, seats = getattr(scenario.parameters, "agent_share", 0.0), seats_of(scenario)
+    if not share:
+        return layout, (0,)
+    able = [n for n, s in enumerate(layout.spawns) if s.part == "helper" and (s.approach, s.route) in seats]
+    draws = noise.uniforms((len(layout.spawns),), scenario.name, seed, "agents")
+    agents = (0, *(n for n in able if draws[n] < share))
+    spawns = tuple(
+        replace(spawn, part="other") if n in able and n not in agents else spawn
+        for n, spawn in enumerate(layout.spawns)
+    )
+    return replace(layout, spawns=spawns), agents
+
+
+def seat_of(scenario: Scenario, vehicle: VehicleState) -> Seat:
+    """Return the seat of an agent that is not the ego."""
+    return seats_of(scenario)[vehicle.approach, vehicle.route]
+
+
+def seated(scenario: Scenario, state: WorldState, agent: int) -> WorldState:
+    """Return a state as it is for an agent, by its place: it is the ego, and the ego is a helper."""
+    names = seat_of(scenario, state.vehicles[agent]).names
+
+    def renamed(v: VehicleState, part: str) -> VehicleState:
+        approach, route = names[v.approach, v.route]
+        return changed(v, part=part, approach=approach, route=route)
+
+    others = [v for n, v in enumerate(state.vehicles) if n != agent]
+    vehicles = [renamed(v, "helper" if v.part == "ego" else v.part) for v in others]
+    return changed(state, vehicles=(renamed(state.vehicles[agent], "ego"), *vehicles))
