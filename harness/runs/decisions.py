@@ -311,12 +311,12 @@ def _write(
     """Write decisions as one Parquet file with these columns but some; whole parts share a row group."""
     kinds = pa.schema([column for column in columns if column.name not in left_out])
     with pq.ParquetWriter(target, kinds, compression="zstd") as writer:
-        group = [kinds.empty_table()]
+        group = [_empty(kinds)]
         for part in parts:
             group.append(part.table.drop_columns(list(left_out)))
             if sum(map(len, group)) >= ROW_GROUP:
                 writer.write_table(_row_group(group))
-                group = [kinds.empty_table()]
+                group = [_empty(kinds)]
         if len(group) > 1:
             writer.write_table(_row_group(group))
 
@@ -341,6 +341,10 @@ def arrow_file(path: Path) -> pa.BufferReader:
 
 
 # pyarrow loads pandas when it converts a foreign array to its own or back; going by buffers avoids that.
+
+
+def _empty(kinds: pa.Schema) -> pa.Table:
+    return pa.table([pa.nulls(0, kind) for kind in kinds.types], schema=kinds)
 
 
 def _array(values: Any, kind: pa.DataType) -> pa.Array:
