@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from markupsafe import Markup
 
 from harness.core.figures import Bounded, known
-from harness.report.page import environment, visible
+from harness.report.templating import environment, visible
 
 LONGEST_NUMBER = 40  # characters of a cell at the right of its column, such as a number with its interval
 WIDTH, HEIGHT = 240, 22  # of a line of a forest plot

@@ -7,20 +7,15 @@ out, and the page's own policy lets two scripts run, named by their digests, and
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-import msgspec
-from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
 from harness.core.errors import UserError, printable
-from harness.core.figures import Unit
 from harness.core.files import opened, replacing
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each
-from harness.core.places import nameless, text
 from harness.parsing.parse import Repair, Status
 from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
@@ -31,9 +26,9 @@ from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
 from harness.report.panels import panels
 from harness.report.runs import Runs
+from harness.report.templating import environment
 from harness.runs.leading import IN_WORDS
 
-TEMPLATES = Path(__file__).parent / "templates"
 PARTS_SHARED = 8  # fewest parts for which starting workers takes less time than they save
 HEAD = 1 << 14  # bytes of a page within which it states what it lacks
 
@@ -219,45 +214,3 @@ def _actions(runs: Runs) -> dict[str, tuple[str, str]]:
         name: (c, colours.INK if 5 * n < 3 * len(every) else colours.WHITE)
         for n, (name, c) in enumerate(every.items())
     }
-
-
-@cache
-def environment(*more: Path) -> Environment:
-    """Return the report's templates, and those of other folders: everything is escaped and made `visible`."""
-    templates = Environment(
-        loader=FileSystemLoader([*more, TEMPLATES]),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=visible,
-    )
-    templates.globals["palette"] = Markup(colours.variables())
-    templates.filters |= {
-        "number": lambda value, decimals: Unit(decimals=decimals).number(value),
-        "facts": words.facts, "shown": words.shown, "cell": words.cell, "p_value": words.p_value,
-        "latency_source": words.latency_source, "answer_times": words.answer_times, "pace": words.pace,
-        "mapping": _mapping, "columns": _table, "nameless": text,
-    }  # fmt: skip
-    return templates
-
-
-def visible(value: Any) -> Any:
-    """Text with every character that shows nothing, or turns the line around, spelt out. None is a dash."""
-    if value is None or isinstance(value, Undefined):
-        return "–"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if not isinstance(value, str) or isinstance(value, Markup) or value.isprintable():
-        return value
-    return "".join(c if c.isprintable() or c in "\n\t" else f"⟨U+{ord(c):04X}⟩" for c in value)
-
-
-def _mapping(record: Any) -> Any:
-    """Return a record as plain values, without the folders of the machine that it was made on."""
-    return nameless(msgspec.to_builtins(record))
-
-
-def _table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[Any]]]:
-    """Return the head and body of a table with a column for every key."""
-    head = list(dict.fromkeys(key for row in rows for key in row))
-    return head, [[row.get(key) for key in head] for row in rows]

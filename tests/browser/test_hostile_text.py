@@ -14,8 +14,9 @@ from reading import Page, details, packed
 from sample_hostile import PAYLOADS, hostile, prompt_of
 
 from harness.core import places
-from harness.report.page import render, visible
+from harness.report.page import render
 from harness.report.runs import gather
+from harness.report.templating import visible
 
 pytestmark = pytest.mark.slow
 

@@ -33,8 +33,9 @@ from harness.prompts import readout
 from harness.prompts import versions as prompts
 from harness.report import contents, library
 from harness.report.details import prompts_of
-from harness.report.page import render, visible
+from harness.report.page import render
 from harness.report.runs import gather
+from harness.report.templating import visible
 from harness.report.words import answer_times, figures, headline, latency_source, pace, shown
 from harness.runs.folder import csv_text, read
 from harness.runs.records import Episode, Latency, Score, Times

@@ -16,7 +16,7 @@ from harness.report.compare.difference import Comparison, DecisionFlip, Differen
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Side
 from harness.report.document import forest, reach
-from harness.report.page import environment
+from harness.report.templating import environment
 from harness.runs.folder import Run
 from harness.runs.metrics import entry
 

@@ -12,8 +12,9 @@ from harness.report import suite as suites
 from harness.report.compare import page as comparison
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
-from harness.report.page import environment, render, with_decision
+from harness.report.page import render, with_decision
 from harness.report.runs import gather
+from harness.report.templating import environment
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD, Listed, runs
 from harness.runs.suite import read

@@ -15,7 +15,7 @@ from harness.core.versions import versions
 from harness.report.compare.gate import Verdict
 from harness.report.compare.words import judged
 from harness.report.document import Table
-from harness.report.page import environment, visible
+from harness.report.templating import environment, visible
 from harness.studies.study import Study
 from harness.studies.twins.asking import Questions, lack
 from harness.studies.twins.declared import TWINS, Twin

@@ -1,0 +1,59 @@
+"""The report's templates, and how they show values."""
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from jinja2 import Environment, FileSystemLoader, Undefined
+from markupsafe import Markup
+
+from harness.core.figures import Unit
+from harness.core.places import nameless, text
+from harness.report import words
+from harness.report.drawing import colours
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+
+@cache
+def environment(*more: Path) -> Environment:
+    """Return the report's templates, and those of other folders: everything is escaped and made `visible`."""
+    templates = Environment(
+        loader=FileSystemLoader([*more, TEMPLATES]),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=visible,
+    )
+    templates.globals["palette"] = Markup(colours.variables())
+    templates.filters |= {
+        "number": lambda value, decimals: Unit(decimals=decimals).number(value),
+        "facts": words.facts, "shown": words.shown, "cell": words.cell, "p_value": words.p_value,
+        "latency_source": words.latency_source, "answer_times": words.answer_times, "pace": words.pace,
+        "mapping": _mapping, "columns": _table, "nameless": text,
+    }  # fmt: skip
+    return templates
+
+
+def visible(value: Any) -> Any:
+    """Text with every character that shows nothing, or turns the line around, spelt out. None is a dash."""
+    if value is None or isinstance(value, Undefined):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if not isinstance(value, str) or isinstance(value, Markup) or value.isprintable():
+        return value
+    return "".join(c if c.isprintable() or c in "\n\t" else f"⟨U+{ord(c):04X}⟩" for c in value)
+
+
+def _mapping(record: Any) -> Any:
+    """Return a record as plain values, without the folders of the machine that it was made on."""
+    return nameless(msgspec.to_builtins(record))
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[Any]]]:
+    """Return the head and body of a table with a column for every key."""
+    head = list(dict.fromkeys(key for row in rows for key in row))
+    return head, [[row.get(key) for key in head] for row in rows]
