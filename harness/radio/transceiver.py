@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from harness.core.arrays import Bools, Floats
 from harness.core.config import between, check
@@ -94,6 +93,8 @@ class Transceiver(Propagation, Physical):
 
     def _read(self, table: Floats, distance_m: Floats, power_dbm: Floats, first_db: float) -> Floats:
         """Interpolate a table `(D, P)` whose first column is `first_db` above the sensing threshold."""
+        from scipy.ndimage import map_coordinates
+
         at = np.broadcast_arrays(distance_m / STEP_M, (power_dbm - self.sensing_dbm - first_db) / STEP_DB)
         # An absent helper has NaN coordinates, but the table must be read somewhere.
         return map_coordinates(table, np.nan_to_num(at), order=1, mode="nearest")
