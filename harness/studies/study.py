@@ -99,7 +99,11 @@ def write_study(study: Study, out: Path) -> Path:
 def write_table(table: "pd.DataFrame", path: Path) -> None:
     """Write a table as CSV, whose texts no spreadsheet takes for formulas, and as JSON Lines."""
     texts = table.select_dtypes(exclude=["number", "bool"])
-    safe = table.assign(**{str(name): column.astype(object).map(neutral) for name, column in texts.items()})
+    # Few texts are in many rows, so that one look at each is cheaper than `neutral` of every cell.
+    risky = [
+        column for _, column in texts.items() if any(neutral(text) is not text for text in column.unique())
+    ]
+    safe = table.assign(**{str(column.name): column.astype(object).map(neutral) for column in risky})
     with replacing(path.with_name(f"{path.name}.csv")) as part:
         safe.to_csv(part, index=False, lineterminator="\n", compression=None)
     with replacing(path.with_name(f"{path.name}.jsonl")) as part:
