@@ -66,7 +66,7 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--layouts", type=int, default=200)
     arguments.add_argument("--scenes", default=SCENES)
-    arguments.add_argument("--scenarios", nargs="+", default=sorted(scenarios.names()))
+    arguments.add_argument("--scenarios", nargs="+", default=scenarios.witnessed())
     given = arguments.parse_args()
     layouts, scenes = given.layouts, given.scenes
     print(f"harmless layouts of {layouts} each, {stated(FIRST['tune'], layouts)}, {scenes}; seconds later")

@@ -22,7 +22,7 @@ from harness.world.scenario import Scenario
 from harness.world.world import World
 
 SMALLEST = "--layouts 1 --scenarios blind-merge"
-LAYOUTS, ALL = 240, sorted(scenarios.names())
+LAYOUTS, ALL = 240, scenarios.witnessed()
 # How layouts are drawn that are judged by each version.
 VERSIONS = {
     1: "limits=1,witnesses=any,radio_share=0,perception=1",

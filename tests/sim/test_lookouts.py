@@ -18,7 +18,7 @@ ALWAYS: dict[str, Any] = {"danger_share": 1.0}
 NEVER: dict[str, Any] = {"danger_share": 0.0}
 
 
-@pytest.fixture(params=scenarios.names())
+@pytest.fixture(params=scenarios.witnessed())
 def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 

@@ -75,9 +75,13 @@ def _perceived(scenario: Scenario, looks: Sequence[Look], left_out: Collection[s
 def _announced(
     scenario: Scenario, state: WorldState, viewer: VehicleState, known: Collection[str]
 ) -> Iterator[Detection]:
-    """Yield who else sends beacons, by the last one that the viewer has; nobody without a radio has any."""
+    """Yield who else sends beacons, by the last one that the viewer has; nobody without a radio has any.
+
+    Helpers are among them if they have goals of their own, since only then they may be in the ego's way.
+    """
     for v in state.vehicles:
-        if v.radio and v.id not in known and viewer.part != "other":
+        sends = v.radio or (scenario.seats is not None and v.part == "helper")
+        if sends and v.id not in known and viewer.part != "other":
             beacon = last_heard(state, v.id, viewer.id)
             if beacon or scenario.parameters.perfect_knowledge:
                 at = estimated(v, beacon, state.time_s)

@@ -28,6 +28,11 @@ def names() -> tuple[str, ...]:
     return tuple(sorted({*_files(), *PLUG_INS}))
 
 
+def witnessed() -> tuple[str, ...]:
+    """Return the names of the scenarios here whose layouts have a declared number of witnesses, in order."""
+    return tuple(name for name in sorted(_files()) if "witnesses" in get(name).dials)
+
+
 def get(text: str) -> Scenario:
     """Return a scenario by name, with other settings if given: `occluded-intersection:ambient=fog`.
 
