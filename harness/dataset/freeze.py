@@ -42,7 +42,7 @@ def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
         episodes, worlds = zip(*level, strict=True)
         out_edges, following = edges(worlds, episodes)
         states = [world.state() for world in worlds]
-        records = records_of([
+        records = records_of(scenario, [
             (world, state, episode, (state.ego, *state.helpers))
             for world, state, episode in zip(worlds, states, episodes, strict=True)
         ])  # fmt: skip
@@ -127,22 +127,26 @@ def record_of(world: World, state: WorldState, episode: int, viewers: Sequence[V
 
     Distances to the conflict zone and to the ego are as the ego knows them.
     """
-    [record] = records_of([(world, state, episode, viewers)])
+    [record] = records_of(world.scenario, [(world, state, episode, viewers)])
     return record
 
 
-def records_of(points: Sequence[tuple[World, WorldState, int, Sequence[VehicleState]]]) -> list[Record]:
+def records_of(
+    scenario: Scenario, points: Sequence[tuple[World, WorldState, int, Sequence[VehicleState]]]
+) -> list[Record]:
     """Return the record of some decision points of one scenario."""
     looks = [(state, viewer.id) for _, state, _, viewers in points for viewer in viewers]
-    graphs = iter(scene_graphs(points[0][0].scenario, looks))
+    graphs, zone_m = iter(scene_graphs(scenario, looks)), scenario.road().zone_m
     return [
-        _record(world, state, episode, {viewer.id: next(graphs) for viewer in viewers})
+        _record(world, state, episode, {viewer.id: next(graphs) for viewer in viewers}, zone_m)
         for world, state, episode, viewers in points
     ]
 
 
-def _record(world: World, state: WorldState, episode: int, graphs: dict[str, SceneGraph]) -> Record:
-    zone, (ego_id, *helpers) = world.scenario.road().zone_m, graphs
+def _record(
+    world: World, state: WorldState, episode: int, graphs: dict[str, SceneGraph], zone: tuple[float, float]
+) -> Record:
+    ego_id, *helpers = graphs
     ego = state.vehicle(ego_id)
     known_states = {name: known(state, name, ego_id) for name in graphs}
     return Record(

@@ -51,6 +51,8 @@ class Scene:
     record: Record  # its record in the dataset
     # results computed from it, by name, kept so that they are computed once
     notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    seat: Scenario | None = None  # the scenario of who decides, if that is an agent on a seat
+    agent: int = 0  # its place among the vehicles that answer; the ego is at 0
 
     @property
     def id(self) -> str:
@@ -76,8 +78,22 @@ class Scene:
             raise unknown(f"viewer of scene {printable(self.id, 40)}", name, self.viewers)
         return self.viewers[0] if name is None else name
 
+    def place(self, viewer: int) -> int:
+        """Return the place of a viewer among the vehicles that answer, whoever decides."""
+        if not viewer:
+            return self.agent
+        return viewer if viewer > self.agent else viewer - 1
+
     def changed(self, **fields: Any) -> "Scene":
-        return Scene(structs.replace(self.record, **fields))
+        return Scene(structs.replace(self.record, **fields), seat=self.seat, agent=self.agent)
+
+
+def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Iterator[tuple[Scenario, list[int]]]:
+    """Yield the scenarios of who decides in some scenes, each with the places of its scenes."""
+    places: dict[Scenario, list[int]] = {}
+    for n, scene in enumerate(scenes):
+        places.setdefault(scene.seat or scenario, []).append(n)
+    yield from places.items()
 
 
 class Trees(Sequence[Tree]):

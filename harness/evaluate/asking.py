@@ -51,15 +51,17 @@ def requests(
 
     With `places`, only those of the viewers at these places of each scene, the ego at 0.
     """
-    agents, actions, scenario, words = spec.agents, spec.actions, spec.scenario, spec.scenario.prompt_words
+    agents, actions = spec.agents, spec.actions
     privileged, sees = any(agent.card.privileged for agent in agents), any(agent.sees for agent in agents)
     blank = cache(partial(_blank, spec))
     for scene, asked in zip(scenes, places or repeat(None), strict=False):
+        scenario = spec.scenario_of(scene)
+        words = scenario.prompt_words
         truth = truth_graph(scenario, scene.state) if privileged else None
         for place, viewer in enumerate(spec.viewers(scene)):
             if (blind and not place) or (asked is not None and place not in asked):
                 continue
-            graph, index = scene.graphs[viewer], spec.agent(place)
+            graph, index = scene.graphs[viewer], spec.agent(scene.place(place))
             if blind:
                 graph = graph.blinded()
             agent = agents[index]
@@ -98,15 +100,17 @@ def fusion_request(
     With a `graph`, the ego is asked with this one instead of its own.
     """
     own, heard = scene.graphs[scene.viewers[0]], messages_of(answers, senders, spec.actions)
-    words, image = spec.scenario.prompt_words, picture(spec, 0, scene, scene.viewers[0])
-    blank = _blank(spec, 0, "ego").alike(id=fusion_id(scene, senders), image=image)
+    scenario, index = spec.scenario_of(scene), spec.agent(scene.agent)
+    agent, words = spec.agents[index], scenario.prompt_words
+    image = picture(spec, index, scene, scene.viewers[0])
+    blank = _blank(spec, index, "ego").alike(id=fusion_id(scene, senders), image=image)
     if graph is None:
-        return blank.alike(messages=spec.ego.rendered(own, spec.actions, heard, words))
-    truth = truth_graph(spec.scenario, scene.state) if spec.ego.card.privileged else None
-    blank = blank.alike(view=graph, truth=truth, scenario=spec.scenario)
+        return blank.alike(messages=agent.rendered(own, spec.actions, heard, words))
+    truth = truth_graph(scenario, scene.state) if agent.card.privileged else None
+    blank = blank.alike(view=graph, truth=truth, scenario=scenario)
     if heard:
-        return blank.alike(messages=spec.ego.rendered(graph, spec.actions, heard, words))
-    return blank.alike(**spec.ego.chats(graph, spec.actions, words))
+        return blank.alike(messages=agent.rendered(graph, spec.actions, heard, words))
+    return blank.alike(**agent.chats(graph, spec.actions, words))
 
 
 def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
@@ -262,7 +266,6 @@ class Asker:
 
     def _answered(self, backend: Backend, chunk: Sequence[Request]) -> dict[str, Answer]:
         """Answer each request, and ask what its answer calls for: a repair turn, or the reversed list."""
-        words = self.spec.scenario.prompt_words
         answers = [answer_of(r, c) for r, c in zip(chunk, backend.complete(chunk), strict=True)]
         repairs, flips = {}, {}
         for place, (request, answer) in enumerate(zip(chunk, answers, strict=True)):
@@ -270,6 +273,7 @@ class Asker:
                 flips[place] = flip.asked(request)
             prompt = self.spec.agents[request.agent].prompt
             if repair.wanted(request, answer, prompt):
+                words = (request.scenario or self.spec.scenario).prompt_words
                 repairs[place] = repair.asked(request, answer, prompt, words)
         completions = backend.complete(list(repairs.values())) if repairs else []
         for place, completion in zip(repairs, completions, strict=True):

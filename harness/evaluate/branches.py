@@ -7,7 +7,7 @@ world branches. A branch continues exactly as the undivided world would, to the 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import itemgetter
 
 from harness.coordination.operating_point import OperatingPoint
@@ -17,7 +17,7 @@ from harness.world.world import Target, World
 
 @dataclass
 class Decision:
-    """A decision of the ego, and when it acts."""
+    """A decision of an agent, and when it acts."""
 
     action: str  # the meta-action
     frame: int  # the frame in which it acts
@@ -33,9 +33,9 @@ class Course:
 
     point: OperatingPoint  # the condition
     seed: int  # seed of the channel's draws
-    # the decision that has not acted yet; until it does, the ego keeps to its last action
-    open: Decision | None = None
-    last: Decision | None = None  # the decision that began last
+    # the decision of each agent that has not acted yet; until it does, the agent keeps to its last action
+    open: dict[int, Decision] = field(default_factory=dict)
+    last: dict[int, Decision] = field(default_factory=dict)  # the decision of each that began last
     skipped: int = 0  # how many decisions did not begin, since one was still open when they were due
 
 
@@ -47,38 +47,53 @@ class Trajectory:
     world: World  # the world
     courses: list[Course]  # the episode under each condition and seed
 
+    @property
+    def under_way(self) -> list[int]:
+        """The agents whose journey is not decided."""
+        return [agent for agent, journey in self.world.journeys.items() if not journey.outcome.ended]
+
     def measure(self) -> None:
-        """Add the world's conflicts to the last decision of each course, and begin them anew."""
-        for decision in (course.last for course in self.courses):
-            if decision:
-                decision.ttc_s = min(decision.ttc_s, self.world.journey.conflicts.ttc_s)
-                decision.pet_s = min(decision.pet_s, self.world.journey.conflicts.pet_s)
-        journey = self.world.journey
-        journey.conflicts = journey.conflicts.anew()
+        """Add each agent's conflicts to its last decision in each course, and begin them anew."""
+        for agent, journey in self.world.journeys.items():
+            for decision in (course.last[agent] for course in self.courses if agent in course.last):
+                decision.ttc_s = min(decision.ttc_s, journey.conflicts.ttc_s)
+                decision.pet_s = min(decision.pet_s, journey.conflicts.pet_s)
+            journey.conflicts = journey.conflicts.anew()
 
     def act(self) -> list["Trajectory"]:
-        """Let the decisions that are ready act; return one trajectory for each target the egos then have."""
-        target_now = self.world.target()
-        worlds, courses = {target_now: self.world}, {target_now: list[Course]()}
-        target_of: dict[str, Target] = {}
+        """Let the decisions that are ready act; return one trajectory for each set of targets that follow."""
+        world, agents = self.world, tuple(self.world.journeys)
+        now = tuple(world.target(agent) for agent in agents)
+        courses: dict[tuple[Target, ...], list[Course]] = {now: []}
+        taken: dict[tuple[Target, ...], dict[int, str]] = {}  # the actions by agent that set the targets
+        target_after: dict[tuple[int, str], Target] = {}
         for course in self.courses:
-            ready = course.open
-            if ready is None or ready.frame > self.world.frame:
-                courses[target_now].append(course)
-                continue
-            if ready.action not in target_of:
-                target_of[ready.action] = self.world.target_after(ready.action)
-            courses.setdefault(target_of[ready.action], []).append(course)
-            ready.acted = True
-            course.open = None
-        new = {target: action for action, target in target_of.items() if target != target_now}
-        for n, (target, action) in enumerate(new.items(), 1):
-            nobody_stays = n == len(new) and not courses[target_now]
-            worlds[target] = self.world if nobody_stays else self.world.branch()
-            worlds[target].take(action)
-        return [
-            Trajectory(self.number, worlds[target], parted) for target, parted in courses.items() if parted
-        ]
+            ready = {
+                agent: course.open.pop(agent)
+                for agent, decision in list(course.open.items())
+                if decision.frame <= world.frame
+            }
+            aims = dict(zip(agents, now, strict=True))
+            for agent, decision in ready.items():
+                if world.journeys[agent].outcome.ended:
+                    continue
+                key = agent, decision.action
+                if key not in target_after:
+                    target_after[key] = world.target_after(decision.action, agent)
+                aims[agent], decision.acted = target_after[key], True
+            following = tuple(aims.values())
+            courses.setdefault(following, []).append(course)
+            taken.setdefault(following, {agent: decision.action for agent, decision in ready.items()})
+        parts = []
+        waiting = [targets for targets, of in courses.items() if targets != now and of]
+        for n, targets in enumerate(waiting, 1):
+            nobody_stays = n == len(waiting) and not courses[now]
+            branched = world if nobody_stays else world.branch()
+            for agent, before, after in zip(agents, now, targets, strict=True):
+                if after != before:
+                    branched.take(taken[targets][agent], agent)
+            parts.append(Trajectory(self.number, branched, courses[targets]))
+        return [Trajectory(self.number, world, courses[now]), *parts] if courses[now] else parts
 
 
 def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajectory]:
@@ -90,12 +105,13 @@ def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajec
     arrived = []
     while running:
         frames = [
-            min((c.open.frame for c in t.courses if c.open), default=until_frame + 1) for _, t in running
+            min((d.frame for c in t.courses for d in c.open.values()), default=until_frame + 1)
+            for _, t in running
         ]
         lockstep.advance([t.world for _, t in running], [min(frame, until_frame) for frame in frames])
         branched = []
         for (order, trajectory), frame in zip(running, frames, strict=True):
-            if trajectory.world.outcome.ended or frame > until_frame:
+            if trajectory.world.ended or frame > until_frame:
                 arrived.append((order, trajectory))
             else:
                 branched += [((*order, -n), part) for n, part in enumerate(trajectory.act())]

@@ -33,6 +33,9 @@ from harness.world.parameters import frames
 from harness.world.scenario import Scenario
 from harness.world.world import World
 
+# Added, where draws are keyed, to the numbers of episode and layout, once for each place after the ego's.
+OF_ANOTHER_AGENT = 1 << 40
+
 
 @dataclass(frozen=True)
 class LiveSource:
@@ -91,7 +94,7 @@ class LiveSource:
         for number in self.numbers[:most]:
             trajectory = Trajectory(number, World.start(self.scenario, self.first_seed + number), [])
             trajectory.world.advance(round(number * p.decision_period_s * p.simulation_hz / 2))
-            yield look(trajectory, 0, ego_alone)
+            yield look(trajectory.world, 0, number, 0, ego_alone)
 
 
 class LiveWorld(SceneWorld):
@@ -119,12 +122,14 @@ class LiveWorld(SceneWorld):
 
     def observe(self) -> Sequence[Scene]:
         while self._going and self._step < self._p.decisions:
-            for trajectory in self._going:
+            due = [(t, agent) for t in self._going for agent in t.under_way]
+            for trajectory, agent in due:
                 for course in trajectory.courses:
-                    course.skipped += course.open is not None
-            self._deciding = [t for t in self._going if any(c.open is None for c in t.courses)]
+                    course.skipped += agent in course.open
+            self._deciding = [(t, agent) for t, agent in due if any(agent not in c.open for c in t.courses)]
             if self._deciding:
-                self.scenes = looks(self._deciding, self._step, self._ego_alone)
+                points = [(t.world, agent, t.number) for t, agent in self._deciding]
+                self.scenes = looks(points, self._step, self._ego_alone)
                 return self.scenes
             self._advance()
         return ()
@@ -133,7 +138,8 @@ class LiveWorld(SceneWorld):
         places = self._places(point)
         at = np.array([n for n, _ in places], dtype=int)
         seed = np.array([course.seed for _, course in places], dtype=int)
-        episode = np.array([trajectory.number for trajectory in self._deciding])[at]
+        number = np.array([t.number + agent * OF_ANOTHER_AGENT for t, agent in self._deciding])
+        episode = number[at]
         helpers = max(len(scene.viewers) for scene in self.scenes) - 1
         step = np.full(len(at), self._step)
         draws = channel_draws(seed, self._first_seed + episode, step, self._p.decisions, helpers)
@@ -144,17 +150,18 @@ class LiveWorld(SceneWorld):
         due_frame = self._p.due_frame(self._step)
         for part in decided:
             latencies_s, chosen = part.result.latency_s.tolist(), part.result.action.tolist()
-            for (_, course), latency_s, action in zip(
+            for (n, course), latency_s, action in zip(
                 self._places(part.point), latencies_s, chosen, strict=True
             ):
-                course.open = course.last = Decision(actions[action], due_frame + frames(latency_s, hz))
-                self._decisions.append(course.open)
+                decision = Decision(actions[action], due_frame + frames(latency_s, hz))
+                course.open[self._deciding[n][1]] = course.last[self._deciding[n][1]] = decision
+                self._decisions.append(decision)
         self._advance()
 
     def _places(self, point: OperatingPoint) -> list[tuple[int, Course]]:
         return [
-            (n, course) for n, trajectory in enumerate(self._deciding) for course in trajectory.courses
-            if course.open is None and course.point is point
+            (n, course) for n, (trajectory, agent) in enumerate(self._deciding)
+            for course in trajectory.courses if agent not in course.open and course.point is point
         ]  # fmt: skip
 
     def _advance(self) -> None:
@@ -162,8 +169,8 @@ class LiveWorld(SceneWorld):
         parts = branches.advance(self._going, self._p.due_frame(self._step))
         for part in parts:
             part.measure()
-        self._ended += [part for part in parts if part.world.outcome.ended]
-        self._going = [part for part in parts if not part.world.outcome.ended]
+        self._ended += [part for part in parts if part.world.ended]
+        self._going = [part for part in parts if not part.world.ended]
 
     def columns(self) -> dict[str, Any]:
         """Return when each decision acts, whether it did, and conflicts, in the order of decisions."""
@@ -183,20 +190,30 @@ class LiveWorld(SceneWorld):
         return [_episode(t, course, references.get(t.number)) for t in self._ended for course in t.courses]
 
 
-def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
-    """Return a trajectory's decision point at this frame."""
-    [scene] = looks([trajectory], step, ego_alone)
+def look(world: World, agent: int, number: int, step: int, ego_alone: bool) -> Scene:
+    """Return an agent's decision point in the world of an episode with this number."""
+    [scene] = looks([(world, agent, number)], step, ego_alone)
     return scene
 
 
-def looks(trajectories: Sequence[Trajectory], step: int, ego_alone: bool) -> list[Scene]:
-    """Return the decision point of each trajectory at this frame."""
-    states = [structs.replace(t.world.state(), step=step) for t in trajectories]
-    points = [
-        (t.world, state, t.number, [state.ego] if ego_alone else [state.ego, *state.helpers])
-        for t, state in zip(trajectories, states, strict=True)
-    ]
-    return list(map(Scene, records_of(points)))
+def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) -> list[Scene]:
+    """Return the decision point of each agent in its world, of an episode with this number, at this step."""
+    views: dict[Scenario, list[int]] = {}
+    states = [structs.replace(world.state(agent), step=step) for world, agent, _ in points]
+    seats = [world.seat(agent) if agent else None for world, agent, _ in points]
+    for n, seat in enumerate(seats):
+        views.setdefault(seat or points[n][0].scenario, []).append(n)
+    scenes = dict[int, Scene]()
+    for scenario, places in views.items():
+        seen = [
+            (points[n][0], states[n], points[n][2],
+             [states[n].ego] if ego_alone else [states[n].ego, *states[n].helpers])
+            for n in places
+        ]  # fmt: skip
+        for n, record in zip(places, records_of(scenario, seen), strict=True):
+            world, agent, _ = points[n]
+            scenes[n] = Scene(record, seat=seats[n], agent=world.answering.index(agent) if agent else 0)
+    return [scenes[n] for n in range(len(points))]
 
 
 def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) -> Episode:

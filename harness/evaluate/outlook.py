@@ -7,24 +7,29 @@ from msgspec.structs import replace
 
 from harness.coordination.scheduling import Outlook
 from harness.core.arrays import Bools, Floats
-from harness.dataset.load import Scene
+from harness.dataset.load import Scene, by_seat
 from harness.world.beacons import known
 from harness.world.perception.rays import blocked_by
 from harness.world.road import Road
+from harness.world.scenario import Scenario
 from harness.world.scene_graph import Node
 from harness.world.state import VehicleState, WorldState
 
 MOVING_MPS = 0.1  # a slower vehicle counts as standing
 
 
-def outlook(road: Road, scenes: Sequence[Scene]) -> Outlook:
-    """Return the outlook of each scene, (n, ...)."""
+def outlook(scenario: Scenario, scenes: Sequence[Scene]) -> Outlook:
+    """Return the outlook of each scene, (n, ...); a road with fewer sectors than others sees the rest."""
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
-    unseen, to_zone_s = np.zeros((n, len(road.sectors))), np.zeros(n)
-    added = np.full((n, helpers, len(road.sectors)), np.nan)
-    for i, scene in enumerate(scenes):
-        seen = _outlook(road, scene)
-        unseen[i], added[i, : len(seen.added)], to_zone_s[i] = seen.unseen, seen.added, seen.to_zone_s
+    roads = [(seat.road(), places) for seat, places in by_seat(scenes, scenario)]
+    most = max((len(road.sectors) for road, _ in roads), default=0)
+    unseen, to_zone_s = np.zeros((n, most)), np.zeros(n)
+    added = np.full((n, helpers, most), np.nan)
+    for road, places in roads:
+        for i in places:
+            seen, sectors = _outlook(road, scenes[i]), len(road.sectors)
+            unseen[i, :sectors], to_zone_s[i] = seen.unseen, seen.to_zone_s
+            added[i, : len(seen.added), :sectors] = seen.added
     return Outlook(unseen, added, to_zone_s)
 
 

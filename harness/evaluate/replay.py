@@ -10,7 +10,6 @@ import numpy as np
 from harness.backends.registry import capabilities
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
-from harness.evaluate.branches import Trajectory
 from harness.evaluate.live_world import look
 from harness.runs.folder import Run, read
 from harness.runs.records import ClosedLoop, Decision, Manifest
@@ -103,7 +102,7 @@ def scene_of(run: Run, name: str) -> Scene:
             world.take(action)
     world.advance(due_frame)
     alone = not capabilities(run.manifest.model["engine"]).asks_helpers
-    return look(Trajectory(decision.episode, world, []), decision.step, alone)
+    return look(world, 0, decision.episode, decision.step, alone)
 
 
 def _due_frame(decision: Decision, p: Parameters) -> int:

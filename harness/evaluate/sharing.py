@@ -10,7 +10,7 @@ from harness.coordination.contents import OBJECTS, TRUTH
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
-from harness.dataset.load import Scene
+from harness.dataset.load import Scene, by_seat
 from harness.evaluate.fusion import changes_of, source_of
 from harness.runs.records import BLIND, REWRITTEN, Answer
 from harness.world.perception.graph import truth_graphs
@@ -27,6 +27,16 @@ def shared_graphs(
     None where their messages hold no objects. All sets have messages of one content; `scenes` has the scenes
     that these come from, by id.
     """
+    graphs: list[SceneGraph | None] = [None] * len(sets)
+    for seat, places in by_seat([scene for scene, _ in sets], scenario):
+        for n, graph in zip(places, _shared_graphs(seat, [sets[n] for n in places], scenes), strict=True):
+            graphs[n] = graph
+    return graphs
+
+
+def _shared_graphs(
+    scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]], scenes: Mapping[str, Scene]
+) -> Sequence[SceneGraph | None]:
     changes = {change for _, senders in sets for key in senders for change in changes_of(key)}
     if TRUTH in changes:
         truths = truth_graphs(scenario, [scene.state for scene, _ in sets])

@@ -307,8 +307,12 @@ class Spec:
         """The agents' cards; the served model's has the servers that were given."""
         return tuple(agent.card.at(self.servers) for agent in self.agents)
 
+    def scenario_of(self, scene: Scene) -> Scenario:
+        """Return the scenario of who decides in a scene."""
+        return scene.seat or self.scenario
+
     def agent(self, place: int) -> int:
-        """Return the index of the agent of the viewer at this place of a scene; the ego is at 0."""
+        """Return the index of the agent of the vehicle at this place (`Scene.place`); the ego is at 0."""
         return 1 + (place - 1) % len(self.helpers) if place and self.helpers else 0
 
     @property

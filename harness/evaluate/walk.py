@@ -103,7 +103,7 @@ class SceneWorld:
         return site(decision_points, units, self.scenario.road().zone_m)
 
     def outlook(self) -> Outlook:
-        return outlook(self.scenario.road(), self.scenes)
+        return outlook(self.scenario, self.scenes)
 
     def claims(self) -> Claims:
         return claims(self.scenario, self.scenes)

@@ -170,7 +170,7 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
     dataset, forest = stored.dataset, stored.dataset.forest
     scenario, shape = dataset.scenario, (len(seeds), len(at))
     scenes = dataset.scenes([forest.ids[n] for n in at.tolist()])
-    intents = replace(stored.whole(scenes), outlook=outlook(scenario.road(), scenes))
+    intents = replace(stored.whole(scenes), outlook=outlook(scenario, scenes))
     if point.physical:
         places = [(scene.state, scene.viewers) for scene in scenes]
         units = [point.unit] if point.unit else []

@@ -228,7 +228,7 @@ class World:
     def _broadcast(self, poses: Floats, first_frame: int) -> None:
         """Add the beacons of who has a radio in some frames, whose poses are (F, V, 4)."""
         p, target_mps = self.scenario.parameters, float(self.vehicles[0].target_speed)
-        radios = [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"]
+        radios = self.answering
         ids = [self.vehicles[n].spawn.id for n in radios]
         announce, sent = [n for n, v in enumerate(self.vehicles) if v.spawn.radio], tuple[Beacon, ...]()
         if len(self.journeys) > 1:  # everybody with a radio hears everybody
@@ -257,6 +257,16 @@ class World:
             return {}
         blamed = fault(mine, partner, self.scenario.road().paths)
         return {"partner": partner.id, "striker": striker(mine, partner), "fault": blamed}
+
+    def seat(self, agent: int) -> Scenario:
+        """Return the scenario as it is for an agent."""
+        spawn = self.vehicles[agent].spawn
+        return seats_of(self.scenario)[spawn.approach, spawn.route].scenario if agent else self.scenario
+
+    @property
+    def answering(self) -> list[int]:
+        """Places of the vehicles that answer questions: the ego, its helpers, and agents."""
+        return [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"]
 
     def _cleared(self, agent: int) -> bool:
         """Return whether an agent has reached its goal."""

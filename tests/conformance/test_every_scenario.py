@@ -14,7 +14,6 @@ from tiers import QUICK
 from harness.coordination.consensus import Messages, inverse_distance_weights
 from harness.coordination.trust import Trust
 from harness.dataset.load import Scene
-from harness.evaluate.branches import Trajectory
 from harness.evaluate.claims import claims
 from harness.evaluate.live_world import look
 from harness.world import scenarios
@@ -124,10 +123,10 @@ def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenar
     """All that could speak against a helper is what it claims: everybody is undecided."""
     rule = Trust()
     for seed in SEEDS:
-        trajectory, moments = Trajectory(seed, World.start(scenario, seed), []), list[Scene]()
-        while len(moments) < scenario.parameters.decisions and not trajectory.world.outcome.ended:
-            moments.append(look(trajectory, len(moments), ego_alone=False))
-            trajectory.world.act(scenario.actions[0])
+        world, moments = World.start(scenario, seed), list[Scene]()
+        while len(moments) < scenario.parameters.decisions and not world.outcome.ended:
+            moments.append(look(world, 0, seed, len(moments), ego_alone=False))
+            world.act(scenario.actions[0])
         said = claims(scenario, moments)
         state = rule.start((), said.speed_mps.shape[1], len(scenario.actions))
         for n, scene in enumerate(moments):

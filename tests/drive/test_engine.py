@@ -75,7 +75,7 @@ def test_braking_three_frames_later_is_42_centimetres_further():
     assert (frames(0.145, 50), frames(0.219, 50), frames(0.14, 50), frames(0.0, 50)) == (8, 11, 7, 0)
     south_m = []
     for latency_s in (0.145, 0.219):
-        course = Course(ALONE, 0, Decision("SLOWER", 50 + frames(latency_s, 50)))
+        course = Course(ALONE, 0, {0: Decision("SLOWER", 50 + frames(latency_s, 50))})
         [one] = advance([Trajectory(0, World.start(SCENARIO, NO_DANGER), [course])], 250)
         assert one.world.state().ego.speed_mps == pytest.approx(7.0, abs=0.02)
         south_m.append(one.world.state().ego.y_m)
@@ -84,7 +84,7 @@ def test_braking_three_frames_later_is_42_centimetres_further():
 
 def test_a_decision_acts_in_its_frame_and_not_before():
     still, braking = World.start(SCENARIO, NO_DANGER), Trajectory(
-        0, World.start(SCENARIO, NO_DANGER), [Course(ALONE, 0, Decision("SLOWER", 8))]
+        0, World.start(SCENARIO, NO_DANGER), [Course(ALONE, 0, {0: Decision("SLOWER", 8)})]
     )  # fmt: skip
     still.advance(8)
     advance([braking], 8)

@@ -101,14 +101,14 @@ def test_what_the_oracle_cannot_bound_is_refused(stored: ReplayedRun, text: str,
 def test_the_ego_knows_of_regions_what_its_graph_says(small: Dataset):
     """And a helper adds no more than the ego lacks."""
     scenes = small.scenes(small.courses())
-    seen = outlook(small.scenario.road(), scenes)
+    seen = outlook(small.scenario, scenes)
     for n, scene in enumerate(scenes):
         graph = scene.graphs[scene.viewers[0]]
         shares = [1 - sector.seen_share for sector in graph.sectors]
         assert seen.unseen[n] == pytest.approx(shares, abs=0.0051)
         assert (np.nan_to_num(seen.added[n]) <= seen.unseen[n] + 1e-9).all()
     assert (seen.added[~np.isnan(seen.added)] > 0.1).any()
-    again = outlook(small.scenario.road(), scenes[3:4])
+    again = outlook(small.scenario, scenes[3:4])
     assert np.array_equal(again.added[0], seen.added[3], equal_nan=True)
 
 
