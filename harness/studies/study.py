@@ -166,6 +166,9 @@ class Cells:
             except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
                 continue
 
+    def __contains__(self, key: Sequence[Any]) -> bool:
+        return tuple(key) in self._cells
+
     def part(self, key: Sequence[Any], compute: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
         """Return a part as it was kept, to the last bit, or else compute it and keep it.
 

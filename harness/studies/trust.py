@@ -133,10 +133,8 @@ def shares_of(text: str) -> tuple[float, ...]:
     return tuple(dict.fromkeys(share for share in shares if share))
 
 
-def play(run: ReplayedRun, point: OperatingPoint, seeds: Sequence[int], key: Key) -> Cell:
-    """Play one cell: a rule, an attack and a share."""
-    setting = Setting(point.name, under(point, *key), run.vehicles)
-    [[result]] = run.walked([setting], seeds, partial(_judged, run))
+def cell_of(key: Key, result: WalkResult) -> Cell:
+    """Return a cell from its walk, whose columns are those of `_judged`."""
     success = result.ends[SUCCESS]
     nats = mean_by_place(result.columns["nats"], result.places, success.size).reshape(success.shape)
     nats[np.isnan(success)] = np.nan  # left out
@@ -149,7 +147,8 @@ def _judged(run: ReplayedRun, part: Decided[Scene]) -> dict[str, Floats]:
     `suspected` is NaN where nobody was heard or the rule judges nobody.
     """
     forest, trust = run.dataset.forest, part.result.trust
-    at = np.array([forest.place[scene.id] for scene in part.decision_points])[part.due.at]
+    scenes, of_scene = np.unique(part.due.at, return_inverse=True)
+    at = np.array([forest.place[part.decision_points[n].id] for n in scenes])[of_scene]
     return {
         "nats": negative_log_likelihood(part.result.fused, forest.safe[at]),
         "suspected": np.where(np.isnan(trust), np.nan, trust < TRUSTED),
@@ -270,11 +269,11 @@ def run_bench(
     if unfused and set(rules) - {BASE}:
         raise UserError(f"--rules {','.join(rules)}: no rule changes anything: {unfused}; leave it out")
     every_rule = dict.fromkeys([BASE, *(rules or (() if unfused else (*RULES, CAPPED)))])
-    every: list[Key] = [
+    every: list[Key] = list(dict.fromkeys([
         *((rule, PEACE, 0.0) for rule in every_rule),
         *((BASE, EXCLUDED, share) for share in shares),
         *product(every_rule, attacks, shares),
-    ]
+    ]))  # fmt: skip
     for key in every:
         under(point, *key)  # which checks that they go together
     refuse_other(
@@ -286,10 +285,14 @@ def run_bench(
     ]  # fmt: skip
     kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[Key, Cell]()
 
+    missing = [key for key in every if key not in kept]
+    settings = [Setting(point.name, under(point, *key), run.vehicles) for key in missing]
+    walks = run.walked(settings, seeds, partial(_judged, run))
+
     def compute(key: Key) -> dict[str, Any]:
-        cell = play(run, point, seeds, key)
+        [result] = next(walks)  # the cells that are missing are walked together
         run.settle()
-        return vars(cell)
+        return vars(cell_of(key, result))
 
     progress.more(len(every))
     for key in every:

@@ -92,13 +92,13 @@ def test_finished_cells_are_kept_and_a_torn_one_is_played_again(
     assert len(lines) == len(first.cells)
     kept.write_bytes(b"".join(lines[:4]) + lines[4][:50])
     again: list[tuple[str, str, float]] = []
-    real = trust.play
+    real = trust.cell_of
 
-    def counting(stored: Any, point: Any, seeds: Any, of: Any) -> Any:
+    def counting(of: Any, result: Any) -> Any:
         again.append(of)
-        return real(stored, point, seeds, of)
+        return real(of, result)
 
-    monkeypatch.setattr(trust, "play", counting)
+    monkeypatch.setattr(trust, "cell_of", counting)
     second = played(done, tmp_path)
     assert len(again) == len(lines) - 4
     for of, cell in first.cells.items():
