@@ -64,14 +64,18 @@ def _claims(road: Road, scene: Scene) -> tuple[Floats, Floats, Floats]:
 def _map(scenario: Scenario) -> Callable[[Floats], Floats]:
     """Return the function from places (..., 2) to metres to the nearest path.
 
-    Places are relative to the centroid of the conflict zone.
+    Places are relative to the centroid of the conflict zone. An absent vehicle, at NaN, is infinitely far.
     """
     road = scenario.road()
     paths = shapely.MultiLineString([path.points - road.zone_m for path in road.paths.values()])
-    paths = paths.simplify(NEGLIGIBLE_M)
+    lines = (shapely.get_coordinates(line) for line in paths.simplify(NEGLIGIBLE_M).geoms)
+    segments = [np.stack([line[:-1], line[1:]], axis=1) for line in lines]
+    tree = shapely.STRtree(shapely.linestrings(np.concatenate(segments)))
 
     def from_road_m(xy_m: Floats) -> Floats:
-        with np.errstate(invalid="ignore"):  # a vehicle that is absent has a NaN place
-            return np.asarray(shapely.distance(shapely.points(xy_m), paths))
+        metres, there = np.full(xy_m.shape[:-1], np.inf), ~np.isnan(xy_m).any(axis=-1)
+        places = shapely.points(xy_m[there])
+        _, metres[there] = tree.query_nearest(places, return_distance=True, all_matches=False)
+        return metres
 
     return from_road_m
