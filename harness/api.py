@@ -54,9 +54,9 @@ class Run(Tables):
             check_scenes(self.source, dataset, [scene])
             seen = dataset.scene(scene)
         else:
-            from harness.evaluate.replay import scene_of
+            from harness.evaluate.replay import scenes_of
 
-            seen = scene_of(self.source, scene)
+            [seen] = scenes_of(self.source, [scene])
             if seen.id != scene:
                 raise UserError(f"decision point {printable(scene)} comes out otherwise in this simulator")
         seen.viewer(viewer)  # refuses a name that nobody has

@@ -33,7 +33,7 @@ def test_an_old_driven_run_is_replayed_in_its_own_scenes(commit: str) -> None:
     played = replay.find(run.path, 0, None, None)
     assert played.scenario.parameters == former.SCENARIO.parameters
     name = max(run.decisions.scenes)
-    assert replay.scene_of(run, name).id == name
+    assert replay.scenes_of(run, [name])[0].id == name
     *_, last = replay.stills(replay.find(run.path, 0, "single-local", 0))
     [row] = [e for e in run.episodes if (e.episode, e.condition, e.seed) == (0, "single-local", 0)]
     assert last.outcome.startswith(f"{row.failure or 'cleared'} at {row.time_s:.1f} s")

@@ -1,8 +1,9 @@
 """Replay a closed-loop episode from its record: equal actions in equal frames give an equal world."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,16 @@ import numpy as np
 from harness.backends.registry import capabilities
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
-from harness.evaluate.live_world import look
+from harness.evaluate.live_world import looks
 from harness.runs.folder import Run, read
 from harness.runs.records import ClosedLoop, Decision, Manifest
-from harness.world import scenarios
+from harness.world import lockstep, scenarios
 from harness.world.parameters import Parameters
 from harness.world.scenario import Scenario
 from harness.world.state import WorldState
 from harness.world.world import World
 
+AT_ONCE = 128  # decision points that are replayed together, which bounds memory
 STILLS_HZ = 10  # while no decision is open
 
 
@@ -86,23 +88,40 @@ def played(run: Run, episode: int, condition: str, seed: int) -> ReplayedEpisode
     return ReplayedEpisode(run.manifest, condition, seed, episode, world.first_seed + episode, decisions)
 
 
-def scene_of(run: Run, name: str) -> Scene:
-    """Return a decision point's scene, by replaying one of the episodes that reach it.
+def scenes_of(run: Run, names: Sequence[str]) -> list[Scene]:
+    """Return decision points' scenes, by replaying together one of the episodes that reach each.
 
-    The scene's id equals the decision point's only if this simulator behaves as the run's did.
+    A scene's id equals its decision point's only if this simulator behaves as the run's did.
     """
-    rows = run.decisions.scenes[name]
-    [decision] = run.decisions.records(rows.start, rows.start + 1)
-    episode = played(run, decision.episode, decision.condition, decision.seed)
-    due_frame = _due_frame(decision, episode.scenario.parameters)
-    world = World.start(episode.scenario, episode.layout_seed)
-    for frame, action in _actions_by_frame(episode).items():
-        if frame <= due_frame:
-            world.advance(frame)
+    return [
+        scene for at in range(0, len(names), AT_ONCE) for scene in _together(run, names[at : at + AT_ONCE])
+    ]
+
+
+def _together(run: Run, names: Sequence[str]) -> list[Scene]:
+    starts = [run.decisions.scenes[name].start for name in names]
+    decisions = [run.decisions.records(start, start + 1)[0] for start in starts]
+    episodes = [played(run, d.episode, d.condition, d.seed) for d in decisions]
+    scenario = episodes[0].scenario
+    worlds = [World.start(scenario, episode.layout_seed) for episode in episodes]
+    due_frames = [_due_frame(decision, scenario.parameters) for decision in decisions]
+    acts = [
+        [(frame, action) for frame, action in _actions_by_frame(episode).items() if frame <= due_frame]
+        for episode, due_frame in zip(episodes, due_frames, strict=True)
+    ]
+    for turn in zip_longest(*acts):  # each world's next action, or None
+        acting = [(world, *act) for world, act in zip(worlds, turn, strict=True) if act]
+        lockstep.advance([world for world, _, _ in acting], [frame for _, frame, _ in acting])
+        for world, _, action in acting:
             world.take(action)
-    world.advance(due_frame)
+    lockstep.advance(worlds, due_frames)
     alone = not capabilities(run.manifest.model["engine"]).asks_helpers
-    return look(world, 0, decision.episode, decision.step, alone)
+    scenes = dict[int, Scene]()
+    for step in {decision.step for decision in decisions}:
+        at = [n for n, decision in enumerate(decisions) if decision.step == step]
+        points = [(worlds[n], 0, decisions[n].episode) for n in at]
+        scenes |= zip(at, looks(points, step, alone), strict=True)
+    return [scenes[n] for n in range(len(names))]
 
 
 def _due_frame(decision: Decision, p: Parameters) -> int:

@@ -62,7 +62,7 @@ class Decisions:
             for run, of in zip(self._runs.runs, failed, strict=True)
             for scene in (run.decisions.scenes if self._full else pick(run, of, REPLAYED))
         )
-        scenes = {name: scene for name in telling if (scene := replayed(self._runs, name))}
+        scenes = replayed(self._runs, list(telling))
         self._not_replayed = len(telling) - len(scenes)
         return scenes
 
@@ -123,24 +123,30 @@ class Decisions:
         return [Part(self._details, self.ids[at : at + AT_ONCE]) for at in range(0, len(self.ids), AT_ONCE)]
 
 
-def replayed(runs: Runs, name: str) -> Scene | None:
-    """Return a decision point of closed-loop runs, played again; None where this simulator ends elsewhere."""
-    from harness.evaluate.replay import scene_of  # loads the simulator
+def replayed(runs: Runs, names: Sequence[str]) -> dict[str, Scene]:
+    """Return decision points of closed-loop runs, played again; those are missing that end elsewhere here."""
+    from harness.evaluate.replay import scenes_of  # loads the simulator
 
-    # A run without helpers, such as a driver's, has fewer viewers.
-    here = [run for run in runs.runs if name in run.decisions.scenes]
-    scene = scene_of(max(here, key=lambda run: run.decisions.helpers), name)
-    return scene if scene.id == name else None
+    of_run: dict[int, list[str]] = {}
+    for name in names:
+        here = [n for n, run in enumerate(runs.runs) if name in run.decisions.scenes]
+        # A run without helpers, such as a driver's, has fewer viewers.
+        of_run.setdefault(max(here, key=lambda n: runs.runs[n].decisions.helpers), []).append(name)
+    scenes = {
+        name: scene
+        for n, mine in of_run.items()
+        for name, scene in zip(mine, scenes_of(runs.runs[n], mine), strict=True)
+        if scene.id == name
+    }
+    return {name: scenes[name] for name in names if name in scenes}
 
 
 def everything(runs: Runs, name: str) -> dict[str, Any]:
     """Return what a full page has of one decision point. Raises UserError if no run has it."""
     if not any(name in run.decisions.scenes for run in runs.runs):
         raise UserError(f"no run here has a decision {printable(name, 40)}; see the list on its page")
-    scene = replayed(runs, name) if runs.live else None
-    details = Details(
-        runs.of_scenes([name]), {name: scene} if scene else {}, frozenset([name]), prompts_of, True
-    )
+    scenes = replayed(runs, [name]) if runs.live else {}
+    details = Details(runs.of_scenes([name]), scenes, frozenset([name]), prompts_of, True)
     [[detail]] = details.blocks([name])
     return detail
 

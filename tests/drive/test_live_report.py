@@ -14,7 +14,7 @@ from run_on_disk import change, rows_of
 
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
-from harness.evaluate.replay import find, scene_of
+from harness.evaluate.replay import find, scenes_of
 from harness.prompts import versions as prompts
 from harness.report.compare.pair import pair
 from harness.report.decisions import failures, pick
@@ -55,7 +55,8 @@ def page(text):
 def test_every_moment_played_again_is_the_moment_that_was_asked(driven):
     found = read(driven)
     assert found.decisions.scenes
-    assert all(scene_of(found, scene).id == scene for scene in found.decisions.scenes)
+    names = list(found.decisions.scenes)
+    assert [scene.id for scene in scenes_of(found, names)] == names
 
 
 @pytest.mark.slow
@@ -73,7 +74,7 @@ def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
     found = read(tmp_path / "run")
     assert isinstance(found.manifest.world, ClosedLoop)
     assert found.manifest.world.scenario["parameters"]["perfect_knowledge"] is True
-    scenes = [scene_of(found, scene) for scene in found.decisions.scenes]
+    scenes = scenes_of(found, list(found.decisions.scenes))
     assert [scene.id for scene in scenes] == list(found.decisions.scenes)
     assert all(scene.record.state.beacons == () for scene in scenes)
     run(spec, tmp_path / "beacons")
@@ -89,12 +90,12 @@ def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
         driven, tmp_path, "run.json", lambda text: text.replace('"time_limit_s": 10.0', '"time_limit_s": 0.5')
     )
     assert find(earlier, 0, None, None).scenario.parameters.time_limit_s == 0.5
-    assert scene_of(read(earlier), scene).id == scene
+    assert [replayed.id for replayed in scenes_of(read(earlier), [scene])] == [scene]
     gone = edited(
         driven, tmp_path / "gone", "run.json", lambda text: text.replace('"time_limit_s"', '"patience_s"')
     )
     with pytest.raises(UserError, match="scenario occluded-intersection has other parameters here"):
-        scene_of(read(gone), scene)
+        scenes_of(read(gone), [scene])
 
 
 @pytest.mark.slow
@@ -106,7 +107,7 @@ def test_the_cameras_of_a_run_see_by_the_light_that_it_was_driven_in(tmp_path):
     every = details(written(tmp_path / "run"))
     assert list(every) == list(found.decisions.scenes)
     for scene, detail in every.items():
-        replayed = scene_of(found, scene)
+        [replayed] = scenes_of(found, [scene])
         assert detail["cameras"] == plain(cameras(scenarios.get(name), replayed))
         assert detail["cameras"] != plain(cameras(SCENARIO, replayed))
 
@@ -192,7 +193,7 @@ def test_prompts_are_the_very_ones_that_were_sent(driven, text):
     assert all(found.values())
     run = read(driven)
     [scene] = {row["scene"] for row in rows_of(driven) if (row["episode"], row["step"]) == (0, 0)}
-    sent = V2.render(scene_of(run, scene).graphs["v1"], run.actions, [])
+    sent = V2.render(scenes_of(run, [scene])[0].graphs["v1"], run.actions, [])
     assert found[scene, "v1"] == [dict(message) for message in sent]
 
 
