@@ -1,12 +1,12 @@
 """highway-env's four-way intersection as a road, for an ego that goes straight over it.
 
-The ego comes from the south and goes north, so for it "left" is the west arm, "right" the east arm and
-"oncoming" the north arm. Lane width and radii are those of highway-env 1.12's `IntersectionEnv`; a test holds
-them against its road network.
+An ego from the south goes north, so for it "left" is the west arm, "right" the east arm and "oncoming" the
+north arm. For one from another arm these names are turned; lanes and coordinates stay. Lane width and radii
+are those of highway-env 1.12's `IntersectionEnv`; a test holds them against its road network.
 """
 
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,19 +19,22 @@ ARM_M = 100.0  # length of an approach or exit lane
 LEFT_TURN_RADIUS_M = 13.0
 SECTOR_REACH_M = (8.0, 50.0)  # stretch of the approach lane, from the conflict point, that is looked at
 
-APPROACHES = ("own", "left", "oncoming", "right")  # south, west, north, east: highway-env's nodes o0..o3
+# South, west, north, east: highway-env's nodes o0..o3. An arm is a number in this order.
+APPROACHES = ("own", "left", "oncoming", "right")
 SECTORS = ("left", "right", "oncoming")  # where danger can come from
 ROUTES = ("straight", "left")
 EXITS = ("exit-own", "exit-left", "exit-ahead", "exit-right")
-# Right of way of highway-env's intersection: the crossing road before the ego's, straight before left.
-PRIORITY = {"left": {"straight": 3, "left": 2}, "right": {"straight": 3, "left": 2},
-            "own": {"straight": 1, "left": 0}, "oncoming": {"straight": 1, "left": 0}}  # fmt: skip
+# Right of way of highway-env's intersection: the road from west to east first, straight before left.
+PRIORITY = {"straight": (1, 3), "left": (0, 2)}
 
 
 @cache
-def road() -> Road:
-    """Return the intersection. Its conflict zone is the centroid of the conflict points of three dangers."""
-    ways, ego = paths(), ("own", "straight")
+def road(arm: int = 0, form: Literal[1, 2] = 1) -> Road:
+    """Return the intersection for an ego from an arm.
+
+    Its conflict zone is the centroid of the conflict points of three dangers.
+    """
+    ways, ego = paths(arm), ("own", "straight")
     # A path that merges into the ego's lane brings no danger here.
     meetings = {key: at for key, at in crossings(ways, ego).items() if at.kind == "crossing"}
     points = [meetings[key] for key in (("left", "straight"), ("right", "straight"), ("oncoming", "left"))]
@@ -49,15 +52,16 @@ def road() -> Road:
         sectors={sector: _approach(ways[sector, "straight"]) for sector in SECTORS},
         network=network,
         ground=ground,
-        form=1,
+        form=form,
     )
 
 
 @cache
-def paths() -> dict[PathKey, Path]:
-    """Return every path by (approach, route)."""
+def paths(arm: int = 0) -> dict[PathKey, Path]:
+    """Return every path by (approach, route), as an ego from an arm names them."""
     built = {}
-    for corner, approach in enumerate(APPROACHES):
+    for corner in range(len(APPROACHES)):
+        approach = seen_from(arm, corner)
         turn = np.pi / 2 * corner
         rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).round(12)
         for route in ROUTES:
@@ -65,7 +69,7 @@ def paths() -> dict[PathKey, Path]:
             arc = np.concatenate([[0.0], np.hypot(*np.diff(points, axis=0).T).cumsum()])
             inside = 2 * JUNCTION_M if route == "straight" else LEFT_TURN_RADIUS_M * np.pi / 2
             end = (corner + (2 if route == "straight" else 1)) % 4
-            roles = (f"approach-{approach}", "junction", EXITS[end])
+            roles = (f"approach-{approach}", "junction", EXITS[(end - arm) % 4])
             lanes: tuple[Lane, ...] = (
                 (f"o{corner}", f"ir{corner}", 0),
                 (f"ir{corner}", f"il{end}", 0),
@@ -73,9 +77,14 @@ def paths() -> dict[PathKey, Path]:
             )
             ends = (ARM_M, ARM_M + inside)
             built[approach, route] = Path(
-                approach, route, points, arc, ends, roles, lanes, PRIORITY[approach][route]
+                approach, route, points, arc, ends, roles, lanes, PRIORITY[route][corner % 2]
             )
     return built
+
+
+def seen_from(arm: int, other: int) -> str:
+    """Return how an ego from an arm names another arm."""
+    return APPROACHES[(other - arm) % 4]
 
 
 def _southern(route: str) -> Floats:

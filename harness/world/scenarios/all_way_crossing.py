@@ -1,0 +1,137 @@
+"""Scenario `all-way-crossing`: two to four cars that decide come to a crossing without signs.
+
+The ego comes from the south at 10 m/s. One to three other agents come from other arms, at least one of them
+from a side; each goes straight on, and buildings on the corners hide those from the sides from each other.
+All keep a speed that brings them to the middle at times of one distribution, so those who cross often meet
+unless somebody gives way, and nothing says who has to. In half of the episodes one more car, which is no
+agent, comes from the ego's left or right and yields to nobody: the agents on that road see it, and those on
+the ego's do not. Behind an agent it keeps its distance.
+
+Without `agent_share` the other agents keep their speed, and the ego has to pass between them.
+
+Where agents are, and when they come, is drawn without knowing of the danger.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from itertools import product
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats, Texts
+from harness.world.crossroads import APPROACHES, ARM_M, JUNCTION_M, ROUTES, SECTORS, road, seen_from
+from harness.world.lookouts import Draft, placed
+from harness.world.parameters import SHARED, Shared
+from harness.world.road import PathKey
+from harness.world.scenario import Draws, Layout, Scenario, Seat, Spawn
+from harness.world.state import Building, Part
+
+NAME = "all-way-crossing"
+BUILDING_END_M = 70.0  # outer walls, from the centre lines
+SIDES = ("left", "right")  # where a danger comes from
+# The direction of travel from each arm: south, west, north and east.
+AHEAD = np.array([(0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)])
+
+
+@dataclass(frozen=True)
+class Parameters(Shared):
+    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+
+    target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0)  # up to 36 km/h
+    speed_mps: float = 10.0  # of every agent at the start
+    arrival_s: tuple[float, float] = (3.2, 4.8)  # when an agent that keeps its speed is in the middle
+    both_share: float = 0.4  # probability of agents from the left and the right; else from one of them
+    oncoming_share: float = 0.5  # probability of an agent from ahead
+    danger_share: float = 0.5  # probability of a car from a side that is no agent
+    # when it would be in the middle, after a cruising ego; behind an agent on its arm, later if need be
+    danger_offset_s: tuple[float, float] = (-0.3, 0.8)
+    follow_s: tuple[float, float] = (1.2, 1.8)  # how long after the agent before it, at the soonest
+    car_mps: tuple[float, float] = (8.5, 10.0)  # speed of a car that is no agent
+    late_share: float = 0.4  # probability of a harmless car from any other arm, long after
+    late_offset_s: tuple[float, float] = (4.5, 6.0)  # when it is in the middle, after a cruising ego
+    corner_m: tuple[float, float] = (7.0, 11.0)  # distance of a building's walls from the centre lines
+    cleared_m: float = 2.5  # how far behind the junction's exit an agent's centre has cleared it
+
+
+def layout(seed: int, parameters: Parameters) -> Layout:
+    """Draw one episode."""
+    return placed(SCENARIO, _draft, seed, parameters)
+
+
+def _draft(draws: Draws, p: Parameters) -> Draft:
+    middle_m = ARM_M + JUNCTION_M
+    chosen = SIDES[int(draws.share("side") * len(SIDES))]
+    there = {side for side in SIDES if side == chosen or draws.share("both") < p.both_share}
+    if draws.share("oncoming") < p.oncoming_share:
+        there.add("oncoming")
+
+    def car(id_: str, approach: str, speed_mps: float, after_s: float, part: Part = "other") -> Spawn:
+        """Return a car that is in the middle at a time if it keeps its speed."""
+        return Spawn(id_, "car", part, approach, "straight", middle_m - speed_mps * after_s, speed_mps)
+
+    arrival_s = {approach: draws.between(f"{approach}_arrival", p.arrival_s) for approach in APPROACHES}
+    order = sorted(SECTORS, key=lambda approach: draws.share(f"{approach}_id"))
+    spawns = [car("v1", "own", p.speed_mps, arrival_s["own"], "ego")]
+    spawns += [
+        car(f"v{2 + n}", approach, p.speed_mps, arrival_s[approach], "helper")
+        for n, approach in enumerate(order)
+        if approach in there
+    ]
+
+    ids = draws.ids(("danger", "late"))
+
+    def coming(name: str, approach: str, offset_s: tuple[float, float]) -> Spawn:
+        after_s = arrival_s["own"] + draws.between(f"{name}_offset", offset_s)
+        if approach in there:
+            after_s = max(after_s, arrival_s[approach] + draws.between(f"{name}_follow", p.follow_s))
+        return car(ids[name], approach, draws.between(f"{name}_speed", p.car_mps), after_s)
+
+    danger = None
+    if draws.share("danger") < p.danger_share:
+        danger = SIDES[int(draws.share("sector") * len(SIDES))]
+        spawns.append(coming("danger", danger, p.danger_offset_s))
+    if draws.share("late") < p.late_share:
+        arm = SECTORS[int(draws.share("late_sector") * len(SECTORS))]
+        spawns.append(coming("late", arm, p.late_offset_s))
+
+    buildings = []
+    for n, (east, south) in enumerate(((-1, 1), (1, 1), (-1, -1), (1, -1))):
+        xs = sorted((east * draws.between(f"corner_{n}_x", p.corner_m), east * BUILDING_END_M))
+        ys = sorted((south * draws.between(f"corner_{n}_y", p.corner_m), south * BUILDING_END_M))
+        buildings.append(Building(f"b{n + 1}", xs[0], ys[0], xs[1], ys[1]))
+    return Draft(Layout.arranged(spawns, danger, ids["danger"], buildings), (), ())
+
+
+def cleared(arm: int, xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
+    """Return whether the centre of an ego from an arm is far enough behind the junction's exit."""
+    return np.asarray(xy_m[..., 0, :] @ AHEAD[arm] >= JUNCTION_M + parameters.cleared_m)
+
+
+@cache
+def seats() -> dict[PathKey, Seat]:
+    """Return the seat of an agent from each arm."""
+    return {(seen_from(0, arm), "straight"): _seat(arm) for arm in range(len(AHEAD))}
+
+
+def _seat(arm: int) -> Seat:
+    its = partial(road, arm, 2)
+    names = {
+        (seen_from(0, other), route): (seen_from(arm, other), route)
+        for other, route in product(range(len(APPROACHES)), ROUTES)
+    }
+    return Seat(replace(SCENARIO, road=its, cleared=partial(cleared, arm), seats=None), names)
+
+
+SCENARIO = Scenario(
+    name=NAME,
+    description=__doc__,
+    actions=("SLOWER", "IDLE", "FASTER"),
+    parameters=Parameters(),
+    road=partial(road, 0, 2),
+    layout=layout,
+    cleared=partial(cleared, 0),
+    dials=SHARED,
+    words={"task": "go straight over a crossing without signs", "hiding": "buildings on the corners"},
+    one_sided=None,  # nobody has right of way, so that times decide and sides do not
+    seats=seats,
+)
