@@ -20,8 +20,6 @@ def p_value(interval: Callable[[float], Estimate]) -> float | None:
     interval it is the p-value of the paired t test. It is None without an interval, `LEAST` for any smaller
     one, and 1 above 0.999. `interval` gives the difference at a level of confidence; a higher one is wider.
     """
-    from scipy.optimize import brentq
-
     difference = interval(1 - LEVEL)
     if math.isnan(difference.low) or math.isnan(difference.high):
         return None
@@ -36,6 +34,8 @@ def p_value(interval: Callable[[float], Estimate]) -> float | None:
         return 1.0
     if reach(surest) >= 0:
         return LEAST
+    from scipy.optimize import brentq
+
     return math.exp(brentq(reach, surest, least_sure, xtol=1e-9))
 
 

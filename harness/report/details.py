@@ -18,7 +18,7 @@ from harness.core.files import digest
 from harness.core.image import Image
 from harness.core.places import text
 from harness.dataset.forest import Forest
-from harness.dataset.load import Scene
+from harness.dataset.load import TREES_AT_ONCE, Scene
 from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.device import answer_s
 from harness.evaluate.fusion import messages_of, source_of
@@ -112,7 +112,9 @@ class Details:
             for run in self.runs.runs:
                 check_scenes(run, dataset, ids)
             scenes = dict(zip(ids, dataset.scenes(ids), strict=True))
-            forest = dataset.of_episodes({scene.record.episode for scene in scenes.values()}).forest
+            shown = {scene.record.episode for scene in scenes.values()}
+            # A small dataset's trees are laid out once, and a large one's where they are shown.
+            forest = (dataset if len(dataset.trees) <= TREES_AT_ONCE else dataset.of_episodes(shown)).forest
         for at in range(0, len(ids), BLOCK):
             yield [self._detail(name, scenes.get(name), forest) for name in ids[at : at + BLOCK]]
 
@@ -194,11 +196,13 @@ class Details:
                 shown["took_s"] = None if answer.error else answer_s(run.speed(answer), answer)
             spans_read = _read_in(answer, run) if answer.repairs else []
             answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
-        decisions: dict[str, dict[str, Any]] = {}  # seeds with the same decision share an entry
-        for row in rows:
-            shown = {**_shown(self._rows[n], row), "end": str(self.ends[n][row])}
-            seed = self._rows[n].row(row)["seed"]
-            decisions.setdefault(repr(shown), {**shown, "seeds": []})["seeds"].append(seed)
+        decisions: dict[Any, dict[str, Any]] = {}  # seeds with the same decision share an entry
+        for index in rows:
+            row, end = self._rows[n].row(index), str(self.ends[n][index])
+            seed, *same = row.values()
+            if (alike := (*same, end)) not in decisions:
+                decisions[alike] = {**_shown(self._rows[n], row), "end": end, "seeds": []}
+            decisions[alike]["seeds"].append(seed)
         detail: dict[str, Any] = {"answers": answers, "decisions": list(decisions.values())}
         if self.runs.live:  # in frozen scenes each action has its outcome
             ended = run.episodes_of(int(self._episodes[n][rows.start]))
@@ -230,8 +234,7 @@ def _columns(d: Decisions) -> list[str]:
     return ["seed", *SHOWN, *OF_DRIVEN, *(f"fused_{action}" for action in d.actions), *of_messages]
 
 
-def _shown(d: Decisions, index: int) -> dict[str, Any]:
-    row = d.row(index)
+def _shown(d: Decisions, row: Mapping[str, Any]) -> dict[str, Any]:
     return {
         **{name: row[name] for name in SHOWN},
         **{name: row[name] for name in OF_DRIVEN if row[name] is not None},
