@@ -2,6 +2,8 @@
 
 import json
 import shlex
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from shutil import copytree
@@ -137,3 +139,20 @@ def test_a_limit_beyond_the_dataset_is_said(harness: Callable[..., Said], small_
     code, out, err = harness("eval", "--dataset", small_path, "--limit", "9999", "--seeds", "0:1")
     assert (code, err) == (0, "--limit 9999: small has 4 episodes, all of which are used\n")
     assert "n = 4 episodes" in out
+
+
+@pytest.mark.slow
+def test_an_evaluation_loads_no_pandas_and_nothing_that_numpy_loads_late(tmp_path: Path) -> None:
+    code = (
+        "import sys, harness.cli as c\n"
+        "sys.argv = ['harness', 'eval', '--model', 'proxy', '--limit', '1', '--out', sys.argv[1]]\n"
+        "try:\n    c.main()\nexcept SystemExit as end:\n    assert not end.code\n"
+        "late = ('scipy.special', 'pandas', 'matplotlib', 'numpy.f2py', 'numpy.testing')\n"
+        "print([name for name in late if name in sys.modules], file=sys.stderr)\n"
+        "import numpy\n"
+        "print(numpy.f2py.__name__, numpy.testing.__name__, file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "run")], capture_output=True, text=True, check=True
+    )
+    assert done.stderr.splitlines()[-2:] == ["['scipy.special']", "numpy.f2py numpy.testing"]

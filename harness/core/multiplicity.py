@@ -46,7 +46,7 @@ def p_of_bootstrap(value: float, low: float, high: float) -> float | None:
     treated as a normal distribution's (Altman and Bland 2011, doi:10.1136/bmj.d2304). None without an
     interval.
     """
-    from scipy.special import ndtr, ndtri
+    from harness.core.special import ndtr, ndtri
 
     if math.isnan(low) or math.isnan(high):
         return None

@@ -124,7 +124,7 @@ def seed_rate_interval(values: Floats) -> Estimate:
     `values` are from 0 to 1, or differences of such, `(S, E)`; NaN is left out. The number of seeds is n; one
     seed has a value and no interval.
     """
-    from scipy.special import stdtrit
+    from harness.core.special import stdtrit
 
     means = known_mean(values, axis=1)
     value, counted = float(known_mean(means, axis=0)), int((~np.isnan(means)).sum())
@@ -219,7 +219,7 @@ def _effective_n(rate: float, totals: Floats, sizes: Floats, level: float = LEVE
     An episode counts as one trial at least, since no values from 0 to 1 vary more than yes or no. `totals`
     are each episode's sum of deviations from the rate, and `sizes` the number of its values, (C,).
     """
-    from scipy.special import stdtrit
+    from harness.core.special import stdtrit
 
     clusters, n = len(totals), float(sizes.sum())
     least = n**2 / float(np.sum(sizes**2))
@@ -241,7 +241,7 @@ def _clusters(values: Floats, episodes: Ints | None) -> tuple[Floats, Floats]:
 
 
 def _student(values: Floats, episodes: Ints, level: float = LEVEL) -> Estimate:
-    from scipy.special import stdtrit
+    from harness.core.special import stdtrit
 
     known = ~np.isnan(values)
     n, n_excluded = int(known.sum()), int((~known).sum())
@@ -258,6 +258,6 @@ def _student(values: Floats, episodes: Ints, level: float = LEVEL) -> Estimate:
 
 
 def _normal(level: float) -> float:
-    from scipy.special import ndtri
+    from harness.core.special import ndtri
 
     return float(ndtri(0.5 + level / 2))

@@ -13,11 +13,11 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from scipy.special import expit
 
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import text_of
+from harness.core.special import expit
 
 # Maps SINR in dB to the probability that a block is lost, of the same shape.
 BlockError = Callable[[Floats], Floats]

@@ -28,11 +28,11 @@ from functools import lru_cache
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from scipy.special import ndtr, ndtri
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import between
 from harness.core.errors import UserError
+from harness.core.special import ndtr, ndtri
 from harness.radio import back_off
 from harness.radio.back_off import SLOT_S, free_share
 from harness.radio.block_error import block_error

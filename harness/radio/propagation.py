@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from scipy.special import ndtr
 
 from harness.core.arrays import Floats, Ints
 from harness.core.config import between
+from harness.core.special import ndtr
 from harness.radio.channel import CLEAR, VEHICLE
 
 Environment = Literal["winner-b1", "tr37885-highway", "tr37885-urban"]

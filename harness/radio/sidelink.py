@@ -17,11 +17,11 @@ from functools import lru_cache
 from typing import Annotated, ClassVar
 
 import numpy as np
-from scipy.special import ndtr
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import between
 from harness.core.errors import UserError
+from harness.core.special import ndtr
 from harness.radio.block_error import BlockError
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Links
 from harness.radio.sps import Scheduling

@@ -287,7 +287,7 @@ def _by_entropy() -> tuple[Floats, Floats]:
 
 def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
     """Return draws of a normal distribution, cut at `CUT` standard deviations, by its quantiles."""
-    from scipy.special import ndtr, ndtri
+    from harness.core.special import ndtr, ndtri
 
     below = ndtr(-CUT)
     return np.asarray(mean + sd * ndtri(below + (1 - 2 * below) * uniforms))

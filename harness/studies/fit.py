@@ -16,7 +16,7 @@ from harness.studies.ledger import paper_numbers
 
 def fit() -> Parameters:
     """Return parameters from the rows of `paper_numbers.csv` that `FITTED_ON` names."""
-    from scipy.special import ndtri
+    from harness.core.special import ndtri
 
     paper = {row["id"]: row for row in paper_numbers()}
     value = {key: float(row["paper_value"]) / 100 for key, row in paper.items() if row["paper_value"]}

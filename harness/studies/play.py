@@ -209,7 +209,7 @@ def over_own_episodes(name: str, values: Floats) -> Estimate:
     estimate = seed_interval(known_mean(values, axis=1))
     if name not in ENDS or estimate.n < 2:
         return in_range(name, estimate)
-    from scipy.special import stdtrit
+    from harness.core.special import stdtrit
 
     least = float(stdtrit(estimate.n - 1, 0.975)) * 0.5 / values.shape[1] / math.sqrt(estimate.n)
     half = float(np.fmax(estimate.high - estimate.value, least))  # no interval where all agree
