@@ -1,5 +1,6 @@
 """`harness drive`: a model with a prompt drives in the simulator."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from harness.runs.records import ClosedLoop
 
 ALL = "all"
+SHARE = "agent_share"
 COLUMNS = (
     Column("success % [95 % CI]", "success_rate", interval=True),
     Column("crash", "collision_rate"),
@@ -35,6 +37,9 @@ def command(
     settings: Settings,
     env: options.Env = None,
     env_config: options.EnvConfig = None,
+    agents: str = typer.Option(
+        "", help="Who decides: ego, all, or the share of the others that do, as 0.5. Default: ego."
+    ),
     workers: options.ModelWorkers = "2",
     out: Path | None = typer.Option(
         None, help="Folder to write the run to. Default: reports/<model>-<prompt>-drive."
@@ -65,6 +70,7 @@ def command(
             raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
         settings = changed(settings, {"condition": ()})
     name = options.scenario_name(world.scenario if world.scenario or env else DEFAULT, env, env_config)
+    name = deciding(name, agents) if agents else name
     who, part = options.workers_of(workers), options.shard_of(shard)
     if part and (out is None or save_video):
         raise UserError(
@@ -98,6 +104,25 @@ def command(
     elif save_video:
         typer.echo(f"no episode failed under {printable(spec.points[-1].name)}: no video")
     typer.echo(f"wrote {page}")
+
+
+def deciding(scenario: str, agents: str) -> str:
+    """Return the name of a scenario in which these agents decide. Raises UserError if it has no seats."""
+    from harness.world import scenarios
+
+    share = {"ego": "0", ALL: "1"}.get(agents, agents)
+    if not re.fullmatch(r"[01]|0?\.\d+|[01]\.0*", share):
+        raise UserError(f"--agents is {printable(agents)!r}; give ego, all, or a share from 0 to 1")
+    if SHARE in scenario:
+        raise UserError(f"--agents {agents}: {printable(scenario)} states {SHARE} already; give one of them")
+    if share != "0" and SHARE not in scenarios.get(scenario).dials:
+        able = [name for name in scenarios.names() if SHARE in scenarios.get(name).dials]
+        raise UserError(
+            f"--agents {agents}: in {printable(scenario)} only the ego has a goal; use {', '.join(able)}"
+        )
+    if share == "0":
+        return scenario
+    return f"{scenario}{',' if ':' in scenario else ':'}{SHARE}={share}"
 
 
 def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:

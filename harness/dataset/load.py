@@ -53,6 +53,7 @@ class Scene:
     notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
     seat: Scenario | None = None  # the scenario of who decides, if that is an agent on a seat
     agent: int = 0  # its place among the vehicles that answer; the ego is at 0
+    deciders: int = 1  # how many vehicles decide in this world
 
     @property
     def id(self) -> str:
@@ -85,7 +86,9 @@ class Scene:
         return viewer if viewer > self.agent else viewer - 1
 
     def changed(self, **fields: Any) -> "Scene":
-        return Scene(structs.replace(self.record, **fields), seat=self.seat, agent=self.agent)
+        return Scene(
+            structs.replace(self.record, **fields), seat=self.seat, agent=self.agent, deciders=self.deciders
+        )
 
 
 def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Iterator[tuple[Scenario, list[int]]]:

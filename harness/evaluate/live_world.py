@@ -5,9 +5,9 @@ taken in the first frame that begins after the decision's latency; until then th
 decision that is still open when the next one is due continues, and the next one is skipped.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import product
 from typing import Any, ClassVar
 
@@ -31,8 +31,10 @@ from harness.world.lookouts import radios
 from harness.world.outcome import Outcome, rating
 from harness.world.parameters import frames
 from harness.world.scenario import Scenario
+from harness.world.swarm import alone
 from harness.world.world import World
 
+GRAVEST = ("collision", "off_road", "time_out")
 # Added, where draws are keyed, to the numbers of episode and layout, once for each place after the ego's.
 OF_ANOTHER_AGENT = 1 << 40
 
@@ -182,7 +184,17 @@ class LiveWorld(SceneWorld):
         }
 
     def episodes(self) -> list[Episode]:
-        """Return how each ended; late is against a full-view driver whose decisions act after the lag."""
+        """Return how each ended; late is against a full-view driver whose decisions act after the lag.
+
+        With several agents nobody is late: there is no such driver for all of them together.
+        """
+        if any(len(t.world.journeys) > 1 for t in self._ended):
+            alone_s = cache(alone)
+            return [
+                _swarm(t, course, alone_s(self.scenario, t.world.seed))
+                for t in self._ended
+                for course in t.courses
+            ]
         numbers = sorted({t.number for t in self._ended if t.world.outcome.success})
         worlds = [World.start(self.scenario, self._first_seed + number) for number in numbers]
         outcomes = reference.finish(worlds, [PRIVILEGED] * len(numbers))
@@ -212,7 +224,8 @@ def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) 
         ]  # fmt: skip
         for n, record in zip(places, records_of(scenario, seen), strict=True):
             world, agent, _ = points[n]
-            scenes[n] = Scene(record, seat=seats[n], agent=world.answering.index(agent) if agent else 0)
+            place = world.answering.index(agent) if agent else 0
+            scenes[n] = Scene(record, seat=seats[n], agent=place, deciders=len(world.journeys))
     return [scenes[n] for n in range(len(points))]
 
 
@@ -233,4 +246,37 @@ def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) 
         least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=world.journey.hard_brakings,
         other_crashes=outcome.other_crashes, skipped=course.skipped,
         **radios(world.scenario, world.seed, world.layout.danger),
+    )  # fmt: skip
+
+
+def _swarm(trajectory: Trajectory, course: Course, alone_s: Mapping[int, float]) -> Episode:
+    """Return how an episode of several agents ended: it succeeds if all of them reach their goals.
+
+    Its failure is the gravest of theirs, and of those the first; `alone_s` has when each would clear alone.
+    """
+    world = trajectory.world
+    journeys, ids = world.journeys, {n: v.spawn.id for n, v in enumerate(world.vehicles)}
+    outcomes = {n: journey.outcome for n, journey in journeys.items()}
+    failed = sorted(
+        (GRAVEST.index(o.result), o.time_s or 0.0, n) for n, o in outcomes.items() if not o.success
+    )
+    worst = outcomes[failed[0][2]] if failed else None
+    lost_s = {n: round((o.time_s or 0.0) - alone_s[n], 3) for n, o in outcomes.items() if o.success}
+    most = max(lost_s, key=lost_s.__getitem__, default=None)
+    agents = {ids[n] for n in outcomes}
+    time_s = worst.time_s if worst else max(o.time_s or 0.0 for o in outcomes.values())
+    failure = worst.result if worst else ""
+    return Episode(
+        condition=course.point.name, seed=course.seed, episode=trajectory.number, layout_seed=world.seed,
+        danger=world.layout.danger or "none", success=not failed, failure=failure,
+        outcome=rating(failure, world.scenario.parameters), time_s=time_s,
+        partner=worst.partner if worst else None, striker=worst.striker if worst else None,
+        fault=worst.fault if worst else None,
+        least_gap_m=round(min(o.least_gap_m for o in outcomes.values()), 3),
+        hard_brakings=sum(journey.hard_brakings for journey in journeys.values()),
+        other_crashes=world.outcome.other_crashes, skipped=course.skipped,
+        agents=len(outcomes), arrived=len(lost_s), met=sum(o.partner in agents for o in outcomes.values()),
+        agents_lost_s=round(sum(lost_s.values()), 3) if lost_s else None,
+        most_lost_s=None if most is None else lost_s[most],
+        gave_way=ids[most] if most is not None and lost_s[most] > 0 else None,
     )  # fmt: skip

@@ -210,7 +210,8 @@ class Run:
             raise ValueError(f"{infinite} is infinite")
         places = self.grid.places(decisions)
         steps, step = np.unique(decisions.whole("step"), return_inverse=True)
-        keys = np.sort(places * len(steps) + step, kind="stable")
+        agent = np.unique(np.array(decisions.labels("agent"), dtype=str), return_inverse=True)[1]
+        keys = np.sort((places * len(steps) + step) * (1 + agent.max(initial=0)) + agent, kind="stable")
         if (keys[1:] == keys[:-1]).any():
             raise ValueError("a decision is there twice")
         counts = np.bincount(places, minlength=len(self.episodes))
@@ -316,7 +317,7 @@ def _read_tables(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[E
 
 def _most_rows(episodes: Sequence[Episode]) -> int:
     """Return how many decisions a file may hold, so that one with a few too many is still read and named."""
-    return 2 * MOST_DECISIONS * len(episodes)
+    return 2 * MOST_DECISIONS * sum(episode.agents or 1 for episode in episodes)
 
 
 def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:
@@ -437,11 +438,15 @@ def check_scenes(run: Run, dataset: Dataset, some: Iterable[str] | None = None) 
 
 def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
     """Return records as CSV: the columns of the variant, then a column for each field; None is empty."""
-    text = io.StringIO()
+    text, records = io.StringIO(), list(records)
     writer = csv.writer(text, lineterminator="\n")
     variant_columns = asdict(variant) if variant else {}
-    writer.writerow([*variant_columns, *kind.__struct_encode_fields__])
-    values = attrgetter(*kind.__struct_fields__)
+    columns = {
+        field: name for field, name in zip(kind.__struct_fields__, kind.__struct_encode_fields__, strict=True)
+        if field not in formats.SPARSE or any(getattr(record, field) is not None for record in records)
+    }  # fmt: skip
+    writer.writerow([*variant_columns, *columns.values()])
+    values = attrgetter(*columns)
     writer.writerows((*variant_columns.values(), *values(record)) for record in records)
     return text.getvalue()
 

@@ -104,6 +104,7 @@ COLUMNS: Mapping[str, Added] = {
                     Added("2026-11-27", None, "misses and false alarms; also missing in closed loop")),
     **dict.fromkeys(("ttc_s", "pet_s", "short_ttc", "short_pet"),
                     Added("2026-11-27", None, "conflicts in time; also missing on trees of older datasets")),
+    "agent": Added("2026-11-27", None, "swarms; also missing where only egos decide"),
 }  # fmt: skip
 # Columns of episodes.csv; `records.Episode` has the same defaults.
 EPISODE: Mapping[str, Added] = {
@@ -120,7 +121,13 @@ EPISODE: Mapping[str, Added] = {
         ("witnesses", "danger_radio"),
         Added("2026-11-27", None, "who sees the danger; also empty where none is declared"),
     ),
+    **dict.fromkeys(
+        ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way"),
+        Added("2026-11-27", None, "swarms; also missing where only egos decide"),
+    ),
 }  # fmt: skip
+
+SPARSE = ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way")  # missing if all unknown
 
 
 def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:

@@ -290,6 +290,16 @@ BUILT_IN = (
             "higher", optional=True, half=True) for k in range(4)),
     _rate("success_dangerous_rate_with_radio", "success rate where the danger has a radio and tells of "
           "itself", lambda e: e.success if e.danger_radio else None, "higher", optional=True, half=True),
+    Metric("arrived_rate", "share of an episode's agents that reach their goal; where several decide",
+           PERCENT, "higher", most=1.0, optional=True,
+           episodes=lambda e: (e.arrived or 0) / e.agents if e.agents else None),
+    _rate("met_rate", "share of episodes in which agents collide with each other; where several decide",
+          lambda e: bool(e.met) if e.agents else None, optional=True),
+    Metric("agents_lost_s", "how much later all agents reach their goals than each would alone, in sum; only "
+           "those that do", SECONDS, "lower", label="time lost by all", episodes=_field("agents_lost_s"),
+           optional=True),
+    Metric("most_lost_s", "the same of the agent that loses most", SECONDS, "lower",
+           label="time lost by one", episodes=_field("most_lost_s"), optional=True),
     Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision", METRES,
            "higher", label="least gap", episodes=_field("least_gap_m")),
     Metric("hard_brakings_per_episode", "number of times that the ego begins to brake harder than 4 m/s²",

@@ -1,0 +1,118 @@
+"""Several agents in one world: seats, the walk, and what a run says of them."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from evaluating import live_spec_of, run
+
+from harness.coordination.operating_point import named_point
+from harness.core.errors import UserError
+from harness.evaluate.live_world import LiveSource, looks
+from harness.runs import folder
+from harness.world import scenarios
+from harness.world.swarm import alone
+from harness.world.world import World
+
+ALL = "all-way-crossing:agent_share=1"
+PAIRS = pytest.mark.parametrize("name", ["all-way-crossing", "platoon-merge"])
+
+
+@PAIRS
+def test_an_agent_is_the_ego_in_its_own_eyes_and_nothing_else_changes(name: str) -> None:
+    scenario = scenarios.get(f"{name}:agent_share=1")
+    for seed in range(8):
+        world = World.start(scenario, seed)
+        true = world.state()
+        for agent in list(world.journeys)[1:]:
+            seen, seat = world.state(agent), world.seat(agent)
+            assert seen.ego.id == true.vehicles[agent].id
+            assert {v.id for v in seen.helpers} == {v.id for v in true.vehicles if v.part != "other"} - {
+                seen.ego.id
+            }
+            for v in seen.vehicles:
+                before, path = true.vehicle(v.id), seat.road().paths[v.approach, v.route]
+                assert (v.x_m, v.y_m, v.heading_rad, v.speed_mps) == (
+                    before.x_m, before.y_m, before.heading_rad, before.speed_mps
+                )  # fmt: skip
+                assert path.project(v.x_m, v.y_m)[1] < 0.1, "on the path that the seat names"
+
+
+@PAIRS
+def test_who_decides_at_a_share_decides_at_a_higher_one(name: str) -> None:
+    deciding = [
+        [set(World.start(scenarios.get(f"{name}:agent_share={share}"), seed).journeys) for seed in range(20)]
+        for share in (0, 0.3, 0.7, 1)
+    ]
+    assert all(agents == {0} for agents in deciding[0])
+    for fewer, more in pairwise(deciding):
+        assert all(a <= b for a, b in zip(fewer, more, strict=True))
+    assert sum(map(len, deciding[1])) < sum(map(len, deciding[2])) < sum(map(len, deciding[3]))
+
+
+def test_agents_act_alone_and_the_world_goes_on_until_all_have_ended() -> None:
+    world = World.start(scenarios.get(ALL), 0)
+    agents = list(world.journeys)
+    world.take("SLOWER", agents[-1])
+    world.advance(50)
+    speeds = [v.speed for v in world.vehicles]
+    assert speeds[agents[-1]] < 9 < min(speeds[n] for n in agents[:-1])
+    world.advance(10**6)
+    assert world.ended
+    assert world.time_s == pytest.approx(
+        max(j.outcome.time_s or 0 for j in world.journeys.values()), abs=0.03
+    )
+
+
+def test_a_world_branches_with_all_its_journeys() -> None:
+    world = World.start(scenarios.get(ALL), 1)
+    branch = world.branch()
+    branch.advance(10**6)
+    assert branch.ended
+    assert not any(journey.outcome.ended for journey in world.journeys.values())
+
+
+def test_every_agent_is_asked_with_its_own_graph() -> None:
+    world = World.start(scenarios.get(ALL), 2)
+    scenes = looks([(world, agent, 0) for agent in world.journeys], 0, ego_alone=False)
+    assert [scene.viewers[0] for scene in scenes] == [world.vehicles[n].spawn.id for n in world.journeys]
+    assert len({scene.id for scene in scenes}) == len(scenes)
+    for scene in scenes:
+        assert scene.graphs[scene.viewers[0]].role == "ego"
+        places = [scene.place(viewer) for viewer in range(len(scene.viewers))]
+        names = [world.vehicles[world.answering[place]].spawn.id for place in places]
+        assert names == list(scene.viewers), "a vehicle keeps its model, whoever decides"
+
+
+def test_a_run_says_who_decided_and_how_all_of_them_ended(tmp_path: Path) -> None:
+    points = named_point("single-local"), named_point("6g")
+    spec = replace(live_spec_of(prompt="v4", points=points, seeds=(0,)), source=LiveSource(50_000, 6, ALL))
+    run(spec, tmp_path / "run")
+    there = folder.read(tmp_path / "run")
+    table = there.decisions
+    for episode in there.episodes:
+        assert episode.agents in (2, 3, 4)
+        assert episode.success == (episode.arrived == episode.agents)
+        rows = [
+            r for r in table.records(0, len(table))
+            if (r.episode, r.condition) == (episode.episode, episode.condition)
+        ]  # fmt: skip
+        assert len(rows) == episode.decisions
+    assert len(set(table.labels("agent"))) == 4
+    scores = {(s.condition, s.metric): s.value for s in there.scores}
+    mean = sum(e.arrived / e.agents for e in there.episodes if e.condition == "6g") / 6
+    assert scores["6g", "arrived_rate"] == pytest.approx(mean)
+
+
+def test_alone_on_the_road_an_agent_comes_as_soon_as_its_speed_takes_it() -> None:
+    scenario = scenarios.get(ALL)
+    for seed in range(4):
+        world, cleared_s = World.start(scenario, seed), alone(scenario, seed)
+        assert cleared_s.keys() == world.journeys.keys()
+        assert all(1 < time_s < scenario.parameters.time_limit_s for time_s in cleared_s.values())
+
+
+def test_a_scenario_in_which_only_the_ego_has_a_goal_has_no_agents() -> None:
+    with pytest.raises(UserError, match="agent_share"):
+        scenarios.get("occluded-intersection:agent_share=1")
