@@ -10,8 +10,8 @@ train layouts, and whether each is known. Beside the distance of each report lay
 train layouts stands that of each train layout to the nearest other one. The ratio is of the medians.
 Intervals of both are 95 %, by bootstrap over layouts.
 
-    python benchmarks/leakage.py [DATASET ...] [--models proxy swarm-tiny-six] [--layouts 20] [--nearest 100]
-                                 [--out reports/leakage]
+    python benchmarks/leakage.py [DATASET ...] [--models proxy swarm-tiny-six] [--prompt v4] [--layouts 20]
+                                 [--nearest 100] [--out reports/leakage]
 """
 
 import argparse
@@ -103,7 +103,7 @@ def distance(data: Dataset, layouts: int) -> dict[str, Any]:
 Scores = dict[tuple[str, str], tuple[Score, Floats]]  # by condition and purpose, with each layout's, (n,)
 
 
-def success(data: Dataset, model: str, layouts: int, out: Path) -> Scores:
+def success(data: Dataset, model: str, prompt: str, layouts: int, out: Path) -> Scores:
     """Return a model's success on the first layouts of each purpose."""
     scores: Scores = {}
     for purpose, first in FIRST.items():
@@ -111,7 +111,7 @@ def success(data: Dataset, model: str, layouts: int, out: Path) -> Scores:
         if not (run / "summary.csv").is_file():
             frozen = range(first, first + layouts)
             kept = data if purpose == "report" else trees(data.scenario, frozen, 2, lambda done: None)
-            asked: dict[str, Any] = {} if model == "proxy" else {"prompt": "v4", "answer": "readout"}
+            asked: dict[str, Any] = {} if model == "proxy" else {"prompt": prompt, "answer": "readout"}
             harness.run(
                 model=model, dataset=str(kept.path), limit=layouts, condition=list(CONDITIONS), seeds="0:5",
                 out=run, quiet=True, **asked,
@@ -144,6 +144,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("datasets", nargs="*", default=DATASETS)
     parser.add_argument("--models", nargs="+", default=["proxy", "swarm-tiny-six"])
+    parser.add_argument("--prompt", default="v4", help="what a model reads; `proxy` reads none")
     parser.add_argument("--layouts", type=int, default=20)
     parser.add_argument("--nearest", type=int, default=100)
     parser.add_argument("--out", type=Path, default=Path("reports/leakage"))
@@ -155,7 +156,7 @@ def main() -> None:
     for data in everything:
         by_model: dict[str, Scores] = {}
         for model in args.models:
-            by_model[model] = scores = success(data, model, args.layouts, args.out)
+            by_model[model] = scores = success(data, model, args.prompt, args.layouts, args.out)
             for condition in CONDITIONS:
                 rng = noise.generator("surplus", data.name, model, condition)
                 first = by_model[args.models[0]]
