@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 def generator(*key: object) -> np.random.Generator:
     """Return the generator of one key. Parts are joined by their `repr`, so `1` and `"1"` differ."""
     seed = hashlib.sha256("\x1f".join(map(repr, key)).encode()).digest()[:16]
-    return np.random.Generator(np.random.PCG64(int.from_bytes(seed, "big")))
+    # The words of the digest as a whole number, which NumPy would take apart at thrice the cost.
+    words = np.frombuffer(seed[::-1], "<u4")
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
 
 
 def uniforms(shape: tuple[int, ...], *key: object) -> NDArray[np.float64]:
