@@ -23,6 +23,7 @@ from harness.world.fields import Side
 PathKey = tuple[str, str]  # approach and route
 Lane = tuple[str, str, int]  # highway-env's lane index: two nodes, and a number from the left
 STEP_M = 0.25  # distance between the points of a path
+STRAIGHT_M = 1e-6  # a path is straight if no point is farther from the line through its first two
 ONE_LANE_M = 1.0  # ways nearer to each other than this share a lane
 BEND_M = 3.0  # distance before and after a point over which its curvature is measured
 STRIPED = 1  # highway-env's LineType of a line that may be crossed
@@ -104,8 +105,13 @@ class Path:
 
     def project_all(self, x_m: Floats, y_m: Floats) -> Floats:
         """Return what `project` does for points (n,), as (3, n)."""
-        nearest = self._tree.query_nearest(shapely.points(x_m, y_m), all_matches=False)[1]
-        # Of equally near points the first counts, whichever the tree's rounding takes.
+        if self._step is None:
+            nearest = self._tree.query_nearest(shapely.points(x_m, y_m), all_matches=False)[1]
+        else:
+            first, step = self.points[0], self._step
+            steps = ((x_m - first[0]) * step[0] + (y_m - first[1]) * step[1]) / (step @ step)
+            nearest = np.rint(np.clip(steps, 0, len(self.points) - 1)).astype(int)
+        # Of equally near points the first counts, whichever the search's rounding takes.
         beside = np.clip(nearest[:, None] + [-1, 0, 1], 0, len(self.points) - 1)
         gaps = np.hypot(self.columns[0][beside] - x_m[:, None], self.columns[1][beside] - y_m[:, None])
         at = np.arange(len(nearest)), gaps.argmin(axis=1)
@@ -116,6 +122,13 @@ class Path:
         # Python's squares are rounded alike on every machine.
         squares = [max(g**2 - a**2, 0.0) for g, a in zip(gap.tolist(), along.tolist(), strict=True)]
         return np.stack([self.arc_m[point] + along, np.sqrt(squares), heading])
+
+    @cached_property
+    def _step(self) -> Floats | None:
+        """From one point of a straight path to the next, (2,) m; None of a path that bends."""
+        step: Floats = self.points[1] - self.points[0]
+        line = self.points[0] + step * np.arange(len(self.points))[:, None]
+        return step if np.abs(self.points - line).max() < STRAIGHT_M else None
 
     @cached_property
     def _tree(self) -> shapely.STRtree:

@@ -5,10 +5,9 @@ The vehicles that many viewers know are laid on the road in one pass over arrays
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, Struct
 
 from harness.core.arrays import Floats
 from harness.world.perception.sensors import Detection
@@ -23,8 +22,7 @@ ALIGNED_RAD = np.radians(40.0)  # more turned from a path than this, an object d
 ALIGNED = float(np.cos(ALIGNED_RAD))
 
 
-@dataclass(frozen=True)
-class Seat:
+class Seat(Struct, frozen=True):
     """Where a viewer sits: its position, and the cosine and sine of its heading."""
 
     x_m: float
@@ -38,8 +36,7 @@ class Seat:
         return Point(tenths(dx * self.cos + dy * self.sin), tenths(dx * self.sin - dy * self.cos))
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(Struct, frozen=True):
     """Where on the road a vehicle is."""
 
     # arc length, and heading there, on each path to which it is nearer than ON_PATH_M
@@ -53,8 +50,7 @@ class Place:
         return self.near[self.key][0]
 
 
-@dataclass(frozen=True)
-class Encounter:
+class Encounter(Struct, frozen=True):
     """A vehicle on a path, as a viewer knows it, beside the ego as that viewer knows it."""
 
     seat: Seat  # the viewer's

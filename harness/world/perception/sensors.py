@@ -10,10 +10,10 @@ automotive data sheets, no particular product), keyed by episode, step, viewer a
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from itertools import compress, product
 
 import numpy as np
+from msgspec import Struct
 
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
@@ -35,8 +35,7 @@ SENSORS = {
 }
 
 
-@dataclass(frozen=True)
-class Detection:
+class Detection(Struct, frozen=True):
     """One object as all of a vehicle's sensors together report it, in the world frame."""
 
     id: str  # the object's id (association across vehicles is assumed to be perfect)
