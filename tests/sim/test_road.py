@@ -8,6 +8,7 @@ from highway_env.envs.intersection_env import IntersectionEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
+from harness.world import scenarios
 from harness.world.crossroads import APPROACHES, ARM_M, ROUTES, paths, road
 
 KEYS = [(approach, route) for approach in APPROACHES for route in ROUTES]
@@ -93,3 +94,19 @@ def test_lane_roles_are_named_from_the_egos_seat():
     assert paths()["oncoming", "straight"].lane_role(after) == "exit-own"
     assert paths()["oncoming", "left"].lane_role(after) == "exit-right"
     assert paths()["own", "left"].lane_role(after) == "exit-left"
+
+
+@pytest.mark.parametrize("name", scenarios.names())
+def test_the_nearest_point_of_a_path_is_found_where_it_bends_and_where_it_does_not(name: str) -> None:
+    draws = np.random.default_rng(0)
+    for path in scenarios.get(name).road().paths.values():
+        between = (path.points[1:] + path.points[:-1])[draws.integers(len(path.points) - 1, size=50)] / 2
+        x, y = np.concatenate([draws.normal(0, 80, (200, 2)), between, path.points[[0, -1]]]).T
+        gaps = np.hypot(path.columns[0] - x[:, None], path.columns[1] - y[:, None])
+        nearest = gaps.argmin(axis=1)
+        heading = path.headings_rad[nearest]
+        along = (x - path.columns[0][nearest]) * np.cos(heading)
+        along += (y - path.columns[1][nearest]) * np.sin(heading)
+        arc, _, found = path.project_all(x, y)
+        assert np.array_equal(found, heading)
+        assert np.array_equal(arc, path.arc_m[nearest] + along)
