@@ -31,10 +31,9 @@ from harness.world.lookouts import radios
 from harness.world.outcome import Outcome, rating
 from harness.world.parameters import frames
 from harness.world.scenario import Scenario
-from harness.world.swarm import alone
+from harness.world.swarm import alone, gravest
 from harness.world.world import World
 
-GRAVEST = ("collision", "off_road", "time_out")
 # Added, where draws are keyed, to the numbers of episode and layout, once for each place after the ego's.
 OF_ANOTHER_AGENT = 1 << 40
 
@@ -257,10 +256,8 @@ def _swarm(trajectory: Trajectory, course: Course, alone_s: Mapping[int, float])
     world = trajectory.world
     journeys, ids = world.journeys, {n: v.spawn.id for n, v in enumerate(world.vehicles)}
     outcomes = {n: journey.outcome for n, journey in journeys.items()}
-    failed = sorted(
-        (GRAVEST.index(o.result), o.time_s or 0.0, n) for n, o in outcomes.items() if not o.success
-    )
-    worst = outcomes[failed[0][2]] if failed else None
+    failing = gravest(journeys)
+    worst = None if failing is None else outcomes[failing]
     lost_s = {n: round((o.time_s or 0.0) - alone_s[n], 3) for n, o in outcomes.items() if o.success}
     most = max(lost_s, key=lost_s.__getitem__, default=None)
     agents = {ids[n] for n in outcomes}
@@ -268,7 +265,7 @@ def _swarm(trajectory: Trajectory, course: Course, alone_s: Mapping[int, float])
     failure = worst.result if worst else ""
     return Episode(
         condition=course.point.name, seed=course.seed, episode=trajectory.number, layout_seed=world.seed,
-        danger=world.layout.danger or "none", success=not failed, failure=failure,
+        danger=world.layout.danger or "none", success=worst is None, failure=failure,
         outcome=rating(failure, world.scenario.parameters), time_s=time_s,
         partner=worst.partner if worst else None, striker=worst.striker if worst else None,
         fault=worst.fault if worst else None,

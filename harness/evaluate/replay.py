@@ -1,6 +1,6 @@
 """Replay a closed-loop episode from its record: equal actions in equal frames give an equal world."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import zip_longest
@@ -15,9 +15,11 @@ from harness.evaluate.live_world import looks
 from harness.runs.folder import Run, read
 from harness.runs.records import ClosedLoop, Decision, Manifest
 from harness.world import lockstep, scenarios
+from harness.world.outcome import Outcome
 from harness.world.parameters import Parameters
 from harness.world.scenario import Scenario
 from harness.world.state import WorldState
+from harness.world.swarm import gravest
 from harness.world.world import World
 
 AT_ONCE = 128  # decision points that are replayed together, which bounds memory
@@ -33,7 +35,7 @@ class ReplayedEpisode:
     seed: int  # seed of the channel's draws
     episode: int  # the episode's number
     layout_seed: int  # seed of its layout
-    decisions: list[Decision]  # its decisions, by step
+    decisions: list[Decision]  # its decisions, by step and agent
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -43,16 +45,29 @@ class ReplayedEpisode:
 
 
 @dataclass(frozen=True)
+class Turn:
+    """The decision of an agent that began last."""
+
+    decision: Decision  # the decision, open or taken
+    since_s: float  # seconds since it began
+    open: bool  # whether it has not acted yet
+    outcome: str  # how the agent's journey ended; empty until it has
+
+
+@dataclass(frozen=True)
 class Still:
     """One picture of an episode."""
 
     state: WorldState  # the state of the world
     seen: WorldState  # the state when the last decision began
-    decision: Decision  # that decision, open or taken
-    since_s: float  # seconds since it began
-    open: bool  # whether it has not acted yet
+    turns: Mapping[str, Turn]  # of each agent, by its id, the ego first
     outcome: str  # how the episode ended; empty until it has
     danger: str | None  # id of the dangerous vehicle, or None
+
+    @property
+    def since_s(self) -> float:
+        """Seconds since the last decision began."""
+        return min(turn.since_s for turn in self.turns.values())
 
 
 def find(path: Path, episode: int, condition: str | None, seed: int | None) -> ReplayedEpisode:
@@ -84,7 +99,7 @@ def played(run: Run, episode: int, condition: str, seed: int) -> ReplayedEpisode
     is_episode = (table.whole("episode") == episode) & (table.whole("seed") == seed)
     is_episode &= table.codes("condition", run.conditions) == run.conditions.index(condition)
     rows = table.take(np.flatnonzero(is_episode))
-    decisions = sorted(rows.records(0, len(rows)), key=lambda decision: decision.step)
+    decisions = sorted(rows.records(0, len(rows)), key=lambda d: (d.step, d.agent or ""))
     return ReplayedEpisode(run.manifest, condition, seed, episode, world.first_seed + episode, decisions)
 
 
@@ -106,20 +121,20 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
     worlds = [World.start(scenario, episode.layout_seed) for episode in episodes]
     due_frames = [_due_frame(decision, scenario.parameters) for decision in decisions]
     acts = [
-        [(frame, action) for frame, action in _actions_by_frame(episode).items() if frame <= due_frame]
+        [(frame, acting) for frame, acting in _actions_by_frame(episode).items() if frame <= due_frame]
         for episode, due_frame in zip(episodes, due_frames, strict=True)
     ]
-    for turn in zip_longest(*acts):  # each world's next action, or None
-        acting = [(world, *act) for world, act in zip(worlds, turn, strict=True) if act]
-        lockstep.advance([world for world, _, _ in acting], [frame for _, frame, _ in acting])
-        for world, _, action in acting:
-            world.take(action)
+    for turn in zip_longest(*acts):  # each world's next actions, or None
+        due = [(world, *act) for world, act in zip(worlds, turn, strict=True) if act]
+        lockstep.advance([world for world, _, _ in due], [frame for _, frame, _ in due])
+        for world, _, acting in due:
+            _act(world, acting)
     lockstep.advance(worlds, due_frames)
     alone = not capabilities(run.manifest.model["engine"]).asks_helpers
     scenes = dict[int, Scene]()
     for step in {decision.step for decision in decisions}:
         at = [n for n, decision in enumerate(decisions) if decision.step == step]
-        points = [(worlds[n], 0, decisions[n].episode) for n in at]
+        points = [(worlds[n], _place(worlds[n], decisions[n].agent), decisions[n].episode) for n in at]
         scenes |= zip(at, looks(points, step, alone), strict=True)
     return [scenes[n] for n in range(len(names))]
 
@@ -128,40 +143,73 @@ def _due_frame(decision: Decision, p: Parameters) -> int:
     return round(decision.step * p.decision_period_s * p.simulation_hz)
 
 
-def _actions_by_frame(played: ReplayedEpisode) -> dict[int, str]:
-    p = played.scenario.parameters
-    return {_acting_frame(d, p): d.action for d in played.decisions if d.acted}
+def _actions_by_frame(played: ReplayedEpisode) -> dict[int, list[Decision]]:
+    """Return the decisions that acted, by the frame in which they did, in the order of time."""
+    p, acting = played.scenario.parameters, dict[int, list[Decision]]()
+    for decision in sorted((d for d in played.decisions if d.acted), key=lambda d: _acting_frame(d, p)):
+        acting.setdefault(_acting_frame(decision, p), []).append(decision)
+    return acting
 
 
 def _acting_frame(decision: Decision, p: Parameters) -> int:
     return round((decision.acts_at_s or 0.0) * p.simulation_hz)
 
 
+def _act(world: World, decisions: Sequence[Decision]) -> None:
+    for decision in decisions:
+        world.take(decision.action, _place(world, decision.agent))
+
+
+def _place(world: World, agent: str | None) -> int:
+    """Return an agent's place among the vehicles; the ego's for None."""
+    return [vehicle.spawn.id for vehicle in world.vehicles].index(agent) if agent else 0
+
+
 def stills(played: ReplayedEpisode, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
     """Yield the stills of an episode: ten a second, and one each frame while a decision is open."""
     p = played.scenario.parameters
     world = World.start(played.scenario, played.layout_seed)
-    due_frames = [_due_frame(decision, p) for decision in played.decisions]
-    actions = _actions_by_frame(played)
-    index, seen = 0, world.state()
+    acting = _actions_by_frame(played)
+    begun = [(_due_frame(decision, p), decision) for decision in played.decisions]
+    due, ids = sorted({frame for frame, _ in begun}), [v.spawn.id for v in world.vehicles]
+    latest, seen = dict[str, Decision](), world.state()
     while True:
-        if index + 1 < len(due_frames) and due_frames[index + 1] <= world.frame:
-            index += 1
-            seen = world.state()
-        decision = played.decisions[index]
-        deciding = world.frame < _acting_frame(decision, p)
-        outcome = world.outcome
-        ending = "" if not outcome.ended else f"{outcome.result.replace('_', ' ')} at {outcome.time_s:.1f} s"
-        ending += f" with {outcome.partner}" if outcome.partner else ""
-        since_s = (world.frame - due_frames[index]) / p.simulation_hz
+        if due and due[0] <= world.frame:
+            now, seen = due.pop(0), world.state()
+            latest |= {decision.agent or ids[0]: decision for frame, decision in begun if frame == now}
+        turns = {ids[place]: _turn(world, place, latest[ids[place]], p) for place in world.journeys}
         progress(1)
-        is_open = deciding and not outcome.ended
-        yield Still(world.state(), seen, decision, since_s, is_open, ending, world.layout.danger_id)
-        if outcome.ended:
+        yield Still(world.state(), seen, turns, _ending(world), world.layout.danger_id)
+        if world.ended:
             return
+        deciding = any(turn.open for turn in turns.values())
         next_frame = world.frame + (1 if deciding else max(1, round(p.simulation_hz / STILLS_HZ)))
-        for frame in sorted(f for f in {*actions, *due_frames} if world.frame < f < next_frame):
-            next_frame = min(next_frame, frame)
-        world.advance(next_frame)
-        if world.frame in actions and not world.outcome.ended:
-            world.take(actions[world.frame])
+        world.advance(min([next_frame, *(f for f in {*acting, *due} if world.frame < f < next_frame)]))
+        if world.frame in acting and not world.ended:
+            _act(world, acting[world.frame])
+
+
+def _turn(world: World, place: int, decision: Decision, p: Parameters) -> Turn:
+    since_s = (world.frame - _due_frame(decision, p)) / p.simulation_hz
+    ended = world.journeys[place].outcome
+    is_open = world.frame < _acting_frame(decision, p) and not ended.ended
+    return Turn(decision, since_s, is_open, _said(ended))
+
+
+def _ending(world: World) -> str:
+    """Return how an episode ended, empty until it has; with several agents, whose failure it is."""
+    if not world.ended:
+        return ""
+    if len(world.journeys) == 1:
+        return _said(world.outcome)
+    agent = gravest(world.journeys)
+    if agent is None:
+        return f"all cleared at {world.time_s:.1f} s"
+    return f"{world.vehicles[agent].spawn.id}: {_said(world.journeys[agent].outcome)}"
+
+
+def _said(outcome: Outcome) -> str:
+    if not outcome.ended:
+        return ""
+    partner = f" with {outcome.partner}" if outcome.partner else ""
+    return f"{outcome.result.replace('_', ' ')} at {outcome.time_s:.1f} s{partner}"

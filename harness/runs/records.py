@@ -233,6 +233,7 @@ class Decision(Struct, frozen=True, kw_only=True):
     off_lag: bool | None
     acts_at_s: float | None  # when the action takes effect; closed loop only
     acted: bool | None  # whether the episode lasted until then; closed loop only
+    agent: str | None = None  # id of who decided; None if only the ego decides
 
 
 class Episode(Struct, frozen=True, kw_only=True):

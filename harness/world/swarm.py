@@ -1,12 +1,15 @@
-"""What several agents are compared with: each of them alone on the road."""
+"""What comes of several agents together, and what they are compared with: each alone on the road."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from harness.world import lockstep
 from harness.world.scenario import Layout, Scenario
 from harness.world.seats import agents_of, seats_of
 from harness.world.simulator import populated
-from harness.world.world import World
+from harness.world.world import Journey, World
+
+GRAVEST = ("collision", "off_road", "time_out")
 
 
 def alone(scenario: Scenario, seed: int) -> dict[int, float]:
@@ -28,3 +31,16 @@ def alone(scenario: Scenario, seed: int) -> dict[int, float]:
         lockstep.advance([world], [round(p.time_limit_s * p.simulation_hz)])
         cleared_s[agent] = world.outcome.time_s if world.outcome.success else p.time_limit_s
     return {agent: time_s or 0.0 for agent, time_s in cleared_s.items()}
+
+
+def gravest(journeys: Mapping[int, Journey]) -> int | None:
+    """Return the place of the agent whose failure is the episode's: the gravest, and of those the first.
+
+    None if nobody has failed.
+    """
+    failed = [
+        (GRAVEST.index(o.result), o.time_s or 0.0, agent)
+        for agent, o in ((agent, journey.outcome) for agent, journey in journeys.items())
+        if o.ended and not o.success
+    ]
+    return min(failed)[2] if failed else None

@@ -10,6 +10,7 @@ from evaluating import live_spec_of, run
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.evaluate.live_world import LiveSource, looks
+from harness.evaluate.replay import played, scenes_of, stills
 from harness.runs import folder
 from harness.world import scenarios
 from harness.world.swarm import alone
@@ -85,24 +86,52 @@ def test_every_agent_is_asked_with_its_own_graph() -> None:
         assert names == list(scene.viewers), "a vehicle keeps its model, whoever decides"
 
 
-def test_a_run_says_who_decided_and_how_all_of_them_ended(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six episodes of two to four agents, whose decisions are not ready at once, or never."""
+    out = tmp_path_factory.mktemp("agents") / "run"
     points = named_point("single-local"), named_point("6g")
-    spec = replace(live_spec_of(prompt="v4", points=points, seeds=(0,)), source=LiveSource(50_000, 6, ALL))
-    run(spec, tmp_path / "run")
-    there = folder.read(tmp_path / "run")
+    spec = live_spec_of(prompt="v4", points=points, seeds=(0,), latency="ego=1.3,helper=1.3,fusion=0")
+    run(replace(spec, source=LiveSource(50_000, 6, ALL)), out)
+    return out
+
+
+def test_a_run_says_who_decided_and_how_all_of_them_ended(driven: Path) -> None:
+    there = folder.read(driven)
     table = there.decisions
     for episode in there.episodes:
         assert episode.agents in (2, 3, 4)
         assert episode.success == (episode.arrived == episode.agents)
         rows = [
             r for r in table.records(0, len(table))
-            if (r.episode, r.condition) == (episode.episode, episode.condition)
+            if (r.episode, r.condition, r.seed) == (episode.episode, episode.condition, episode.seed)
         ]  # fmt: skip
         assert len(rows) == episode.decisions
     assert len(set(table.labels("agent"))) == 4
     scores = {(s.condition, s.metric): s.value for s in there.scores}
     mean = sum(e.arrived / e.agents for e in there.episodes if e.condition == "6g") / 6
     assert scores["6g", "arrived_rate"] == pytest.approx(mean)
+
+
+@pytest.mark.slow
+def test_every_decision_point_comes_out_again_from_the_seat_of_who_decided(driven: Path) -> None:
+    there = folder.read(driven)
+    names = list(there.decisions.scenes)
+    assert sum(e.skipped or 0 for e in there.episodes) > 0 < sum(e.never_acted or 0 for e in there.episodes)
+    assert [scene.id for scene in scenes_of(there, names)] == names
+
+
+@pytest.mark.slow
+def test_an_episode_of_agents_played_again_ends_as_it_did(driven: Path) -> None:
+    there = folder.read(driven)
+    for e in there.episodes[::5]:
+        *_, last = stills(played(there, e.episode, e.condition, e.seed))
+        ended = {agent: turn.outcome for agent, turn in last.turns.items()}
+        assert sum(said.startswith("cleared") for said in ended.values()) == e.arrived
+        if not e.success:
+            how, partner = e.failure.replace("_", " "), f" with {e.partner}" if e.partner else ""
+            [worst] = {said for agent, said in ended.items() if last.outcome == f"{agent}: {said}"}
+            assert worst == f"{how} at {e.time_s:.1f} s{partner}"
 
 
 def test_alone_on_the_road_an_agent_comes_as_soon_as_its_speed_takes_it() -> None:

@@ -44,7 +44,7 @@ def test_thinking_is_seen_frame_by_frame_and_the_rest_ten_times_a_second(out):
     times = [s.state.time_s for s in seen if 1.0 <= s.state.time_s < 2.0]
     assert times[:9] == pytest.approx([1.0 + 0.02 * n for n in range(9)])  # 145 ms are 8 frames
     assert max(b - a for a, b in pairwise(times)) == pytest.approx(0.1)
-    assert [s.open for s in seen[:9]] == [True] * 8 + [False]
+    assert [next(iter(s.turns.values())).open for s in seen[:9]] == [True] * 8 + [False]
 
 
 def typed(monkeypatch, capsys, *words):

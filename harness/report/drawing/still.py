@@ -5,6 +5,7 @@ Words are drawn when they change, what lies on the ground each time: the view fr
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
+from itertools import chain
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -14,11 +15,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch, Rectangle
 from matplotlib.path import Path as Outline
+from matplotlib.text import Text
 from matplotlib.textpath import TextPath
 
 from harness.core.arrays import Floats, Pixels
 from harness.core.errors import printable
-from harness.evaluate.replay import ReplayedEpisode, Still
+from harness.evaluate.replay import ReplayedEpisode, Still, Turn
 from harness.report.drawing.artists import body, named, roads, scale_m, shade, sight, walls
 from harness.report.drawing.colours import BAD, BUILDING_NAME, GOOD, GREY, INK, LATE, LIGHT, ROLES
 from harness.report.drawing.colours import actions as colours_of
@@ -38,7 +40,9 @@ GAPS_PT = (3.5, 13.0, 23.0, 35.0)  # between a vehicle and its name
 class Canvas:
     """A figure whose fixed parts are drawn once; what moves is drawn over a copy of them."""
 
-    def __init__(self, played: ReplayedEpisode, buildings: Sequence[Building]) -> None:
+    def __init__(
+        self, played: ReplayedEpisode, buildings: Sequence[Building], agents: Sequence[str]
+    ) -> None:  # fmt: skip
         self.played, self.actions, self.buildings = played, played.scenario.actions, buildings
         height, width = HEIGHT_IN, SIDE_IN + CAMERA_IN
         self.figure = Figure(figsize=(width, height), dpi=DPI)
@@ -49,9 +53,11 @@ class Canvas:
         self.roads, self.walls = list(roads(played.scenario)), list(walls(buildings))
         for artist in (*self.roads, *self.walls):
             self.axes.add_artist(artist)
-        self.bars = self.figure.add_axes((3.1 / width, 0.28 / height, 1.75 / width, (below - 0.4) / height))
-        self.bars.set(xlim=(0, 1), ylim=(len(self.actions) - 0.5, -0.5), xticks=[0, 0.5, 1])
-        self.bars.set_yticks(range(len(self.actions)), labels=self.actions, size=7)
+        several = len(agents) > 1
+        rows, long = (agents, 1.2) if several else (self.actions, 1.75)
+        self.bars = self.figure.add_axes((3.1 / width, 0.28 / height, long / width, (below - 0.4) / height))
+        self.bars.set(xlim=(0, 1), ylim=(len(rows) - 0.5, -0.5), xticks=[0, 0.5, 1])
+        self.bars.set_yticks(range(len(rows)), labels=list(map(printable, rows)), size=7)
         self.bars.tick_params(labelsize=6, length=2)
         self.lines = [
             self.figure.text(0.1 / width, (below - 0.4 - 0.22 * n) / height, "", size=8) for n in range(4)
@@ -83,26 +89,36 @@ class Canvas:
 
     def _words(self, still: Still, viewers: Sequence[str]) -> None:
         """The policy and what is said of it, drawn again if it is not as in the last still; and the time."""
-        decision, ego = still.decision, still.state.ego
+        turns, ego = list(still.turns.values()), still.state.ego
+        decision = turns[0].decision
         ending = still.outcome or f"decision {decision.action} at {decision.acts_at_s:.2f} s"
-        words = (decision.step, still.open, ending, *viewers)
+        if len(turns) > 1:
+            ending = still.outcome or f"{len(turns)} agents decide"
+        words = (ending, *((turn.decision.step, turn.open, turn.outcome) for turn in turns), *viewers)
         if words != self.words:
             self.words = words
             self.canvas.restore_region(self.fixed)  # type: ignore[no-untyped-call]
-            for bar in _bars(still, self.actions):
+            for bar in _shares(turns, self.actions) if len(turns) > 1 else _bars(turns[0], self.actions):
                 self.bars.add_artist(bar)
                 self.bars.draw_artist(bar)
                 bar.remove()
             self.lines[3].set(text=ending, weight="bold" if still.outcome else "normal")
             for viewer, caption in zip(viewers, self.captions, strict=False):
-                whose = "ego" if viewer == ego.id else "helper"
+                whose = "agent" if viewer in still.turns and len(turns) > 1 else "helper"
+                whose = "ego" if viewer == ego.id and len(turns) == 1 else whose
                 caption.set_text(f"cameras of {printable(viewer)}, {whose}: front above, rear below")
             for line in (self.lines[3], *self.captions[: len(viewers)]):
                 self.figure.draw_artist(line)
             self.worded = self._copy()
         self.canvas.restore_region(self.worded)  # type: ignore[no-untyped-call]
-        slow = ", thinking (slowed)" if still.open else ""
-        self.lines[2].set_text(f"{still.state.time_s:5.2f} s, ego {ego.speed_mps:4.1f} m/s{slow}")
+        thinking = [
+            f"{printable(agent)} " if len(turns) > 1 else ""
+            for agent, turn in still.turns.items()
+            if turn.open
+        ]
+        speed = f", ego {ego.speed_mps:4.1f} m/s" if len(turns) == 1 else ""
+        slow = f", {''.join(thinking)}thinking (slowed)" if thinking else ""
+        self.lines[2].set_text(f"{still.state.time_s:5.2f} s{speed}{slow}")
         self.figure.draw_artist(self.lines[2])
 
     def _above(self, still: Still, seen: dict[str, list[str]], view: View) -> None:
@@ -112,17 +128,21 @@ class Canvas:
         draw(self.axes.patch)
         for road in self.roads:
             draw(road)
-        self._over(shade(still.state, ego))
+        if len(still.turns) == 1:
+            self._over(shade(still.state, ego))
         for wall in self.walls:
             draw(wall)
         pt_per_m = SIDE_IN * 72 / view.width_m
         self._over(_buildings(self.buildings, view, pt_per_m))
         for viewer, ids in seen.items():
-            colour = ROLES["ego" if viewer == ego.id else "helper"]
+            colour = ROLES["ego" if viewer in still.turns else "helper"]
             self._over(sight(still.state, viewer, ids, colors=colour, linewidths=0.6, alpha=0.5))
+        known = {*still.turns, *chain.from_iterable(seen[agent] for agent in still.turns)}
         for vehicle in still.state.vehicles:
-            look = "danger" if vehicle.id == still.danger else vehicle.part
-            self._over(body(vehicle, look, vehicle.id not in (*seen[ego.id], ego.id)))
+            look = "ego" if vehicle.id in still.turns else vehicle.part
+            self._over(
+                body(vehicle, "danger" if vehicle.id == still.danger else look, vehicle.id not in known)
+            )
         self._over(*_messages(self.played, still), *self._names(still, view, pt_per_m))
         for spine in self.axes.spines.values():
             draw(spine)
@@ -140,11 +160,13 @@ class Canvas:
     def _names(self, still: Still, view: View, pt_per_m: float) -> Iterator[Artist]:
         """Every vehicle's id and speed beside it, over nobody: where it was in the last still if it can."""
         shown = [v for v in still.state.vehicles if view.holds(north_up(np.array([v.x_m, v.y_m])))]
-        attackers = {message.sender for message in still.decision.messages if message.attacker}
+        decisions = {agent: turn.decision for agent, turn in still.turns.items()}
+        attackers = {m.sender for decision in decisions.values() for m in decision.messages if m.attacker}
         taken = [_around(v) for v in still.state.vehicles]
         outlines, leaders = list[Outline](), list[Floats]()
         for v in shown:
-            text = f"{v.id} {v.speed_mps:.0f} m/s{' attacks' if v.id in attackers else ''}"
+            action = f" {decisions[v.id].action}" if v.id in decisions and len(decisions) > 1 else ""
+            text = f"{v.id} {v.speed_mps:.0f} m/s{action}{' attacks' if v.id in attackers else ''}"
             outline, size = _outline(text), _size(text) / pt_per_m
             box = _around(v)
             at, reach = box.mean(axis=0), (box[1] - box[0]) / 2
@@ -216,36 +238,51 @@ def _size(text: str) -> Floats:
 
 
 def _messages(played: ReplayedEpisode, still: Still) -> Iterator[Artist]:
-    """Each reply on its way from its helper to the ego; one that was lost goes half of it.
+    """Each reply on its way from its helper to who asked; one that was lost goes half of it.
 
     Where each answer has a time of its own, a reply is drawn from the decision's start.
     """
     latency = played.manifest.latency
     sent_s = max(latency.ego_s or 0.0, *latency.helper_times_s(), 0.0)
-    ego = still.state.ego
     there = {v.id for v in still.state.vehicles}
-    for message in still.decision.messages if still.open else ():
+    open_turns = [(agent, turn) for agent, turn in still.turns.items() if turn.open]
+    for agent, turn, message in ((a, t, m) for a, t in open_turns for m in t.decision.messages):
         if message.sender not in there:
             continue
-        end_s = (message.arrival_ms or still.decision.latency_ms or 0.0) / 1000
-        share = np.clip((still.since_s - sent_s) / max(end_s - sent_s, 1e-9), 0.0, 1.0)
+        asker = still.state.vehicle(agent)
+        end_s = (message.arrival_ms or turn.decision.latency_ms or 0.0) / 1000
+        share = np.clip((turn.since_s - sent_s) / max(end_s - sent_s, 1e-9), 0.0, 1.0)
         lost = not message.delivered
         share = min(share, 0.5) if lost else share
         helper = still.state.vehicle(message.sender)
-        path = north_up(np.array([[helper.x_m, helper.y_m], [ego.x_m, ego.y_m]]))
+        path = north_up(np.array([[helper.x_m, helper.y_m], [asker.x_m, asker.y_m]]))
         place = path[0] + share * (path[1] - path[0])
         yield Line2D(*path.T, color=GREY, linewidth=0.8, linestyle=":")
-        if still.since_s >= sent_s:
+        if turn.since_s >= sent_s:
             colour = BAD if lost else GOOD if message.on_time else LATE
             yield Line2D(place[:1], place[1:], marker="X" if lost else "o", color=colour, markersize=6)
 
 
-def _bars(still: Still, actions: Sequence[str]) -> Iterator[Artist]:
+def _bars(turn: Turn, actions: Sequence[str]) -> Iterator[Artist]:
     """Yield the policy of the last decision, pale until it is ready."""
-    decision, colours = still.decision, colours_of(actions)
+    decision, colours = turn.decision, colours_of(actions)
     for n, (action, p) in enumerate(zip(actions, decision.fused, strict=True)):
         width = 1.4 if action == decision.action else 0.3
-        pale = 0.35 if still.open else 1.0
+        pale = 0.35 if turn.open else 1.0
         yield Rectangle(
             (0.0, n - 0.4), p, 0.8, facecolor=colours[action], alpha=pale, edgecolor=INK, linewidth=width
         )
+
+
+def _shares(turns: Sequence[Turn], actions: Sequence[str]) -> Iterator[Artist]:
+    """Yield the policy of each agent's last decision as a row from slow to fast, and what it came to."""
+    colours = list(colours_of(actions).values())
+    for n, turn in enumerate(turns):
+        starts = np.cumsum([0.0, *turn.decision.fused[:-1]])
+        for start, p, colour in zip(starts.tolist(), turn.decision.fused, colours, strict=True):
+            pale = 0.35 if turn.open or turn.outcome else 1.0
+            yield Rectangle(
+                (start, n - 0.4), p, 0.8, facecolor=colour, alpha=pale, edgecolor=INK, linewidth=0.3
+            )
+        said = turn.outcome.split(" at ")[0] or turn.decision.action
+        yield Text(1.05, n, said, size=7, va="center", clip_on=False)

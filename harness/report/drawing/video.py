@@ -88,7 +88,7 @@ def _mp4(pictures: Iterator[Pixels], out: Path) -> None:
 def _pictures(played: ReplayedEpisode, progress: Callable[[int], None]) -> Iterator[Pixels]:
     listed = list(stills(played))
     graphs = list(_graphs(played.scenario, listed))
-    canvas = Canvas(played, listed[0].state.buildings)
+    canvas = Canvas(played, listed[0].state.buildings, list(listed[0].turns))
     for still, seen, view in zip(listed, graphs, _views(played.scenario, listed, graphs), strict=True):
         yield canvas.picture(still, {v: [*graph.seen] for v, graph in seen.items()}, view)
         progress(1)
@@ -112,7 +112,8 @@ def _views(
     held = []
     for still, seen in zip(listed, graphs, strict=True):
         now = still.since_s < period_s  # later, who was asked last and who was met is of the past
-        asked = [message.sender for message in still.decision.messages] if now else []
+        decisions = [turn.decision for turn in still.turns.values()] if now else []
+        asked = [message.sender for decision in decisions for message in decision.messages]
         graph = seen[still.state.ego.id] if now else None
-        held.append(spots(still.state, zone_m, graph, (still.danger, *asked)))
+        held.append(spots(still.state, zone_m, graph, (still.danger, *still.turns, *asked)))
     return views(held, [int(still.state.time_s / period_s + 1e-6) for still in listed], shape_of(scenario))
