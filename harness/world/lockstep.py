@@ -222,7 +222,8 @@ class Fleet:
         self.route = np.full((*shape, longest + 1), -1)
         self.section = np.zeros(shape, dtype=int)
         self.seat = np.full(shape, -1)  # number of each agent's seat; -1 for an ego
-        seats = list(seats_of(scenario))
+        self.seats = seats_of(scenario)
+        seats = list(self.seats)
         for b, world in enumerate(worlds):
             for n, v in enumerate(world.vehicles):
                 self._read(b, n, v)
@@ -300,7 +301,7 @@ class Fleet:
         if (egos := seat < 0).any():
             xy = np.where(self.there[..., None], self.xy, np.nan)
             cleared[egos] = self.scenario.cleared(xy, self.approach, p)[self.agents[0][egos]]
-        for n, (key, its) in enumerate(seats_of(self.scenario).items()):
+        for n, (key, its) in enumerate(self.seats.items()):
             if (at := seat == n).any():
                 xy = self.xy[self.agents][at][:, None]
                 names = np.full(xy.shape[:2], its.names[key][0])

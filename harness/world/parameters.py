@@ -145,6 +145,9 @@ class Shared(Parameters):
     # probability that a vehicle which could decide does so, the ego aside: 1 makes all of them agents. Which
     # ones do belongs to the layout, and those of a lower share are among those of a higher one
     agent_share: float = 0.0
+    # time for whoever gave way to go on, and decisions for it: fewer would make a deadlock of every stop
+    decisions: int = 10
+    time_limit_s: float = 14.0
     limits: int = 2
     perception: int = 2
 

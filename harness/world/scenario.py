@@ -78,7 +78,8 @@ class Layout:
 class Seat:
     """The view of an agent that is not the ego: a scene in which it is, on the same network and in its frame.
 
-    The scenario has the same name, parameters and actions; road, goal and words are the agent's.
+    The scenario has the same name and actions, and whatever parameters the shared one has; road, goal and
+    words are the agent's.
     """
 
     scenario: "Scenario"  # the scenario with the agent as its ego

@@ -6,6 +6,7 @@ several agents nothing but the names of vehicles' parts and of paths differs bet
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 
 from msgspec.structs import replace as changed
 
@@ -15,9 +16,15 @@ from harness.world.scenario import Layout, Scenario, Seat
 from harness.world.state import VehicleState, WorldState
 
 
+@lru_cache(maxsize=64)
 def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
-    """Return the seats of a scenario by the path that an agent is on; none if only the ego has a goal."""
-    return scenario.seats() if scenario.seats else {}
+    """Return the seats of a scenario by the path that an agent is on; none if only the ego has a goal.
+
+    Their scenarios have its parameters.
+    """
+    seats = scenario.seats() if scenario.seats else {}
+    p = scenario.parameters
+    return {key: replace(at, scenario=replace(at.scenario, parameters=p)) for key, at in seats.items()}
 
 
 def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tuple[int, ...]]:

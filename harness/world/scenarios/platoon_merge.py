@@ -37,7 +37,6 @@ class Parameters(Shared):
     """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0)  # up to 54 km/h
-    time_limit_s: float = 14.0
     speed_mps: float = 15.0  # speed of everybody at the start
     # from the start to where the ramp has run into the right lane
     ego_start_m: tuple[float, float] = (58.0, 70.0)
