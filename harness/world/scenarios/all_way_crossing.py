@@ -119,7 +119,7 @@ def _seat(arm: int) -> Seat:
         (seen_from(0, other), route): (seen_from(arm, other), route)
         for other, route in product(range(len(APPROACHES)), ROUTES)
     }
-    return Seat(replace(SCENARIO, road=its, cleared=partial(cleared, arm), seats=None), names)
+    return Seat(replace(SCENARIO, road=its, cleared=partial(cleared, arm)), names)
 
 
 SCENARIO = Scenario(
