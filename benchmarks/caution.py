@@ -39,7 +39,7 @@ def costs_s(scenario: Scenario, seeds: Sequence[int]) -> Floats:
         if not going:
             break
         driven = [worlds[e] for e in going]
-        actions = reference.decide(driven, [PRIVILEGED] * len(driven))
+        actions = [each[0] for each in reference.decide(driven, [PRIVILEGED] * len(driven))]
         lockstep.advance(driven, [p.due_frame(step) + p.lag_frames] * len(driven))
         for e, world, action in zip(going, driven, actions, strict=True):
             if action != SLOWER and not world.outcome.ended:

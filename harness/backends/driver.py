@@ -9,8 +9,9 @@ from harness.backends.registry import BUILT_IN
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, sha256_file
 from harness.world.drivers import CONSTANT, CONSTANTS, DRIVERS, UNIFORM, choices, constant
+from harness.world.precedence import RULES
 
-REFERENCES = (*DRIVERS, UNIFORM, CONSTANT)
+REFERENCES = (*DRIVERS, *RULES, UNIFORM, CONSTANT)
 
 
 def open(card: Card, **_: Any) -> "DriverBackend":

@@ -1,7 +1,8 @@
 """Reference drivers: rule-based baselines to compare models with.
 
 `cruise` keeps its speed, `brake` always brakes, `local-view` plans with what the ego's sensors know and
-`full-view` plans with everything in view.
+`full-view` plans with everything in view. `right-hand` and `first-come` know what `local-view` knows, and
+keep a rule of the road with those who keep it, too (`precedence`).
 
 Two references look at nothing at all. `uniform` holds every action for equally likely. `constant` always
 takes the action that did best in a scenario's tune layouts: `constants.csv` has what each clears, and
@@ -16,12 +17,14 @@ from pathlib import Path
 
 from harness.core.files import text_of
 from harness.world.planner import plans
+from harness.world.precedence import RULES, under
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
 
 DRIVERS = ("cruise", "brake", "local-view", "full-view")
 ALWAYS = {"cruise": "IDLE", "brake": "SLOWER"}
 PRIVILEGED = "full-view"  # the only one that may read the truth
+LOOKING = ("local-view", PRIVILEGED, *RULES)  # decide by a scene graph
 UNIFORM, CONSTANT = "uniform", "constant"
 BLIND = (*ALWAYS, UNIFORM, CONSTANT)  # look at nothing
 CONSTANTS = Path(__file__).with_name("constants.csv")
@@ -41,7 +44,7 @@ def choices(
     A driver may also be an action, which is always taken.
     """
     always = {**{action: action for action in scenario.actions}, **ALWAYS}
-    planned = iter(plans(scenario, [_read(*each) for each in asked if each[0] not in always]))
+    planned = iter(plans(scenario, [_read(scenario, *each) for each in asked if each[0] not in always]))
     return [always.get(driver) or next(planned) for driver, *_ in asked]
 
 
@@ -71,9 +74,9 @@ def _score(row: Mapping[str, str]) -> int:
     return (cleared - harmless_cleared) * harmless + harmless_cleared * (layouts - harmless)
 
 
-def _read(driver: str, graph: SceneGraph | None, truth: SceneGraph | None) -> SceneGraph:
+def _read(scenario: Scenario, driver: str, graph: SceneGraph | None, truth: SceneGraph | None) -> SceneGraph:
     """Return the graph that a driver plans with."""
-    read = graph if driver == "local-view" else truth
+    read = truth if driver == PRIVILEGED else graph
     if read is None:
         raise ValueError(f"driver {driver!r} was not given the graph that it reads")
-    return read
+    return under(driver, scenario, read) if driver in RULES else read

@@ -1,6 +1,6 @@
 """Drive the reference drivers in closed loop, from start to outcome."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -9,42 +9,64 @@ import numpy as np
 from harness.core.parallel import Workers, spread
 from harness.core.statistics import Estimate, mean_of, rate_interval
 from harness.world import lockstep
-from harness.world.drivers import DRIVERS, PRIVILEGED, choices
+from harness.world.drivers import DRIVERS, LOOKING, PRIVILEGED, choices
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
-from harness.world.state import WorldState
 from harness.world.world import World
 
 TOGETHER = 16  # episodes that are simulated together
 BY_DANGER = ("balanced", "dangerous", "harmless")  # success by danger, in a `summary`
 
 
-def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[str]:
-    """Return each world's driver's meta-action in its present state; the worlds are of one scenario."""
-    scenario = worlds[0].scenario
-    states: dict[str, list[WorldState]] = {"local-view": [], PRIVILEGED: []}
-    for world, driver in zip(worlds, drivers, strict=True):
-        if driver in states:
-            states[driver].append(world.state())
-    seen = iter(scene_graphs(scenario, [(state, state.ego.id) for state in states["local-view"]]))
-    truths = iter(truth_graphs(scenario, states[PRIVILEGED]))
-    graphs = {"local-view": seen, PRIVILEGED: truths}
-    knows = [next(graphs[driver]) if driver in graphs else None for driver in drivers]
-    return choices(scenario, [(driver, graph, graph) for driver, graph in zip(drivers, knows, strict=True)])
+def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, str]]:
+    """Return the meta-action of each world's driver for each of its agents under way, by their places.
+
+    The worlds are of one scenario.
+    """
+    deciding = [
+        (n, agent) for n, world in enumerate(worlds)
+        for agent, journey in world.journeys.items() if not journey.outcome.ended
+    ]  # fmt: skip
+    by_seat: dict[Scenario, list[tuple[int, int]]] = {}
+    for n, agent in deciding:
+        by_seat.setdefault(worlds[n].seat(agent), []).append((n, agent))
+    actions: list[dict[int, str]] = [{} for _ in worlds]
+    for scenario, places in by_seat.items():
+        states = {(n, agent): worlds[n].state(agent) for n, agent in places if drivers[n] in LOOKING}
+        truthful = [at for at in states if drivers[at[0]] == PRIVILEGED]
+        others = [at for at in states if drivers[at[0]] != PRIVILEGED]
+        seen = scene_graphs(scenario, [(states[at], states[at].ego.id) for at in others])
+        graphs = dict(zip(others, seen, strict=True))
+        graphs |= zip(truthful, truth_graphs(scenario, [states[at] for at in truthful]), strict=True)
+        asked = [(drivers[n], graphs.get((n, agent)), graphs.get((n, agent))) for n, agent in places]
+        for (n, agent), action in zip(places, choices(scenario, asked), strict=True):
+            actions[n][agent] = action
+    return actions
 
 
 def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
-    """Let each world's driver take all remaining decisions; the worlds are of one scenario."""
+    """Let each world's driver take all remaining decisions of each agent; return the ego's outcomes.
+
+    The worlds are of one scenario.
+    """
     going = list(zip(worlds, drivers, strict=True))
-    while going := [(world, driver) for world, driver in going if not world.outcome.ended]:
-        p, driven = worlds[0].scenario.parameters, [world for world, _ in going]
-        actions = decide(driven, [driver for _, driver in going])
-        lockstep.advance(driven, [p.due_frame(world.step) + p.lag_frames for world in driven])
-        for world, action in zip(driven, actions, strict=True):
-            world.decide(action)
-        lockstep.advance(driven, [p.due_frame(world.step) for world in driven])
+    while going := [(world, driver) for world, driver in going if not world.ended]:
+        driven = [world for world, _ in going]
+        take_turn(driven, decide(driven, [driver for _, driver in going]))
     return [world.outcome for world in worlds]
+
+
+def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> None:
+    """Let the agents of each world act, by their places, after the lag, and simulate to the next decision."""
+    p = worlds[0].scenario.parameters
+    lockstep.advance(worlds, [p.due_frame(world.step) + p.lag_frames for world in worlds])
+    for world, chosen in zip(worlds, actions, strict=True):
+        for agent, action in chosen.items():
+            if not world.journeys[agent].outcome.ended:
+                world.take(action, agent)
+        world.step += 1
+    lockstep.advance(worlds, [p.due_frame(world.step) for world in worlds])
 
 
 def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
