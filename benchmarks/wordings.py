@@ -1,8 +1,8 @@
-"""What a search over marked wordings gains: SmolLM2 with `v9`, and swarm-tiny-six with `v4`, both read out.
+"""What a search over marked wordings gains, by read-out: SmolLM2 with `v9`, and two small models with `v4`.
 
     python benchmarks/wordings.py [--only TEXT] [--out reports/wordings] [OPTION ...]
 
-It makes a project in the folder, marks alternatives in copies of the two prompts, and types `harness prompt
+It makes a project in the folder, marks alternatives in copies of the prompts, and types `harness prompt
 optimize` for each row of `ROWS`, with further options if any are given. What is finished stays; a stopped
 search goes on with the same command. SmolLM2 asks its weights of `harness model pull smollm2-135m`.
 """
@@ -19,7 +19,6 @@ from harness.core.resources import MARKER, folder
 
 SMALLEST = "--only six --layouts 2 --budget 20"
 NEEDS = "torch"
-DATASET = "blind-merge-v2"
 
 
 class Row(NamedTuple):
@@ -29,6 +28,7 @@ class Row(NamedTuple):
     prompt: str  # the released version that is marked
     marks: dict[str, str]  # text of its ego.j2, and with what it is replaced
     options: str
+    dataset: str = "blind-merge-v2"
 
 
 SAFE, QUICK = "Never collide. ", "Do not lose time where nothing is in your way. "
@@ -43,6 +43,16 @@ SPREAD, CAREFUL = (
     "Where a region is hidden, be careful.",
 )
 HEAD = "CONFLICTS id how lane: ego m, s / it m, s"
+OBJECTS = (
+    "OBJECTS id type ahead left speed lane light\n"
+    "{% for n in objects -%}\n"
+    "{{ n.id }} {{ n.type }} {{ n.forward_m | round | int }} {{ n.left_m | round | int }} "
+    "{{ n.speed_mps | round | int }} {{ n.lane }} "
+    '{{ "brake" if n.braking is defined and n.braking else n.indicator or "?" }}\n'
+    "{% else -%}\nnone\n{% endfor -%}\n"
+    "{% if more and not messages %}and {{ more }} farther away\n{% endif -%}\n"
+)
+SEEN, TENS = "{{ (s.seen_share * 100) | round | int }}", "{{ (s.seen_share * 10) | round | int * 10 }}"
 
 
 def either(name: str, *texts: str) -> str:
@@ -74,12 +84,23 @@ ROWS = {
         },
         "--engine llama-cpp --layouts 4 --budget 80 --limit 6",
     ),
+    "objects": Row(
+        "swarm-tiny-six-v2",
+        "v4",
+        {
+            OBJECTS: either("objects", OBJECTS, ""),
+            SPREAD: either("hidden", SPREAD, CAREFUL, SPREAD + " " + CAREFUL),
+            SEEN: either("seen", SEEN, TENS),
+            "Distribution:": either("end", "Distribution:", "Careful distribution:"),
+        },
+        "--layouts 60 --budget 6000",
+        "occluded-intersection-v3",
+    ),
 }
 
 
-def mark(row: Row, where: Path) -> str:
-    """Write a copy of the row's prompt with its marks into a project; return its name."""
-    name = f"{row.prompt}-marked"
+def mark(row: Row, name: str, where: Path) -> str:
+    """Write a copy of the row's prompt with its marks into a project, unless it is there; return its name."""
     if not (where / name).is_dir():
         shutil.copytree(folder("prompts") / row.prompt, where / name)
         file = where / name / "ego.j2"
@@ -102,10 +123,10 @@ def main() -> None:
     os.chdir(project)
     for name, row in ROWS.items():
         if options.only in name and not Path("reports", name, "optimize.json").is_file():
-            base = mark(row, Path("prompts"))
+            base = mark(row, f"{row.prompt}-{name}", Path("prompts"))
             harness(
                 "prompt", "optimize", "--model", row.model, "--prompt", base, "--answer", "readout",
-                "--dataset", DATASET, "--out", name, *row.options.split(), *others,
+                "--dataset", row.dataset, "--out", name, *row.options.split(), *others,
             )  # fmt: skip
 
 
