@@ -58,6 +58,7 @@ PUBLISHED = (
     Row("smollm2-135m", "v10", "constrained"),
     Row("smollm2-135m", "v9", "readout"),
     Row("smollm2-135m", "v10", "readout"),
+    Row("swarm-smol", "v9", "readout"),  # the same weights with an adapter, so as slow
 )
 OURS = (
     Row("swarm-tiny", "v2", "json"),
