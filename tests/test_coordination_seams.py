@@ -16,6 +16,7 @@ from harness.coordination.consensus import Messages, Rule
 from harness.coordination.coordinate import Coordination, FusionInputs, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.coordination.plans import Plans
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
 from harness.core.plugins import Plugins
@@ -199,20 +200,22 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
                 np.full(20, 0.2), np.where(rng.random((20, 3)) < 0.5, 1.0, np.nan),
                 lambda xy_m: np.abs(xy_m[..., 0]) / 10,
             ),
+            Plans(np.tile(np.arange(4), (20, 1)), rng.uniform(0, 9, (20, 4)), rng.uniform(0, 3, (20, 4))),
         )  # fmt: skip
         fused = rule.fuse(messages, state)
         assert fused.policy.sum(axis=-1) == pytest.approx(1.0)
         assert (fused.policy >= 0).all()
         arrays = {field: getattr(messages, field) for field in messages.__dataclass_fields__}
-        claims = arrays.pop("claims").take(7)
-        row = Messages(**{name: array[7] for name, array in arrays.items()}, claims=claims)
+        more = {name: arrays.pop(name).take(7) for name in ("claims", "plans")}
+        row = Messages(**{name: array[7] for name, array in arrays.items()}, **more)
         single = rule.fuse(row, alone)
         assert single.policy == pytest.approx(fused.policy[7])
         order = [2, 0, 1]
         with_ego = [0, 3, 1, 2]
         shuffled = replace(
-            messages, intents=intents[:, with_ego], weights=weights[:, with_ego], heard=heard[:, order]
-        )
+            messages, intents=intents[:, with_ego], weights=weights[:, with_ego], heard=heard[:, order],
+            plans=Plans(*(array[:, with_ego] for array in vars(messages.plans).values())),
+        )  # fmt: skip
         if state.shape[-1] == 0:  # a rule with memory may remember who said what
             assert rule.fuse(shuffled, state).policy == pytest.approx(fused.policy)
         state, alone = fused.state, single.state

@@ -65,13 +65,16 @@ def command(
     from harness.backends.cache import default_file
     from harness.backends.registry import open_backend
     from harness.coordination.attacks import ATTACKS
-    from harness.coordination.rules import RULES
+    from harness.coordination.rules import RULES, reads_plans
     from harness.evaluate.run import read_or_evaluate
     from harness.studies.replayed_run import ReplayedRun
     from harness.studies.trust import names_of, run_bench, shares_of, trust_study
 
     attack_names = names_of("--attacks", attacks, tuple(ATTACKS))
-    rule_names, shares = names_of("--rules", rules, tuple(RULES)), shares_of(share)
+    rule_names, shares = (
+        names_of("--rules", rules, tuple(rule for rule in RULES if not reads_plans(rule))),
+        shares_of(share),
+    )
     if (run is None and model is None) or (run and prompt):
         raise UserError("give either RUN, the folder of a finished run, or --model, with its --prompt")
     with bar("rules under attack", quiet=as_json or quiet, grows=True) as progress:

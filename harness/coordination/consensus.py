@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from harness.coordination.claims import Claims
+from harness.coordination.plans import Plans
 from harness.core.arrays import Bools, Floats, summed
 
 
@@ -31,6 +32,8 @@ class Messages:
     range_m: Floats  # distance to the ego, `(..., H)`
     # what helpers claim about themselves, for a rule whose `needs` names it; else None
     claims: Claims | None = None
+    # what agents say of themselves, for a rule whose `needs` names it; `intents` are then plans. Else None
+    plans: Plans | None = None
 
 
 class Fused(NamedTuple):
@@ -50,7 +53,8 @@ class Rule(Protocol):
 
     The steps of an episode are fused in order, each from the state that the last one left. This includes
     steps in which the ego hears nobody; there it acts on its own intent, whatever the rule returns. A rule
-    that uses `Messages.claims` has `needs = ("claims",)`.
+    that uses `Messages.claims` has `needs = ("claims",)`. One that has `needs = ("plans",)` reads what agents
+    are themselves going to do, and no other rule does.
     """
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:

@@ -3,6 +3,7 @@
 What a message holds besides an intent is for the ego's model, which is asked once more: with the helpers'
 words in its prompt, or with a scene graph that their objects make larger. A list of objects needs no model:
 it can leave as soon as the request is there, while an intent and words wait for the helper's inference.
+Where several vehicles decide, a message can hold its sender's own plan, which costs no further inference.
 """
 
 from typing import Final, Literal, NamedTuple
@@ -10,6 +11,7 @@ from typing import Final, Literal, NamedTuple
 INTENT: Final = "intent"
 TEXT: Final = "text"
 OBJECTS: Final = "objects"
+PLAN: Final = "plan"
 TRUTH: Final = "truth"
 
 
@@ -21,6 +23,8 @@ class Content(NamedTuple):
     # the `truth`, which no message can hold; empty where it is not asked again
     graph: Literal["", "objects", "truth"] = ""
     words: bool = False  # whether it holds the helper's words and nothing else
+    # whether it holds what its sender is itself going to do: the answer that it gave as an agent
+    plan: bool = False
 
     @property
     def asks_helpers(self) -> bool:
@@ -36,6 +40,7 @@ class Content(NamedTuple):
 CONTENTS = {
     INTENT: Content(intent=True),  # the paper's
     TEXT: Content(intent=False, words=True),  # the ego acts on its answer to the helpers' words
+    PLAN: Content(intent=False, plan=True),  # from agents alone
     # as a CPM or an SDSM; the ego acts on its answer to the larger graph
     OBJECTS: Content(intent=False, graph=OBJECTS),
     # the ego's answer to the larger graph is fused with the helpers' intents

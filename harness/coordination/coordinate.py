@@ -108,8 +108,9 @@ def fuse(
             p[..., 0, :] = fused
         rule, (*batch, vehicles, actions) = RULES[point.fusion.consensus], p.shape
         messages = Messages(
-            p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, intents.claims
-        )
+            p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, intents.claims,
+            intents.plans,
+        )  # fmt: skip
         state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
         fused, weights, state, rule_trust = rule.fuse(messages, state)
         trust = trust if rule_trust is None else np.where(heard.on_time, rule_trust, np.nan)

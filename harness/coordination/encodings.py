@@ -28,8 +28,9 @@ def reply_bits(encoding: str, content: Content, intents: Intents, headers: bool)
     text_bytes = 0.0 if intents.text_bytes is None else intents.text_bytes
     if content.words and encoding == JSON:
         bits += 8 * (len(SAYS) + text_bytes)
-    elif content.asks_helpers:
-        counts = Counts(actions=intents.own.shape[-1] * content.intent, text_bytes=text_bytes)
+    elif content.asks_helpers or content.plan:
+        holds_intent = content.intent or content.plan
+        counts = Counts(actions=intents.own.shape[-1] * holds_intent, text_bytes=text_bytes)
         bits += intents.payload_bits if encoding == JSON else _packet(encoding, "intent", counts, headers)
     if content.graph:
         assert intents.object_bits is not None

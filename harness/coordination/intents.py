@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.claims import Claims
+from harness.coordination.plans import Plans
 from harness.coordination.scheduling import Outlook
 from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Site
@@ -44,6 +45,12 @@ class Intents:
     # whether the helper's model was not asked yet, `(..., H)`; until then it counts as valid. None if the
     # models of all were
     unasked: Bools | None = None
+    # what agents say of themselves, if messages hold plans; of the agent alone, `(..., 1)`, until it is known
+    # whom it hears. Else None
+    plans: Plans | None = None
+    # size of the agent's own answer as a reply, and bytes of its text, `(...)`, if messages hold plans
+    own_bits: Floats | None = None
+    own_text_bytes: Floats | None = None
 
     def take(self, at: Any) -> "Intents":
         """Return the decisions at these indices of the leading dimension."""
@@ -52,6 +59,7 @@ class Intents:
             site=self.site and self.site.take(at),
             outlook=self.outlook and self.outlook.take(at),
             claims=self.claims and self.claims.take(at),
+            plans=self.plans and self.plans.take(at),
             **{name: array[at] for name, array in self.arrays().items()},
         )
 
@@ -78,6 +86,28 @@ class Intents:
         unasked = np.zeros(self.valid.shape, dtype=bool) if self.unasked is None else self.unasked
         return replace(self, valid=self.valid & ((said > 0) | unasked))
 
+    def planned(self, senders: Ints) -> "Intents":
+        """Return what agents (n,) hear whose messages hold plans, by the row of each sender (n, H) or -1.
+
+        Only whoever decides now, and whose answer could be read, has a plan to send.
+        """
+        assert self.plans is not None
+        assert self.own_bits is not None
+        assert self.own_text_bytes is not None
+        there = senders >= 0
+        helpers = np.where(there[..., None], self.own[senders], np.nan)
+        ready_s = np.where(there, self.inference_s[senders, 0], np.nan)
+        return replace(
+            self,
+            helpers=helpers,
+            valid=~np.isnan(helpers).any(axis=-1) & np.isfinite(self.range_m),
+            payload_bits=np.where(there, self.own_bits[senders], 0.0),
+            text_bytes=np.where(there, self.own_text_bytes[senders], 0.0),
+            inference_s=np.concatenate([self.inference_s[:, :1], ready_s], axis=1),
+            unasked=None,
+            plans=self.plans.among(senders),
+        )
+
     @classmethod
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":
         """Concatenate decisions with the same number of vehicles; none has a site, an outlook or claims."""
@@ -90,7 +120,7 @@ class Intents:
         cut = {
             name: array[..., : helpers + (name in WITH_EGO)]
             for name, array in self.arrays().items()
-            if name not in ("own", "helpers")
+            if name not in (*OF_EGO, "helpers")
         }
         return replace(self, helpers=self.helpers[..., :helpers, :], **cut)
 
@@ -100,7 +130,7 @@ class Intents:
         selected = {
             name: np.take_along_axis(array, with_ego if name in WITH_EGO else places, axis=-1)
             for name, array in self.arrays().items()
-            if name not in ("own", "helpers")
+            if name not in (*OF_EGO, "helpers")
         }
         helpers = np.take_along_axis(self.helpers, places[..., None], axis=-2)
         return replace(
@@ -109,6 +139,7 @@ class Intents:
             site=self.site and self.site.of_helpers(places),
             outlook=self.outlook and self.outlook.of_helpers(places),
             claims=self.claims and self.claims.of_helpers(places),
+            plans=self.plans and self.plans.of_helpers(places),
             **selected,
         )
 
@@ -118,5 +149,6 @@ class Intents:
         return {name: value for name, value in values.items() if name not in PARTS and value is not None}
 
 
-PARTS = ("site", "outlook", "claims")
+PARTS = ("site", "outlook", "claims", "plans")
+OF_EGO = ("own", "own_bits", "own_text_bytes")  # arrays without a column for each vehicle
 WITH_EGO = ("distance_m", "inference_s")  # arrays whose first column is the ego's

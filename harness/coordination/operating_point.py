@@ -8,11 +8,12 @@ from typing import Any, Literal, NamedTuple, get_type_hints
 from msgspec import structs
 
 from harness.coordination.attacks import ATTACKS, Absent, attacks_of, in_question
-from harness.coordination.contents import CONTENTS, INTENT, OBJECTS, TRUTH, Content
+from harness.coordination.contents import CONTENTS, INTENT, OBJECTS, PLAN, TRUTH, Content
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.parts import FUSION, RELAY, Ask, Cloud, Fusion, Guard, Part, Radio, wrong
+from harness.coordination.precedence import Precedence
 from harness.coordination.robust import Heads
-from harness.coordination.rules import EGO_PROMPT, RULES
+from harness.coordination.rules import EGO_PROMPT, RULES, names, reads_plans
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
 from harness.core.config import changed, pairs, settable, value_of
@@ -86,6 +87,7 @@ class OperatingPoint:
 
     def _check_together(self) -> None:
         holds = f"content is {self.ask.content}"
+        self._check_plans(holds)
         if self.guard.attack and self.radio.profile is None:
             raise wrong("attack", self.guard.attack, "left out where there is no channel")
         if self.cloud.round_trip and self.has_fusion_call:
@@ -106,7 +108,7 @@ class OperatingPoint:
             raise wrong("attack", self.guard.attack, "one on intents where content lists no objects")
         kind = "in_words" if self.content.words else "in_objects"
         apt = all(getattr(attack, kind) or isinstance(attack, Absent) for attack in attacks)
-        if not (self.content.intent or apt):
+        if not (self.content.intent or self.content.plan or apt):
             able = ", ".join(name for name in ATTACKS if getattr(ATTACKS[name], kind))
             allowed = f"some of {able} and absent where {holds}, which holds no intents"
             raise wrong("attack", self.guard.attack, allowed)
@@ -128,6 +130,22 @@ class OperatingPoint:
             raise wrong("content", self.ask.content, allowed)
         if self.radio.edge == FUSION:
             raise wrong("edge", FUSION, f"none or relay {where}: a unit has no model")
+
+    def _check_plans(self, holds: str) -> None:
+        """Raise ValueError for a rule that does not fit the content, and for what plans go without."""
+        if reads_plans(self.fusion.consensus) != self.content.plan:
+            if self.content.plan:
+                able = ", ".join(name for name in names() if reads_plans(name))
+                raise wrong("consensus", self.fusion.consensus, f"one of {able} where {holds}")
+            raise wrong("content", self.ask.content, f"{PLAN} where consensus is {self.fusion.consensus}")
+        if not self.content.plan:
+            return
+        if self.ask.messages != "own":
+            raise wrong("messages", self.ask.messages, f"own where {holds}")
+        if self.ask.on_demand:
+            raise wrong("on_demand", True, f"false where {holds}: an agent plans in any case")
+        if self.radio.edge == FUSION:
+            raise wrong("edge", FUSION, f"none or relay where {holds}: a unit has no plan")
 
     @classmethod
     def of(cls, name: str, profile: str | None = None, **settings: Any) -> "OperatingPoint":
@@ -265,9 +283,10 @@ class OperatingPoint:
         if setting in UNIT and self.radio.edge == "none":
             return "it has no roadside unit (edge is none)"
         on_demand = setting == "on_demand" and self.content.asks_helpers
-        if setting in OF_INTENTS and not (self.content.intent or on_demand):
+        if setting in OF_INTENTS and not (self.content.intent or self.content.plan or on_demand):
             return f"content {ask.content} holds no intents"
-        if setting in WEIGHING and (consensus == EGO_PROMPT or isinstance(RULES[consensus], Heads)):
+        weighs_none = consensus == EGO_PROMPT or isinstance(RULES[consensus], Heads | Precedence)
+        if setting in WEIGHING and weighs_none:
             return f"consensus {consensus} weighs no distances"
         counts_rounds = isinstance(self.channel, constant.Radio) and not self.channel.density_coupled
         if setting == "helper_rounds" and not counts_rounds:

@@ -6,6 +6,7 @@ paper's section III-C).
 """
 
 from harness.coordination.consensus import Pool, Rule, linear_pool, log_pool, median, trimmed_mean
+from harness.coordination.precedence import PRECEDENCE
 from harness.coordination.robust import HEADS
 from harness.coordination.trust import Trust
 from harness.core.plugins import Plugins
@@ -14,9 +15,14 @@ POOLS = {"linear": linear_pool, "log-pool": log_pool, "median": median, "trimmed
 RULES: Plugins[Rule] = Plugins(
     "swarmdrive.rules",
     Rule,
-    {**{name: Pool(pool) for name, pool in POOLS.items()}, **HEADS, "trust": Trust()},
+    {**{name: Pool(pool) for name, pool in POOLS.items()}, **HEADS, "trust": Trust(), **PRECEDENCE},
 )
 EGO_PROMPT = "ego-prompt"
+
+
+def reads_plans(name: str) -> bool:
+    """Return whether a rule reads what agents are themselves going to do, and no other intents."""
+    return "plans" in getattr(RULES.get(name), "needs", ())
 
 
 def names() -> tuple[str, ...]:

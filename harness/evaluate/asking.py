@@ -358,11 +358,19 @@ class Asker:
         valid = ~np.isnan(intents[:, 1:]).any(axis=-1)
         shape = len(scenes), width - 1
         not_yet = None if self.spec.asks_all else np.array(unasked, dtype=bool).reshape(shape)
+        own_bits, own_text_bytes = None, None
+        if any(point.content.plan for point in self.spec.points):
+            own = [row[0] for row in answers]
+            own_bits = np.array(
+                [_bits(scene, a) if a else 0.0 for scene, a in zip(scenes, own, strict=True)], dtype=float
+            )
+            own_text_bytes = np.array([len(_text(a).encode()) for a in own], dtype=float)
         return Intents(
             intents[:, 0], intents[:, 1:], valid if not_yet is None else valid | not_yet,
             np.array(distances_m, dtype=float), np.array(ranges_m, dtype=float).reshape(shape),
             np.array(bits, dtype=float).reshape(shape), inference_s(self.latency, answers), unasked=not_yet,
             text_bytes=np.array(texts_b, dtype=float).reshape(shape),
+            own_bits=own_bits, own_text_bytes=own_text_bytes,
         )  # fmt: skip
 
     def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:

@@ -15,6 +15,8 @@ import numpy as np
 from msgspec import structs
 
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.plans import STANDING_MPS, Plans
+from harness.core.arrays import Ints
 from harness.dataset.freeze import records_of
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
@@ -144,7 +146,36 @@ class LiveWorld(SceneWorld):
         helpers = max(len(scene.viewers) for scene in self.scenes) - 1
         step = np.full(len(at), self._step)
         draws = channel_draws(seed, self._first_seed + episode, step, self._p.decisions, helpers)
-        return Due(at, episode, seed, draws)
+        return Due(at, episode, seed, draws, self._senders(places) if point.content.plan else None)
+
+    def _senders(self, places: Sequence[tuple[int, Course]]) -> Ints:
+        """Return the decision that each helper makes itself now, (n, H), as `Due.senders`."""
+        rows: dict[tuple[int, str], int] = {}
+        for row, (n, course) in enumerate(places):
+            rows[id(course), self.scenes[n].viewers[0]] = row
+        senders = np.full((len(places), max(len(scene.viewers) for scene in self.scenes) - 1), -1)
+        for row, (n, course) in enumerate(places):
+            for h, helper in enumerate(self.scenes[n].viewers[1:]):
+                senders[row, h] = rows.get((id(course), helper), -1)
+        return senders
+
+    def plans(self) -> Plans | None:
+        if all(scene.deciders == 1 for scene in self.scenes):
+            return None
+        road, vehicles = self.scenario.road(), [t.world.vehicles[agent] for t, agent in self._deciding]
+        spawns, egos = [v.spawn for v in vehicles], [scene.state.ego for scene in self.scenes]
+        x_m, y_m, heading_rad, speed_mps, time_s = np.array(
+            [(v.x_m, v.y_m, v.heading_rad, v.speed_mps, s.state.time_s)
+             for v, s in zip(egos, self.scenes, strict=True)]
+        ).T  # fmt: skip
+        ahead_m = (road.zone_m[0] - x_m) * np.cos(heading_rad) + (road.zone_m[1] - y_m) * np.sin(heading_rad)
+        distance_m = np.hypot(road.zone_m[0] - x_m, road.zone_m[1] - y_m)
+        reaches_s = distance_m / np.maximum(speed_mps, STANDING_MPS)
+        reaches_s[(speed_mps < STANDING_MPS) | (ahead_m <= 0)] = np.inf
+        arc_m = road.project([(s.approach, s.route) for s in spawns], x_m, y_m)[0]
+        driven_s = (arc_m - [s.arc_m for s in spawns]) / [s.speed_mps for s in spawns]
+        number = np.array([agent for _, agent in self._deciding])
+        return Plans(number[:, None], reaches_s[:, None], np.maximum(time_s - driven_s, 0.0)[:, None])
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         actions, hz = self.scenario.actions, self._p.simulation_hz

@@ -13,6 +13,7 @@ from harness.backends.registry import ENGINES
 from harness.coordination import calibrations
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.plans import NO_PLANS
 from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError, printable
 from harness.core.files import sha256_file
@@ -239,6 +240,8 @@ class Spec:
         shown, ego = f"condition {printable(point.name)}", self.ego
         if point.ask.messages == "shuffled" and self.source.kind != "frozen":
             raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
+        if point.content.plan and not getattr(self.scenario.parameters, "agent_share", 0):
+            raise UserError(NO_PLANS.format(printable(point.name)))
         if point.ask.calibration:
             self._check_calibration(shown, point)
         if point.has_fusion_call and point.content.graph and ego.can.language_model:

@@ -9,6 +9,7 @@ import numpy as np
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Ints, any_of
 from harness.dataset.load import Scene
+from harness.evaluate.agreement import broken_words
 from harness.evaluate.walk import Decided
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
@@ -81,6 +82,7 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
     values = {
         **{name: np.concatenate([part[name] for part in numbers]) for name in numbers[0]},
         **by_action("fused", np.concatenate([part.result.fused for part in decided]), actions),
+        "broke_word": np.concatenate([broken_words(part) for part in decided]),
         **more,
         **{
             column: array

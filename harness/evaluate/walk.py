@@ -17,8 +17,10 @@ from harness.coordination.encodings import JSON, reply_bits
 from harness.coordination.exchange import Exchange, exchange, needed
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
+from harness.coordination.plans import NO_PLANS, Plans
 from harness.coordination.scheduling import Outlook
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import UserError, printable
 from harness.dataset.load import Scene
 from harness.evaluate.attackers import Attackers, SentIntents
 from harness.evaluate.claims import claims
@@ -42,6 +44,9 @@ class Due:
     episode: Ints  # the episode's number of each, (n,)
     seed: Ints  # the seed of the channel's draws for each, (n,)
     draws: Draws  # those draws, (n, ...)
+    # the decision that each helper makes itself now, in the same world, (n, H): its place among these; -1
+    # where it makes none. None where messages hold no plans
+    senders: Ints | None = None
 
     @property
     def episodes(self) -> list[tuple[int, int]]:
@@ -83,6 +88,10 @@ class World(Protocol[DecisionPoint]):
         """Return what helpers claim in the points just shown, (n, ...); None in a world without places."""
         ...
 
+    def plans(self) -> Plans | None:
+        """Return what each agent says of itself in the points just shown, (n, 1); None for one ego."""
+        ...
+
     def listed(self) -> tuple[Floats, Floats] | None:
         """Return how many objects helpers list, and in how many bits, (n, H); None without places."""
         ...
@@ -107,6 +116,9 @@ class SceneWorld:
 
     def claims(self) -> Claims:
         return claims(self.scenario, self.scenes)
+
+    def plans(self) -> Plans | None:
+        return None
 
     def listed(self) -> tuple[Floats, Floats]:
         """Return how many objects the helpers of each scene list, and in how many bits."""
@@ -162,6 +174,8 @@ def walk(
             intents = replace(intents, outlook=world.outlook())
         if any(point.needs("claims") for point in due):
             intents = replace(intents, claims=world.claims())
+        if any(point.content.plan for point in due):
+            intents = replace(intents, plans=world.plans())
         if any(point.content.graph for point in due):
             counts, bits = world.listed() or (None, None)
             intents = replace(intents, objects=counts, object_bits=bits)
@@ -242,6 +256,10 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
         source, alone = own.take(places), places == np.arange(len(places))
         own = _with_helpers(own, source, source.valid & ~alone[:, None])
     own = corrected(point, own)
+    if point.content.plan:
+        if own.plans is None or due.senders is None:
+            raise UserError(NO_PLANS.format(printable(point.name)))
+        own = own.planned(due.senders)
     return as_sent(point, own) if point.asks else own
 
 
@@ -261,7 +279,8 @@ def _able(point: OperatingPoint, intents: Intents) -> Intents:
     """Return the intents where only those helpers count as valid that have what the content wants."""
     if point.content.words:
         return intents.with_words()
-    return intents if point.content.intent or not point.asks else intents.without_models()
+    by_model = point.content.intent or point.content.plan or not point.asks
+    return intents if by_model else intents.without_models()
 
 
 def as_sent(point: OperatingPoint, intents: Intents) -> Intents:

@@ -32,12 +32,12 @@ COLUMNS = {
     "fusion_ms": NUMBER, "fusion_failed": FLAG, "effective_loss": NUMBER, "observed_loss": NUMBER,
     "value": FLAG, "safe": FLAG, "regret": FLAG, "delay_s": NUMBER, "off_lag": FLAG, "acts_at_s": NUMBER,
     "acted": FLAG, "miss": FLAG, "false_alarm": FLAG, "ttc_s": NUMBER, "pet_s": NUMBER, "short_ttc": FLAG,
-    "short_pet": FLAG, "agent": LABEL,
+    "short_pet": FLAG, "agent": LABEL, "broke_word": FLAG,
 }  # fmt: skip
 # A file has no such column if all its values are unknown.
 OPTIONAL = (
     "busy_ratio", "inference_j", "helpers_j", "radio_mj", "waiting_j", "miss", "false_alarm", "ttc_s",
-    "pet_s", "short_ttc", "short_pet", "agent",
+    "pet_s", "short_ttc", "short_pet", "agent", "broke_word",
 )  # fmt: skip
 NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # One column for each action: the policy, and the outcome of the action.

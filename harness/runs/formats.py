@@ -105,6 +105,7 @@ COLUMNS: Mapping[str, Added] = {
     **dict.fromkeys(("ttc_s", "pet_s", "short_ttc", "short_pet"),
                     Added("2026-11-27", None, "conflicts in time; also missing on trees of older datasets")),
     "agent": Added("2026-11-27", None, "swarms; also missing where only egos decide"),
+    "broke_word": Added("2026-11-27", None, "plans; also missing where none is sent"),
 }  # fmt: skip
 # Columns of episodes.csv; `records.Episode` has the same defaults.
 EPISODE: Mapping[str, Added] = {

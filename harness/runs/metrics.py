@@ -300,6 +300,8 @@ BUILT_IN = (
            optional=True),
     Metric("most_lost_s", "the same of the agent that loses most", SECONDS, "lower",
            label="time lost by one", episodes=_field("most_lost_s"), optional=True),
+    _share("broken_word_rate", "share of decisions in which an agent's action is not the likeliest of the "
+           "plan that another got from it", "broke_word", optional=True),
     Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision", METRES,
            "higher", label="least gap", episodes=_field("least_gap_m")),
     Metric("hard_brakings_per_episode", "number of times that the ego begins to brake harder than 4 m/s²",

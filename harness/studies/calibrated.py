@@ -158,7 +158,7 @@ class CalibratedWorld:
     def outlook(self, *_: Any) -> None:
         """Return None: the study's vehicles are nowhere in particular, see nothing and claim nothing."""
 
-    site = claims = listed = outlook
+    site = claims = plans = listed = outlook
 
     def step(self, decided: Sequence[Decided[int]]) -> None:
         """Learn what was heard, and see whether the last action is the right one."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint, setting_of
-from harness.coordination.rules import EGO_PROMPT, RULES
+from harness.coordination.rules import EGO_PROMPT, RULES, reads_plans
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
@@ -268,7 +268,8 @@ def run_bench(
     unfused = point.idle("consensus")
     if unfused and set(rules) - {BASE}:
         raise UserError(f"--rules {','.join(rules)}: no rule changes anything: {unfused}; leave it out")
-    every_rule = dict.fromkeys([BASE, *(rules or (() if unfused else (*RULES, CAPPED)))])
+    usual = [rule for rule in RULES if not reads_plans(rule)]
+    every_rule = dict.fromkeys([BASE, *(rules or (() if unfused else (*usual, CAPPED)))])
     every: list[Key] = list(dict.fromkeys([
         *((rule, PEACE, 0.0) for rule in every_rule),
         *((BASE, EXCLUDED, share) for share in shares),

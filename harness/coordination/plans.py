@@ -1,0 +1,50 @@
+"""Define `Plans`: what agents say about themselves beside the intents that they are going to act by."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.core.arrays import Floats, Ints
+
+STANDING_MPS = 1.0  # a slower vehicle stands, or is about to
+NO_PLANS = (
+    "condition {}: content plan needs several agents, and here one ego decides; give --agents all with "
+    "`harness drive`, or content=intent"
+)
+
+
+@dataclass(frozen=True)
+class Plans:
+    """What an agent and the H others say of themselves, `(..., 1+H)`, the agent itself first.
+
+    All is what the sender itself states, so all who hear it compare the same numbers.
+    """
+
+    vehicle: Ints  # the vehicle's number in its world; -1 for one without a plan
+    # seconds until it is at the centroid of the conflict zone at its speed; inf for one that stands, or has
+    # passed it. NaN without a plan
+    reaches_s: Floats
+    # how much later it is than at the speed that it had in the beginning, at least 0; NaN without a plan
+    lost_s: Floats
+
+    def take(self, at: Any) -> "Plans":
+        """Return the plans at these indices of the leading dimension."""
+        return Plans(self.vehicle[at], self.reaches_s[at], self.lost_s[at])
+
+    def of_helpers(self, places: Ints) -> "Plans":
+        """Return those of the helpers at these indices, `(..., H')`; one may be repeated."""
+        at = np.insert(places + 1, 0, 0, axis=-1)
+
+        def of(array: Any) -> Any:
+            return np.take_along_axis(array, at, axis=-1)
+
+        return Plans(of(self.vehicle), of(self.reaches_s), of(self.lost_s))
+
+    def among(self, senders: Ints) -> "Plans":
+        """Return what agents (n, 1) hear of each other, (n, 1+H), by the row of each sender (n, H) or -1."""
+
+        def heard(own: Any, unknown: float) -> Any:
+            return np.concatenate([own, np.where(senders >= 0, own[senders, 0], unknown)], axis=1)
+
+        return Plans(heard(self.vehicle, -1), heard(self.reaches_s, np.nan), heard(self.lost_s, np.nan))

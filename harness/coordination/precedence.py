@@ -1,0 +1,69 @@
+"""Rules that read plans: who goes first is decided by an order that all agents know, and the others wait.
+
+A rule knows what agents say of themselves (`plans.Plans`) and the actions that they plan. It is not told
+whether two ways cross, and nobody pays for going first.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from harness.coordination.consensus import Fused, Messages
+from harness.coordination.plans import Plans
+from harness.core.arrays import Floats
+
+
+@dataclass(frozen=True)
+class Precedence:
+    """An agent takes its most careful action if one that goes before it is near, and plans to go on.
+
+    Else it acts by its own intent. Who plans the most careful action waits already, and who stands or has
+    passed the conflict is near nobody, so nobody waits for these. Agents of the same rank go by their number
+    in the world.
+    """
+
+    rank: Callable[[Plans], Floats]  # of each vehicle, `(..., 1+H)`; the lowest goes first
+    # two agents are near if they reach the conflict at times less than this apart. Declared: the headway of
+    # the two-second rule
+    apart_s: float = 2.0
+    needs: ClassVar[tuple[str, ...]] = ("plans",)
+
+    def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
+        """Return an empty memory."""
+        return np.zeros((*batch, 0))
+
+    def fuse(self, messages: Messages, state: Floats) -> Fused:
+        """Let each agent go on or wait; there are no weights."""
+        if (plans := messages.plans) is None:
+            raise ValueError("a rule that reads plans needs them")
+        p, rank = messages.intents, self.rank(plans)
+        mine, others = rank[..., :1], rank[..., 1:]
+        ties = (others == mine) & (plans.vehicle[..., 1:] < plans.vehicle[..., :1])
+        reaches_s = np.where(np.isinf(plans.reaches_s), np.nan, plans.reaches_s)
+        near = np.abs(reaches_s[..., 1:] - reaches_s[..., :1]) < self.apart_s
+        goes = np.argmax(p[..., 1:, :], axis=-1) > 0
+        waits = np.any(messages.heard & near & goes & ((others < mine) | ties), axis=-1)
+        careful = np.eye(p.shape[-1])[0]
+        policy = np.where(waits[..., None], careful, p[..., 0, :])
+        return Fused(policy, np.full(messages.weights.shape, np.nan), state)
+
+
+def _by_time(plans: Plans) -> Floats:
+    return plans.reaches_s
+
+
+def _by_number(plans: Plans) -> Floats:
+    return plans.vehicle.astype(float)
+
+
+def _by_bid(plans: Plans) -> Floats:
+    return -plans.lost_s
+
+
+PRECEDENCE = {
+    "yield-by-time": Precedence(_by_time),  # who reaches the conflict sooner goes on
+    "yield-by-id": Precedence(_by_number),
+    "auction": Precedence(_by_bid),  # each bids the time that it has lost; the highest bid goes on
+}
