@@ -5,7 +5,7 @@ import os
 import shlex
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -220,7 +220,9 @@ def _frozen(
                 there = {**given, **before, **so_far}
                 return Asker(spec, lambda: backend, latency, kept, there, progress, more)
 
-            return _walk(spec, chunk, asker_of)
+            # A chunk fits into memory; what a language model's engine leaves behind in cycles might not.
+            with uncollected() if _reproducible(spec) else nullcontext():
+                return _walk(spec, chunk, asker_of)
 
         def report_kept(chunk: Sequence[int]) -> None:
             n_answers = folder.answers_in(place / _folder_name(chunk))
