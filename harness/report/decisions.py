@@ -20,7 +20,7 @@ ABSENT = "-"
 
 
 class Decisions:
-    """Everything that runs have to say of single scenes, in order of episode and step.
+    """Everything that runs have to say of single scenes, in order of episode, step and agent.
 
     Attributes:
         ids: of the scenes that any run has.
@@ -29,13 +29,15 @@ class Decisions:
 
     def __init__(self, runs: Runs, prompts: Prompts = prompts_of, full: bool = False) -> None:
         self._runs, self._full = runs, full
-        places: dict[str, tuple[int, int, str | None]] = {}
+        places: dict[str, tuple[int, int, str | None, str | None]] = {}
         for run in reversed(runs.runs):
             episode, step = run.decisions.whole("episode"), run.decisions.whole("step")
-            danger = run.decisions.labels("danger")
+            danger, agent = run.decisions.labels("danger"), run.decisions.labels("agent")
             for scene, rows in run.decisions.scenes.items():
-                places[scene] = int(episode[rows.start]), int(step[rows.start]), danger[rows.start]
-        order = sorted(places.items(), key=lambda item: (*item[1][:2], item[0]))
+                at = rows.start
+                places[scene] = int(episode[at]), int(step[at]), danger[at], agent[at]
+        order = sorted(places.items(), key=lambda item: (*item[1][:2], item[1][3] or "", item[0]))
+        several = any(agent for *_, agent in places.values())  # else a scene has no place for who decides
         self.ids = [scene for scene, _ in order]
         failed = [failures(run) if runs.live else {} for run in runs.runs]
         if runs.dataset:
@@ -47,7 +49,7 @@ class Decisions:
         self._details = Details(runs, self._replayed, framed, prompts, full)
         self.index = {
             "actions": runs.actions,
-            "scenes": [[scene, *place] for scene, place in order],
+            "scenes": [[scene, *(place if several else place[:3])] for scene, place in order],
             "block": BLOCK,
             "live": runs.live,
             "framed": len(framed),
@@ -155,20 +157,25 @@ def failures(run: Run) -> dict[str, int]:
     """Return decision points at which a driven layout begins to fail, and the seed with which it does.
 
     It is the last that a layout's failed episodes share with one that did not fail; where all of them fail,
-    the last of the first.
+    the last of the first. With several agents it is one of each that decides in that step.
     """
     d = run.decisions
     failed = np.array([not episode.success for episode in run.episodes])[run.grid.places(d)]
-    seeds, episodes = d.whole("seed"), d.whole("episode")
-    telling: dict[int, tuple[bool, str, int]] = {}
+    seeds, episodes, steps, agents = (
+        d.whole("seed"), d.whole("episode"), d.whole("step"), d.labels("agent"),
+    )  # fmt: skip
+    telling: dict[int, tuple[bool, int, dict[str | None, tuple[str, int]]]] = {}
     for scene, rows in d.scenes.items():
         here = failed[rows.start : rows.stop]
         number = int(episodes[rows.start])
         if here.any():
-            parts = not here.all()
-            if number not in telling or parts >= telling[number][0]:
-                telling[number] = parts, scene, int(seeds[rows.start + int(here.argmax())])
-    return {scene: seed for _, scene, seed in telling.values()}
+            parts, step = not here.all(), int(steps[rows.start])
+            if number not in telling or (parts, step) > telling[number][:2]:
+                telling[number] = parts, step, {}
+            if (parts, step) == telling[number][:2]:
+                found = scene, int(seeds[rows.start + int(here.argmax())])
+                telling[number][2][agents[rows.start]] = found
+    return dict(each for *_, by_agent in telling.values() for each in by_agent.values())
 
 
 def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:

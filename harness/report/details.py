@@ -72,8 +72,8 @@ def prompts_of(run: Run) -> Sent | None:
         prompts[prompt.version] = prompt
 
     def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
-        words = scenarios.get(scene.state.scenario).prompt_words
-        agent = manifest.agent(scene.viewers.index(viewer))
+        words = (scene.seat or scenarios.get(scene.state.scenario)).prompt_words
+        agent = manifest.agent(scene.place(scene.viewers.index(viewer)))
         prompt = prompts[agent["prompt"]["version"]]
         graph = scene.graphs[viewer]
         if prompt.version in failed:  # it would take as long again
@@ -148,8 +148,8 @@ class Details:
         runs = [self._of_run(n, name, scene, sent) for n in range(len(self.runs.runs))]
         asked = {tuple(m["from"] for m in d["messages"]) for run in runs if run for d in run["decisions"]}
         return {
-            "world": scene and _world(self.runs.scenario, scene, asked),
-            "cameras": scene and name in self.framed and cameras(self.runs.scenario, scene),
+            "world": scene and _world(scene.seat or self.runs.scenario, scene, asked),
+            "cameras": scene and name in self.framed and cameras(scene.seat or self.runs.scenario, scene),
             "outcomes": forest and _outcomes(forest, name),
             "runs": runs,
             "prompts": list(sent.values()),
@@ -181,7 +181,8 @@ class Details:
             # Shuffled messages are in the details of another scene.
             elif scene and prompts and source_of(name, answer.heard) == name:
                 heard = messages_of(by_viewer, answer.heard, run.actions)
-                messages = prompts(as_asked(self.runs.scenario, scene, answer), answer.viewer, heard)
+                as_shown = as_asked(scene.seat or self.runs.scenario, scene, answer)
+                messages = prompts(as_shown, answer.viewer, heard)
                 key = digest(messages)
                 if answer.prompt_sha256 == key:
                     sent.setdefault(key, messages)

@@ -1,16 +1,21 @@
 """Several agents in one world: seats, the walk, and what a run says of them."""
 
+import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from evaluating import live_spec_of, run
+from reading import details, packed
 
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.evaluate.live_world import LiveSource, looks
 from harness.evaluate.replay import played, scenes_of, stills
+from harness.report.decisions import failures
+from harness.report.page import render
+from harness.report.runs import gather
 from harness.runs import folder
 from harness.world import scenarios
 from harness.world.swarm import alone
@@ -132,6 +137,22 @@ def test_an_episode_of_agents_played_again_ends_as_it_did(driven: Path) -> None:
             how, partner = e.failure.replace("_", " "), f" with {e.partner}" if e.partner else ""
             [worst] = {said for agent, said in ended.items() if last.outcome == f"{agent}: {said}"}
             assert worst == f"{how} at {e.time_s:.1f} s{partner}"
+
+
+@pytest.mark.slow
+def test_a_page_lists_decisions_by_step_and_agent_and_has_the_prompts_that_were_sent(driven: Path) -> None:
+    text = render(gather([driven]), full=True)
+    index, every, there = json.loads(packed(text, "index")), details(text), folder.read(driven)
+    assert [place[1:3] + place[4:] for place in index["scenes"]] == sorted(
+        place[1:3] + place[4:] for place in index["scenes"]
+    )
+    for scene, *_, agent in index["scenes"]:
+        vehicles = {v["id"]: v["part"] for v in every[scene]["world"]["vehicles"]}
+        assert vehicles[agent] == "ego", "who decides is marked as the ego is"
+        assert all(a["prompt"] is not None for a in every[scene]["runs"][0]["answers"])
+    telling = failures(there)
+    points = {(place[1], place[2], place[4]) for place in index["scenes"] if place[0] in telling}
+    assert len(points) == len(telling) > len({episode for episode, *_ in points}), "one of each agent"
 
 
 def test_alone_on_the_road_an_agent_comes_as_soon_as_its_speed_takes_it() -> None:

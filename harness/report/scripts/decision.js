@@ -118,8 +118,39 @@ class DecisionPage {
     this.chosen = decisions.find((d) => d.condition === state.condition) ?? decisions.at(-1);
     this.viewer = viewers.includes(viewer) ? viewer : viewers[0];
     this.run = about.runs[state.run];
+    this.together = await this.others();
     this.conditions = [...new Set(index.runs.flatMap((run) => run.conditions))];
     return name === new URLSearchParams(location.hash.slice(1)).get("scene");
+  }
+
+  // Of each agent that decides in this step: its id, its decision point, what it decided, and its page.
+  async others() {
+    const { list, index, n, state, chosen, params } = this, [, , , , agent] = index.scenes[n];
+    if (!agent || !chosen) return [];
+    const { viewer, scene, ...rest } = Object.fromEntries(params);
+    return Promise.all(list.together(n, state.run, chosen.condition, state.seed).map(async (k) => {
+      const detail = k === n ? this.detail : (await block(Math.floor(k / index.block)))[k % index.block];
+      const record = detail.runs[state.run];
+      const decision = record.decisions.find((d) => d.seeds.includes(state.seed) && d.condition === chosen.condition);
+      const own = record.answers.find((a) => a.role === "ego");
+      const href = list.link(k, { ...rest, run: state.run, seed: state.seed, condition: chosen.condition });
+      return { id: index.scenes[k][4], here: k === n, decision, own, href };
+    }));
+  }
+
+  agents() {
+    if (!this.together.length) return null;
+    const { actions } = this.index, { condition } = this.chosen;
+    return [
+      h("h3", {}, `What each agent decided in this step, under ${condition}`),
+      table("agents", ["agent", "its own intent", "what it heard", "fused", "action"], this.together.map((each) => [
+        each.here ? h("strong", {}, each.id) : h("a", { href: each.href }, each.id),
+        distribution(actions, each.own?.intent),
+        each.decision.messages.length ? each.decision.messages.map((m) => h("div", {}, reply(m))) : "asked nobody",
+        distribution(actions, each.decision.fused),
+        [each.decision.action, acted(each.decision)],
+      ])),
+    ];
   }
 
   async draw(params) {
@@ -135,6 +166,7 @@ class DecisionPage {
         this.leftOut(),
         h("h2", {}, "What was decided"),
         this.record ? this.decided() : null,
+        this.agents(),
         this.messages(),
         this.about.names.length > 1 ? this.inEveryRun() : null,
         h("h3", {}, "Latency, from seeing to acting"), timeline,
@@ -161,10 +193,10 @@ class DecisionPage {
   }
 
   title() {
-    const [id, episode, step, danger] = this.index.scenes[this.n], words = endWords(this.index.live);
+    const [id, episode, step, danger, agent] = this.index.scenes[this.n], words = endWords(this.index.live);
     return [
       h("h1", { tabindex: "-1" }, `${this.index.live ? "Decision point" : "Decision"} ${id}`),
-      h("p", {}, `Episode ${episode}, step ${step}; ${danger ? `danger from ${danger}` : "no danger"}. `,
+      h("p", {}, `Episode ${episode}, step ${step}; `, agent && [h("strong", {}, `${agent} decides`), "; "], `${danger ? `danger from ${danger}` : "no danger"}. `,
         this.decisions.map((d) => {
           const [look, sign] = ENDS[d.end];
           return [h("span", { class: `verdict ${look}` }, `${d.condition}: ${d.action} ${sign} ${words[d.end]}`), " "];
@@ -193,10 +225,11 @@ class DecisionPage {
         ? "No picture: it could not be played again here."
         : "No picture: the page has pictures of the most telling decision points only. `harness run video` draws the whole episode.");
     }
-    const [drawing, said] = birdsEye(world, ground, this.viewer, this.chosen?.messages ?? [], this.params.get("zoom"));
+    const [drawing, said] = birdsEye(
+      world, ground, this.viewer, this.chosen?.messages ?? [], this.params.get("zoom"), this.together);
     const save = (kind) => small(`Save as ${kind.toUpperCase()}`, () => saved(drawing, id, kind));
     return h("div", { class: "picture" },
-      drawing, h("p", { class: "quiet" }, `${said}. `, KEY), save("svg"), " ", save("png"));
+      drawing, h("p", { class: "quiet" }, `${said}. `, KEY, this.together.length ? KEY_OF_AGENTS : ""), save("svg"), " ", save("png"));
   }
 
   cameras() {

@@ -54,9 +54,22 @@ class Episodes {
     const lost = of.filter((one) => one.lost), one = lost[0] ?? of[0];
     const said = lost.length ? `lost with ${lost.length} of ${of.length} seeds` : one.slow ? "slow" : "not lost";
     return one.path.length ? [
-      h("span", { class: "strip" }, one.path.map((n, k) => this.cell(n, k, one, run, condition))),
+      this.byAgent(one.path).map(([agent, decisions]) => {
+        const cells = h("span", { class: "strip" }, decisions.map(([n, k]) => this.cell(n, k, one, run, condition)));
+        return agent ? h("div", {}, h("small", {}, `${agent} `), cells) : cells;
+      }),
       h("small", { class: lost.length ? "bad" : "" }, said),
     ] : "–";
+  }
+
+  // Decisions with their places, of each agent on its own.
+  byAgent(path) {
+    const by = new Map();
+    path.forEach((n, k) => {
+      const agent = this.list.index.scenes[n][4];
+      by.set(agent, [...(by.get(agent) ?? []), [n, k]]);
+    });
+    return [...by];
   }
 
   cell(n, k, { ends, lost, seed }, run, condition) {
@@ -66,7 +79,8 @@ class Episodes {
     const [colour, text] = this.colours[action];
     const asked = list.letter("asked", n, run, condition, seed) === "1";
     const words = { s: "safe", d: "safe, slower than the best", u: "the answer that lost this episode", n: "success was lost before" };
-    const told = `step ${index.scenes[n][2]}: ${action}${asked ? ", asked" : ""}${index.live && end === "s" ? "" : `, ${words[end]}`}`;
+    const [, , step, , agent] = index.scenes[n];
+    const told = `step ${step}${agent ? `, ${agent}` : ""}: ${action}${asked ? ", asked" : ""}${index.live && end === "s" ? "" : `, ${words[end]}`}`;
     return h("a", {
       class: `cell end-${end}`, href: list.link(n, { run, seed, condition }), title: told, "aria-label": told,
       style: end === "n" ? null : `background:${colour};color:${text}`,

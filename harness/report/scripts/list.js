@@ -1,12 +1,13 @@
 // The list of all decisions: filters, search, pages. Its state is in the page's address.
 
 const PAGE = 20;
-const FILTERS = ["q", "run", "seed", "condition", "outcome", "danger", "status", "differ", "asked", "page"];
+const FILTERS = ["q", "run", "seed", "condition", "agent", "outcome", "danger", "status", "differ", "asked", "page"];
 
 class List {
   constructor(index, about, place) {
     Object.assign(this, { index, about, place });
     this.live = index.live;
+    this.agents = [...new Set(index.scenes.map(([, , , , agent]) => agent).filter(Boolean))].sort();
     this.found = [];
     this.hits = null; // scenes whose answers or prompts have the text
     this.controls = this.form();
@@ -48,6 +49,7 @@ class List {
       several && choice("run", "run", about.names.map((name, n) => [String(n), name]), "0", change),
       choice("seed", "seed", same(index.runs.flatMap((run) => run.seeds)), null, change),
       filter("condition", "condition", same(index.runs.flatMap((run) => run.conditions))),
+      this.agents.length ? filter("who decides", "agent", same(this.agents)) : null,
       filter("outcome", "outcome", [...outcomes, ...(live ? [["first", "where an episode begins to fail"]] : [])]),
       filter("danger", "danger", same(index.scenes.map(([, , , danger]) => danger ?? "none"))),
       filter("answers", "status", same(index.statuses.filter((_, n) => met & (1 << n)))),
@@ -92,12 +94,13 @@ class List {
   }
 
   wanted(n, state) {
-    const [id, , , danger] = this.index.scenes[n], { run, seed } = state, { conditions, statuses } = this.run;
+    const [id, , , danger, agent] = this.index.scenes[n], { run, seed } = state, { conditions, statuses } = this.run;
     const here = (state.condition ? [state.condition] : conditions).filter((c) => this.action(n, run, c, seed) != null);
     const any = (kind, letter) => here.some((c) => this.letter(kind, n, run, c, seed) === letter);
     const actions = (of) => new Set(of.filter(Boolean)).size;
     const tests = {
       q: () => id.toLowerCase().includes(state.q.toLowerCase()) || this.hits?.has(n),
+      agent: () => agent === state.agent,
       danger: () => (danger ?? "none") === state.danger,
       status: () => statuses[n] & (1 << this.index.statuses.indexOf(state.status)),
       asked: () => any("asked", state.asked),
@@ -123,7 +126,7 @@ class List {
     const here = this.found.length > PAGE ? `, ${page * PAGE + 1} to ${page * PAGE + shown.length} here` : "";
     const what = this.live ? "decision points" : "decisions";
     this.count.textContent = `${this.found.length} of ${this.index.scenes.length} ${what}${here}; seed ${state.seed}`;
-    const heads = ["scene", "danger", ...this.run.conditions, "not strict"];
+    const heads = ["scene", ...(this.agents.length ? ["decides"] : []), "danger", ...this.run.conditions, "not strict"];
     this.rows.replaceChildren(table("decisions", heads, shown.map((n) => this.row(n, state))));
     const to = (n, text) => h("a", { href: `#${new URLSearchParams({ ...this.kept(state), decisions: "", page: n })}` }, text);
     this.pages.replaceChildren();
@@ -131,7 +134,7 @@ class List {
   }
 
   row(n, state) {
-    const [id, , , danger] = this.index.scenes[n], { run, seed } = state;
+    const [id, , , danger, agent] = this.index.scenes[n], { run, seed } = state;
     const odd = this.index.statuses.filter((s, k) => s !== "strict" && this.run.statuses[n] & (1 << k));
     const cell = (c) => {
       const action = this.action(n, run, c, seed), asked = this.letter("asked", n, run, c, seed) === "1";
@@ -140,7 +143,14 @@ class List {
       return [action, " ", end, asked && h("span", { class: "quiet" }, " asked")];
     };
     const link = h("a", { href: this.link(n, state), "data-n": n }, id);
-    return [link, danger ?? "none", ...this.run.conditions.map(cell), odd.join(", ")];
+    return [link, ...(this.agents.length ? [agent ?? "ego"] : []), danger ?? "none", ...this.run.conditions.map(cell), odd.join(", ")];
+  }
+
+  // Who else decides in the same step of an episode, and this decision point, by agent.
+  together(n, run, condition, seed) {
+    const [, episode, step] = this.index.scenes[n];
+    return this.index.scenes.map((_, k) => k).filter((k) => this.index.scenes[k][1] === episode
+      && this.index.scenes[k][2] === step && this.action(k, run, condition, seed) != null);
   }
 
   kept(state) {

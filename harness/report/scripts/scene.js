@@ -44,7 +44,8 @@ function shadows(world, eye, far) {
   })));
 }
 
-function birdsEye(world, ground, viewer, messages, zoom) {
+// `agents` are those that decide in the same step: each with its id, what it decided and its page.
+function birdsEye(world, ground, viewer, messages, zoom, agents) {
   const eye = world.vehicles.find((v) => v.id === viewer), sees = world.viewers[viewer];
   const seen = new Set([viewer, ...sees.seen]), most = ground.view_m;
   const ego = world.vehicles.find((v) => v.part === "ego") ?? eye;
@@ -84,7 +85,8 @@ function birdsEye(world, ground, viewer, messages, zoom) {
     const shape = corners(v);
     const nose = [v.x + (Math.cos(v.heading) * v.length) / 2, v.y + (Math.sin(v.heading) * v.length) / 2];
     const tip = [nose[0] + Math.cos(v.heading) * v.speed, nose[1] + Math.sin(v.heading) * v.speed];
-    picture.append(svg("g", { class: `vehicle ${v.part}${seen.has(v.id) ? "" : " unseen"}` },
+    const agent = agents.find((each) => each.id === v.id && !each.here);
+    picture.append(svg(agent ? "a" : "g", { ...(agent && { href: agent.href }), class: `vehicle ${v.part}${seen.has(v.id) ? "" : " unseen"}` },
       svg("title", {}, `${v.id}, ${v.kind}, ${v.speed} m/s${seen.has(v.id) ? "" : `, hidden from ${viewer}`}`),
       svg("polygon", { points: points(shape) }),
       svg("polyline", { points: points([shape[1], nose, shape[0]]), class: "nose" }),
@@ -106,7 +108,8 @@ function birdsEye(world, ground, viewer, messages, zoom) {
     const fate = messages.find((m) => m.from === v.id);
     const arrived = !fate ? "" : fate.delivered ? `, ${number(fate.arrival_ms, 0, "ms")}${fate.on_time ? "" : " late"}` : ", lost";
     const said = fate?.attacker ? `${arrived}, attacks` : arrived;
-    label(`${v.id} ${number(v.speed, 0, "m/s")}${v.crashed ? ", crashed" : ""}${said}`, v.x, -v.y, v.width / 2 + 1, v.part);
+    const action = agents.find((each) => each.id === v.id)?.decision.action;
+    label(`${v.id} ${number(v.speed, 0, "m/s")}${action ? ` ${action}` : ""}${v.crashed ? ", crashed" : ""}${said}`, v.x, -v.y, v.width / 2 + 1, v.part);
   }
   for (const c of sees.conflicts) label(both(c), c.x, -c.y, 1.6, "crossing");
   const bar = side > 100 ? 20 : 10, [left, foot] = [west + side * 0.03, view[3] - side * 0.03];
@@ -119,6 +122,7 @@ function birdsEye(world, ground, viewer, messages, zoom) {
 
 const KEY = "Purple: the ego. Light: helpers. Pink with a ring: the dangerous vehicle. Dashed, and all that is shaded: hidden from the "
   + "viewer. Arrow: the way in 1 s. ×: where paths cross, and when each vehicle is there. Thick lines: replies to the ego.";
+const KEY_OF_AGENTS = " Purple is who decides here; at each agent is what it decides in this step. Click another to see its decision.";
 const LOOKS = [
   "fill", "stroke", "stroke-width", "stroke-dasharray", "stroke-linejoin", "vector-effect", "opacity", "font-family",
   "font-weight", "text-anchor", "dominant-baseline", "paint-order",
