@@ -1,18 +1,20 @@
 """Several agents in one world: seats, the walk, and what a run says of them."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from evaluating import live_spec_of, run
+from evaluating import FILES, live_spec_of, run
 from reading import details, packed
 
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.evaluate.live_world import LiveSource, looks
 from harness.evaluate.replay import played, scenes_of, stills
+from harness.evaluate.run import evaluate
 from harness.report.decisions import failures
 from harness.report.page import render
 from harness.report.runs import gather
@@ -137,6 +139,39 @@ def test_an_episode_of_agents_played_again_ends_as_it_did(driven: Path) -> None:
             how, partner = e.failure.replace("_", " "), f" with {e.partner}" if e.partner else ""
             [worst] = {said for agent, said in ended.items() if last.outcome == f"{agent}: {said}"}
             assert worst == f"{how} at {e.time_s:.1f} s{partner}"
+
+
+@pytest.mark.slow
+def test_workers_shards_and_a_stop_change_no_byte(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harness: Callable[..., tuple[int, str, str]]
+) -> None:
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)
+    words = ("drive", "--scenario", "all-way-crossing", "--agents", "all", "--model", "proxy", "--quiet")
+    words = (*words, "--condition", "6g", "--episodes", 3, "--first-seed", 50_000, "--seeds", 0)
+    assert harness(*words, "--workers", 1, "--out", "one")[0] == 0
+    one = {name: (tmp_path / "one" / name).read_bytes() for name in FILES}
+
+    assert harness(*words, "--workers", 2, "--out", "two")[0] == 0
+    for n in (1, 2):
+        assert harness(*words, "--workers", 1, "--shard", f"{n}/2", "--out", f"part-{n}")[0] == 0
+    assert harness("run", "merge", "part-2", "part-1", "--out", "merged", "--quiet")[0] == 0
+    assert (tmp_path / "two" / "decisions.parquet").is_file()
+
+    spec = live_spec_of(prompt="v4", points=(named_point("6g"),), seeds=(0,))
+    spec = replace(spec, source=LiveSource(50_000, 3, ALL))
+    begun: list[int] = []
+
+    def stopping(done: int) -> None:
+        begun.append(done)
+        if sum(begun) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(spec, tmp_path / "stopped", stopping)
+    assert (tmp_path / "stopped" / ".work").is_dir()
+    run(spec, tmp_path / "stopped")
+    for other in ("two", "merged", "stopped"):
+        assert {name: (tmp_path / other / name).read_bytes() for name in FILES} == one, other
 
 
 @pytest.mark.slow
