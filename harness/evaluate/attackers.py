@@ -1,7 +1,8 @@
 """Draw the attackers of a condition, and return what the ego then hears.
 
 Attackers are drawn once for each seed of the channel and layout. So every rule, prompt and model faces the
-same ones, in frozen scenes, sweeps and the closed loop.
+same ones, in frozen scenes, sweeps and the closed loop. Where several agents decide, they are those whom the
+ego faces where it alone decides: each is one vehicle that attacks whoever asks, and the ego attacks nobody.
 """
 
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError
+from harness.evaluate.draws import OF_ANOTHER_AGENT
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips
 
@@ -56,8 +58,10 @@ class Attackers:
         first, past = self._remembered(truth, episodes)
         present, said, attacking = np.isfinite(truth.range_m), truth, none_attack
         for attack in self._attacks:
-            drawn = attackers(attack.share, present, uniforms[..., 0])
-            said = attack.act(said, Turn(truth, drawn, first, past, uniforms[..., 1]))
+            drawn = _of_helpers(attackers(attack.share, present, uniforms[..., 0]), draws.trips)
+            said = attack.act(
+                said, Turn(truth, drawn, first, past, _of_helpers(uniforms[..., 1], draws.trips))
+            )
             attacking |= drawn
         for intents, episode in zip(truth.helpers, episodes, strict=True):
             intended = self._intended.setdefault(episode, [])
@@ -82,11 +86,23 @@ class Attackers:
 
 
 def _uniforms(trips: Trips, helpers: int) -> Floats:
-    """Return two draws for each helper, one of the episode and one of the step, (n, H, 2)."""
-    keys = zip(trips.seed.tolist(), trips.layout_seed.tolist(), strict=True)
+    """Return two draws for each helper of the ego, one of the episode and one of the step, (n, H, 2)."""
+    keys = zip(trips.seed.tolist(), (trips.layout_seed % OF_ANOTHER_AGENT).tolist(), strict=True)
     uniforms = np.array([_helper_uniforms(seed, layout, trips.steps, helpers) for seed, layout in keys])
     of_step = uniforms[np.arange(len(uniforms)), :, 1 + trips.step]
     return np.stack([uniforms[..., 0], of_step], axis=-1)
+
+
+def _of_helpers(values: Any, trips: Trips) -> Any:
+    """Return values (n, H) of the ego's helpers as those of who decides, whose first helper is the ego.
+
+    Of the ego itself they are 0, or False.
+    """
+    agent, helper = trips.layout_seed[:, None] // OF_ANOTHER_AGENT, np.arange(values.shape[1])
+    if not agent.any():
+        return values
+    theirs = np.take_along_axis(values, np.where((helper < agent) & (helper > 0), helper - 1, helper), axis=1)
+    return np.where((agent > 0) & (helper == 0), 0, theirs).astype(values.dtype)
 
 
 # The draws of one helper follow those of another, so more helpers in a batch change no earlier draw.

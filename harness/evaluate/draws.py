@@ -10,6 +10,9 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips
 
+# Added, where draws are keyed, to the numbers of episode and layout, once for each place after the ego's.
+OF_ANOTHER_AGENT = 1 << 40
+
 
 @lru_cache(maxsize=1 << 16)
 def _channel_uniforms(seed: int, layout_seed: int, steps: int, helpers: int) -> Floats:

@@ -22,7 +22,7 @@ from harness.dataset.load import Scene
 from harness.dataset.select import drawn
 from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
-from harness.evaluate.draws import channel_draws
+from harness.evaluate.draws import OF_ANOTHER_AGENT, channel_draws
 from harness.evaluate.settings import DriveSettings
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.runs import metrics
@@ -35,9 +35,6 @@ from harness.world.parameters import frames
 from harness.world.scenario import Scenario
 from harness.world.swarm import alone, gravest
 from harness.world.world import World
-
-# Added, where draws are keyed, to the numbers of episode and layout, once for each place after the ego's.
-OF_ANOTHER_AGENT = 1 << 40
 
 
 @dataclass(frozen=True)
@@ -141,7 +138,10 @@ class LiveWorld(SceneWorld):
         places = self._places(point)
         at = np.array([n for n, _ in places], dtype=int)
         seed = np.array([course.seed for _, course in places], dtype=int)
-        number = np.array([t.number + agent * OF_ANOTHER_AGENT for t, agent in self._deciding])
+        number = np.array([
+            t.number + scene.agent * OF_ANOTHER_AGENT
+            for (t, _), scene in zip(self._deciding, self.scenes, strict=True)
+        ])  # fmt: skip
         episode = number[at]
         helpers = max(len(scene.viewers) for scene in self.scenes) - 1
         step = np.full(len(at), self._step)

@@ -142,12 +142,35 @@ def test_an_episode_of_agents_played_again_ends_as_it_did(driven: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_liar_is_one_vehicle_and_lies_to_whoever_asks(tmp_path: Path) -> None:
+    liars = []
+    for name in (ALL, "all-way-crossing"):
+        points = (named_point("6g:attack=liar"),)
+        spec = live_spec_of(prompt="v4", points=points, seeds=(0,))
+        table = folder.read(
+            run(replace(spec, source=LiveSource(50_000, 4, name)), tmp_path / f"run-{len(liars)}").out
+        ).decisions
+        said = [
+            (d.agent, (d.episode, m.sender), m.attacker)
+            for d in table.records(0, len(table))
+            for m in d.messages
+        ]
+        liars.append({sender for _, sender, attacks in said if attacks})
+        assert not any(attacks for _, sender, attacks in said if sender not in liars[-1])
+        assert all(attacks for _, sender, attacks in said if sender in liars[-1])
+    assert liars[0] == liars[1], "those whom the ego faces where it alone decides"
+    assert len({episode for episode, _ in liars[0]}) == 4 == len(liars[0])
+
+
+@pytest.mark.slow
 def test_workers_shards_and_a_stop_change_no_byte(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harness: Callable[..., tuple[int, str, str]]
 ) -> None:
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)
-    words = ("drive", "--scenario", "all-way-crossing", "--agents", "all", "--model", "proxy", "--quiet")
-    words = (*words, "--condition", "6g", "--episodes", 3, "--first-seed", 50_000, "--seeds", 0)
+    words = (
+        "drive", "--scenario", "all-way-crossing", "--agents", "all", "--model", "proxy", "--quiet",
+        "--condition", "6g", "--episodes", 3, "--first-seed", 50_000, "--seeds", 0,
+    )  # fmt: skip
     assert harness(*words, "--workers", 1, "--out", "one")[0] == 0
     one = {name: (tmp_path / "one" / name).read_bytes() for name in FILES}
 
