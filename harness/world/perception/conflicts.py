@@ -123,9 +123,10 @@ def conflicts(road: Road, all_known: Sequence[Encounter]) -> list[list[Conflict]
     if road.form == 2:
         for n, conflict in _along(road, all_known):
             met[n].append(conflict)
-    for seen, known in zip(met, all_known, strict=True):
-        if not seen and (meeting := _meeting(road, known)):
-            seen.append(meeting)
+    for n, known in enumerate(all_known):
+        # Who comes on a path of its own through a lane that both share has one place to meet, the crossing.
+        if all(conflict.kind == "oncoming" for conflict in met[n]) and (meeting := _meeting(road, known)):
+            met[n] = [meeting]
     return met
 
 

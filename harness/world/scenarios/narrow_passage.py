@@ -1,0 +1,183 @@
+"""Scenario `narrow-passage`: cars from both sides come to an underpass that is too narrow for two.
+
+A street goes under a railway where only one car fits, and both directions share that lane. The ego comes from
+the west at 8 m/s, and one or two agents from the east; another may follow the ego. The first of either side
+would be in the middle at times of one distribution, so they often meet there unless a side waits, and nothing
+says which. Behind the embankment, a side road comes from the ego's right. In half of the episodes a car that
+is no agent comes along it, timed to be where a cruising ego crosses it, and yields to nobody. The embankment
+hides it from the ego; those who come the other way see it.
+
+Without `agent_share` the other agents keep their speed, and the ego has to let them pass or be through before
+they come.
+
+Where agents are, and when they come, is drawn without knowing of the danger.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats, Texts
+from harness.world.lookouts import Draft, placed
+from harness.world.parameters import SHARED, Shared
+from harness.world.road import Crossing, Lane, PathKey, Road, crossings, paths_along
+from harness.world.scenario import Draws, Layout, Scenario, Seat, Spawn
+from harness.world.state import Building, Part
+
+NAME = "narrow-passage"
+LANE_WIDTH_M = 4.0
+PASSAGE_M = 4.0  # from the middle of the lane that is shared to its ends
+END_M = 90.0  # from the middle to where the street ends
+APART = 0.3  # how far the lanes of either direction part outside, m to the side per m along
+SIDE_M = 16.0  # where the side road is, m to the east
+SIDE_END_M = 100.0  # its ends, to the north and to the south
+EMBANKMENT_M = 70.0  # how far it reaches to the north and to the south
+SECTOR_REACH_M = (4.0, 44.0)  # stretch of a road before the place to meet that is looked at
+OWN, ONCOMING, RIGHT = ("own", "straight"), ("oncoming", "straight"), ("right", "straight")
+FROM_EAST = {
+    OWN: ONCOMING,
+    ONCOMING: OWN,
+    RIGHT: ("left", "straight"),
+}  # names of paths for who comes from the east
+
+
+@dataclass(frozen=True)
+class Parameters(Shared):
+    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+
+    target_speeds_mps: tuple[float, ...] = (0.0, 4.0, 8.0)  # up to 29 km/h
+    time_limit_s: float = 18.0
+    speed_mps: float = 8.0  # of every agent at the start
+    # when the first agent of a side is in the middle, if it keeps its speed
+    arrival_s: tuple[float, float] = (3.5, 4.7)
+    second_share: float = 0.5  # probability of a second agent on a side
+    headway_s: tuple[float, float] = (1.1, 1.4)  # of that one behind the first
+    danger_share: float = 0.5  # probability of a car from the side road
+    # when it is where the ego crosses the side road, after a cruising ego
+    danger_offset_s: tuple[float, float] = (-0.4, 0.4)
+    side_mps: tuple[float, float] = (6.0, 8.0)  # speed of cars from the side road
+    embankment_m: tuple[float, float] = (3.0, 4.0)  # from the middle of the passage to its foot
+    opening_m: tuple[float, float] = (1.6, 2.0)  # from the middle of the lane to the walls of the passage
+    cleared_m: float = 21.0  # how far behind the middle of the passage an agent has cleared it
+
+
+@cache
+def network() -> Any:
+    """Build a lane for either direction, each of three that are straight, and the side road."""
+    from highway_env.road.lane import LineType, StraightLane
+    from highway_env.road.road import RoadNetwork
+
+    net, lines = RoadNetwork(), (LineType.NONE, LineType.NONE)
+    apart_m = APART * (END_M - PASSAGE_M)
+    corners = np.array([(-END_M, apart_m), (-PASSAGE_M, 0.0), (PASSAGE_M, 0.0), (END_M, apart_m)])
+    for name, ahead in (("e", 1), ("w", -1)):
+        for n, (begin, end) in enumerate(pairwise(ahead * corners)):
+            net.add_lane(f"{name}{n}", f"{name}{n + 1}", StraightLane(begin, end, LANE_WIDTH_M, lines))
+    side = StraightLane([SIDE_M, SIDE_END_M], [SIDE_M, -SIDE_END_M], LANE_WIDTH_M, lines)
+    net.add_lane("south", "north", side)
+    return net
+
+
+@cache
+def road(from_east: bool = False) -> Road:
+    """Return the street for an ego from either end. Its conflict zone is the middle of the passage."""
+    names = FROM_EAST if from_east else {key: key for key in FROM_EAST}
+
+    def street(direction: str, whose: str) -> tuple[Sequence[Lane], Sequence[str], int]:
+        """Return the lanes of a direction, their roles, and its right of way."""
+        lanes = [(f"{direction}{n}", f"{direction}{n + 1}", 0) for n in range(3)]
+        return lanes, [f"{whose} lane", "passage", f"{whose} lane behind"], 0
+
+    beside = names[RIGHT]
+    ways = {
+        names[OWN]: street("e", names[OWN][0]),
+        names[ONCOMING]: street("w", names[ONCOMING][0]),
+        beside: ([("south", "north", 0)], ["side road"], 1),
+    }
+    paths, ego, other = paths_along(network(), ways), OWN, ONCOMING
+    # An ego that waits does so before the passage, until who comes the other way is through.
+    x = PASSAGE_M if from_east else -PASSAGE_M
+    meeting = Crossing(x, 0.0, paths[ego].project(x, 0.0)[0], paths[other].project(x, 0.0)[0])
+    back_m = np.linspace(*SECTOR_REACH_M, 11)
+    side = crossings(paths, ego)[beside]
+    return Road(
+        facts={"kind": "street with a narrow passage", "lane_width_m": LANE_WIDTH_M, "ego": "/".join(ego)},
+        paths=paths,
+        ego=ego,
+        crossings={beside: side, other: meeting},
+        zone_m=(0.0, 0.0),
+        sectors={
+            beside[0]: paths[beside].points_at(side.other_arc_m - back_m),
+            other[0]: paths[other].points_at(paths[other].ends_m[0] - back_m),
+        },
+        network=network,
+    )
+
+
+@cache
+def seats() -> dict[PathKey, Seat]:
+    """Return the seats of agents from the west and from the east."""
+    from_east = replace(SCENARIO, road=partial(road, True), cleared=partial(cleared, ahead=-1))
+    return {OWN: Seat(SCENARIO, {key: key for key in FROM_EAST}), ONCOMING: Seat(from_east, FROM_EAST)}
+
+
+def layout(seed: int, parameters: Parameters) -> Layout:
+    """Draw one episode."""
+    return placed(SCENARIO, _draft, seed, parameters)
+
+
+def _draft(draws: Draws, p: Parameters) -> Draft:
+    here = road()
+
+    def agent(id_: str, part: Part, way: PathKey, after_s: float) -> Spawn:
+        """Return an agent that is in the middle of the passage at a time if it keeps its speed."""
+        middle_m = here.paths[way].project(0.0, 0.0)[0]
+        return Spawn(id_, "car", part, *way, middle_m - p.speed_mps * after_s, p.speed_mps)
+
+    times_s = {}
+    for way in (OWN, ONCOMING):
+        first_s = draws.between(f"{way[0]}_arrival", p.arrival_s)
+        second_s = first_s + draws.between(f"{way[0]}_headway", p.headway_s)
+        times_s[way] = [first_s, *([second_s] if draws.share(f"{way[0]}_second") < p.second_share else [])]
+    ego_s, *others_s = times_s[OWN]
+    helpers = [*((OWN, time_s) for time_s in others_s), *((ONCOMING, time_s) for time_s in times_s[ONCOMING])]
+    order = sorted(range(3), key=lambda n: draws.share(f"{n}_id"))
+    spawns = [
+        agent("v1", "ego", OWN, ego_s),
+        *(agent(f"v{2 + n}", "helper", *helper) for n, helper in zip(order, helpers, strict=False)),
+    ]
+
+    (id_,) = draws.ids(("danger",)).values()
+    at, speed = here.crossings[RIGHT], draws.between("danger_speed", p.side_mps)
+    after_s = (at.ego_arc_m - spawns[0].arc_m) / p.speed_mps + draws.between("offset", p.danger_offset_s)
+    danger = "right" if draws.share("danger") < p.danger_share else None
+    if danger:
+        spawns.append(Spawn(id_, "car", "other", *RIGHT, at.other_arc_m - speed * after_s, speed))
+    foot, wall = draws.between("embankment", p.embankment_m), draws.between("opening", p.opening_m)
+    sides = (wall, EMBANKMENT_M), (-EMBANKMENT_M, -wall)
+    walls = [Building(f"b{n}", -foot, north, foot, south) for n, (north, south) in enumerate(sides, 1)]
+    return Draft(Layout.arranged(spawns, danger, id_, walls), (), ())
+
+
+def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters, ahead: int = 1) -> Bools:
+    """Return whether an ego that goes east (1) or west (-1) is far enough behind the passage."""
+    return np.asarray(ahead * xy_m[..., 0, 0] > parameters.cleared_m)
+
+
+SCENARIO = Scenario(
+    name=NAME,
+    description=__doc__,
+    actions=("SLOWER", "IDLE", "FASTER"),
+    parameters=Parameters(),
+    road=road,
+    layout=layout,
+    cleared=cleared,
+    dials=SHARED,
+    words={"task": "drive through an underpass that is too narrow for two", "hiding": "the embankment"},
+    one_sided="the side road comes from the right",
+    seats=seats,
+)
