@@ -200,7 +200,10 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
                 np.full(20, 0.2), np.where(rng.random((20, 3)) < 0.5, 1.0, np.nan),
                 lambda xy_m: np.abs(xy_m[..., 0]) / 10,
             ),
-            Plans(np.tile(np.arange(4), (20, 1)), rng.uniform(0, 9, (20, 4)), rng.uniform(0, 3, (20, 4))),
+            Plans(
+                np.tile(np.arange(3), (20, 1)), np.tile(np.arange(4), (20, 1)), rng.uniform(0, 9, (20, 4)),
+                rng.uniform(0, 3, (20, 4)),
+            ),
         )  # fmt: skip
         fused = rule.fuse(messages, state)
         assert fused.policy.sum(axis=-1) == pytest.approx(1.0)
@@ -214,7 +217,7 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
         with_ego = [0, 3, 1, 2]
         shuffled = replace(
             messages, intents=intents[:, with_ego], weights=weights[:, with_ego], heard=heard[:, order],
-            plans=Plans(*(array[:, with_ego] for array in vars(messages.plans).values())),
+            plans=messages.plans.of_helpers(np.tile(order, (20, 1))),
         )  # fmt: skip
         if state.shape[-1] == 0:  # a rule with memory may remember who said what
             assert rule.fuse(shuffled, state).policy == pytest.approx(fused.policy)

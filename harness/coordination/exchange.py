@@ -70,6 +70,7 @@ class Exchange:
     arrival_s: Floats  # end of the reply at whoever fuses, `(..., H)`; inf if lost or not asked
     on_time: Bools  # whether it arrived within the window and so is fused, `(..., H)`
     exchange_s: Floats  # end of the whole exchange, `(...)`
+    repeats: Ints  # scheduled replies of further rounds, `(...)`
 
     @cached_property
     def normalised_entropy(self) -> Floats:
@@ -78,8 +79,8 @@ class Exchange:
 
     @cached_property
     def messages(self) -> Ints:
-        """The number of scheduled replies, `(...)`; like the paper, it does not count the request."""
-        return count_of(self.asked)
+        """The number of scheduled replies of all rounds, `(...)`; like the paper, without requests."""
+        return count_of(self.asked) + self.repeats
 
     @cached_property
     def lost(self) -> Ints:
@@ -94,7 +95,8 @@ class Exchange:
     @cached_property
     def observed_loss(self) -> Floats:
         """The share of the messages that did not arrive, `(...)`; NaN without messages."""
-        return np.where(self.messages > 0, self.lost / np.maximum(self.messages, 1), np.nan)
+        asked = count_of(self.asked)
+        return np.where(asked > 0, self.lost / np.maximum(asked, 1), np.nan)
 
 
 def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools | None = None) -> Exchange:
@@ -133,6 +135,7 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         arrival_s=arrival_s,
         on_time=outcome.fused & (arrival_s <= point.fusion.window_s),
         exchange_s=np.minimum(request_s[..., 0] + outcome.acts_s, waits_until_s),
+        repeats=np.zeros(own_failed.shape, dtype=int),
     )
 
 

@@ -139,7 +139,11 @@ class OperatingPoint:
                 raise wrong("consensus", self.fusion.consensus, f"one of {able} where {holds}")
             raise wrong("content", self.ask.content, f"{PLAN} where consensus is {self.fusion.consensus}")
         if not self.content.plan:
+            if self.fusion.rounds > 1:
+                raise wrong("rounds", self.fusion.rounds, f"1 where {holds}, which holds no plans")
             return
+        if self.fusion.rounds > 1 and (self.cloud.round_trip or self.cloud.round_trip_s is not None):
+            raise wrong("rounds", self.fusion.rounds, "1 where the ego's model runs in a cloud")
         if self.ask.messages != "own":
             raise wrong("messages", self.ask.messages, f"own where {holds}")
         if self.ask.on_demand:
@@ -285,6 +289,8 @@ class OperatingPoint:
         on_demand = setting == "on_demand" and self.content.asks_helpers
         if setting in OF_INTENTS and not (self.content.intent or self.content.plan or on_demand):
             return f"content {ask.content} holds no intents"
+        if setting == "rounds" and not self.content.plan:
+            return f"content {ask.content} holds no plans"
         weighs_none = consensus == EGO_PROMPT or isinstance(RULES[consensus], Heads | Precedence)
         if setting in WEIGHING and weighs_none:
             return f"consensus {consensus} weighs no distances"

@@ -26,6 +26,7 @@ DEFENCES = ("quoted", "schema", "majority")
 RELAY, FUSION = "relay", "fusion"
 EDGES = ("none", RELAY, FUSION)
 MOST_HELPERS = 1000
+MOST_ROUNDS = 3
 
 Metres = Annotated[float, Meta(gt=0, le=1e6, description="metres above 0, at most 1000000")]
 Place = Annotated[float, Meta(ge=-10_000, le=10_000, description="metres from -10000 to 10000")]
@@ -161,6 +162,10 @@ class Fusion(Part, frozen=True, kw_only=True):
     # What replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass on the
     # first action, which is the most conservative one.
     fallback: Text = "uniform"
+    # How often agents tell each other their plans before they act (`harness.evaluate.rounds`).
+    rounds: Annotated[
+        int, Meta(ge=1, le=MOST_ROUNDS, description=f"a whole number from 1 to {MOST_ROUNDS}")
+    ] = 1
 
     def check(self) -> None:
         if self.fallback not in FALLBACKS:

@@ -21,6 +21,9 @@ class Plans:
     All is what the sender itself states, so all who hear it compare the same numbers.
     """
 
+    # the row of the decision that each other makes itself now, among those made together, `(..., H)`; -1
+    # where it makes none. H is 0 until it is known whom an agent hears
+    row: Ints
     vehicle: Ints  # the vehicle's number in its world; -1 for one without a plan
     # seconds until it is at the centroid of the conflict zone at its speed; inf for one that stands, or has
     # passed it. NaN without a plan
@@ -30,7 +33,7 @@ class Plans:
 
     def take(self, at: Any) -> "Plans":
         """Return the plans at these indices of the leading dimension."""
-        return Plans(self.vehicle[at], self.reaches_s[at], self.lost_s[at])
+        return Plans(self.row[at], self.vehicle[at], self.reaches_s[at], self.lost_s[at])
 
     def of_helpers(self, places: Ints) -> "Plans":
         """Return those of the helpers at these indices, `(..., H')`; one may be repeated."""
@@ -39,7 +42,8 @@ class Plans:
         def of(array: Any) -> Any:
             return np.take_along_axis(array, at, axis=-1)
 
-        return Plans(of(self.vehicle), of(self.reaches_s), of(self.lost_s))
+        row = np.take_along_axis(self.row, places, axis=-1)
+        return Plans(row, of(self.vehicle), of(self.reaches_s), of(self.lost_s))
 
     def among(self, senders: Ints) -> "Plans":
         """Return what agents (n, 1) hear of each other, (n, 1+H), by the row of each sender (n, H) or -1."""
@@ -47,4 +51,6 @@ class Plans:
         def heard(own: Any, unknown: float) -> Any:
             return np.concatenate([own, np.where(senders >= 0, own[senders, 0], unknown)], axis=1)
 
-        return Plans(heard(self.vehicle, -1), heard(self.reaches_s, np.nan), heard(self.lost_s, np.nan))
+        return Plans(
+            senders, heard(self.vehicle, -1), heard(self.reaches_s, np.nan), heard(self.lost_s, np.nan)
+        )

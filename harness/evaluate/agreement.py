@@ -11,16 +11,14 @@ from harness.evaluate.walk import Decided
 def broken_words(decided: Decided[Any]) -> Floats:
     """Return whether each agent breaks its word, (n,): its action is not the likeliest of the plan it sent.
 
-    It counts as sent if anybody got it, as it was sent last. NaN for an agent whose plan nobody got.
+    It breaks its word if that holds for anybody who got a plan, of the last that this one fused. NaN for an
+    agent whose plan nobody got.
     """
-    broken = np.full(len(decided.due.at), np.nan)
-    if (senders := decided.due.senders) is None:
+    broken, intents = np.full(len(decided.due.at), np.nan), decided.said.intents
+    if decided.due.senders is None or intents.plans is None:
         return broken
-    intents, delivered = decided.said.intents, decided.result.delivered
-    if intents.voice_of is not None:  # an attacker with several voices
-        senders = np.take_along_axis(senders, intents.voice_of, axis=-1)
-    got = delivered & (senders >= 0)
+    senders = intents.plans.row
+    got = decided.result.delivered & (senders >= 0)
     who, word = senders[got], np.argmax(intents.helpers[got], axis=-1)
-    # all who got its plan got the same, and an attacker with several voices is judged by the last
-    broken[who] = decided.result.action[who] != word
+    np.fmax.at(broken, who, decided.result.action[who] != word)
     return broken

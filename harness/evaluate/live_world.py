@@ -175,7 +175,8 @@ class LiveWorld(SceneWorld):
         arc_m = road.project([(s.approach, s.route) for s in spawns], x_m, y_m)[0]
         driven_s = (arc_m - [s.arc_m for s in spawns]) / [s.speed_mps for s in spawns]
         number = np.array([agent for _, agent in self._deciding])
-        return Plans(number[:, None], reaches_s[:, None], np.maximum(time_s - driven_s, 0.0)[:, None])
+        nobody = np.empty((len(number), 0), dtype=int)
+        return Plans(nobody, number[:, None], reaches_s[:, None], np.maximum(time_s - driven_s, 0.0)[:, None])
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         actions, hz = self.scenario.actions, self._p.simulation_hz

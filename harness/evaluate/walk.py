@@ -6,6 +6,7 @@ They differ only in where their decision points come from and where an action le
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -27,6 +28,7 @@ from harness.evaluate.claims import claims
 from harness.evaluate.draws import tie_draws
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.outlook import outlook
+from harness.evaluate.rounds import further_rounds
 from harness.evaluate.sharing import listed
 from harness.radio.channel import Draws, Site, Unit
 from harness.world.scenario import Scenario
@@ -191,6 +193,11 @@ def walk(
             for point, each in due.items()
         }
         sent = {point: exchange(point, each.intents, each.draws) for point, each in broadcasts.items()}
+        for point in (point for point in due if point.fusion.rounds > 1):
+            fusion = FusionInputs(None, memories[point].recall(due[point]), tie_draws(due[point].draws, ties))
+            broadcasts[point], sent[point] = further_rounds(
+                point, broadcasts[point], sent[point], partial(_decided, point, fusion)
+            )
         calls = _fusion_calls(due, broadcasts, sent, decision_points, ask)
         decided = []
         for point, due_here in due.items():
@@ -209,6 +216,10 @@ def walk(
             memories[part.point].keep(part.due, part.result.state)
         yield decided
         world.step(decided)
+
+
+def _decided(point: OperatingPoint, fusion: FusionInputs, heard: Exchange, intents: Intents) -> Coordination:
+    return fuse(point, heard, intents, fusion)
 
 
 def _asked(

@@ -68,6 +68,7 @@ CONDITION: Mapping[str, Added] = {
     "content": Added("2026-11-27", "intent", "messages that hold objects; all held intents"),
     "encoding": Added("2026-11-27", "json", "the standards' sizes of messages; all were JSON"),
     "calibration": Added("2026-11-27", "", "corrected probabilities; all were as they were answered"),
+    "rounds": Added("2026-11-27", 1, "several rounds of negotiation; all had one"),
     "weight_cap": Added("2026-11-23", 1.0, "a cap on one helper's weight"),
 }
 # Of `versions`, in run.json and in the record that a run begins with.

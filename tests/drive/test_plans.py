@@ -8,11 +8,17 @@ import pytest
 from evaluating import live_spec_of, run
 
 from harness.coordination.consensus import Messages
-from harness.coordination.operating_point import named_point
+from harness.coordination.coordinate import Coordination, fuse
+from harness.coordination.exchange import Exchange, exchange
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.coordination.plans import Plans
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
+from harness.evaluate.attackers import SentIntents
 from harness.evaluate.live_world import LiveSource
+from harness.evaluate.rounds import further_rounds
+from harness.radio.channel import Draws
 from harness.runs import folder
 
 ALL = "all-way-crossing:agent_share=1"
@@ -24,7 +30,10 @@ def decided(rule, intents, reaches_s, lost_s=(), heard=None, vehicle=None) -> li
     """The policy of an agent, the first row, which hears the others' plans."""
     n = len(intents)
     plans = Plans(
-        np.array(vehicle or range(n)), np.array(reaches_s, dtype=float), np.array(lost_s or [0.0] * n)
+        np.arange(n - 1),
+        np.array(vehicle or range(n)),
+        np.array(reaches_s, dtype=float),
+        np.array(lost_s or [0.0] * n),
     )
     there = np.array(heard if heard is not None else [True] * (n - 1))
     messages = Messages(
@@ -93,3 +102,53 @@ def test_what_plans_go_without_is_refused_in_one_line(condition: str, says: str)
 def test_an_ego_alone_has_nobody_whose_plan_it_hears() -> None:
     with pytest.raises(UserError, match="content plan needs several agents"):
         live_spec_of(points=(named_point(PLAN + "auction"),))
+
+
+def three(point: OperatingPoint) -> tuple[SentIntents, Exchange]:
+    """The first round of three agents that all want to go, 1.5 s apart; each is near the next one."""
+    n, senders = 3, np.array([[1, 2], [0, 2], [0, 1]])
+    own = Intents(
+        own=np.array([BOLD, STEADY, STEADY]), helpers=np.full((n, 2, 3), np.nan), valid=np.ones((n, 2), bool),
+        distance_m=np.full((n, 3), 20.0), range_m=np.full((n, 2), 30.0), payload_bits=np.zeros((n, 2)),
+        inference_s=np.full((n, 3), 0.1), own_bits=np.full(n, 1000.0), own_text_bytes=np.zeros(n),
+        plans=Plans(
+            np.empty((n, 0), int), np.arange(n)[:, None], np.array([[3.0], [4.5], [6.0]]), np.zeros((n, 1))
+        ),
+    )  # fmt: skip
+    intents, draws = own.planned(senders), Draws(np.full((n, 2, 2), 0.99), np.zeros((n, 2)))
+    return SentIntents(intents, draws, np.zeros((n, 2), bool)), exchange(point, intents, draws)
+
+
+def acted(point: OperatingPoint) -> Coordination:
+    said, heard = further_rounds(point, *three(point), lambda heard, intents: fuse(point, heard, intents))
+    return fuse(point, heard, said.intents)
+
+
+def test_in_a_second_round_one_goes_since_the_one_before_it_waits() -> None:
+    point = named_point(PLAN + "yield-by-time,loss=0")
+    once, twice = acted(point), acted(point.changed(rounds=2))
+    assert once.action.tolist() == [2, 0, 0]
+    assert twice.action.tolist() == [2, 0, 1], "the last one heard that the second waits"
+    assert twice.messages.tolist() == [4, 4, 4]
+    assert twice.reply_bits == pytest.approx(2 * once.reply_bits)
+    assert twice.airtime_s == pytest.approx(2 * once.airtime_s)
+    assert twice.latency_s - 0.1 == pytest.approx(2 * (once.latency_s - 0.1))
+    assert acted(point.changed(rounds=3)).action.tolist() == [2, 0, 1]
+
+
+def test_a_round_that_ends_after_the_window_is_not_heard_and_none_begins_after_it() -> None:
+    point = named_point(PLAN + "yield-by-time,loss=0")
+    first_s = float(acted(point).latency_s[0])
+    late = acted(point.changed(rounds=2, window_s=first_s + 0.001))
+    assert late.action.tolist() == [2, 0, 0]
+    assert late.deadline_missed.all()
+    never = acted(point.changed(rounds=3, window_s=first_s))
+    assert never.messages.tolist() == [2, 2, 2]
+    assert never.latency_s == pytest.approx(first_s)
+
+
+def test_rounds_are_of_plans_alone() -> None:
+    with pytest.raises(UserError, match="rounds is 2; it must be 1 where content is intent"):
+        named_point("6g:rounds=2")
+    with pytest.raises(UserError, match="rounds is 4; it must be a whole number from 1 to 3"):
+        named_point(PLAN + "auction,rounds=4")

@@ -1,0 +1,80 @@
+"""Further rounds of a negotiation: agents send what they have decided, and decide again with what they hear.
+
+In seconds from the start of the decision: an agent that has decided by the window asks the same others once
+more. Each replies once it has decided itself, with its policy after the round before. What arrives in the
+window takes the place of the plan of the round before; who is not heard again is taken at its last word. The
+agent decides again by its own intent and by what it now knows.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from harness.coordination.coordinate import Coordination
+from harness.coordination.exchange import Exchange, exchange
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.arrays import count_of
+from harness.evaluate.attackers import SentIntents
+from harness.radio.channel import Draws
+
+
+def further_rounds(
+    point: OperatingPoint,
+    said: SentIntents,
+    heard: Exchange,
+    fused: Callable[[Exchange, Intents], Coordination],
+) -> tuple[SentIntents, Exchange]:
+    """Return what is known after the last round, and the exchange of all rounds together.
+
+    Args:
+        point: the condition.
+        said: what was said in the first round, in decisions (n,).
+        heard: the exchange of the first round.
+        fused: decides by an exchange and by the intents that it brought.
+    """
+    for number in range(2, point.fusion.rounds + 1):
+        intents, draws = said.intents, said.draws
+        assert intents.plans is not None
+        senders = intents.plans.row
+        there, policy = senders >= 0, fused(heard, intents).fused
+        # An attacker repeats what it said.
+        newer = np.where(said.attackers[..., None], intents.helpers, policy[senders])
+        decided_s = heard.exchange_s
+        helpers_s = np.where(there, decided_s[senders], np.nan)
+        more = exchange(
+            point,
+            replace(intents, inference_s=np.concatenate([decided_s[:, None], helpers_s], axis=1)),
+            _of_round(draws, number),
+            heard.asked & (decided_s < point.fusion.window_s)[:, None],
+        )
+        said = replace(
+            said, intents=replace(intents, helpers=np.where(more.on_time[..., None], newer, intents.helpers))
+        )
+        heard = _together(heard, more)
+    return said, heard
+
+
+def _of_round(draws: Draws, number: int) -> Draws:
+    """Return a round's draws: links and shadowing stay, each packet is drawn anew."""
+    if draws.trips is None:
+        return draws
+    trips = replace(draws.trips, links=f".round-{number}")
+    return replace(draws, given=trips.uniforms(draws.jitter.shape[-1]))
+
+
+def _together(earlier: Exchange, later: Exchange) -> Exchange:
+    """Return the exchange of two rounds: what both cost, who was heard in either, and the later end."""
+    return replace(
+        earlier,
+        requests=earlier.requests + later.requests,
+        request_bits=earlier.request_bits + later.request_bits,
+        reply_bits=earlier.reply_bits + later.reply_bits,
+        airtime_s=earlier.airtime_s + later.airtime_s,
+        delivered=earlier.delivered | later.delivered,
+        arrival_s=np.where(later.on_time, later.arrival_s, earlier.arrival_s),
+        on_time=earlier.on_time | later.on_time,
+        exchange_s=later.exchange_s,
+        repeats=earlier.repeats + count_of(later.asked),
+    )
