@@ -11,7 +11,7 @@ from msgspec import structs
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
 from harness.world.reference import drive
-from harness.world.scenarios.roundabout_entry import RING_M, layout, road
+from harness.world.scenarios.roundabout_entry import PLACE, layout, road
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import World
 
@@ -50,7 +50,10 @@ def listed(graph):
 def test_only_who_goes_on_past_the_egos_arm_meets_it_and_where_it_enters():
     assert road().crossings.keys() == {("left", "straight"), ("oncoming", "straight")}
     for meet in road().crossings.values():
-        assert (math.hypot(meet.x_m, meet.y_m), meet.kind) == (pytest.approx(RING_M, abs=0.01), "merging")
+        assert (math.hypot(meet.x_m, meet.y_m), meet.kind) == (
+            pytest.approx(PLACE.ring_m, abs=0.01),
+            "merging",
+        )
 
 
 def test_the_hedge_hides_from_the_ego_what_two_helpers_see():

@@ -12,40 +12,30 @@ What the ego can see before it is too late (hedge, mound, helpers, a car that le
 later) is drawn without knowing of the danger.
 """
 
-import math
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed, queue
 from harness.world.parameters import WITNESSED, Witnessed
-from harness.world.road import Lane, Path, PathKey, Road, crossings
+from harness.world.road import PathKey, Road, crossings
+from harness.world.roundabouts import ARM_M, LANE_WIDTH_M, Roundabout
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import Building
 
 NAME = "roundabout-entry"
-LANE_WIDTH_M = 4.0
-RING_M = 20.0  # radius of the middle of the ring's lane: 44 m from kerb to kerb, 27 to 55 m are usual
-ENTRY_M = 18.0  # radius of the arcs by which cars enter and leave
-BESIDE_M = 4.0  # from an arm's centre line to the middle of its lanes, beside the splitter island
-ARM_M = 80.0  # length of the straight before and behind the arcs
-ARC_Y_M = math.sqrt((RING_M + ENTRY_M) ** 2 - (BESIDE_M + ENTRY_M) ** 2)  # where the south arm's arcs begin
-TOUCH_RAD = math.atan2(ARC_Y_M, BESIDE_M + ENTRY_M)  # where on the ring the south entry joins it
-ARMS = {"own": 0, "right": 1, "oncoming": 2, "left": 3}  # quarter turns from the south, the way cars go round
+# The middle of the ring's lane has a radius of 20 m: 44 m from kerb to kerb, 27 to 55 m are usual.
+PLACE = Roundabout(ring_m=20.0, entry_m=18.0, beside_m=4.0)
 SECTORS = ("left", "oncoming")  # the arm that a danger has come from
 SECTOR_REACH_M = (8.0, 45.0)  # stretch before the point of entry that is looked at
-RING = ("se", "ex", "ee", "nx", "ne", "wx", "we", "sx")  # as in highway-env: entries and exits in order
 # Where witnesses are declared, the third lookout is a second car that leaves at the west arm, this far behind
 # the first.
 SECOND_M = 8.0, 10.0
 # Blind seats: slow cars behind the ego, which they never reach; from centre to centre.
 SEATS_M = (14.0, 18.0), (9.0, 11.0), (9.0, 11.0)
 SEATS_MPS = (1.0, 2.0)
-SEEN_AS = {"own": "south", "right": "east", "oncoming": "north", "left": "west"}
 
 
 @dataclass(frozen=True)
@@ -84,75 +74,17 @@ class Parameters(Witnessed):
 
 
 @cache
-def network() -> Any:
-    """Build a ring with four arms of highway-env's lanes, which meet; its own ring has gaps."""
-    from highway_env.road.lane import CircularLane, LineType, StraightLane
-    from highway_env.road.road import RoadNetwork
-
-    none, edge = LineType.NONE, LineType.CONTINUOUS
-    streets = RoadNetwork()
-    for arm, quarters in ARMS.items():
-        turn, c = -math.pi / 2 * quarters, SEEN_AS[arm][0]
-        rotate = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]).round(12)
-
-        def at(x: float, y: float, rotate: Floats = rotate) -> Floats:
-            turned: Floats = rotate @ np.array([x, y])
-            return turned
-
-        def arc(side: int, begin: float, end: float, at: Any = at, turn: float = turn) -> Any:
-            centre = at(side * (BESIDE_M + ENTRY_M), ARC_Y_M)
-            return CircularLane(centre, ENTRY_M, turn + begin, turn + end, True, line_types=(edge, edge))
-
-        far = ARC_Y_M + ARM_M
-        way_in = StraightLane(at(BESIDE_M, far), at(BESIDE_M, ARC_Y_M), line_types=(edge, edge))
-        way_out = StraightLane(at(-BESIDE_M, ARC_Y_M), at(-BESIDE_M, far), line_types=(edge, edge))
-        streets.add_lane(f"{c}er", f"{c}es", way_in)
-        streets.add_lane(f"{c}es", f"{c}e", arc(1, math.pi, math.pi + TOUCH_RAD))
-        streets.add_lane(f"{c}x", f"{c}xs", arc(-1, -TOUCH_RAD, 0.0))
-        streets.add_lane(f"{c}xs", f"{c}xr", way_out)
-    for n, (begin, end) in enumerate(zip(RING, RING[1:] + RING[:1], strict=True)):
-        start_rad, end_rad = _ring_rad(n), _ring_rad(n + 1)
-        lane = CircularLane((0.0, 0.0), RING_M, start_rad, end_rad, False, line_types=(none, edge))
-        streets.add_lane(begin, end, lane)
-    return streets
-
-
-def _ring_rad(node: int) -> float:
-    """Return the angle of the ring's nth node; angles fall the way cars go round."""
-    exits = TOUCH_RAD if node % 2 == 0 else math.pi / 2 - TOUCH_RAD
-    return exits - math.pi / 2 * (node // 2)
-
-
-def _path(approach: str, route: str, begin: str, end: str, priority: int) -> Path:
-    """Build the path from the arm of `begin`, by the ring, to the arm of `end` (arms by first letter)."""
-    first, last = RING.index(f"{begin}e"), RING.index(f"{end}x")
-    nodes = [RING[k % len(RING)] for k in range(first, last + 1 if last > first else last + len(RING) + 1)]
-    lanes: list[Lane] = [(f"{begin}er", f"{begin}es", 0), (f"{begin}es", f"{begin}e", 0)]
-    lanes += [(a, b, 0) for a, b in pairwise(nodes)]
-    lanes += [(f"{end}x", f"{end}xs", 0), (f"{end}xs", f"{end}xr", 0)]
-    return Path.along(network(), approach, route, lanes, [_role(lane) for lane in lanes], priority)
-
-
-def _role(lane: Lane) -> str:
-    """Name a lane as the ego sees it."""
-    where = {c[0]: arm for arm, c in SEEN_AS.items()}[lane[1][0]]
-    if lane[0] in RING and lane[1] in RING:
-        return f"ring-{where}"  # before the exit of that arm, or between its exit and its entry
-    return f"approach-{where}" if "e" in lane[1] else f"exit-{where}"
-
-
-@cache
 def road() -> Road:
     """Return the roundabout. Its conflict zone is where the ego's way joins the ring."""
     ego = ("own", "straight")
     # Routes are named at the ego's arm: `right` leaves there and shows it, `straight` goes on past it.
     paths = {
-        ego: _path(*ego, "s", "n", 0),
-        ("own", "left"): _path("own", "left", "s", "w", 0),
-        ("left", "straight"): _path("left", "straight", "w", "e", 1),
-        ("left", "right"): _path("left", "right", "w", "s", 1),
-        ("oncoming", "straight"): _path("oncoming", "straight", "n", "e", 1),
-        ("oncoming", "right"): _path("oncoming", "right", "n", "s", 1),
+        ego: PLACE.path(*ego, "s", "n", 0),
+        ("own", "left"): PLACE.path("own", "left", "s", "w", 0),
+        ("left", "straight"): PLACE.path("left", "straight", "w", "e", 1),
+        ("left", "right"): PLACE.path("left", "right", "w", "s", 1),
+        ("oncoming", "straight"): PLACE.path("oncoming", "straight", "n", "e", 1),
+        ("oncoming", "right"): PLACE.path("oncoming", "right", "n", "s", 1),
     }
     meetings = crossings(paths, ego)
     at = meetings["left", "straight"]
@@ -162,13 +94,18 @@ def road() -> Road:
         for sector in SECTORS
     }
     return Road(
-        facts={"kind": "roundabout", "lane_width_m": LANE_WIDTH_M, "ring_m": RING_M, "ego": "/".join(ego)},
+        facts={
+            "kind": "roundabout",
+            "lane_width_m": LANE_WIDTH_M,
+            "ring_m": PLACE.ring_m,
+            "ego": "/".join(ego),
+        },
         paths=paths,
         ego=ego,
         crossings=meetings,
         zone_m=(at.x_m, at.y_m),
         sectors=watched,
-        network=network,
+        network=PLACE.network,
     )
 
 
@@ -219,11 +156,8 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
         spawns.append(car("late", arm("late_sector"), "straight", p.late_offset_s))
 
     half, mound = p.hedge_half_m, draws.between("mound", p.mound_m)
-    boxes = [(-half, draws.between("hedge_end", p.hedge_end_m), half, ARC_Y_M + ARM_M)]
-    for degrees in (22.5, 45.0, 67.5):  # three boxes whose corners lie on a circle
-        x, y = mound * math.cos(math.radians(degrees)), mound * math.sin(math.radians(degrees))
-        boxes.append((-x, -y, x, y))
-    buildings = [Building(f"b{n}", *box) for n, box in enumerate(boxes, 1)]
+    hedge = -half, draws.between("hedge_end", p.hedge_end_m), half, PLACE.arc_y_m + ARM_M
+    buildings = [Building(f"b{n}", *box) for n, box in enumerate([hedge, *PLACE.mound(mound)], 1)]
     made = Layout.arranged(spawns, danger, ids["round"], buildings)
     return Draft(made, (*phantoms.values(),), queue(draws, ids, spawns[0], SEATS_M, SEATS_MPS))
 
@@ -231,7 +165,7 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
     """Return whether the ego is past the first exit behind its entry."""
     x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
-    return np.asarray((x > 0) & (np.arctan2(y, x) < _ring_rad(1)))
+    return np.asarray((x > 0) & (np.arctan2(y, x) < PLACE.ring_rad(1)))
 
 
 SCENARIO = Scenario(

@@ -1,0 +1,114 @@
+"""Roundabouts of one lane with four arms, as roads; traffic goes round from an arm to that on its right."""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.world.road import Lane, Path
+
+LANE_WIDTH_M = 4.0
+ARM_M = 80.0  # length of the straight before and behind the arcs
+ARMS = "senw"  # south, east, north and west: the way cars go round
+RING = ("se", "ex", "ee", "nx", "ne", "wx", "we", "sx")  # as in highway-env: entries and exits in order
+NAMES = ("own", "right", "oncoming", "left")  # of the arms, from an agent's own on, the way cars go round
+
+
+@dataclass(frozen=True)
+class Roundabout:
+    """The sizes of a roundabout around the origin, and what follows from them."""
+
+    ring_m: float  # radius of the middle of the ring's lane
+    entry_m: float  # radius of the arcs by which cars enter and leave
+    beside_m: float  # from an arm's centre line to the middle of its lanes, beside the splitter island
+
+    @property
+    def arc_y_m(self) -> float:
+        """Where the south arm's arcs begin."""
+        return math.sqrt((self.ring_m + self.entry_m) ** 2 - (self.beside_m + self.entry_m) ** 2)
+
+    @property
+    def touch_rad(self) -> float:
+        """Where on the ring the south entry joins it."""
+        return math.atan2(self.arc_y_m, self.beside_m + self.entry_m)
+
+    def ring_rad(self, node: int) -> float:
+        """Return the angle of the ring's nth node; angles fall the way cars go round."""
+        exits = self.touch_rad if node % 2 == 0 else math.pi / 2 - self.touch_rad
+        return exits - math.pi / 2 * (node // 2)
+
+    @cache  # noqa: B019 there are few, and they are never freed
+    def network(self) -> Any:
+        """Build a ring with four arms of highway-env's lanes, which meet; its own ring has gaps."""
+        from highway_env.road.lane import CircularLane, LineType, StraightLane
+        from highway_env.road.road import RoadNetwork
+
+        none, edge = LineType.NONE, LineType.CONTINUOUS
+        beside, entry, arc_y, touch = self.beside_m, self.entry_m, self.arc_y_m, self.touch_rad
+        streets = RoadNetwork()
+        for quarters, c in enumerate(ARMS):
+            turn = -math.pi / 2 * quarters
+            rotate = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]).round(12)
+
+            def at(x: float, y: float, rotate: Floats = rotate) -> Floats:
+                turned: Floats = rotate @ np.array([x, y])
+                return turned
+
+            def arc(side: int, begin: float, end: float, at: Any = at, turn: float = turn) -> Any:
+                centre = at(side * (beside + entry), arc_y)
+                return CircularLane(centre, entry, turn + begin, turn + end, True, line_types=(edge, edge))
+
+            far = arc_y + ARM_M
+            way_in = StraightLane(at(beside, far), at(beside, arc_y), line_types=(edge, edge))
+            way_out = StraightLane(at(-beside, arc_y), at(-beside, far), line_types=(edge, edge))
+            streets.add_lane(f"{c}er", f"{c}es", way_in)
+            streets.add_lane(f"{c}es", f"{c}e", arc(1, math.pi, math.pi + touch))
+            streets.add_lane(f"{c}x", f"{c}xs", arc(-1, -touch, 0.0))
+            streets.add_lane(f"{c}xs", f"{c}xr", way_out)
+        for n, (begin, end) in enumerate(zip(RING, RING[1:] + RING[:1], strict=True)):
+            start_rad, end_rad = self.ring_rad(n), self.ring_rad(n + 1)
+            lane = CircularLane((0.0, 0.0), self.ring_m, start_rad, end_rad, False, line_types=(none, edge))
+            streets.add_lane(begin, end, lane)
+        return streets
+
+    def path(
+        self, approach: str, route: str, begin: str, end: str, priority: int, own: str = ARMS[0]
+    ) -> Path:
+        """Build the path from the arm of `begin`, by the ring, to the arm of `end` (arms by first letter).
+
+        Sections are named as an agent from the arm `own` sees them.
+        """
+        first, last = RING.index(f"{begin}e"), RING.index(f"{end}x")
+        nodes = [
+            RING[k % len(RING)] for k in range(first, last + 1 if last > first else last + len(RING) + 1)
+        ]
+        lanes: list[Lane] = [(f"{begin}er", f"{begin}es", 0), (f"{begin}es", f"{begin}e", 0)]
+        lanes += [(a, b, 0) for a, b in pairwise(nodes)]
+        lanes += [(f"{end}x", f"{end}xs", 0), (f"{end}xs", f"{end}xr", 0)]
+        roles = [_role(lane, own) for lane in lanes]
+        return Path.along(self.network(), approach, route, lanes, roles, priority)
+
+    def mound(self, radius_m: float) -> list[tuple[float, float, float, float]]:
+        """Return three boxes (west, north, east, south) whose corners lie on a circle around the origin."""
+        boxes = []
+        for degrees in (22.5, 45.0, 67.5):
+            x, y = radius_m * math.cos(math.radians(degrees)), radius_m * math.sin(math.radians(degrees))
+            boxes.append((-x, -y, x, y))
+        return boxes
+
+
+def name_of(arm: str, own: str) -> str:
+    """Return the name of an arm for an agent from the arm `own`."""
+    return NAMES[(ARMS.index(arm) - ARMS.index(own)) % len(ARMS)]
+
+
+def _role(lane: Lane, own: str) -> str:
+    """Name a lane as an agent from the arm `own` sees it."""
+    where = name_of(lane[1][0], own)
+    if lane[0] in RING and lane[1] in RING:
+        return f"ring-{where}"  # before the exit of that arm, or between its exit and its entry
+    return f"approach-{where}" if "e" in lane[1] else f"exit-{where}"
