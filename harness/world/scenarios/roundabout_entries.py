@@ -1,0 +1,198 @@
+"""Scenario `roundabout-entries`: cars enter a small roundabout from several arms, each in the next one's way.
+
+The ego comes from the south, and other agents from the west, from the east, or from both; all go straight on.
+Who has entered goes round past the next arm when the one from there is about to enter: the car from the west
+past the south arm, and the ego past the east arm. Each has a seat of its own. Without `agent_share` they keep
+their way and speed, as all other traffic does: it brakes only for who is in its lane, ahead and slower.
+
+In most episodes one more car is dangerous. It is no agent, has come from the north arm and goes on past the
+south arm, closely behind the car from the west, or, where there is none, when the ego enters. Hedges beside
+every arm and a planted mound in the middle hide it. A car just like it that leaves at the south arm does not
+harm the ego.
+
+When two agents meet is drawn evenly about the moment at which both are at the entry, so neither is first more
+often; ids tell nobody's place.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats, Texts
+from harness.world.lookouts import Draft, placed
+from harness.world.parameters import SHARED, Shared
+from harness.world.road import PathKey, Road, crossings
+from harness.world.roundabouts import ARM_M, ARMS, LANE_WIDTH_M, Roundabout, name_of
+from harness.world.scenario import Draws, Layout, Scenario, Seat, Spawn
+from harness.world.state import Building
+
+NAME = "roundabout-entries"
+PLACE = Roundabout(ring_m=12.0, entry_m=10.0, beside_m=3.0)  # 28 m from kerb to kerb
+FROM = (("w", "s"), ("s", "e"), ("w", "s", "e"))  # arms that agents come from, the way cars go round
+EGO = "s"
+# The arms from which cars come that pass an agent's entry, and the way of these.
+SECTORS = {"left": ("left", "straight"), "oncoming": ("oncoming", "left")}
+SECTOR_REACH_M = (6.0, 30.0)  # stretch before the point of entry that is looked at
+# The route of a car by where it has come from, and at which arm from there on it leaves. Who leaves at the
+# agent's own arm is named `right` and shows it, since that is what matters there. The first of equally good
+# ways is what a car on the ring is taken for.
+ROUTES = {
+    ("own", 2): "straight", ("own", 3): "left", ("left", 2): "straight", ("left", 3): "left",
+    ("right", 2): "straight", ("oncoming", 2): "right", ("oncoming", 3): "left", ("right", 3): "right",
+}  # fmt: skip
+PRIORITY = {"left": 2, "oncoming": 2, "own": 1, "right": 0}  # who is on the ring goes before who enters
+
+
+@dataclass(frozen=True)
+class Parameters(Shared):
+    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+
+    target_speeds_mps: tuple[float, ...] = (0.0, 3.5, 7.0)
+    time_limit_s: float = 18.0
+    # speed of everybody at the start: 25 km/h; NCHRP 672 has 23 for a circle of 12 m (8.76 R^0.386)
+    speed_mps: float = 7.0
+    third_share: float = 0.34  # probability of agents from three arms, not two
+    ego_s: tuple[float, float] = (3.4, 4.0)  # when the ego enters if it keeps its speed
+    # when an agent enters if both keep their speed, after the one from the arm before passes there
+    offset_s: tuple[float, float] = (-1.4, 1.4)
+    danger_share: float = 0.65  # probability that an episode holds a danger
+    # how long after the car from the west a danger passes the south entry
+    headway_s: tuple[float, float] = (1.1, 1.5)
+    # without that car, when a danger passes the south entry, after a cruising ego would
+    danger_offset_s: tuple[float, float] = (-0.4, 0.4)
+    # probability, without a danger, of a car in its place that leaves at the south arm
+    leaver_share: float = 0.6
+    mound_m: tuple[float, float] = (6.0, 8.0)  # radius of the planted part of the island
+    hedge_end_m: tuple[float, float] = (15.0, 17.0)  # from the ring's centre to the end of a hedge
+    hedge_half_m: float = 0.8  # half its width; the splitter islands are 2 m wide
+
+
+def key_of(begin: str, leaves: int, own: str = EGO) -> PathKey:
+    """Return the name of a way by its first arm and at which one from there it leaves, for an agent."""
+    approach = name_of(begin, own)
+    return approach, ROUTES[approach, leaves]
+
+
+@cache
+def road(own: str = EGO) -> Road:
+    """Return the roundabout for an agent from an arm. Its conflict zone is where its way joins the ring."""
+    ego = key_of(own, 2, own)
+    arms = {name_of(arm, own): arm for arm in ARMS}
+    paths = {}
+    for (approach, leaves), route in ROUTES.items():
+        end = ARMS[(ARMS.index(arms[approach]) + leaves) % len(ARMS)]
+        paths[approach, route] = PLACE.path(approach, route, arms[approach], end, PRIORITY[approach], own)
+    meetings = crossings(paths, ego)
+    at, mine = meetings["left", "straight"], paths[ego]
+    goal_m = float(mine.arc_m[cleared_from(own)(mine.points[:, None], np.array(ego[0]), None).argmax()])
+    back_m = np.linspace(*SECTOR_REACH_M, 13)
+    return Road(
+        facts={
+            "kind": "roundabout", "lane_width_m": LANE_WIDTH_M, "ring_m": PLACE.ring_m, "ego": "/".join(ego),
+        },
+        paths=paths,
+        ego=ego,
+        crossings=meetings,
+        zone_m=(at.x_m, at.y_m),
+        sectors={
+            sector: paths[key].points_at(meetings[key].other_arc_m - back_m)
+            for sector, key in SECTORS.items()
+        },
+        network=PLACE.network,
+        goal_m=lambda parameters: goal_m,
+    )  # fmt: skip
+
+
+def cleared_from(own: str) -> Callable[[Floats, Texts, Any], Bools]:
+    """Return whether an agent from an arm has left the ring, past the next entry and who enters there."""
+    turned_rad, edge_m = math.pi / 2 * ARMS.index(own), PLACE.ring_m + LANE_WIDTH_M / 2
+
+    def cleared(xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
+        x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
+        at_rad = (np.arctan2(y, x) + turned_rad + math.pi) % (2 * math.pi) - math.pi
+        beyond = (-math.pi / 2 < at_rad) & (at_rad < PLACE.ring_rad(3))
+        return np.asarray(beyond & (np.hypot(x, y) > edge_m))
+
+    return cleared
+
+
+@cache
+def seats() -> dict[PathKey, Seat]:
+    """Return the seats of those from the west and the east."""
+    seats = {}
+    for arm in "we":
+        mine = replace(SCENARIO, road=partial(road, arm), cleared=cleared_from(arm))
+        names = {key_of(a, leaves): key_of(a, leaves, arm) for a in ARMS for leaves in (2, 3)}
+        seats[key_of(arm, 2)] = Seat(mine, names)
+    return seats
+
+
+def layout(seed: int, parameters: Parameters) -> Layout:
+    """Draw one episode."""
+    return placed(SCENARIO, _draft, seed, parameters)
+
+
+def _draft(draws: Draws, p: Parameters) -> Draft:
+    paths, at = road().paths, road().crossings[SECTORS["oncoming"]]
+    quarter_s = PLACE.ring_m * math.pi / 2 / p.speed_mps  # from one entry to the next
+    arms = FROM[2] if draws.share("third") < p.third_share else FROM[int(draws.share("which") < 0.5)]
+    ego_s = draws.between("ego", p.ego_s)
+    enters_s = {
+        "w": ego_s - quarter_s - draws.between("offset w", p.offset_s),
+        EGO: ego_s,
+        "e": ego_s + quarter_s + draws.between("offset e", p.offset_s),
+    }
+    helpers = sorted((arm for arm in arms if arm != EGO), key=lambda arm: draws.share(f"id {arm}"))
+    ids = {EGO: "v1", **{arm: f"v{n}" for n, arm in enumerate(helpers, 2)}}
+    spawns = []
+    for arm in (EGO, *helpers):
+        key = key_of(arm, 2)
+        arc = paths[key].ends_m[1] - p.speed_mps * enters_s[arm]
+        spawns.append(Spawn(ids[arm], "car", "ego" if arm == EGO else "helper", *key, arc, p.speed_mps))
+    passes_s = ego_s + draws.between("danger_offset", p.danger_offset_s)
+    if "w" in arms:
+        passes_s = enters_s["w"] + quarter_s + draws.between("headway", p.headway_s)
+    (comes,) = draws.ids(("comes",)).values()
+    goes_on, turns_off = (
+        Spawn(
+            comes, "car", "other", *key_of("n", leaves), at.other_arc_m - p.speed_mps * passes_s, p.speed_mps
+        )
+        for leaves in (3, 2)
+    )
+    danger = "oncoming" if draws.share("danger") < p.danger_share else None
+    if danger:
+        spawns.append(goes_on)
+    elif draws.share("leaver") < p.leaver_share:
+        spawns.append(turns_off)
+
+    half, far = p.hedge_half_m, PLACE.arc_y_m + ARM_M
+    ends = {arm: draws.between(f"hedge {arm}", p.hedge_end_m) for arm in ARMS}
+    boxes = [
+        (-half, ends["s"], half, far), (ends["e"], -half, far, half),
+        (-half, -far, half, -ends["n"]), (-far, -half, -ends["w"], half),
+        *PLACE.mound(draws.between("mound", p.mound_m)),
+    ]  # fmt: skip
+    buildings = [Building(f"b{n}", *box) for n, box in enumerate(boxes, 1)]
+    return Draft(Layout.arranged(spawns, danger, comes, buildings), (goes_on,), ())
+
+
+SCENARIO = Scenario(
+    name=NAME,
+    description=__doc__,
+    actions=("SLOWER", "IDLE", "FASTER"),
+    parameters=Parameters(),
+    road=road,
+    layout=layout,
+    cleared=cleared_from(EGO),
+    dials=SHARED,
+    seats=seats,
+    words={
+        "task": "enter a roundabout, go round past the next arm and straight on",
+        "hiding": "hedges and a planted island",
+    },
+    one_sided="traffic goes round one way and comes from the left",
+)
