@@ -62,6 +62,7 @@ CUT = {
     "harness dataset scenario audit": "--layouts 24 --workers 1",  # of 300
     "harness dataset scenario audit occluded-intersection": "--layouts 40 --workers 1",  # 24: a tell
     "harness dataset scenario audit all-way-crossing": "--layouts 40 --workers 1",
+    "harness dataset scenario audit narrow-passage": "--layouts 40 --workers 1",
     "harness model distill": "--layouts 2 --samples 16,16,16,16 --workers 1",  # of 240 and 300 000
     CHECKED: "--dataset ../few",  # 4 episodes of 240
     "harness prompt optimize": "--tune ../few --limit 2",  # 4 layouts of 24, and 2 of 240
