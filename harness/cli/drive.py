@@ -37,9 +37,7 @@ def command(
     settings: Settings,
     env: options.Env = None,
     env_config: options.EnvConfig = None,
-    agents: str = typer.Option(
-        "", help="Who decides: ego, all, or the share of the others that do, as 0.5. Default: ego."
-    ),
+    agents: options.Agents = "",
     workers: options.ModelWorkers = "2",
     out: Path | None = typer.Option(
         None, help="Folder to write the run to. Default: reports/<model>-<prompt>-drive."

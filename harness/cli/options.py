@@ -79,6 +79,9 @@ RunsDataset = Annotated[
 ]
 Dataset = Annotated[str, Option(help="Name of a shipped dataset, or a dataset's folder.")]
 Seeds = Annotated[str, Option(help=HELP["seeds"])]
+Agents = Annotated[
+    str, Option(help="Who decides: ego, all, or the share of the others that do, as 0.5. Default: ego.")
+]
 FirstSeed = Annotated[int, Option(help="Layout seed of the first episode; the others follow.")]
 Thinking = Annotated[bool, Option("--thinking", help=HELP["thinking"])]
 Answer = Annotated[AnswerMode, Option(help=HELP["answer"])]

@@ -56,20 +56,32 @@ def drive(
     name: options.Scenario,
     episodes: int = typer.Option(500, help="Number of episodes; every driver drives each."),
     seed: options.FirstSeed = 0,
+    agents: options.Agents = "",
     workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
     """Let the reference drivers drive, and show how episodes end.
 
-    All drive the same episodes.
+    All drive the same episodes. With several agents each is driven so, and a
+    joint plan for all of them is the best that they could do.
     """
-    scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
-    from harness.world import reference as live
-    from harness.world import scenarios
+    from harness.cli.drive import deciding
 
+    name = deciding(name, agents) if agents else name
+    scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
+    from harness.world import policies, scenarios
+    from harness.world import reference as live
+
+    together = getattr(scenario.parameters, "agent_share", 0) > 0
     with bar(f"driving {printable(name, 30)}", episodes) as progress:
-        outcomes = live.check(scenario, episodes, seed, who, progress)
-    if as_json:
+        outcomes = (policies if together else live).check(scenario, episodes, seed, who, progress)
+    if together:
+        if as_json:
+            echo_json({"scenario": name, "episodes": episodes, "seed": seed, **outcomes})
+        else:
+            typer.echo(printable(scenarios.title(scenario)))
+            _swarm_tables(episodes, seed, outcomes)
+    elif as_json:
         echo_json({"scenario": name, "episodes": episodes, "seed": seed, "drivers": outcomes})
     else:
         typer.echo(printable(scenarios.title(scenario)))
@@ -141,6 +153,34 @@ def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     console().print(
         f"n = {episodes} episodes, {stated(seed, episodes)};\nWilson intervals; off the road: {off_road}"
     )
+
+
+def _swarm_tables(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
+    policies, seconds = outcomes["policies"], Unit("s", 2)
+    table(
+        ("driver of all agents", "success % [95 % CI]", "less than joint", "arrived %", "met %", "stuck %"),
+        [
+            (policy, shown(of["success"]), shown(of["less_than_joint"], sign="+"),
+             *(f"{100 * of[k].value:.1f}" for k in ("arrived", "met", "stuck")))
+            for policy, of in policies.items()
+        ],
+    )  # fmt: skip
+    table(
+        ("driver of all agents", "lost s, in sum", "lost s, the most", "price of anarchy", "n"),
+        [
+            (policy, *(shown(of[k], seconds) for k in ("lost_s", "most_lost_s")),
+             shown(of["anarchy"], Unit(decimals=3)), str(of["anarchy"].n))
+            for policy, of in policies.items()
+        ],
+    )  # fmt: skip
+    text = console()
+    text.print(
+        f"n = {episodes} episodes, {stated(seed, episodes)}; times where all arrive;\n"
+        "price of anarchy: summed time of trips against joint's, on the n that both clear"
+    )
+    for what, seeds in (("without a joint plan", "unsolved"), ("not searched to the end", "inexact")):
+        named = ", ".join(map(str, outcomes[seeds][:10])) + (", …" if len(outcomes[seeds]) > 10 else "")
+        text.print(f"{what}: {len(outcomes[seeds])}" + (f" (seeds {named})" if named else ""))
 
 
 def _print(result: "Audit") -> None:

@@ -1,6 +1,6 @@
 """What comes of several agents together, and what they are compared with: each alone on the road."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from harness.world import lockstep
@@ -20,17 +20,28 @@ def alone(scenario: Scenario, seed: int) -> dict[int, float]:
     layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
     cleared_s = {}
     for agent in agents:
-        spawn, its = layout.spawns[agent], scenario
-        if agent:
-            seat = seats_of(scenario)[spawn.approach, spawn.route]
-            approach, route = seat.names[spawn.approach, spawn.route]
-            spawn, its = replace(spawn, part="ego", approach=approach, route=route), seat.scenario
-        layout_alone = Layout((spawn,), layout.buildings, None, None)
+        its, layout_alone = on_seat(scenario, layout, agent)
         world = World(its, seed, layout_alone, populated(its, layout_alone))
         p = its.parameters
         lockstep.advance([world], [round(p.time_limit_s * p.simulation_hz)])
         cleared_s[agent] = world.outcome.time_s if world.outcome.success else p.time_limit_s
     return {agent: time_s or 0.0 for agent, time_s in cleared_s.items()}
+
+
+def on_seat(
+    scenario: Scenario, layout: Layout, agent: int, others: Sequence[int] = ()
+) -> tuple[Scenario, Layout]:
+    """Return an agent's own scenario, and the layout in it with nobody but the agent and some others."""
+    spawns, its = [layout.spawns[n] for n in (agent, *others)], scenario
+    if agent:
+        seat = seats_of(scenario)[spawns[0].approach, spawns[0].route]
+        its, spawns[0] = seat.scenario, replace(spawns[0], part="ego")
+        names = [seat.names[spawn.approach, spawn.route] for spawn in spawns]
+        spawns = [
+            replace(spawn, approach=approach, route=route)
+            for spawn, (approach, route) in zip(spawns, names, strict=True)
+        ]
+    return its, Layout(tuple(spawns), layout.buildings, None, None)
 
 
 def gravest(journeys: Mapping[int, Journey]) -> int | None:

@@ -1,0 +1,125 @@
+"""How all agents of a layout fare under reference drivers, and under a plan for all of them together."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from harness.core import noise
+from harness.core.parallel import Workers, spread
+from harness.core.statistics import (
+    Estimate,
+    episode_interval,
+    rate_difference,
+    rate_interval,
+    resampled,
+    resampled_estimate,
+)
+from harness.world import joint, reference
+from harness.world.drivers import PRIVILEGED
+from harness.world.precedence import RULES
+from harness.world.scenario import Scenario
+from harness.world.swarm import alone, gravest
+from harness.world.world import World
+
+JOINT = "joint"
+POLICIES = ("cruise", "local-view", PRIVILEGED, *RULES, JOINT)  # every agent drives by it
+TOGETHER = 8  # layouts that are driven together
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Fate:
+    """How the agents of a layout ended under a policy."""
+
+    arrived: float  # share of agents that reached their goals
+    met: bool  # whether agents collided with each other
+    stuck: bool  # whether nobody came to harm, but somebody never arrived
+    trips_s: float  # when agents reached their goals, in sum; NaN unless all did
+    lost_s: float  # how much later than alone on the road, in sum; NaN unless all arrived
+    most_lost_s: float  # the same of the one who loses most
+    exact: bool = True  # whether no plan is better, of a joint plan
+
+    @property
+    def success(self) -> bool:
+        return self.arrived == 1
+
+
+def fate(world: World, alone_s: dict[int, float], exact: bool = True) -> Fate:
+    """Return how the agents of a world that has ended fared; `alone_s` has when each would arrive alone."""
+    outcomes = {agent: journey.outcome for agent, journey in world.journeys.items()}
+    ids = {world.vehicles[agent].spawn.id for agent in outcomes}
+    worst = gravest(world.journeys)
+    times_s = np.array([(o.time_s or 0.0) if o.success else np.nan for o in outcomes.values()])
+    lost_s = times_s - np.array([alone_s[agent] for agent in outcomes])
+    return Fate(
+        float(np.mean(~np.isnan(times_s))), any(o.partner in ids for o in outcomes.values()),
+        worst is not None and outcomes[worst].result == "time_out",
+        float(times_s.sum()), float(lost_s.sum()), float(lost_s.max()), exact,
+    )  # fmt: skip
+
+
+def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]:
+    """Drive layouts under every policy."""
+    drivers = POLICIES[:-1]
+    worlds = [World.start(scenario, seed) for seed in seeds for _ in drivers]
+    reference.finish(worlds, drivers * len(seeds))
+    fates = []
+    for n, seed in enumerate(seeds):
+        alone_s, plan = alone(scenario, seed), joint.plan(scenario, seed)
+        by_driver = zip(drivers, worlds[n * len(drivers) :], strict=False)
+        fates.append({driver: fate(world, alone_s) for driver, world in by_driver})
+        if plan:
+            fates[-1][JOINT] = fate(joint.played(scenario, seed, plan), alone_s, plan.exact)
+        else:
+            fates[-1][JOINT] = Fate(0.0, False, False, np.nan, np.nan, np.nan)
+    return fates
+
+
+def check(
+    scenario: Scenario, episodes: int, seed: int, workers: Workers, progress: Callable[[int], None]
+) -> dict[str, Any]:
+    """Drive every policy through the same layouts; return the `summary` of each, and what `joint` left open.
+
+    `unsolved` are the seeds without a joint plan in which all arrive, `inexact` those with a bound only.
+    """
+    seeds = range(seed, seed + episodes)
+    chunks = [seeds[at : at + TOGETHER] for at in range(0, len(seeds), TOGETHER)]
+    sizes = iter(map(len, chunks))
+    parts = spread(
+        partial(drive_all, scenario), chunks, workers, lambda done: progress(next(sizes)),
+        lambda chunk: f"layout seeds {chunk[0]} to {chunk[-1]}",
+    )  # fmt: skip
+    fates = [each for part in parts for each in part]
+    best = [of[JOINT] for of in fates]
+    return {
+        "policies": {policy: summary([of[policy] for of in fates], best, policy) for policy in POLICIES},
+        "unsolved": [each for each, of in zip(seeds, best, strict=True) if not of.success],
+        "inexact": [each for each, of in zip(seeds, best, strict=True) if not of.exact],
+    }
+
+
+def summary(fates: Sequence[Fate], best: Sequence[Fate], policy: str) -> dict[str, Estimate]:
+    """Return figures of a policy over layouts, and beside the `best` plan on the same layouts.
+
+    `anarchy` is the summed time of trips divided by that of the plan, where all arrive under both: the price
+    of anarchy (Koutsoupias and Papadimitriou 1999), of the mean and not of the worst case. Its interval is
+    that of a bootstrap over layouts. `less_than_joint` is the difference of success.
+    """
+
+    def each(of: Sequence[Fate], name: str) -> Any:
+        return np.array([float(getattr(one, name)) for one in of])
+
+    trips_s, least_s = each(fates, "trips_s"), each(best, "trips_s")
+    both = ~np.isnan(trips_s) & ~np.isnan(least_s)
+    n = int(both.sum())
+    counts = resampled(noise.generator("price of anarchy", policy), n, RESAMPLES) if n else np.ones((1, 0))
+    anarchy = (counts @ trips_s[both]) / (counts @ least_s[both]) if n else np.array([np.nan])
+    return {
+        **{name: rate_interval(each(fates, name)) for name in ("success", "arrived", "met", "stuck")},
+        **{name: episode_interval(each(fates, name)) for name in ("lost_s", "most_lost_s")},
+        "anarchy": resampled_estimate(anarchy, n),
+        "less_than_joint": rate_difference(each(fates, "success"), each(best, "success")),
+    }

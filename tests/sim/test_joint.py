@@ -1,0 +1,140 @@
+"""Plans for all agents together, and the table of policies beside them."""
+
+import json
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.core.arrays import Bools
+from harness.world import joint, policies, scenarios
+from harness.world.joint import NEVER_S, Options, Search
+from harness.world.policies import JOINT, Fate, summary
+
+TWO, PLATOON = "all-way-crossing:agent_share=1", "platoon-merge:agent_share=1"
+
+
+@pytest.fixture(scope="module")
+def able() -> dict[int, Options]:
+    """Return what the two agents of a layout can do."""
+    return joint.options(scenarios.get(TWO), 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [TWO, PLATOON])
+def test_what_a_plan_promises_the_simulator_does(name: str) -> None:
+    scenario = scenarios.get(name)
+    plan = joint.plan(scenario, 1)
+    assert plan
+    assert plan.exact
+    world = joint.played(scenario, 1, plan)
+    assert {agent: j.outcome.time_s for agent, j in world.journeys.items()} == plan.arrives_s
+    assert all(j.outcome.success for j in world.journeys.values())
+    assert plan.sum_s == pytest.approx(sum(plan.arrives_s.values()))
+
+
+@pytest.mark.slow
+def test_options_are_ways_to_drive_the_soonest_to_arrive_first(able: dict[int, Options]) -> None:
+    scenario = scenarios.get(TWO)
+    for its in able.values():
+        assert len(set(its.actions)) == len(its.actions)
+        assert (np.diff(its.arrives_s) >= 0).all()
+        assert its.poses.shape[2] == 1 + sum(
+            spawn.part == "other" for spawn in scenario.layout(2, scenario.parameters).spawns
+        )
+        moved_m = np.hypot(*np.diff(its.poses[:, :, 0, :2], axis=1).T)
+        assert moved_m.max() <= scenario.parameters.target_speeds_mps[-1] * 1.01 / its.hz
+
+
+def of(costs_s: list[float]) -> Options:
+    """Return options that cost this much."""
+    never = np.array([np.inf if cost == NEVER_S else cost for cost in costs_s])
+    poses = np.zeros((len(costs_s), 1, 1, 3))
+    return Options([(str(n),) for n in range(len(costs_s))], never, poses, np.ones((1, 2)), 50)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_branch_and_bound_finds_what_trying_all_finds(seed: int) -> None:
+    draws = np.random.default_rng(seed)
+    able = [of([*sorted(draws.uniform(3, 9, 5).tolist()), NEVER_S]) for _ in range(3)]
+    rows: dict[tuple[int, int, int], Bools] = {
+        (a, n, b): draws.random(6) < 0.4 for a, b in ((0, 1), (0, 2), (1, 2)) for n in range(6)
+    }
+    search = Search(able, rows=rows)
+    search.run()
+    fit = [
+        choice for choice in product(range(6), repeat=3)
+        if all(rows[a, choice[a], b][choice[b]] for a, b in ((0, 1), (0, 2), (1, 2)))
+    ]  # fmt: skip
+    costs_s = {c: sum(float(able[a].cost_s[n]) for a, n in enumerate(c)) for c in fit}
+    assert search.cost_s == pytest.approx(min(costs_s.values(), default=np.inf))
+    assert search.bound_s == pytest.approx(search.cost_s)
+    if search.best:
+        search.unfit.add(search.best)
+        del costs_s[search.best]
+        search.run()
+        assert search.cost_s == pytest.approx(min(costs_s.values(), default=np.inf))
+
+
+def test_a_search_that_stops_says_how_good_any_plan_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    able = [of([1.0, 2.0, 3.0])] * 2
+    rows = {(0, n, 1): np.array([False, False, True]) for n in range(3)}
+    exact = Search(able, rows=rows)
+    exact.run()
+    monkeypatch.setattr(joint, "MOST_NODES", 1)
+    cut = Search(able, rows=rows)
+    cut.run()
+    assert (exact.cost_s, exact.bound_s) == (4.0, 4.0)
+    assert cut.bound_s <= 4.0 <= cut.cost_s
+
+
+@pytest.mark.slow
+def test_agents_that_would_meet_do_not_go_together(able: dict[int, Options]) -> None:
+    own, other = able.values()
+    fits = joint.together(own, 0, other)
+    assert 0 < fits.sum() < len(fits), "some of the other's options are in the way of driving on"
+    again = [joint.together(other, n, own)[0] for n in range(len(fits))]
+    assert again == fits.tolist(), "whoever is asked"
+
+
+def test_the_price_of_anarchy_is_that_of_layouts_which_both_clear() -> None:
+    def fate(trips_s: float) -> Fate:
+        arrived = float(not np.isnan(trips_s))
+        return Fate(arrived, not arrived, False, trips_s, trips_s - 1, trips_s - 2)
+
+    best = [fate(10.0), fate(20.0), fate(np.nan), fate(8.0)]
+    some = summary([fate(12.0), fate(np.nan), fate(9.0), fate(10.0)], best, "cruise")
+    assert (some["anarchy"].value, some["anarchy"].n) == (pytest.approx(22 / 18), 2)
+    assert some["success"].value == 0.75
+    assert some["less_than_joint"].value == 0.0
+    assert summary(best, best, JOINT)["anarchy"].low == 1.0
+
+
+@pytest.mark.slow
+def test_all_policies_drive_the_same_layouts_and_none_beats_the_plan() -> None:
+    [by_policy] = policies.drive_all(scenarios.get(TWO), [2])
+    assert tuple(by_policy) == policies.POLICIES
+    assert by_policy[JOINT].success
+    assert all(not each.trips_s < by_policy[JOINT].trips_s for each in by_policy.values())
+
+
+@pytest.mark.slow
+def test_a_check_of_agents_states_figures_with_intervals_and_n(harness: Any) -> None:
+    command = ("dataset", "scenario", "drive", "all-way-crossing", "--agents", "all", "--episodes", 2)
+    code, out, err = harness(*command, "--workers", 1, "--json")
+    found = json.loads(out)
+    assert (code, err, found["scenario"]) == (0, "", "all-way-crossing:agent_share=1")
+    assert (found["unsolved"], found["inexact"]) == ([], [])
+    assert found["policies"].keys() == {*policies.POLICIES}
+    assert found["policies"]["joint"]["success"]["value"] == 1.0
+    code, out, _ = harness(*command, "--workers", 1)
+    assert code == 0
+    assert "without a joint plan: 0" in out
+
+
+def test_agents_of_a_scenario_without_seats_are_refused_in_one_line(harness: Any) -> None:
+    code, out, err = harness("dataset", "scenario", "drive", "blind-merge", "--agents", "all")
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "only the ego has a goal" in err
