@@ -236,7 +236,7 @@ def test_the_declared_latency_has_one_more_inference(small: Dataset) -> None:
     _, asker = asked(with_repair(spec_of(small)), Scripted({ego: BAD, ego + AGAIN: GOOD}), small)
     [seconds] = asker.laid_out([scene]).inference_s
     assert seconds == pytest.approx([0.2] + [0.1] * (len(scene.viewers) - 1))
-    assert fusion_s(A_TENTH, [asker.answers[ego]]) == pytest.approx([0.2])
+    assert fusion_s(A_TENTH, [asker.answers[ego]], [0]) == pytest.approx([0.2])
 
 
 def test_a_helper_that_was_asked_twice_may_be_too_late(small: Dataset) -> None:

@@ -377,7 +377,7 @@ def test_every_answer_takes_what_is_declared_for_its_role(small: Dataset) -> Non
         [took("ego", 0.3), took("helper", 0.5, slow_s=0.4), None],
         [took("ego", None, error="context overflow"), took("helper", None), took("helper", 9.0)],
     ]
-    seconds = inference_s(Latency("card", "b", 0.1, 0.2, 0.3), answers)
+    seconds = inference_s(Latency("card", "b", 0.1, 0.2, 0.3), answers, [[0, 1, 2]] * 2)
     assert seconds == pytest.approx(np.array([[0.1, 0.6, np.nan], [0.1, 0.2, 0.2]]), nan_ok=True)
 
 

@@ -281,9 +281,11 @@ class Asker:
         completions = backend.complete(list(flips.values())) if flips else []
         for place, completion in zip(flips, completions, strict=True):
             answers[place] = flip.compared(answers[place], answer_of(flips[place], completion))
-        if len(self.spec.helpers) > 1 and not self.spec.asks_all:  # its place would not say whose it is
+        several = self.spec.several_decide and len(self.spec.helpers) > 0
+        # Where its place would not say whose it is.
+        if several or (len(self.spec.helpers) > 1 and not self.spec.asks_all):
             for place, request in enumerate(chunk):
-                if request.agent:
+                if request.agent or several:
                     answers[place] = msgspec.structs.replace(answers[place], agent=request.agent)
         return {request.id: answer for request, answer in zip(chunk, answers, strict=True)}
 
@@ -343,6 +345,7 @@ class Asker:
         width = max(width, *map(len, answers))
         unknown = (math.nan,) * len(self.spec.actions)
         p, distances_m, ranges_m, bits, texts_b, unasked = [], [], [], [], [], []
+        models = [self._models(scene, width) for scene in scenes]
         for scene, row in zip(scenes, answers, strict=True):
             record, (ego, *helpers) = scene.record, scene.viewers
             absent = width - len(row)
@@ -368,19 +371,28 @@ class Asker:
         return Intents(
             intents[:, 0], intents[:, 1:], valid if not_yet is None else valid | not_yet,
             np.array(distances_m, dtype=float), np.array(ranges_m, dtype=float).reshape(shape),
-            np.array(bits, dtype=float).reshape(shape), inference_s(self.latency, answers), unasked=not_yet,
+            np.array(bits, dtype=float).reshape(shape), inference_s(self.latency, answers, models),
+            unasked=not_yet,
             text_bytes=np.array(texts_b, dtype=float).reshape(shape),
             own_bits=own_bits, own_text_bytes=own_text_bytes,
         )  # fmt: skip
 
+    def _models(self, scene: Scene, width: int) -> list[int]:
+        """Return whose model each viewer has, by place; with one for all, as if the ego decided."""
+        there = range(len(scene.viewers))
+        places = [scene.place(n) for n in there] if self.spec.helpers else [*there]
+        return [*places, *range(len(places), width)]
+
     def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
-        ids = [fusion_id(*each) for each in _heard_sets(scenes, codes, rewrites)]
+        sets = list(_heard_sets(scenes, codes, rewrites))
+        ids = [fusion_id(*each) for each in sets]
         if not self.answers.keys() >= set(ids):
             self.answer(self.fusion_requests(scenes, codes, rewrites))
         answers = [self.answers[name] for name in ids]
+        models = [self._models(scene, 1)[0] for scene, _ in sets]
         unknown = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or unknown for a in answers]).reshape(len(ids), len(unknown))
-        return FusionAnswers(codes, intents, fusion_s(self.latency, answers)).at
+        return FusionAnswers(codes, intents, fusion_s(self.latency, answers, models)).at
 
     def fusion_requests(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT

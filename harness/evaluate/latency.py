@@ -94,27 +94,35 @@ def as_declared(latency: Latency) -> str:
     return f"ego={latency.ego_s},helper={helpers},fusion={latency.fusion_s}"
 
 
-def inference_s(latency: Latency, answers: Sequence[Sequence[Answer | None]]) -> Floats:
-    """Return the seconds of inference, (n, 1+H), the ego first; NaN without an answer.
+def inference_s(
+    latency: Latency, answers: Sequence[Sequence[Answer | None]], places: Sequence[Sequence[int]]
+) -> Floats:
+    """Return the seconds of inference, (n, 1+H), of who decides first; NaN without an answer.
 
+    `places` say whose model answers, as in `Latency.speed`: with one model for all, the role alone counts.
     A repair turn takes the time of one more answer. An answer's own declared delay (`slow_s`) is added.
     """
     if latency.speeds:
         return np.array([
-            [answer_s(latency.speed(place), a) if a else np.nan for place, a in enumerate(row)]
-            for row in answers
+            [answer_s(latency.speed(place), a) if a else np.nan for place, a in zip(of, row, strict=True)]
+            for of, row in zip(places, answers, strict=True)
         ])  # fmt: skip
     turns = np.array([[a.turns if a else np.nan for a in row] for row in answers])
     slow = np.array([[a.slow_s if a else np.nan for a in row] for row in answers])
     by_place = [latency.ego_s, *islice(cycle(latency.helper_times_s()), slow.shape[1] - 1)]
-    return np.asarray(slow + turns * np.array(by_place, dtype=float))
+    return np.asarray(slow + turns * np.array(by_place, dtype=float)[np.array(places, dtype=int)])
 
 
-def fusion_s(latency: Latency, answers: Sequence[Answer]) -> Floats:
-    """Return the seconds of each fusion call, (K,), counted as in `inference_s`."""
+def fusion_s(latency: Latency, answers: Sequence[Answer], places: Sequence[int]) -> Floats:
+    """Return the seconds of each fusion call, (K,), counted as in `inference_s`.
+
+    A vehicle with a helper model takes as long as for any other answer.
+    """
     if latency.speeds:
-        return np.array([answer_s(latency.speeds[0], a) for a in answers])
-    return np.array([cast("float", latency.fusion_s) * a.turns + a.slow_s for a in answers])
+        return np.array([answer_s(latency.speed(n), a) for n, a in zip(places, answers, strict=True)])
+    by_place = [latency.fusion_s, *islice(cycle(latency.helper_times_s()), max(places, default=0))]
+    seconds = [cast("float", by_place[n]) for n in places]
+    return np.array([s * a.turns + a.slow_s for s, a in zip(seconds, answers, strict=True)])
 
 
 def times(answers: Iterable[Answer | AnswerFacts]) -> dict[str, Times]:

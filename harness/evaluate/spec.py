@@ -129,7 +129,7 @@ class Spec:
         for agent in self.agents:
             self._check(agent)
         drivers = [agent for agent in self.agents if not agent.can.asks_helpers]
-        if self.helpers and drivers:
+        if self.helpers and drivers and (self.ego in drivers or not self.several_decide):
             if self.ego in drivers:
                 raise UserError(
                     f"--model {printable(self.ego.card.name)}: it is a driver, which asks no helpers; give "
@@ -325,6 +325,11 @@ class Spec:
     @property
     def scenario(self) -> Scenario:
         return self.source.scenario
+
+    @property
+    def several_decide(self) -> bool:
+        """Whether vehicles beside the ego decide, too."""
+        return getattr(self.scenario.parameters, "agent_share", 0.0) > 0
 
     @property
     def asks_all(self) -> bool:

@@ -161,10 +161,12 @@ class Run:
 
     def _viewer_place(self, answer: Answer) -> int:
         """Return the place of an answer's viewer, the ego at 0; also 0 if one agent answers for all."""
-        if answer.role in ("ego", "merge") or not self.manifest.helpers:
+        if not self.manifest.helpers:
             return 0
         if answer.agent is not msgspec.UNSET:
             return answer.agent
+        if answer.role in ("ego", "merge"):
+            return 0
         # The answers of a scene are in the order of its viewers, the ego first.
         viewers = [each.viewer for each in self.answers_by_scene[answer.scene] if not each.heard]
         return viewers.index(answer.viewer)

@@ -80,7 +80,8 @@ class Answer(Struct, frozen=True, kw_only=True):
     # whether the likeliest action changed when the list of actions was reversed; unset where that was
     # not asked, or got no answer
     flipped: bool | UnsetType = UNSET
-    # which of several helper models answered, from 1; unset where the place among all answers says
+    # which of several helper models answered, from 1; where several vehicles decide, also 0, the ego's; unset
+    # where the place among all answers says
     agent: int | UnsetType = UNSET
     # all that is wrong with a failed answer, the status first; unset where that is the only fault
     faults: tuple[str, ...] | UnsetType = UNSET

@@ -10,11 +10,14 @@ import pytest
 from evaluating import FILES, live_spec_of, run
 from reading import details, packed
 
+from harness.backends import cards
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
+from harness.evaluate.agent import Agent
 from harness.evaluate.live_world import LiveSource, looks
 from harness.evaluate.replay import played, scenes_of, stills
 from harness.evaluate.run import evaluate
+from harness.prompts import versions
 from harness.report.decisions import failures
 from harness.report.page import render
 from harness.report.runs import gather
@@ -139,6 +142,23 @@ def test_an_episode_of_agents_played_again_ends_as_it_did(driven: Path) -> None:
             how, partner = e.failure.replace("_", " "), f" with {e.partner}" if e.partner else ""
             [worst] = {said for agent, said in ended.items() if last.outcome == f"{agent}: {said}"}
             assert worst == f"{how} at {e.time_s:.1f} s{partner}"
+
+
+@pytest.mark.slow
+def test_a_vehicle_decides_with_its_own_model_and_takes_that_ones_time(tmp_path: Path) -> None:
+    cruise = Agent(cards.resolve("cruise"), versions.load("v4"))
+    point = named_point("single-local")
+    spec = live_spec_of(prompt="v4", points=(point,), seeds=(0,))
+    spec = replace(spec, source=LiveSource(50_000, 3, ALL), helpers=(cruise,), latency="ego=0.1,helper=0.3")
+    there = folder.read(run(spec, tmp_path / "run").out)
+    egos = {World.start(scenarios.get(ALL), seed).vehicles[0].spawn.id for seed in range(50_000, 50_003)}
+    table = there.decisions
+    for d in table.records(0, len(table)):
+        [answer] = [a for a in there.answers_by_scene[d.scene] if a.role == "ego"]
+        model = there.agent(answer)["model"]["name"]
+        assert d.latency_ms == {"proxy": 100.0, "cruise": 300.0}[model]
+        assert d.action == "IDLE" or model == "proxy", "who never yields"
+        assert (model == "proxy") == (d.agent in egos)
 
 
 @pytest.mark.slow
