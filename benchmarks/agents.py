@@ -1,4 +1,4 @@
-"""What a swarm is worth: every vehicle decides, alone, with intents, objects or plans, by scene and model.
+"""What a swarm is worth: every vehicle decides, with what they may hear of each other, by scene and model.
 
     python benchmarks/agents.py [--only TEXT] [--layouts N] [--out reports/agents] [--page docs/agents.md]
 
@@ -20,16 +20,17 @@ from harness.runs.metrics import METRICS
 from harness.world import scenarios
 
 SMALLEST = "--only proxy-all-way-crossing-1 --layouts 1"
+EVERYBODY = "6g:schedule=always"
+PLAN = f"{EVERYBODY},content=plan,consensus=yield-by-time"
 CONDITIONS = {
-    "alone": "single-local",
-    "intents": "6g",
-    "objects": "6g:content=objects",
-    "plans, by time": "6g:content=plan,consensus=yield-by-time",
-    "plans, by id": "6g:content=plan,consensus=yield-by-id",
-    "plans, auction": "6g:content=plan,consensus=auction",
+    "nothing": "single-local",
+    "intents": EVERYBODY,
+    "objects": f"{EVERYBODY},content=objects",
+    "plans": PLAN,
+    "plans, two rounds": f"{PLAN},rounds=2",
 }
 COLUMNS = ("success_rate", "arrived_rate", "met_rate", "time_out_rate", "agents_lost_s", "most_lost_s")
-HEADS = ("success %", "arrived %", "met %", "stuck %", "lost, all s", "lost, most s", "latency ms")
+HEADS = ("success %", "arrived %", "met %", "stuck %", "lost, s", "lost by one, s", "latency, ms")
 SHARES = (0.25, 0.5, 0.75)
 
 
@@ -65,7 +66,7 @@ def main() -> None:
 
 def drive(driver: Driver, scene: str, share: float, layouts: int, out: Path) -> None:
     """Drive a scene's report layouts in which this share of the vehicles decide."""
-    names = list(CONDITIONS.values()) if share == 1 else [CONDITIONS["alone"], CONDITIONS["intents"]]
+    names = list(CONDITIONS.values()) if share == 1 else [CONDITIONS["nothing"], EVERYBODY]
     points = [word for name in names for word in ("--condition", name)]
     who = ("--model", driver.model, "--prompt", "v4", "--answer", driver.answer)
     where = ("--scenario", scene, "--agents", f"{share:g}", "--episodes", str(layouts))
@@ -80,8 +81,8 @@ def tables(made: Sequence[tuple[Driver, str, float, Run]]) -> Iterator[str]:
             n, seeds = len(run.grid.episodes), len(run.grid.seeds)
             rows = [[name, *cells(run, point)] for name, point in CONDITIONS.items()]
             yield f"**{scene}, {driver.model}**, n = {n} layouts × {seeds} channel seeds:"
-            yield markdown(("", *HEADS), rows)
-    pair = [CONDITIONS[name] for name in ("alone", "intents")]
+            yield markdown(("they hear", *HEADS), rows)
+    pair = [CONDITIONS["nothing"], EVERYBODY]
     shares = [
         [scene, f"{share:.0%}", *(estimate(run, point, "success_rate") for point in pair)]
         for driver, scene, share, run in made
@@ -89,7 +90,7 @@ def tables(made: Sequence[tuple[Driver, str, float, Run]]) -> Iterator[str]:
     ]
     if shares:
         yield f"**How many decide**, {DRIVERS[0].model}: success of all agents, by the share that are agents:"
-        yield markdown(("scene", "agents", "alone", "intents"), sorted(shares))
+        yield markdown(("scene", "agents", "nothing", "intents"), sorted(shares))
 
 
 def cells(run: Run, condition: str) -> list[str]:
