@@ -46,6 +46,7 @@ from harness.world.environments import environment
 from harness.world.environments.examination import examine
 from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
+from harness.world.seats import refuse_agents
 
 TOGETHER = 8  # the most layouts that are frozen together
 CHECKED_EVERY = 10  # layouts whose number this divides are driven in closed loop as well
@@ -67,6 +68,7 @@ def build(
     a finished dataset, one begun with other settings, or something else; the seeds are for several purposes;
     or the audit needs a package that is missing.
     """
+    refuse_agents(scenario, "a dataset")
     # An environment states no danger.
     audits = audits and episodes >= LEAST_AUDITED and not scenario.is_environment
     if audits and not shard:

@@ -18,6 +18,7 @@ from harness.world.drivers import DRIVERS, PRIVILEGED
 from harness.world.outcome import Outcome
 from harness.world.reference import drive, finish
 from harness.world.scenario import Scenario
+from harness.world.seats import refuse_agents
 from harness.world.world import World
 
 
@@ -120,6 +121,7 @@ class Roads:
     then: str | None = None  # a reference driver; None where values are not asked for
 
     def __post_init__(self) -> None:
+        refuse_agents(self.scenario, "an environment to learn in")
         if self.then not in (None, *DRIVERS):
             raise unknown("then", str(self.then), DRIVERS, "; only trees know more than drivers do")
 

@@ -11,9 +11,19 @@ from functools import lru_cache
 from msgspec.structs import replace as changed
 
 from harness.core import noise
+from harness.core.errors import UserError, printable
 from harness.world.road import PathKey
 from harness.world.scenario import Layout, Scenario, Seat
 from harness.world.state import VehicleState, WorldState
+
+
+def refuse_agents(scenario: Scenario, what: str) -> None:
+    """Raise UserError if vehicles beside the ego decide in a scenario, and in `what` the ego alone does."""
+    if share := getattr(scenario.parameters, "agent_share", 0.0):
+        raise UserError(
+            f"{printable(scenario.name)}: agent_share is {share:g}, and {what} has one ego that decides; "
+            "leave it out, or use `harness drive`"
+        )
 
 
 @lru_cache(maxsize=64)

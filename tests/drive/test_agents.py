@@ -13,10 +13,12 @@ from reading import details, packed
 from harness.backends import cards
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
+from harness.dataset.build import build
 from harness.evaluate.agent import Agent
 from harness.evaluate.live_world import LiveSource, looks
 from harness.evaluate.replay import played, scenes_of, stills
 from harness.evaluate.run import evaluate
+from harness.learning.trips import Roads
 from harness.prompts import versions
 from harness.report.decisions import failures
 from harness.report.page import render
@@ -239,6 +241,15 @@ def test_alone_on_the_road_an_agent_comes_as_soon_as_its_speed_takes_it() -> Non
         world, cleared_s = World.start(scenario, seed), alone(scenario, seed)
         assert cleared_s.keys() == world.journeys.keys()
         assert all(1 < time_s < scenario.parameters.time_limit_s for time_s in cleared_s.values())
+
+
+def test_what_has_one_ego_says_so_of_a_scenario_of_several(tmp_path: Path) -> None:
+    scenario = scenarios.get(ALL)
+    with pytest.raises(UserError, match="agent_share is 1, and a dataset has one ego that decides; leave it"):
+        build(scenario, tmp_path / "set", 2, 100, 1, lambda done: None)
+    assert not (tmp_path / "set").exists()
+    with pytest.raises(UserError, match="agent_share is 1, and an environment to learn in has one ego"):
+        Roads(scenario, (100,))
 
 
 def test_a_scenario_in_which_only_the_ego_has_a_goal_has_no_agents() -> None:
