@@ -21,7 +21,7 @@ from families import Row, finished
 from markupsafe import Markup
 from pages import harness, markdown, options, write_tables
 
-from harness.coordination.contents import CONTENTS
+from harness.coordination.contents import OF_HELPERS
 from harness.core.arrays import Bools, Floats
 from harness.core.figures import shown
 from harness.core.progress import Progress
@@ -37,7 +37,7 @@ from harness.studies.study import Study, write_study
 from harness.world import scenarios
 
 SMALLEST = "--only proxy --layouts 1 --dataset blind-merge-v2"
-PLAYED = {NOTHING: "single-local", **{name: f"{BASE},content={name}" for name in CONTENTS}}
+PLAYED = {NOTHING: "single-local", **{name: f"{BASE},content={name}" for name in OF_HELPERS}}
 
 
 class Asked(NamedTuple):

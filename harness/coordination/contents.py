@@ -49,3 +49,5 @@ CONTENTS = {
     # model may misread the truth, and plans on its own view again where it does not ask
     "oracle": Content(intent=False, graph=TRUTH),
 }
+# What messages of one ego's helpers hold; a plan is sent by agents alone.
+OF_HELPERS = tuple(name for name, content in CONTENTS.items() if not content.plan)

@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.coordination import calibrations
 from harness.coordination.attacks import ATTACKS
-from harness.coordination.contents import CONTENTS
+from harness.coordination.contents import CONTENTS, OF_HELPERS
 from harness.coordination.operating_point import POINTS, SETTINGS, SHORT, OperatingPoint, setting_of
 from harness.coordination.rules import POOLS, names
 from harness.coordination.schedules import SCHEDULES
@@ -61,7 +61,7 @@ class Axis:
         return freed.changed(**{self.field: setting})
 
 
-OF_ANY_MODEL = [name for name, content in CONTENTS.items() if not content.words]
+OF_ANY_MODEL = [name for name in OF_HELPERS if not CONTENTS[name].words]
 AXES = {
     axis.name: axis
     for axis in (

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from evaluating import live_spec_of, run, spec_of
 
-from harness.coordination.contents import CONTENTS, TEXT
+from harness.coordination.contents import OF_HELPERS, TEXT
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
@@ -29,7 +29,7 @@ from harness.world.drivers import DRIVERS
 
 LAYOUTS = 40  # of the reference drivers, and half of them for the others, who take ten times as long
 ALONE, OVER_6G = POINTS["single-local"], POINTS["6g"]
-CONTENT = {name: named_point(f"6g:content={name}") for name in CONTENTS}
+CONTENT = {name: named_point(f"6g:content={name}") for name in OF_HELPERS}
 SAME = (
     "layout_seed", "danger", "success", "failure", "time_s", "delay_s", "partner", "striker", "fault",
     "least_gap_m", "hard_brakings", "other_crashes", "decisions", "messages", "trigger_rate", "latency_ms",
