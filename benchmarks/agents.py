@@ -85,12 +85,12 @@ def tables(made: Sequence[tuple[Driver, str, float, Run]]) -> Iterator[str]:
     pair = [CONDITIONS["nothing"], EVERYBODY]
     shares = [
         [scene, f"{share:.0%}", *(estimate(run, point, "success_rate") for point in pair)]
-        for driver, scene, share, run in made
+        for driver, scene, share, run in sorted(made, key=lambda each: each[:3])
         if driver == DRIVERS[0]
     ]
     if shares:
         yield f"**How many decide**, {DRIVERS[0].model}: success of all agents, by the share that are agents:"
-        yield markdown(("scene", "agents", "nothing", "intents"), sorted(shares))
+        yield markdown(("scene", "agents", "nothing", "intents"), shares)
 
 
 def cells(run: Run, condition: str) -> list[str]:

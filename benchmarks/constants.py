@@ -22,11 +22,11 @@ from harness.world.scenario import Scenario
 from harness.world.world import World
 
 SMALLEST = "--layouts 1 --scenarios blind-merge"
-LAYOUTS, ALL = 240, scenarios.witnessed()
-# How layouts are drawn that are judged by each version.
+LAYOUTS, ALL = 240, sorted(scenarios._files())
+# How layouts are drawn that are judged by each version, as far as a scenario has these settings.
 VERSIONS = {
-    1: "limits=1,witnesses=any,radio_share=0,perception=1",
-    2: "limits=2,witnesses=each,radio_share=0.25,perception=2",
+    1: {"limits": "1", "witnesses": "any", "radio_share": "0", "perception": "1"},
+    2: {"limits": "2", "witnesses": "each", "radio_share": "0.25", "perception": "2"},
 }
 HEADS = ("scenario", "limits", "action", "cleared", "layouts", "harmless_cleared", "harmless", "first_seed")
 
@@ -51,7 +51,9 @@ def cleared(scenario: Scenario, layouts: int) -> tuple[Bools, dict[str, Bools]]:
 
 def measured(name: str, limits: int, layouts: int) -> Iterator[tuple[object, ...]]:
     """Print what each action clears in percent, and yield the rows of the table."""
-    dangerous, success = cleared(scenarios.get(f"{name}:{VERSIONS[limits]}"), layouts)
+    dials = scenarios.get(name).dials
+    settings = ",".join(f"{dial}={value}" for dial, value in VERSIONS[limits].items() if dial in dials)
+    dangerous, success = cleared(scenarios.get(f"{name}:{settings}"), layouts)
     for action, of in success.items():
         halves = [rate_interval(of[half].astype(float)) for half in (dangerous, ~dangerous)]
         rates = (rate_interval(of.astype(float)), mean_of(halves), *halves)
