@@ -12,7 +12,8 @@ from harness.world import joint, policies, scenarios
 from harness.world.joint import NEVER_S, Options, Search
 from harness.world.policies import JOINT, Fate, summary
 
-TWO, PLATOON = "all-way-crossing:agent_share=1", "platoon-merge:agent_share=1"
+SCENES = [f"{name}:agent_share=1" for name in scenarios.names() if scenarios.get(name).seats]
+TWO = "all-way-crossing:agent_share=1"
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +23,7 @@ def able() -> dict[int, Options]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [TWO, PLATOON])
+@pytest.mark.parametrize("name", SCENES)
 def test_what_a_plan_promises_the_simulator_does(name: str) -> None:
     scenario = scenarios.get(name)
     plan = joint.plan(scenario, 1)

@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from jointly import driven, plans_for_all
+from jointly import driven
 from scipy.stats import binomtest, ks_2samp
 from tiers import QUICK
 
@@ -175,9 +175,7 @@ def test_who_sees_everything_waits_and_who_keeps_its_speed_meets_somebody():
         )
 
 
-@pytest.mark.slow
-def test_with_a_plan_for_all_everybody_arrives_and_without_one_nobody_gets_through():
+def test_if_nobody_gives_way_they_collide():
     for seed in range(4):
-        found = LAYOUTS[seed]
-        assert {*driven(SCENARIO, seed, plans_for_all(SCENARIO, found))} == {"cleared"}
-        assert "collision" in driven(SCENARIO, seed, [["IDLE"] * P.decisions] * len(agents(found)))
+        idle = [["IDLE"] * P.decisions] * len(agents(LAYOUTS[seed]))
+        assert "collision" in driven(SCENARIO, seed, idle)
