@@ -5,7 +5,8 @@ gives way to who comes from the right. `first-come` lets go first who would be t
 come within `TIE_S` the one with the lower id. Under both, who can no longer stop goes first.
 
 Where two roads merge, nobody comes from the right, and under `right-hand` the one with right of way goes
-first. So does, of two who stand, the one with the lower id: four who wait for each other would wait for ever.
+first; of two who come head-on, the one who is sooner in the middle; of two who stand, the one with the lower
+id: four who wait for each other would wait for ever.
 
 Whoever bears the id of an ego or of a helper is expected to keep the rule. That is too much where some of
 them decide nothing (`agent_share` below 1).
@@ -25,6 +26,7 @@ KEEPING = ("v1", "v2", "v3", "v4")  # ids of the ego and of whom it asks (`harne
 TIE_S = 0.2  # arrivals nearer to each other in time are at once, for each knows the other's with an error
 GAP_S = 0.5  # who gives way leaves the other so long, since it may be slower than it seems
 STANDS_MPS = 0.5  # who is slower stands
+HEAD_ON = -0.9  # cosine between headings below which two come head-on
 CLEAR_M = (
     sum(SIZES_M["car"]) + 1.0
 ) / 2  # from the conflict point to the middle of a car that stops before it
@@ -37,14 +39,31 @@ def _from_the_right(road: Road, graph: SceneGraph, conflict: Conflict) -> bool:
         return own.priority > other.priority
     if max(graph.ego.speed_mps, conflict.other.speed_mps) < STANDS_MPS:
         return _lower(graph, conflict)
-    turn = other.project(at.x_m, at.y_m)[2] - own.project(at.x_m, at.y_m)[2]
+    turn = _turn_rad(road, conflict)
+    if np.cos(turn) < HEAD_ON:
+        return _sooner(road, graph, conflict)
     return bool(np.sin(turn) > 0)  # y is to the south: who comes from the left heads to the right
+
+
+def _turn_rad(road: Road, conflict: Conflict) -> float:
+    """Return from which heading to which the ego's path and the other's meet."""
+    own, other = road.paths[road.ego], road.paths[conflict.sector, conflict.route]
+    at = road.crossings[conflict.sector, conflict.route]
+    return other.project(at.x_m, at.y_m)[2] - own.project(at.x_m, at.y_m)[2]
 
 
 def _sooner(road: Road, graph: SceneGraph, conflict: Conflict) -> bool:
     own_s, other_s = (
         np.inf if arrival.time_s is None else arrival.time_s for arrival in (conflict.ego, conflict.other)
     )
+    if np.cos(_turn_rad(road, conflict)) < HEAD_ON:  # they meet in the middle, wherever each has to wait
+        path, at = (
+            road.paths[conflict.sector, conflict.route],
+            road.crossings[conflict.sector, conflict.route],
+        )
+        ahead_m = path.project(*road.zone_m)[0] - at.other_arc_m + conflict.other.arc_m
+        speeds_mps = max(graph.ego.speed_mps, STANDS_MPS), max(conflict.other.speed_mps, STANDS_MPS)
+        own_s, other_s = graph.ego.zone_m / speeds_mps[0], ahead_m / speeds_mps[1]
     if own_s == other_s or abs(own_s - other_s) < TIE_S:
         return _lower(graph, conflict)
     return own_s < other_s

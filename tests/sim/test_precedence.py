@@ -27,7 +27,7 @@ def graph(world: World, agent: int) -> SceneGraph:
 
 
 @pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("name", ["all-way-crossing", "platoon-merge"])
+@pytest.mark.parametrize("name", ["all-way-crossing", "platoon-merge", "roundabout-entries"])
 def test_of_two_whose_paths_meet_exactly_one_gives_way(name: str, rule: str) -> None:
     pairs = dict[tuple[int, str, str], int]()
     for seed in range(12):
@@ -40,6 +40,21 @@ def test_of_two_whose_paths_meet_exactly_one_gives_way(name: str, rule: str) -> 
     assert len(pairs) > 24
     for (seed, own, other), times in pairs.items():
         assert sorted((times, pairs[seed, other, own])) == [0, 3]
+
+
+def test_of_two_who_come_head_on_nearly_always_one_gives_way() -> None:
+    """Both go if each is too near to its own end of the passage to stop."""
+    pairs = dict[tuple[int, str, str], int]()
+    for seed in range(12):
+        world = World.start(scenarios.get(f"narrow-passage:{KNOWN}"), seed)
+        for agent in world.journeys:
+            seen = graph(world, agent)
+            kept = [c.vehicle for c in under("first-come", seat(world, agent), seen).conflicts if c.meets]
+            met = {c.vehicle for c in seen.conflicts if c.meets and c.vehicle in ASKED}
+            pairs |= {(seed, seen.viewer, other): kept.count(other) for other in met}
+    times = [sorted((count, pairs[seed, other, own])) for (seed, own, other), count in pairs.items()]
+    assert len(times) > 24
+    assert times.count([0, 3]) > 0.9 * len(times)
 
 
 def test_who_comes_from_the_right_goes_first_and_so_does_the_main_lane() -> None:
