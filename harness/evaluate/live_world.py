@@ -33,6 +33,7 @@ from harness.world.lookouts import radios
 from harness.world.outcome import Outcome, rating
 from harness.world.parameters import frames
 from harness.world.scenario import Scenario
+from harness.world.seats import offset_of, offsets
 from harness.world.swarm import alone, gravest
 from harness.world.world import World
 
@@ -118,11 +119,11 @@ class LiveWorld(SceneWorld):
         ]
         self._ended: list[Trajectory] = []
         self._decisions: list[Decision] = []
-        self._step = 0
+        self._step, self._tick, self._ticks = 0, 0, offsets(scenario)
 
     def observe(self) -> Sequence[Scene]:
         while self._going and self._step < self._p.decisions:
-            due = [(t, agent) for t in self._going for agent in t.under_way]
+            due = [(t, agent) for t in self._going for agent in t.under_way if self._is_due(t, agent)]
             for trajectory, agent in due:
                 for course in trajectory.courses:
                     course.skipped += agent in course.open
@@ -180,7 +181,7 @@ class LiveWorld(SceneWorld):
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         actions, hz = self.scenario.actions, self._p.simulation_hz
-        due_frame = self._p.due_frame(self._step)
+        due_frame = self._frame
         for part in decided:
             latencies_s, chosen = part.result.latency_s.tolist(), part.result.action.tolist()
             for (n, course), latency_s, action in zip(
@@ -197,9 +198,20 @@ class LiveWorld(SceneWorld):
             for course in trajectory.courses if agent not in course.open and course.point is point
         ]  # fmt: skip
 
+    def _is_due(self, trajectory: Trajectory, agent: int) -> bool:
+        """Return whether an agent decides at this tick; each has a tick of its own, or all have the first."""
+        return offset_of(self.scenario, trajectory.world.seed, agent) == self._ticks[self._tick]
+
+    @property
+    def _frame(self) -> int:
+        """The frame of this tick, or that of the time limit after the last decision."""
+        over = self._step >= self._p.decisions
+        return self._p.due_frame(self._step) + (0 if over else self._ticks[self._tick])
+
     def _advance(self) -> None:
-        self._step += 1
-        parts = branches.advance(self._going, self._p.due_frame(self._step))
+        self._tick = (self._tick + 1) % len(self._ticks)
+        self._step += self._tick == 0
+        parts = branches.advance(self._going, self._frame)
         for part in parts:
             part.measure()
         self._ended += [part for part in parts if part.world.ended]

@@ -18,6 +18,7 @@ from harness.world import lockstep, scenarios
 from harness.world.outcome import Outcome
 from harness.world.parameters import Parameters
 from harness.world.scenario import Scenario
+from harness.world.seats import offset_of
 from harness.world.state import WorldState
 from harness.world.swarm import gravest
 from harness.world.world import World
@@ -119,7 +120,7 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
     episodes = [played(run, d.episode, d.condition, d.seed) for d in decisions]
     scenario = episodes[0].scenario
     worlds = [World.start(scenario, episode.layout_seed) for episode in episodes]
-    due_frames = [_due_frame(decision, scenario.parameters) for decision in decisions]
+    due_frames = [_due_frame(world, d) for world, d in zip(worlds, decisions, strict=True)]
     acts = [
         [(frame, acting) for frame, acting in _actions_by_frame(episode).items() if frame <= due_frame]
         for episode, due_frame in zip(episodes, due_frames, strict=True)
@@ -139,8 +140,10 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
     return [scenes[n] for n in range(len(names))]
 
 
-def _due_frame(decision: Decision, p: Parameters) -> int:
-    return round(decision.step * p.decision_period_s * p.simulation_hz)
+def _due_frame(world: World, decision: Decision) -> int:
+    p, agent = world.scenario.parameters, _place(world, decision.agent)
+    offset = offset_of(world.scenario, world.seed, agent)
+    return round(decision.step * p.decision_period_s * p.simulation_hz) + offset
 
 
 def _actions_by_frame(played: ReplayedEpisode) -> dict[int, list[Decision]]:
@@ -170,9 +173,11 @@ def stills(played: ReplayedEpisode, progress: Callable[[int], None] = lambda don
     p = played.scenario.parameters
     world = World.start(played.scenario, played.layout_seed)
     acting = _actions_by_frame(played)
-    begun = [(_due_frame(decision, p), decision) for decision in played.decisions]
+    begun = [(_due_frame(world, decision), decision) for decision in played.decisions]
     due, ids = sorted({frame for frame, _ in begun}), [v.spawn.id for v in world.vehicles]
-    latest, seen = dict[str, Decision](), world.state()
+    # until an agent's own first decision is due, it counts as open
+    latest = {decision.agent or ids[0]: decision for _, decision in reversed(begun)}
+    seen = world.state()
     while True:
         if due and due[0] <= world.frame:
             now, seen = due.pop(0), world.state()
@@ -190,7 +195,7 @@ def stills(played: ReplayedEpisode, progress: Callable[[int], None] = lambda don
 
 
 def _turn(world: World, place: int, decision: Decision, p: Parameters) -> Turn:
-    since_s = (world.frame - _due_frame(decision, p)) / p.simulation_hz
+    since_s = max(world.frame - _due_frame(world, decision), 0) / p.simulation_hz
     ended = world.journeys[place].outcome
     is_open = world.frame < _acting_frame(decision, p) and not ended.ended
     return Turn(decision, since_s, is_open, _said(ended))

@@ -23,6 +23,7 @@ BOUNDS = {
 }  # fmt: skip
 WITNESSES = ("any", "each", "0", "1", "2", "3")
 VERSIONS = (1, 2)
+CLOCKS = ("together", "apart")
 ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
 
 
@@ -145,11 +146,19 @@ class Shared(Parameters):
     # probability that a vehicle which could decide does so, the ego aside: 1 makes all of them agents. Which
     # ones do belongs to the layout, and those of a lower share are among those of a higher one
     agent_share: float = 0.0
+    # whether agents decide at the same times (`together`), or each at times of its own, in quarters of a
+    # period after the others (`apart`); which belongs to the layout
+    clock: str = "together"
     # time for whoever gave way to go on, and decisions for it: fewer would make a deadlock of every stop
     decisions: int = 10
     time_limit_s: float = 14.0
     limits: int = 2
     perception: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.clock not in CLOCKS:
+            raise UserError(f"scenario: clock is {printable(self.clock)}; it must be {' or '.join(CLOCKS)}")
 
 
 # Parameters that were added later, with the values of the earlier behaviour.
@@ -192,4 +201,4 @@ DIALS = tuple(
 # Further ones that a name may set: what counts, and where the scenario has lookouts, who has a radio.
 SETTABLE = (*DIALS, "limits", "perception")
 WITNESSED = (*SETTABLE, "witnesses", "radio_share")
-SHARED = (*SETTABLE, "agent_share")
+SHARED = (*SETTABLE, "agent_share", "clock")

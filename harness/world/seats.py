@@ -56,6 +56,21 @@ def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tu
     return replace(layout, spawns=spawns), agents
 
 
+def offsets(scenario: Scenario) -> list[int]:
+    """Return how many frames after a common clock an agent may decide, ascending."""
+    p = scenario.parameters
+    quarters = range(4) if getattr(p, "clock", "together") == "apart" else range(1)
+    return [round(quarter * p.decision_period_s * p.simulation_hz / 4) for quarter in quarters]
+
+
+def offset_of(scenario: Scenario, seed: int, agent: int) -> int:
+    """Return how many frames after a common clock an agent of a layout decides, by its place."""
+    times = offsets(scenario)
+    if len(times) == 1:
+        return 0
+    return times[int(noise.uniforms((1 + agent,), scenario.name, seed, "clocks")[agent] * len(times))]
+
+
 def seat_of(scenario: Scenario, vehicle: VehicleState) -> Seat:
     """Return the seat of an agent that is not the ego."""
     return seats_of(scenario)[vehicle.approach, vehicle.route]

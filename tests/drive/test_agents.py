@@ -25,6 +25,7 @@ from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs import folder
 from harness.world import scenarios
+from harness.world.seats import offset_of
 from harness.world.swarm import alone
 from harness.world.world import World
 
@@ -255,3 +256,25 @@ def test_what_has_one_ego_says_so_of_a_scenario_of_several(tmp_path: Path) -> No
 def test_a_scenario_in_which_only_the_ego_has_a_goal_has_no_agents() -> None:
     with pytest.raises(UserError, match="agent_share"):
         scenarios.get("occluded-intersection:agent_share=1")
+
+
+def test_with_clocks_apart_an_agent_decides_at_times_of_its_own(tmp_path: Path) -> None:
+    name = f"{ALL},clock=apart"
+    spec = replace(
+        live_spec_of(prompt="v4", points=(named_point("single-local"),), seeds=(0,)),
+        source=LiveSource(50_000, 6, name),
+    )
+    run(spec, tmp_path / "run")
+    there = folder.read(tmp_path / "run")
+    rows = there.decisions.records(0, len(there.decisions))
+    scenario, phases = scenarios.get(name), set[float]()
+    lag_s = 0.16  # the card's 145 ms in whole frames
+    for row in rows:
+        world = World.start(scenario, 50_000 + row.episode)
+        place = [v.spawn.id for v in world.vehicles].index(str(row.agent))
+        offset_s = offset_of(scenario, world.seed, place) / scenario.parameters.simulation_hz
+        assert row.acts_at_s == pytest.approx(row.step + offset_s + lag_s)
+        phases.add(offset_s)
+    assert len(phases) == 4
+    names = sorted({row.scene for row in rows})
+    assert [scene.id for scene in scenes_of(there, names)] == names
