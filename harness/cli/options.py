@@ -80,7 +80,11 @@ RunsDataset = Annotated[
 Dataset = Annotated[str, Option(help="Name of a shipped dataset, or a dataset's folder.")]
 Seeds = Annotated[str, Option(help=HELP["seeds"])]
 Agents = Annotated[
-    str, Option(help="Who decides: ego, all, or the share of the others that do, as 0.5. Default: ego.")
+    str,
+    Option(
+        help="Who decides: ego, all, or the share of the others that do, as 0.5. Default: ego.",
+        rich_help_panel=stated.EPISODES,
+    ),
 ]
 FirstSeed = Annotated[int, Option(help="Layout seed of the first episode; the others follow.")]
 Thinking = Annotated[bool, Option("--thinking", help=HELP["thinking"])]

@@ -111,8 +111,8 @@ def test_hostile_text_cannot_reach_the_terminal(parse: Parse) -> None:
         (["."], "harness: cannot read completion file '.': Is a directory;"),
         (["-", "--role", "egg"], "harness: unknown role 'egg'; did you mean 'ego'? known: ego, helper"),
         (
-            ["-", "--scenario", "roundabout"],
-            "harness: unknown scenario 'roundabout'; did you mean 'roundabout-entry'? known: ",
+            ["-", "--scenario", "roundabout-entri"],
+            "harness: unknown scenario 'roundabout-entri'; did you mean 'roundabout-entries'? known: ",
         ),
         (
             ["-", "--finish-reason", "lenght"],
