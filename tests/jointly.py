@@ -1,8 +1,9 @@
-"""Episodes in which all agents take the actions that a test says."""
+"""What tests of several agents share."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
+from harness.world.perception.graph import scene_graphs
 from harness.world.scenario import Scenario
 from harness.world.world import World
 
@@ -19,3 +20,11 @@ def driven(scenario: Scenario, seed: int, plans: Sequence[Sequence[str]]) -> lis
         world.step += 1
         world.advance(p.due_frame(world.step))
     return [journey.outcome.result for journey in world.journeys.values()]
+
+
+def who_list_the_danger(world: World) -> set[str]:
+    """Return the approaches of the agents whose scene graphs list the danger."""
+    state = world.state()
+    viewers = [v for v in state.vehicles if v.part != "other"]
+    graphs = scene_graphs(world.scenario, [(state, v.id) for v in viewers])
+    return {v.approach for v, g in zip(viewers, graphs, strict=True) if world.layout.danger_id in g.seen}

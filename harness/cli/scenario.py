@@ -71,8 +71,9 @@ def drive(
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     from harness.world import policies, scenarios
     from harness.world import reference as live
+    from harness.world.seats import agent_share
 
-    together = getattr(scenario.parameters, "agent_share", 0) > 0
+    together = agent_share(scenario) > 0
     with bar(f"driving {printable(name, 30)}", episodes) as progress:
         outcomes = (policies if together else live).check(scenario, episodes, seed, who, progress)
     if together:

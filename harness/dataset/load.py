@@ -37,6 +37,7 @@ from harness.dataset.verify import (
 from harness.world.drivers import CONSTANT, UNIFORM, constant
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
+from harness.world.seats import places_by
 from harness.world.state import WorldState
 
 # How many of a dataset's scenes and trees stay in memory, the last ones read: some 120 and 100 MB.
@@ -91,12 +92,9 @@ class Scene:
         )
 
 
-def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Iterator[tuple[Scenario, list[int]]]:
-    """Yield the scenarios of who decides in some scenes, each with the places of its scenes."""
-    places: dict[Scenario, list[int]] = {}
-    for n, scene in enumerate(scenes):
-        places.setdefault(scene.seat or scenario, []).append(n)
-    yield from places.items()
+def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Mapping[Scenario, list[int]]:
+    """Return the scenarios of who decides in some scenes, each with the places of its scenes."""
+    return places_by(scene.seat or scenario for scene in scenes)
 
 
 class Trees(Sequence[Tree]):

@@ -33,7 +33,7 @@ from harness.world.lookouts import radios
 from harness.world.outcome import Outcome, rating
 from harness.world.parameters import frames
 from harness.world.scenario import Scenario
-from harness.world.seats import offset_of, offsets
+from harness.world.seats import offset_of, offsets, places_by
 from harness.world.swarm import alone, gravest
 from harness.world.world import World
 
@@ -253,13 +253,9 @@ def look(world: World, agent: int, number: int, step: int, ego_alone: bool) -> S
 
 def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) -> list[Scene]:
     """Return the decision point of each agent in its world, of an episode with this number, at this step."""
-    views: dict[Scenario, list[int]] = {}
     states = [structs.replace(world.state(agent), step=step) for world, agent, _ in points]
-    seats = [world.seat(agent) if agent else None for world, agent, _ in points]
-    for n, seat in enumerate(seats):
-        views.setdefault(seat or points[n][0].scenario, []).append(n)
     scenes = dict[int, Scene]()
-    for scenario, places in views.items():
+    for scenario, places in places_by(world.seat(agent) for world, agent, _ in points).items():
         seen = [
             (points[n][0], states[n], points[n][2],
              [states[n].ego] if ego_alone else [states[n].ego, *states[n].helpers])
@@ -267,8 +263,8 @@ def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) 
         ]  # fmt: skip
         for n, record in zip(places, records_of(scenario, seen), strict=True):
             world, agent, _ = points[n]
-            place = world.answering.index(agent) if agent else 0
-            scenes[n] = Scene(record, seat=seats[n], agent=place, deciders=len(world.journeys))
+            place, seat = (world.answering.index(agent), scenario) if agent else (0, None)
+            scenes[n] = Scene(record, seat=seat, agent=place, deciders=len(world.journeys))
     return [scenes[n] for n in range(len(points))]
 
 

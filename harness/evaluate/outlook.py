@@ -21,7 +21,7 @@ MOVING_MPS = 0.1  # a slower vehicle counts as standing
 def outlook(scenario: Scenario, scenes: Sequence[Scene]) -> Outlook:
     """Return the outlook of each scene, (n, ...); a road with fewer sectors than others sees the rest."""
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
-    roads = [(seat.road(), places) for seat, places in by_seat(scenes, scenario)]
+    roads = [(seat.road(), places) for seat, places in by_seat(scenes, scenario).items()]
     most = max((len(road.sectors) for road, _ in roads), default=0)
     unseen, to_zone_s = np.zeros((n, most)), np.zeros(n)
     added = np.full((n, helpers, most), np.nan)

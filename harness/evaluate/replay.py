@@ -141,9 +141,8 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
 
 
 def _due_frame(world: World, decision: Decision) -> int:
-    p, agent = world.scenario.parameters, _place(world, decision.agent)
-    offset = offset_of(world.scenario, world.seed, agent)
-    return round(decision.step * p.decision_period_s * p.simulation_hz) + offset
+    offset = offset_of(world.scenario, world.seed, _place(world, decision.agent))
+    return world.scenario.parameters.due_frame(decision.step) + offset
 
 
 def _actions_by_frame(played: ReplayedEpisode) -> dict[int, list[Decision]]:

@@ -28,7 +28,7 @@ def shared_graphs(
     that these come from, by id.
     """
     graphs: list[SceneGraph | None] = [None] * len(sets)
-    for seat, places in by_seat([scene for scene, _ in sets], scenario):
+    for seat, places in by_seat([scene for scene, _ in sets], scenario).items():
         for n, graph in zip(places, _shared_graphs(seat, [sets[n] for n in places], scenes), strict=True):
             graphs[n] = graph
     return graphs

@@ -29,6 +29,7 @@ from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes
 from harness.world.perception.graph import truth_graph
 from harness.world.scenario import Scenario
+from harness.world.seats import agent_share
 
 TAG_CHARACTERS = 40
 HOTTEST = 2.0
@@ -240,7 +241,7 @@ class Spec:
         shown, ego = f"condition {printable(point.name)}", self.ego
         if point.ask.messages == "shuffled" and self.source.kind != "frozen":
             raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
-        if point.content.plan and not getattr(self.scenario.parameters, "agent_share", 0):
+        if point.content.plan and not self.several_decide:
             raise UserError(NO_PLANS.format(printable(point.name)))
         if point.ask.calibration:
             self._check_calibration(shown, point)
@@ -329,7 +330,7 @@ class Spec:
     @property
     def several_decide(self) -> bool:
         """Whether vehicles beside the ego decide, too."""
-        return getattr(self.scenario.parameters, "agent_share", 0.0) > 0
+        return agent_share(self.scenario) > 0
 
     @property
     def asks_all(self) -> bool:

@@ -24,7 +24,7 @@ from harness.world.state import SIZES_M, separation_m
 from harness.world.swarm import on_seat
 from harness.world.world import Journey, World
 
-HORIZON = 5  # decisions of an agent that are planned; whoever has not arrived by then takes FASTER
+HORIZON = 5  # decisions of an agent that are planned; after them it takes FASTER
 MARGIN_M = 0.1  # least gap between two agents of a plan
 NEVER_S = 1000.0  # cost of an agent that never arrives: more than all times of a layout
 MOST_NODES = 20_000  # of a search; one that needs more ends with the best plan so far, and a bound

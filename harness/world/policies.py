@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from harness.core import noise
-from harness.core.parallel import Workers, spread
+from harness.core.parallel import Workers
 from harness.core.statistics import (
     Estimate,
     episode_interval,
@@ -86,13 +86,7 @@ def check(
     `unsolved` are the seeds without a joint plan in which all arrive, `inexact` those with a bound only.
     """
     seeds = range(seed, seed + episodes)
-    chunks = [seeds[at : at + TOGETHER] for at in range(0, len(seeds), TOGETHER)]
-    sizes = iter(map(len, chunks))
-    parts = spread(
-        partial(drive_all, scenario), chunks, workers, lambda done: progress(next(sizes)),
-        lambda chunk: f"layout seeds {chunk[0]} to {chunk[-1]}",
-    )  # fmt: skip
-    fates = [each for part in parts for each in part]
+    fates = reference.in_chunks(partial(drive_all, scenario), seeds, TOGETHER, workers, progress)
     best = [of[JOINT] for of in fates]
     return {
         "policies": {policy: summary([of[policy] for of in fates], best, policy) for policy in POLICIES},

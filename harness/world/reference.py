@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,8 +13,10 @@ from harness.world.drivers import DRIVERS, LOOKING, PRIVILEGED, choices
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
+from harness.world.seats import places_by
 from harness.world.world import World
 
+T = TypeVar("T")
 TOGETHER = 16  # episodes that are simulated together
 BY_DANGER = ("balanced", "dangerous", "harmless")  # success by danger, in a `summary`
 
@@ -28,11 +30,9 @@ def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, st
         (n, agent) for n, world in enumerate(worlds)
         for agent, journey in world.journeys.items() if not journey.outcome.ended
     ]  # fmt: skip
-    by_seat: dict[Scenario, list[tuple[int, int]]] = {}
-    for n, agent in deciding:
-        by_seat.setdefault(worlds[n].seat(agent), []).append((n, agent))
     actions: list[dict[int, str]] = [{} for _ in worlds]
-    for scenario, places in by_seat.items():
+    for scenario, at_seat in places_by(worlds[n].seat(agent) for n, agent in deciding).items():
+        places = [deciding[at] for at in at_seat]
         states = {(n, agent): worlds[n].state(agent) for n, agent in places if drivers[n] in LOOKING}
         truthful = [at for at in states if drivers[at[0]] == PRIVILEGED]
         others = [at for at in states if drivers[at[0]] != PRIVILEGED]
@@ -91,16 +91,24 @@ def drive_apart(
     scenario: Scenario, seeds: Sequence[int], workers: Workers, progress: Callable[[int], None]
 ) -> list[dict[str, Outcome]]:
     """Run `drive_all` on workers; `progress` is called with the number of episodes just done."""
-    chunks = [seeds[at : at + TOGETHER] for at in range(0, len(seeds), TOGETHER)]
+    return in_chunks(partial(drive_all, scenario), seeds, TOGETHER, workers, progress)
+
+
+def in_chunks(
+    drives: Callable[[Sequence[int]], list[T]], seeds: Sequence[int], together: int, workers: Workers,
+    progress: Callable[[int], None],
+) -> list[T]:  # fmt: skip
+    """Return what comes of some layouts, so many of which are driven together, on workers."""
+    chunks = [seeds[at : at + together] for at in range(0, len(seeds), together)]
     sizes = iter(map(len, chunks))  # all but the last have one size, so the order of completion is no matter
     parts = spread(
-        partial(drive_all, scenario),
+        drives,
         chunks,
         workers,
         lambda done: progress(next(sizes)),
         lambda chunk: f"layout seeds {chunk[0]} to {chunk[-1]}",
     )
-    return [outcomes for part in parts for outcomes in part]
+    return [of_layout for part in parts for of_layout in part]
 
 
 def check(

@@ -4,7 +4,7 @@ What an agent sees, is asked, aims at and is judged by is that of an ego, in the
 several agents nothing but the names of vehicles' parts and of paths differs between them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 
@@ -13,13 +13,18 @@ from msgspec.structs import replace as changed
 from harness.core import noise
 from harness.core.errors import UserError, printable
 from harness.world.road import PathKey
-from harness.world.scenario import Layout, Scenario, Seat
+from harness.world.scenario import Layout, Scenario, Seat, Spawn
 from harness.world.state import VehicleState, WorldState
+
+
+def agent_share(scenario: Scenario) -> float:
+    """Return the share of the vehicles beside the ego that decide; 0 where only an ego has a goal."""
+    return getattr(scenario.parameters, "agent_share", 0.0)
 
 
 def refuse_agents(scenario: Scenario, what: str) -> None:
     """Raise UserError if vehicles beside the ego decide in a scenario, and in `what` the ego alone does."""
-    if share := getattr(scenario.parameters, "agent_share", 0.0):
+    if share := agent_share(scenario):
         raise UserError(
             f"{printable(scenario.name)}: agent_share is {share:g}, and {what} has one ego that decides; "
             "leave it out, or use `harness drive`"
@@ -43,7 +48,7 @@ def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tu
     With a share of 0, helpers decide nothing, but answer. With a greater one, whoever could be an agent and
     is none is other traffic.
     """
-    share, seats = getattr(scenario.parameters, "agent_share", 0.0), seats_of(scenario)
+    share, seats = agent_share(scenario), seats_of(scenario)
     if not share:
         return layout, (0,)
     able = [n for n, s in enumerate(layout.spawns) if s.part == "helper" and (s.approach, s.route) in seats]
@@ -71,9 +76,17 @@ def offset_of(scenario: Scenario, seed: int, agent: int) -> int:
     return times[int(noise.uniforms((1 + agent,), scenario.name, seed, "clocks")[agent] * len(times))]
 
 
-def seat_of(scenario: Scenario, vehicle: VehicleState) -> Seat:
+def seat_of(scenario: Scenario, vehicle: VehicleState | Spawn) -> Seat:
     """Return the seat of an agent that is not the ego."""
     return seats_of(scenario)[vehicle.approach, vehicle.route]
+
+
+def places_by(scenarios: Iterable[Scenario]) -> dict[Scenario, list[int]]:
+    """Return the places at which each scenario stands, in the order in which they come first."""
+    places: dict[Scenario, list[int]] = {}
+    for n, scenario in enumerate(scenarios):
+        places.setdefault(scenario, []).append(n)
+    return places
 
 
 def seated(scenario: Scenario, state: WorldState, agent: int) -> WorldState:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from harness.world import lockstep
 from harness.world.scenario import Layout, Scenario
-from harness.world.seats import agents_of, seats_of
+from harness.world.seats import agents_of, seat_of
 from harness.world.simulator import populated
 from harness.world.world import Journey, World
 
@@ -34,7 +34,7 @@ def on_seat(
     """Return an agent's own scenario, and the layout in it with nobody but the agent and some others."""
     spawns, its = [layout.spawns[n] for n in (agent, *others)], scenario
     if agent:
-        seat = seats_of(scenario)[spawns[0].approach, spawns[0].route]
+        seat = seat_of(scenario, spawns[0])
         its, spawns[0] = seat.scenario, replace(spawns[0], part="ego")
         names = [seat.names[spawn.approach, spawn.route] for spawn in spawns]
         spawns = [

@@ -16,7 +16,7 @@ from harness.world import beacons, lockstep
 from harness.world.conflict_measures import Conflicts
 from harness.world.outcome import Outcome, fault, outline, striker
 from harness.world.scenario import Layout, Scenario
-from harness.world.seats import agents_of, seated, seats_of
+from harness.world.seats import agents_of, seat_of, seated
 from harness.world.simulator import copied, new_road, populated, spawn_of, state_of, vehicle_on
 from harness.world.state import (
     ActionsTaken,
@@ -227,14 +227,13 @@ class World:
 
     def _broadcast(self, poses: Floats, first_frame: int) -> None:
         """Add the beacons of who has a radio in some frames, whose poses are (F, V, 4)."""
-        p, target_mps = self.scenario.parameters, float(self.vehicles[0].target_speed)
-        radios = self.answering
+        p, radios = self.scenario.parameters, self.answering
         ids = [self.vehicles[n].spawn.id for n in radios]
         announce, sent = [n for n, v in enumerate(self.vehicles) if v.spawn.radio], tuple[Beacon, ...]()
         if len(self.journeys) > 1:  # everybody with a radio hears everybody
             announce = [*radios, *announce]
         else:
-            loss = beacons.losses(p, self.state, ids, poses)
+            loss, target_mps = beacons.losses(p, self.state, ids, poses), float(self.vehicles[0].target_speed)
             sent = beacons.broadcast(
                 p, self.seed, self.beacons, ids, target_mps, poses[:, radios], first_frame, loss
             )
@@ -260,8 +259,7 @@ class World:
 
     def seat(self, agent: int) -> Scenario:
         """Return the scenario as it is for an agent."""
-        spawn = self.vehicles[agent].spawn
-        return seats_of(self.scenario)[spawn.approach, spawn.route].scenario if agent else self.scenario
+        return seat_of(self.scenario, self.vehicles[agent].spawn).scenario if agent else self.scenario
 
     @property
     def answering(self) -> list[int]:
@@ -274,7 +272,7 @@ class World:
         if not agent:
             return bool(self.scenario.cleared(xy_m, np.array(names), self.scenario.parameters))
         spawn = self.vehicles[agent].spawn
-        seat = seats_of(self.scenario)[spawn.approach, spawn.route]
+        seat = seat_of(self.scenario, spawn)
         name, _ = seat.names[spawn.approach, spawn.route]
         return bool(seat.scenario.cleared(xy_m[[agent]], np.array([name]), self.scenario.parameters))
 

@@ -7,14 +7,14 @@ from operator import attrgetter
 
 import numpy as np
 import pytest
-from jointly import driven
+from jointly import driven, who_list_the_danger
 from scipy.stats import binomtest, ks_2samp
 from tiers import QUICK
 
 from harness.world import scenarios
 from harness.world.crossroads import APPROACHES, ARM_M, JUNCTION_M, SECTORS
 from harness.world.drivers import DRIVERS
-from harness.world.perception.graph import scene_graphs, truth_graph
+from harness.world.perception.graph import truth_graph
 from harness.world.planner import plan
 from harness.world.reference import drive_all
 from harness.world.scenarios.all_way_crossing import SIDES, Parameters, layout, seats
@@ -94,13 +94,7 @@ def test_all_arms_have_one_distribution_of_times():
 def test_a_danger_is_hidden_from_the_egos_road_and_seen_from_the_one_that_it_comes_on():
     always = replace(SCENARIO, parameters=replace(P, danger_share=1.0))
     for seed in range(12):
-        world = World.start(always, seed)
-        state = world.state()
-        viewers = [v for v in state.vehicles if v.part != "other"]
-        graphs = scene_graphs(always, [(state, v.id) for v in viewers])
-        listed = {
-            v.approach for v, g in zip(viewers, graphs, strict=True) if world.layout.danger_id in g.seen
-        }
+        listed = who_list_the_danger(World.start(always, seed))
         assert listed
         assert listed <= {*SIDES}
 

@@ -19,7 +19,6 @@ from itertools import accumulate
 
 import numpy as np
 
-from harness.core.arrays import Bools, Floats, Texts
 from harness.world.lookouts import Draft, placed
 from harness.world.parameters import SHARED, Shared
 from harness.world.road import PathKey, Road, crossings
@@ -119,11 +118,6 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     return Draft(Layout.arranged(spawns, danger, ids["danger"], [wall]), (phantom,), ())
 
 
-def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the agent's centre is far enough along the right lane."""
-    return np.asarray(xy_m[..., 0, 0] > parameters.cleared_m)
-
-
 SCENARIO = Scenario(
     name=NAME,
     description=__doc__,
@@ -131,7 +125,7 @@ SCENARIO = Scenario(
     parameters=Parameters(),
     road=road,
     layout=layout,
-    cleared=cleared,
+    cleared=blind_merge.cleared,
     dials=SHARED,
     seats=seats,
     words={"task": "merge from a ramp into the right lane of a road", "hiding": "a wall beside the ramp"},
