@@ -24,7 +24,7 @@ from harness.world.scenario import Scenario
 from harness.world.world import World
 
 SMALLEST = "--scenarios blind-merge --layouts 2 --worlds 2 --sizes 1 2 --frozen 1"
-TABLE = "--layouts 64"
+TABLE = "--layouts 16"
 NEEDS = "highway_env"
 FIRST_SEED = 2000  # (tune)
 FRAMES = 25  # before anybody meets: a fleet does not stop by itself where an episode ends
