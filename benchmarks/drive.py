@@ -1,9 +1,9 @@
 """Live driving: where time goes, and what a second worker adds.
 
 The parts are measured in one process with the proxy, whose answers cost next to nothing, so that the
-harness's own share is the largest it can be.
+harness's own share is the largest it can be. Of repeats the one whose time is the median counts.
 
-    python benchmarks/drive.py [--episodes 32] [--seeds 5]
+    python benchmarks/drive.py [--episodes 32] [--seeds 5] [--repeats 3]
 """
 
 import argparse
@@ -34,7 +34,7 @@ from harness.runs.records import Episode, Latency
 from harness.world import lockstep, scenarios
 from harness.world import reference as live
 
-SMALLEST = "--episodes 1 --seeds 1"
+SMALLEST = "--episodes 1 --seeds 1 --repeats 1"
 TABLE = ""
 NAME = "occluded-intersection:witnesses=any,radio_share=0,limits=1,perception=1"
 SCENARIO = scenarios.get(NAME)
@@ -53,6 +53,7 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--episodes", type=int, default=32)
     arguments.add_argument("--seeds", type=int, default=5)
+    arguments.add_argument("--repeats", type=int, default=3)
     given = arguments.parse_args()
     spec = Spec(
         Agent(cards.resolve("proxy"), prompts.load("v2")), LiveSource(0, given.episodes, NAME),
@@ -63,7 +64,9 @@ def main() -> None:
     drive(spec, range(1))  # pays for imports and compiled templates
     cpu_s(replace(spec, source=LiveSource(0, 1)))
     cpu = cpu_s(spec)
-    parts, frames, frames_lived = shares(spec, range(given.episodes))
+    repeats = [shares(spec, range(given.episodes)) for _ in range(given.repeats)]
+    repeats.sort(key=lambda each: sum(each[0].values()))
+    parts, frames, frames_lived = repeats[len(repeats) // 2]
     walls = {workers: wall_s(spec, workers, 2) for workers in (1, 2)}
     total = sum(parts.values())
 
@@ -78,8 +81,8 @@ def main() -> None:
     print(f"  one worker, CPU: {cpu:.2f} s")
     print(f"  a second worker makes it {walls[1] / walls[2]:.2f} times as fast")
     rows = [
-        Row("closed loop, episodes a CPU second", lives / total, "/s", 1, aim="≥ 1000"),
-        Row("closed loop, own share of the CPU time", 100 * parts["own"] / total, "%", 1, aim="≤ 20"),
+        Row("closed loop, episodes a CPU second", lives / total, "/s", given.repeats, aim="≥ 1000"),
+        Row("closed loop, own share of the CPU time", 100 * parts["own"] / total, "%", given.repeats, aim="≤ 20"),
         Row("closed loop, times as fast with 2 workers, wall", walls[1] / walls[2], "times", 2, 2.0),
     ]
     finish(
