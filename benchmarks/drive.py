@@ -82,7 +82,13 @@ def main() -> None:
     print(f"  a second worker makes it {walls[1] / walls[2]:.2f} times as fast")
     rows = [
         Row("closed loop, episodes a CPU second", lives / total, "/s", given.repeats, aim="≥ 1000"),
-        Row("closed loop, own share of the CPU time", 100 * parts["own"] / total, "%", given.repeats, aim="≤ 20"),
+        Row(
+            "closed loop, own share of the CPU time",
+            100 * parts["own"] / total,
+            "%",
+            given.repeats,
+            aim="≤ 20",
+        ),
         Row("closed loop, times as fast with 2 workers, wall", walls[1] / walls[2], "times", 2, 2.0),
     ]
     finish(
