@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -81,7 +82,7 @@ def main() -> None:
             model = str(shapes.build(given.shape, given.tokenizer, Path(folder) / "shape"))
         card = cards.resolve(model, "transformers")
         rates, limits, limits_at_one = measure(card, given)
-        if not given.shape:
+        if not given.shape and find_spec("llama_cpp"):
             rates |= of_llama(cards.resolve(given.model, "llama-cpp"), given)
     peers = {"(a)": rates.get(PLAIN), "(b)": rates.get(PEER)}
 
