@@ -67,6 +67,7 @@ def main() -> None:
     arguments.add_argument("--device", default="cpu")
     arguments.add_argument("--dtype", default="float32")
     arguments.add_argument("--prompts", type=int, default=32)
+    arguments.add_argument("--alone", type=int, help="how many of the prompts are asked one at a time")
     arguments.add_argument("--batch-size", type=int, default=8)
     arguments.add_argument("--threads", type=int, default=1)
     arguments.add_argument("--repeats", type=int, default=1)
@@ -147,21 +148,24 @@ def measure(
     backend = open_backend(card, device=given.device, dtype=given.dtype, batch_size=given.batch_size)
     chat, engine = backend.chat, backend.engine  # type: ignore[attr-defined]
     work: dict[str, Callable[[], Any]] = {}
+    alone = given.alone or given.prompts
     if free := asked.get("json"):
         texts = [chat.render(r.messages, thinking=False) for r in free]
-        work[PLAIN] = lambda: plain(engine.model, chat, texts, free)
+        work[PLAIN] = lambda: plain(engine.model, chat, texts[:alone], free[:alone])
         if by_others := lm_eval(engine.model, chat, texts, free, given.batch_size):
             work[PEER] = by_others
-    for size in (1, given.batch_size):
+    for size, most_asked in ((1, alone), (given.batch_size, given.prompts)):
         for mode in given.modes:
-            work[f"{mode}, batch {size}"] = partial(LanguageModel(engine, size).complete, asked[mode])
+            ask = LanguageModel(engine, size).complete
+            work[f"{mode}, batch {size}"] = partial(ask, asked[mode][:most_asked])
     for each in work.values():
         each()  # to warm up
     found: dict[str, list[float]] = {name: [] for name in work}
     for _ in range(given.repeats):
         for name, each in work.items():
             engine._reader._prefixes.clear()  # the modes' prompts begin alike, which no run's do
-            found[name].append(given.prompts / seconds_of(each))
+            count = alone if name == PLAIN or name.endswith(", batch 1") else given.prompts
+            found[name].append(count / seconds_of(each))
     flops_per_s = product_rate(engine.model)
     limits = {mode: limit(backend, asked[mode], flops_per_s) for mode in given.modes}
     pass_s = reading_s(engine.model)
