@@ -1,20 +1,27 @@
 """What a swarm is worth: every vehicle decides, with what they may hear of each other, by scene and model.
 
-    python benchmarks/agents.py [--only TEXT] [--layouts N] [--out reports/agents] [--page docs/agents.md]
+    python benchmarks/agents.py [--only TEXT] [--layouts N] [--out reports/agents] [--page PAGE] [OPTIONS]
 
-Drives each scene that has seats on report layouts with all of its vehicles as agents, and with the first
-model also with a share of them (`SHARES`). What is finished is read and not made again; a stopped one goes on
-with the same command. It writes the tables of the page between its marks.
+Drives each scene that has seats on report layouts: with all of its vehicles as agents, with the ego alone,
+and with the first model also with a share of them, and beside it plans each layout for all agents together.
+Further options, such as `--device cuda`, go to `harness drive`. What is finished is read and not made again;
+a stopped one goes on with the same command, and several with a TEXT of their own may run side by side. Then
+it writes the tables of the page, of all that is there, between its marks.
 """
 
-from collections.abc import Iterator, Sequence
+import json
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 from pages import harness, markdown, options, write_tables
 
-from harness.core.figures import shown
+from harness.core.figures import DASH, shown
+from harness.core.files import write_whole
 from harness.core.seeds import FIRST
+from harness.core.statistics import rate_difference, rate_interval
 from harness.runs.folder import Run, read
 from harness.runs.metrics import METRICS
 from harness.world import scenarios
@@ -29,73 +36,148 @@ CONDITIONS = {
     "plans": PLAN,
     "plans, two rounds": f"{PLAN},rounds=2",
 }
-COLUMNS = ("success_rate", "arrived_rate", "met_rate", "time_out_rate", "agents_lost_s", "most_lost_s")
-HEADS = ("success %", "arrived %", "met %", "stuck %", "lost, s", "lost by one, s", "latency, ms")
+ALONE = {f"one ego, {name}": CONDITIONS[name] for name in ("nothing", "intents")}
+FIGURES = {
+    "arrived %": "arrived_rate",
+    "met %": "met_rate",
+    "stuck %": "time_out_rate",
+    "lost, s": "agents_lost_s",
+    "lost by one, s": "most_lost_s",
+    "latency, ms": "latency_proxy_ms",
+}
 SHARES = (0.25, 0.5, 0.75)
+Plans = Mapping[int, bool]  # by layout seed, whether there is a joint plan in which everybody arrives
 
 
 class Driver(NamedTuple):
     """A model that drives, and how it is asked."""
 
     model: str
+    prompt: str
     answer: str
     layouts: int  # report layouts of each scene
 
 
-DRIVERS = (Driver("proxy", "json", 100), Driver("swarm-tiny-six-v2", "readout", 40))
+DRIVERS = (
+    Driver("proxy", "v4", "json", 100),
+    Driver("swarm-tiny-six-v2", "v4", "readout", 40),
+    Driver("swarm-smol", "v9", "readout", 40),
+    Driver("smollm2-135m", "v9", "readout", 40),
+)
+
+
+class Driven(NamedTuple):
+    """A run of a scene in which a share of the vehicles decide; of 0 only the ego does."""
+
+    driver: Driver
+    scene: str
+    share: float
+    run: Run
 
 
 def main() -> None:
     """Drive what is missing, and write the page's tables."""
-    given = options(__doc__, "agents").parse_args()
-    scenes = [name for name in scenarios.names() if "agent_share" in scenarios.get(name).dials]
-    made = []
-    for driver in DRIVERS:
-        for scene in scenes:
-            for share in (1, *(SHARES if driver == DRIVERS[0] else ())):
+    given, further = options(__doc__, "agents").parse_known_args()
+    made, plans = list[Driven](), dict[str, Plans]()
+    for scene in (name for name in scenarios.names() if "agent_share" in scenarios.get(name).dials):
+        for driver in DRIVERS:
+            layouts = given.layouts or driver.layouts
+            for share in (1, 0, *(SHARES if driver == DRIVERS[0] else ())):
                 out = given.out / f"{driver.model}-{scene}-{share:g}"
                 if given.only in out.name and not (out / "run.json").exists():
-                    drive(driver, scene, share, given.layouts or driver.layouts, out)
+                    drive(driver, scene, share, layouts, out, further)
                 if (out / "run.json").exists():
-                    made.append((driver, scene, share, read(out)))
-    text = "\n\n".join(tables(made))
+                    made.append(Driven(driver, scene, share, read(out)))
+        file = given.out / f"joint-{scene}.json"
+        if given.only in f"{DRIVERS[0].model}-{scene}-1" and not file.exists():
+            write_whole(file, jointly(scene, given.layouts or DRIVERS[0].layouts))
+        plans[scene] = solved(json.loads(file.read_bytes())) if file.exists() else {}
+    text = "\n\n".join((*overall(made, plans), *details(made, plans), *by_share(made)))
     print(text)
     if given.page:
         write_tables(given.page, text)
 
 
-def drive(driver: Driver, scene: str, share: float, layouts: int, out: Path) -> None:
+def drive(driver: Driver, scene: str, share: float, layouts: int, out: Path, further: Sequence[str]) -> None:
     """Drive a scene's report layouts in which this share of the vehicles decide."""
-    names = list(CONDITIONS.values()) if share == 1 else [CONDITIONS["nothing"], EVERYBODY]
-    points = [word for name in names for word in ("--condition", name)]
-    who = ("--model", driver.model, "--prompt", "v4", "--answer", driver.answer)
+    points = [word for name in conditions(share).values() for word in ("--condition", name)]
+    who = ("--model", driver.model, "--prompt", driver.prompt, "--answer", driver.answer)
     where = ("--scenario", scene, "--agents", f"{share:g}", "--episodes", str(layouts))
     seeds = ("--first-seed", str(FIRST["report"]), "--out", str(out), "--quiet")
-    harness("drive", *who, *where, *points, *seeds)
+    harness("drive", *who, *where, *points, *seeds, *further)
 
 
-def tables(made: Sequence[tuple[Driver, str, float, Run]]) -> Iterator[str]:
-    """Yield a table for each run in which all decide, and one over shares."""
-    for driver, scene, share, run in made:
-        if share == 1:
-            n, seeds = len(run.grid.episodes), len(run.grid.seeds)
-            rows = [[name, *cells(run, point)] for name, point in CONDITIONS.items()]
-            yield f"**{scene}, {driver.model}**, n = {n} layouts × {seeds} channel seeds:"
-            yield markdown(("they hear", *HEADS), rows)
-    pair = [CONDITIONS["nothing"], EVERYBODY]
-    shares = [
-        [scene, f"{share:.0%}", *(estimate(run, point, "success_rate") for point in pair)]
-        for driver, scene, share, run in sorted(made, key=lambda each: each[:3])
-        if driver == DRIVERS[0]
+def conditions(share: float) -> dict[str, str]:
+    """Return the conditions that a run of this share has, by what is heard."""
+    return CONDITIONS if share == 1 else ALONE
+
+
+def jointly(scene: str, layouts: int) -> str:
+    """Return what is said of the joint plans of a scene's report layouts."""
+    where = ("--agents", "all", "--episodes", str(layouts), "--seed", str(FIRST["report"]))
+    return harness("dataset", "scenario", "drive", scene, *where, "--json")
+
+
+def solved(said: dict[str, Any]) -> Plans:
+    """Return whether a joint plan brings everybody to its goal, by layout seed."""
+    return {
+        seed: seed not in said["unsolved"] for seed in range(said["seed"], said["seed"] + said["episodes"])
+    }
+
+
+def overall(made: Sequence[Driven], plans: Mapping[str, Plans]) -> Iterator[str]:
+    """Yield a table of success, with a row for each scene and model."""
+    rows = dict[tuple[str, str], dict[str, str]]()
+    for each in (each for each in made if each.share in (0, 1)):
+        success = {
+            name: estimate(each.run, point, "success_rate") for name, point in conditions(each.share).items()
+        }
+        layouts = {"n": str(len(each.run.grid.episodes))}
+        rows.setdefault((each.scene, each.driver.model), layouts).update(success)
+    ways = ("n", *ALONE, *CONDITIONS)
+    best = {
+        scene: shown(rate_interval(np.array([*plan.values()], dtype=float))) if plan else DASH
+        for scene, plan in plans.items()
+    }
+    yield "**Success %**, of the ego where it alone decides, and else of all agents:"
+    yield markdown(
+        ("scene", "model", *ways, "joint plan"),
+        [
+            (scene, model, *(row.get(way, DASH) for way in ways), best[scene])
+            for (scene, model), row in rows.items()
+        ],
+    )
+
+
+def details(made: Sequence[Driven], plans: Mapping[str, Plans]) -> Iterator[str]:
+    """Yield a table for each run in which all decide."""
+    for each in (each for each in made if each.share == 1):
+        run, n, seeds = each.run, len(each.run.grid.episodes), len(each.run.grid.seeds)
+        yield f"**{each.scene}, {each.driver.model}**, n = {n} layouts × {seeds} channel seeds:"
+        rows = [
+            (
+                name, estimate(run, point, "success_rate"), less_than_plan(run, point, plans[each.scene]),
+                *(estimate(run, point, metric) for metric in FIGURES.values()),
+            )
+            for name, point in CONDITIONS.items()
+        ]  # fmt: skip
+        yield markdown(("they hear", "success %", "less than the plan's", *FIGURES), rows)
+
+
+def by_share(made: Sequence[Driven]) -> Iterator[str]:
+    """Yield a table of the first model's success by the share that decide."""
+    rows = [
+        (
+            each.scene,
+            f"{each.share:.0%}",
+            *(estimate(each.run, point, "success_rate") for point in ALONE.values()),
+        )
+        for each in sorted(made, key=lambda each: each[:3])
+        if each.driver == DRIVERS[0] and each.share
     ]
-    if shares:
+    if rows:
         yield f"**How many decide**, {DRIVERS[0].model}: success of all agents, by the share that are agents:"
-        yield markdown(("scene", "agents", "nothing", "intents"), shares)
-
-
-def cells(run: Run, condition: str) -> list[str]:
-    """Return a condition's figures."""
-    return [estimate(run, condition, name) for name in (*COLUMNS, "latency_proxy_ms")]
+        yield markdown(("scene", "agents", "nothing", "intents"), rows)
 
 
 def estimate(run: Run, condition: str, metric: str) -> str:
@@ -103,7 +185,17 @@ def estimate(run: Run, condition: str, metric: str) -> str:
     for score in run.scores:
         if (score.condition, score.metric, score.interval) == (condition, metric, "episodes"):
             return shown(score.estimate, METRICS[metric].unit)
-    return "–"
+    return DASH
+
+
+def less_than_plan(run: Run, condition: str, plan: Plans) -> str:
+    """Return by how much success differs from the joint plan's, in points, over layouts that both have."""
+    success = defaultdict[int, list[bool]](list)
+    for episode in run.episodes:
+        if episode.condition == condition and episode.layout_seed in plan:
+            success[episode.layout_seed].append(episode.success)
+    pair = np.array([(np.mean(each), plan[layout]) for layout, each in success.items()], dtype=float)
+    return shown(rate_difference(*pair.T), sign="+") if success else DASH
 
 
 if __name__ == "__main__":

@@ -20,10 +20,13 @@ def options(doc: str, out: str, picture: bool = False) -> argparse.ArgumentParse
     return parser
 
 
-def harness(*words: str) -> None:
-    """Run a command of the harness, and say which."""
+def harness(*words: str) -> str:
+    """Run a command of the harness, say which, and return what it prints."""
     print(f"harness {' '.join(words)}", file=sys.stderr, flush=True)
-    subprocess.run([sys.executable, "-m", "harness", *words], check=True, stdout=sys.stderr)
+    command = [sys.executable, "-m", "harness", *words]
+    printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    print(printed, file=sys.stderr, end="")
+    return printed
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

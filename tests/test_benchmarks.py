@@ -35,9 +35,10 @@ def test_a_benchmark_runs_at_its_smallest(
     for package in stated.get("NEEDS", "").split():
         pytest.importorskip(package)
 
-    def typed(*words: str) -> None:
-        code, _, said = harness(*words)
+    def typed(*words: str) -> str:
+        code, printed, said = harness(*words)
         assert code == 0, said
+        return printed
 
     monkeypatch.setattr(pages, "harness", typed)
     monkeypatch.setattr(sys, "argv", [str(script), *stated["SMALLEST"].split()])
