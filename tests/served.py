@@ -6,11 +6,13 @@ It prints its base URL. What it answers depends on the question alone.
 import hashlib
 import json
 import os
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from misbehaving import Asked, completion, serving
 
@@ -34,6 +36,31 @@ def served(answers: int | None = None) -> Iterator[str]:
             yield process.stdout.readline().strip()
         finally:
             process.kill()
+
+
+@contextmanager
+def llama_cpp_server(gguf: Path, log: Path, **more: str) -> Iterator[str]:
+    """The base URL of llama-cpp-python's server with a model, in a process of its own."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    options = {"model": str(gguf), "port": str(port), "n_threads": "1", "n_threads_batch": "1",
+               "verbose": "false", **more}  # fmt: skip
+    command = [sys.executable, "-m", "llama_cpp.server"]
+    command += [part for name, value in options.items() for part in (f"--{name}", value)]
+    with log.open("w") as file, subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT) as server:
+        try:
+            until_s = time.monotonic() + 120
+            while server.poll() is None and time.monotonic() < until_s:
+                with socket.socket() as trial:
+                    if trial.connect_ex(("127.0.0.1", port)) == 0:
+                        break
+                time.sleep(0.1)
+            else:
+                raise AssertionError(f"the server did not start: {log.read_text()[-2000:]}")
+            yield f"http://127.0.0.1:{port}/v1"
+        finally:
+            server.terminate()
 
 
 def main(answers: float) -> None:

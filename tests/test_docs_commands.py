@@ -85,6 +85,11 @@ NOT_RUN = {
     "harness serve --model swarm-tiny": "as above; tests/test_serving.py starts it",
     "harness eval --model systemone-example --server http://127.0.0.1:8080/v1 --answer decision --prompt v9"
     " --batch-size 1": "needs that server; tests/test_serving.py has one",
+    **{
+        line: "needs that server; tests/test_by_url.py has such ones"
+        for line in TYPED
+        if re.match(r"harness eval --model '?http://", line)
+    },
     "harness model pull qwen3-4b": "fetches weights from a hub",
     "harness model pull smollm2-135m": "fetches weights from a registry; tests/test_packages.py does",
     "harness model check smollm2-135m": "needs those weights",

@@ -2,10 +2,6 @@
 
 import json
 import re
-import socket
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
@@ -14,6 +10,7 @@ from pathlib import Path
 import pytest
 from evaluating import FILES, run, scenes_of, spec_of, with_ego
 from run_on_disk import answers_of
+from served import llama_cpp_server
 
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.card import Card, Latency
@@ -57,29 +54,9 @@ def gguf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def url(gguf: Path) -> Iterator[str]:
     """A server of its own process, which asks for a key."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    options = {
-        "model": str(gguf), "model_alias": "tiny", "port": str(port), "api_key": KEY, "n_ctx": "2048",
-        "logits_all": "true", "n_threads": "1", "n_threads_batch": "1", "verbose": "false",
-    }  # fmt: skip
-    command = [sys.executable, "-m", "llama_cpp.server"]
-    command += [part for name, value in options.items() for part in (f"--{name}", value)]
-    log = gguf.with_name("server.log")
-    with log.open("w") as file, subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT) as server:
-        try:
-            until_s = time.monotonic() + 120
-            while server.poll() is None and time.monotonic() < until_s:
-                with socket.socket() as trial:
-                    if trial.connect_ex(("127.0.0.1", port)) == 0:
-                        break
-                time.sleep(0.1)
-            else:
-                pytest.fail(f"the server did not start: {log.read_text()[-2000:]}")
-            yield f"http://127.0.0.1:{port}/v1"
-        finally:
-            server.terminate()
+    options = {"model_alias": "tiny", "api_key": KEY, "n_ctx": "2048", "logits_all": "true"}
+    with llama_cpp_server(gguf, gguf.with_name("server.log"), **options) as url:
+        yield url
 
 
 @pytest.fixture

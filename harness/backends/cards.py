@@ -1,6 +1,6 @@
 """The model cards by name: those of files, and those made for a model that has none.
 
-A model without a file is a directory, a GGUF file, a hub id or `replay:RUN_DIR`.
+A model without a file is a directory, a GGUF file, a hub id, `replay:RUN_DIR`, or a served one by its URL.
 """
 
 import json
@@ -24,6 +24,7 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import bytes_of, text_of
 
 DISTILLED = "training.json"  # stands beside weights that were distilled here
+SERVED = ("http", "https", "openai")  # what a served model begins with, before a colon
 PROJECTOR = "mmproj-"  # prefix of a projector's GGUF file
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
@@ -61,10 +62,11 @@ def load_all() -> list[Card]:
 
 
 def resolve(text: str, engine: str | None = None) -> Card:
-    """Return the card of a name, `replay:RUN_DIR`, a path or a hub id, tried in this order.
+    """Return the card of a name, a URL, `replay:RUN_DIR`, a path or a hub id, tried in this order.
 
-    It runs on `engine`, if there is a choice. Raises UserError if there is no such model or engine, or the
-    model does not run on the engine.
+    It runs on `engine`, if there is a choice. The server at a URL is asked what it serves. Raises UserError
+    if there is no such model or engine, or the model does not run on the engine; Unanswered if no server
+    answers.
     """
     if engine is not None:
         registration(engine)
@@ -75,7 +77,8 @@ def resolve(text: str, engine: str | None = None) -> Card:
         card = local
     else:
         hint = (
-            "a directory with a config.json, a .gguf file, a hub id such as Qwen/Qwen3-4B, or replay:RUN_DIR"
+            "a directory with a config.json, a .gguf file, a hub id such as Qwen/Qwen3-4B, the URL of a "
+            "server such as http://127.0.0.1:8080/v1, or replay:RUN_DIR"
         )
         raise unknown("model", text, names(), f"; or {hint}")
     if engine not in (None, card.engine):
@@ -87,6 +90,8 @@ def argument(card: Card) -> str:
     """Return a value of `--model` that resolves to this card."""
     if card.name.partition(":")[0] in names() and load(card.name) == card:
         return card.name
+    if card.server:
+        return f"{card.server.urls[0]}#{card.weights}"
     return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
 
 
@@ -127,11 +132,15 @@ def _differing(card: Card, stated: Card) -> list[str]:
 
 
 def _local_card(text: str, engine: str | None) -> Card | None:
-    """Return the card of `replay:RUN_DIR`, a path or a hub id, on `engine` if there is a choice, or None.
+    """Return the card of a URL, `replay:RUN_DIR`, a path or a hub id, or None; on `engine` if it can choose.
 
     Raises UserError if there is no such file or run, or it does not say how to open it.
     """
     kind, _, rest = text.partition(":")
+    if kind in SERVED:
+        from harness.backends.openai.by_url import served_card  # imports aiohttp, which takes time
+
+        return served_card(text)
     if kind == "replay":
         run = _path(rest)
         if run is None or not run.is_dir():

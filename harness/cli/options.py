@@ -29,16 +29,16 @@ Reports = Annotated[Path, Argument(metavar="DIR", help="Folder that holds the ru
 Model = Annotated[
     str,
     Option(
-        help="Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file or "
-        "a hub id."
+        help="Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file, a "
+        "hub id, or the URL of a server."
     ),
 ]
 RunModel = Annotated[
     list[str] | None,
     Option(
         "--model",
-        help="The run's model, where it is none of your cards: a checkpoint directory, a .gguf file or a hub "
-        "id. Nothing that only a run names is opened or asked. Repeatable, for several models.",
+        help="The run's model, where it is none of your cards: a checkpoint directory, a .gguf file, a hub "
+        "id or a URL. Nothing that only a run names is opened or asked. Repeatable, for several models.",
     ),
 ]
 Scenario = Annotated[str, Argument(help="Scenario name; `harness dataset scenario list` shows them.")]

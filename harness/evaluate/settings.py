@@ -118,7 +118,8 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         str,
         option(
             "Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file, a "
-            "hub id, or replay:RUN, which scores the stored answers of a run again."
+            "hub id, the URL of a server such as http://127.0.0.1:8080/v1, or replay:RUN, which scores the "
+            "stored answers of a run again."
         ),
     ] = "proxy"
     engine: Annotated[

@@ -1,0 +1,191 @@
+"""The card of a model behind a URL: its server says what it serves, and what it answers tells its kind.
+
+A served model is `URL`, or `URL#NAME` where its server has several. `openai:NAME` is one at the base URL in
+`OPENAI_BASE_URL`, else at OpenAI's.
+"""
+
+import asyncio
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+
+from harness.backends.card import Card, Latency, Thinking
+from harness.backends.chat_template import needs_first_user
+from harness.backends.openai.http import Client, Reply
+from harness.backends.openai.statements import Ask
+from harness.backends.servers import Kind, Server
+from harness.core.errors import Unanswered, UserError, printable
+
+PREFIX = "served:"  # of a card's name: such a model is none of the card files
+BASE, KEY = "OPENAI_BASE_URL", "OPENAI_API_KEY"
+OPENAI = "https://api.openai.com/v1"
+LONGEST, SHOWN = 200, 8  # characters of a model's name; names in an error
+SWITCH = "enable_thinking"  # name of the thinking switch in chat templates
+_PATH = re.compile(r"[/~]|[A-Za-z]:[/\\]")  # how the name of a file or a folder begins
+
+
+class _Listed(NamedTuple):
+    """A model in a server's list."""
+
+    id: str
+    owner: str
+    decides: bool  # whether it says that it is a decision model
+
+
+# Where each kind of server tells that it is one, in the order in which they are believed: llama-server has
+# paths of Ollama's as well. What vLLM says of itself stands in its list of models.
+_MARKS: Mapping[Kind, tuple[str, Callable[[dict[str, Any]], bool]]] = {
+    "llama-server": ("/props", lambda said: "default_generation_settings" in said),
+    "lm-studio": ("/api/v0/models", lambda said: isinstance(said.get("data"), list)),
+    "ollama": ("/api/version", lambda said: isinstance(said.get("version"), str)),
+    "llama-cpp-python": ("/openapi.json", lambda said: "llama.cpp Python API" in str(said.get("info"))[:500]),
+}
+
+
+def served_card(text: str) -> Card:
+    """Return the card of a served model, after asking its server what it has.
+
+    The key in `OPENAI_API_KEY`, if there is one, goes to that server. Raises UserError if the text is no base
+    URL or does not say which of several models is meant, Unanswered if no server answers or it refuses the
+    key.
+    """
+    address, _, name = text.partition("#")
+    if address.startswith("openai:"):
+        address, name = os.environ.get(BASE) or OPENAI, text.removeprefix("openai:")
+    try:
+        server = Server(_base(address))
+    except ValueError as error:  # whose words show no URL, since it may hold a password
+        raise UserError(f"--model: {error}") from None
+    with ThreadPoolExecutor(1) as thread:  # a notebook has an event loop in this one
+        return thread.submit(asyncio.run, _ask(server, name)).result()
+
+
+def _base(address: str) -> str:
+    """Return a base URL; without a path, it is the one that every kind of server has."""
+    try:
+        parts = urlsplit(address)
+        bare = parts.path in ("", "/") and not parts.query
+    except ValueError:
+        bare = False
+    return f"{address.rstrip('/')}/v1" if bare else address.rstrip("/")
+
+
+async def _ask(server: Server, name: str) -> Card:
+    url = server.urls[0]
+    async with Client(server) as client:
+
+        async def ask(path: str, content: bytes | None) -> Reply:
+            return await client.get(url, url.removesuffix("/v1") + path, content)
+
+        model = _chosen(url, await client.get(url, f"{url}/models"), name)
+        kind: Kind = "vllm" if model.owner == "vllm" else await _kind(ask)
+        template, thinking = await _TEMPLATES.get(kind, _unknown)(model.id, ask)
+    if thinking == "none" and SWITCH in template and kind == "llama-server":
+        thinking = "switch"
+    return Card(
+        f"{PREFIX}{_short(model.id)}",
+        "systemone" if model.decides else "openai",
+        f"Served by {'a server' if kind == 'generic' else kind}",
+        Latency("paper", None, "none declared: the paper's"),
+        weights=model.id,
+        thinking="none" if model.decides else thinking,
+        server=Server(server.base_url, kind),
+        system="first-user" if template and not model.decides and needs_first_user(template) else None,
+    )
+
+
+def _chosen(url: str, reply: Reply, name: str) -> _Listed:
+    """Return the model of a name, or the only one. Raises what `served_card` raises."""
+    shown = printable(url)
+    if reply.unreached or reply.again:
+        raise Unanswered(f"no server answers at {shown} ({reply.fault}); start it, or fix --model")
+    if reply.status in (401, 403):
+        raise Unanswered(
+            f"the server at {shown} refuses the key ({reply.fault}); set {KEY} in the environment"
+        )
+    listed = {model.id: model for model in _listed(reply.payload)}
+    if not listed and not name:
+        raise UserError(
+            f"{shown}/models lists no model ({reply.fault or 'the list is empty or none of OpenAI'}); give "
+            f"the base URL up to and with /v1, or the model's name as well: --model {shown}#NAME"
+        )
+    alike = [
+        model for key, model in listed.items() if name in (key, _short(key), key.removesuffix(":latest"))
+    ]
+    if len(alike) == 1:
+        return alike[0]
+    if not listed:  # some servers have no list
+        if len(name) > LONGEST or not name.isprintable():
+            raise UserError(f"--model: {printable(name)} is no model's name; give one that {shown} knows")
+        return _Listed(name, "", False)
+    if not name and len(listed) == 1:
+        return next(iter(listed.values()))
+    names = sorted(printable(each) for each in listed)
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    reason = f"has no model {printable(name)!r}" if name else f"serves {len(names)} models"
+    raise UserError(
+        f"{shown} {reason}: {', '.join(names[:SHOWN])}{more}; give one, as --model '{shown}#{names[0]}'"
+    )
+
+
+def _listed(payload: Any) -> list[_Listed]:
+    """Return the models in a server's answer to `/models`; what has no usable name is left out."""
+    listed = payload.get("data") if isinstance(payload, dict) else None
+    models = []
+    for entry in listed if isinstance(listed, list) else []:
+        name = entry.get("id") if isinstance(entry, dict) else None
+        if isinstance(name, str) and 0 < len(name) <= LONGEST and name.isprintable():
+            about = entry.get("architecture")
+            outputs = (about if isinstance(about, dict) else entry).get("output_modalities")
+            decides = isinstance(outputs, list) and "decisions" in outputs
+            models.append(_Listed(name, str(entry.get("owned_by", "")), decides))
+    return models
+
+
+async def _kind(ask: Ask) -> Kind:
+    """Return which kind of server answers as only one kind does; `generic` if none does."""
+    replies = await asyncio.gather(*(ask(path, None) for path, _ in _MARKS.values()))
+    for (kind, (_, tells)), reply in zip(_MARKS.items(), replies, strict=True):
+        if isinstance(reply.payload, dict) and reply.status == 200 and tells(reply.payload):
+            return kind
+    return "generic"
+
+
+async def _llama_server(model: str, ask: Ask) -> tuple[str, Thinking]:
+    template = _field(await ask("/props", None), "chat_template")
+    return template if isinstance(template, str) else "", "none"
+
+
+async def _ollama(model: str, ask: Ask) -> tuple[str, Thinking]:
+    can = _field(await ask("/api/show", json.dumps({"model": model}).encode()), "capabilities")
+    return "", "always" if isinstance(can, list) and "thinking" in can else "none"
+
+
+async def _vllm(model: str, ask: Ask) -> tuple[str, Thinking]:
+    """Return whether a request can turn thinking off: another prompt is made of the same messages then."""
+    chat = {"model": model, "messages": [{"role": "user", "content": "?"}]}
+    bodies = [json.dumps({**chat, "chat_template_kwargs": {SWITCH: on}}).encode() for on in (True, False)]
+    counts = [_field(await ask("/tokenize", body), "count") for body in bodies]
+    return "", "switch" if None not in counts and counts[0] != counts[1] else "none"
+
+
+async def _unknown(model: str, ask: Ask) -> tuple[str, Thinking]:
+    return "", "none"
+
+
+_TEMPLATES = {"llama-server": _llama_server, "ollama": _ollama, "vllm": _vllm}
+
+
+def _field(reply: Reply, name: str) -> Any:
+    return reply.payload.get(name) if isinstance(reply.payload, dict) else None
+
+
+def _short(name: str) -> str:
+    """Return a model's name for people: of a file or a folder, the last part of its path."""
+    if not (name.endswith(".gguf") or _PATH.match(name)):
+        return name
+    return name.replace("\\", "/").rstrip("/").rpartition("/")[2].removesuffix(".gguf") or name

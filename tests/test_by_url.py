@@ -1,0 +1,204 @@
+"""A model by its URL: the server is asked what it has and what it is, and is believed no further."""
+
+import json
+import shlex
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+from misbehaving import Asked, Play, serving
+from served import answer, llama_cpp_server
+from test_server_identity import SERVERS, answering
+
+from harness.backends import cards
+from harness.backends.openai import http
+from harness.backends.servers import Kind
+from harness.core import resources
+from harness.core.errors import Unanswered, UserError
+
+KEY = "sk-of-mine-5ecret"
+OTHERS = {
+    "llama-cpp-python": {"/openapi.json": {"info": {"title": "🦙 llama.cpp Python API", "version": "0.3"}}},
+}  # fmt: skip
+NEEDED = ("llama_cpp", "fastapi", "starlette_context", "sse_starlette", "pydantic_settings")
+
+
+@pytest.fixture(autouse=True)
+def local(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+
+
+def never(asked: Asked) -> None:
+    raise AssertionError(f"asked for {asked.path}")
+
+
+def listing(*ids: Any) -> Play:
+    return answering({"/v1/models": {"data": [{"id": each} for each in ids]}})
+
+
+@pytest.mark.parametrize("kind", SERVERS)
+def test_each_kind_of_server_is_told_by_what_it_alone_answers(kind: Kind) -> None:
+    paths = SERVERS[kind] | OTHERS.get(kind, {})
+    with serving(never, answering(paths)) as there:
+        card = cards.resolve(f"{there.url}#m" if kind == "ollama" else there.url)
+        assert card.server.kind == kind
+        assert card.server.base_url == there.url
+    # A file's name is what people read, and the server is asked by what it lists.
+    name, listed = ("tiny", "/srv/models/tiny.gguf") if kind == "llama-server" else ("m", "m")
+    listed = "m:latest" if kind == "ollama" else listed
+    assert (card.name, card.weights) == (f"served:{listed if kind == 'ollama' else name}", listed)
+    assert (card.engine, card.thinking, card.system) == ("openai", "none", None)
+
+
+@pytest.mark.parametrize(
+    ("kind", "path", "says", "thinking"),
+    [
+        ("llama-server", "/props", {"chat_template": "{% if enable_thinking %}{% endif %}"}, "switch"),
+        ("ollama", "/api/show", {"capabilities": ["completion", "thinking"]}, "always"),
+        ("ollama", "/api/show", {"capabilities": ["completion"]}, "none"),
+    ],
+)
+def test_a_model_thinks_as_its_server_says(kind: Kind, path: str, says: Any, thinking: str) -> None:
+    paths = SERVERS[kind] | {path: SERVERS[kind][path] | says}
+    with serving(never, answering(paths)) as there:
+        assert cards.resolve(f"{there.url}#m" if kind == "ollama" else there.url).thinking == thinking
+
+
+@pytest.mark.parametrize(("heeds", "thinking"), [(True, "switch"), (False, "none")])
+def test_vllm_tells_by_its_count_of_tokens_whether_thinking_can_be_turned_off(
+    heeds: bool, thinking: str
+) -> None:
+    def listed(asked: Asked) -> None:
+        if asked.path == "/tokenize":
+            on = asked.body["chat_template_kwargs"]["enable_thinking"]
+            asked.reply({"count": 9 if on or not heeds else 13})
+        else:
+            answering(SERVERS["vllm"])(asked)
+
+    with serving(never, listed) as there:
+        assert cards.resolve(there.url).thinking == thinking
+
+
+def test_a_decision_model_is_asked_for_decisions() -> None:
+    listed = {"data": [{"id": "d", "architecture": {"output_modalities": ["text", "decisions"]}}]}
+    with serving(never, answering({"/v1/models": listed})) as there:
+        assert cards.resolve(there.url).engine == "systemone"
+
+
+def test_one_of_several_is_named_behind_the_url(monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(never, listing("b", "a:latest", 7, "", "x" * 900, "evil\x1b[2J")) as there:
+        with pytest.raises(
+            UserError, match=f"serves 2 models: a:latest, b; give one, as --model '{there.url}#a"
+        ):
+            cards.resolve(there.url)
+        with pytest.raises(UserError, match="has no model 'c': a:latest, b; give one"):
+            cards.resolve(f"{there.url}#c")
+        one = cards.resolve(f"{there.url}#a")
+        assert one.weights == "a:latest"
+        assert cards.resolve(cards.argument(one)) == one
+        monkeypatch.setenv("OPENAI_BASE_URL", f"{there.url}/")
+        assert cards.resolve("openai:a") == one
+        bare = there.url.removesuffix("/v1")
+        assert cards.resolve(f"{bare}#b") == cards.resolve(f"{there.url}#b")
+
+
+def test_a_server_without_a_list_needs_the_models_name() -> None:
+    with serving(never, answering({})) as there:
+        with pytest.raises(
+            UserError, match=r"/models lists no model \(HTTP 404: no such path\); give the base"
+        ):
+            cards.resolve(there.url)
+        assert cards.resolve(f"{there.url}#m").weights == "m"
+
+
+def refusing(status: int) -> Play:
+    return lambda asked: asked.reply({"error": f"no, {KEY} is wrong"}, status)
+
+
+def endless(asked: Asked) -> None:
+    asked.raw(b"HTTP/1.1 200 OK\r\n\r\n")
+    while True:
+        asked.raw(b" ")
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize(
+    ("play", "error", "words"),
+    [
+        (refusing(401), Unanswered, r"refuses the key \(HTTP 401: no, \[key\] is wrong\); set OPENAI"),
+        (refusing(503), Unanswered, r"no server answers at .*HTTP 503"),
+        (endless, Unanswered, r"no server answers at .* \(no whole answer within 0.3 s\)"),
+        (lambda asked: asked.reply(b" " * (http.MOST_BYTES + 1)), UserError, "longer than"),
+        (lambda asked: asked.reply(b'{"data": ' + b"[" * 10**5), UserError, "the answer is no JSON"),
+        (lambda asked: asked.reply({"data": {"id": "m"}}), UserError, "lists no model"),
+    ],
+)  # fmt: skip
+def test_a_bad_server_is_one_line(
+    play: Play, error: type[Exception], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(http, "CONNECT_S", 0.3 if play is endless else 10)
+    with serving(never, play) as there, pytest.raises(error, match=words) as raised:
+        cards.resolve(there.url)
+    assert "\n" not in str(raised.value)
+    assert KEY not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["http://me:hunter22@127.0.0.1/v1", "http://", "http://127.0.0.1:0/v1", "https://h/v1?key=hunter22", "http://[/v1"],
+)  # fmt: skip
+def test_what_is_no_base_url_is_not_asked_and_not_shown(url: str) -> None:
+    with pytest.raises(UserError, match=r"--model: base_url .*; give one such as http") as raised:
+        cards.resolve(url)
+    assert "hunter22" not in str(raised.value)
+
+
+def test_a_run_by_url_states_its_card_and_can_be_typed_again(
+    small_path: Path, harness: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    what = ["--dataset", small_path, "--limit", "1", "--condition", "single-local", "--seeds", "0:1"]
+    quiet = ("--no-cache", "--quiet")
+    with serving(answer, listing("lab/tiny:q4")) as there:
+        code, _, said = harness("eval", "--model", there.url, *what, *quiet, "--out", "one")
+        assert code == 0, said
+        record = json.loads(Path("one/run.json").read_text())
+        assert record["model"]["server"]["base_url"] == there.url
+        assert (record["model"]["name"], record["model"]["weights"]) == ("served:lab/tiny:q4", "lab/tiny:q4")
+        assert all(asked.headers["Authorization"] == f"Bearer {KEY}" for asked in there.asked)
+        typed = shlex.split(record["command"])
+        assert typed[typed.index("--model") + 1] == f"{there.url}#lab/tiny:q4"
+        code, _, said = harness(*typed[1:-1], "two", *quiet)
+        assert code == 0, said
+    one, two = (
+        [json.loads(line)["raw"] for line in Path(run, "answers.jsonl").read_text().splitlines()]
+        for run in ("one", "two")
+    )
+    assert one == two
+    assert len(one) > 1
+    files = [path for path in Path("one").rglob("*") if path.is_file()]
+    assert not any(KEY.encode() in path.read_bytes() for path in files)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(any(find_spec(name) is None for name in NEEDED), reason=f"needs {', '.join(NEEDED)}")
+def test_a_real_server_is_known_and_evaluated_by_its_url(
+    small_path: Path, harness: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    """llama-cpp-python's, with the model that ships; its list has the file's path."""
+    gguf = resources.find("models", "swarm-tiny") / "swarm-tiny-f16.gguf"
+    with llama_cpp_server(gguf, tmp_path / "server.log", api_key=KEY, n_ctx="1024") as url:
+        card = cards.resolve(url)
+        assert (card.name, card.server.kind) == ("served:swarm-tiny-f16", "llama-cpp-python")
+        code, out, said = harness(
+            "eval", "--model", url, "--dataset", small_path, "--limit", "1", "--condition", "single-local",
+            "--seeds", "0:1", "--no-cache", "--out", "run",
+        )  # fmt: skip
+    assert code == 0, said
+    assert "served:swarm-tiny-f16" in out
+    answers = [json.loads(line) for line in Path("run/answers.jsonl").read_text().splitlines()]
+    assert {each["status"] for each in answers} == {"strict"}
