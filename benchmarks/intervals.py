@@ -85,23 +85,35 @@ def success(rate: float, alike: float, seeds: int) -> Kind:
     return draw
 
 
-def gain(before: float, after: float, alike: tuple[float, float], seeds: int) -> Kind:
-    """A paired gain in success.
+def paired(
+    rng: np.random.Generator,
+    before: float,
+    after: float,
+    alike: tuple[float, float],
+    seeds: int,
+    episodes: int,
+) -> list[Floats]:
+    """Successes (E, S) of two conditions.
 
     In a share `alike` of episodes the layout decides, in the others each seed; nine layouts in ten are as
     hard for one condition as for the other.
     """
+    hard = rng.random(episodes)
+    same, decides = rng.random(episodes) < 0.9, rng.random(episodes)
+    luck = rng.random((episodes, seeds))
+    both = []
+    for rate, share in zip((before, after), alike, strict=True):
+        own = np.where(same, hard, rng.random(episodes))
+        both.append(np.where((decides < share)[:, None], own[:, None], luck) < rate)
+    return [each.astype(float) for each in both]
+
+
+def gain(before: float, after: float, alike: tuple[float, float], seeds: int) -> Kind:
+    """A paired gain in success."""
 
     def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
         for _ in range(runs):
-            hard = rng.random(episodes)
-            same, decides = rng.random(episodes) < 0.9, rng.random(episodes)
-            luck = rng.random((episodes, seeds))
-            both = []
-            for rate, share in zip((before, after), alike, strict=True):
-                own = np.where(same, hard, rng.random(episodes))
-                both.append(np.where((decides < share)[:, None], own[:, None], luck) < rate)
-            a, b = (each.astype(float) for each in both)
+            a, b = paired(rng, before, after, alike, seeds, episodes)
             yield difference(SUCCESS, b, a), after - before
 
     return draw

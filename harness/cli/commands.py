@@ -7,6 +7,7 @@ COMMANDS = {
     "eval": "eval",
     "drive": "drive",
     "compare": "compare",
+    "plan": "plan",
     "report": "report",
     "view": "view",
     "serve": "serve",
@@ -76,7 +77,7 @@ GROUPS = {
 PANELS = {
     "Evaluate": ("init", "eval", "drive"),
     "Look at results": ("compare", "report", "view"),
-    "More": ("serve", "study", "run", "model", "prompt", "dataset", "radio"),
+    "More": ("plan", "serve", "study", "run", "model", "prompt", "dataset", "radio"),
 }
 
 # Spellings of 0.2 and what replaces them; they work until 0.4.0, with a note.

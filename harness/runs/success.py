@@ -10,6 +10,7 @@ import numpy as np
 
 from harness.core import multiplicity
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.power import Spread, variance
 from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of, resampled
 from harness.runs import metrics
 from harness.runs.leading import BALANCED, IN_WORDS, SUCCESS
@@ -58,6 +59,12 @@ class Success:
     def p_value(self, a: Floats, b: Floats) -> float | None:
         """Return the p-value of no such difference; None without an interval."""
         return multiplicity.p_value(lambda level: self.difference(a, b, level))
+
+    def spread(self, a: Floats, b: Floats, counts: Ints) -> Spread:
+        """Return how much success b - a, both (S, E), varies where episodes count so often, (..., E)."""
+        differences, parts = known_mean(b - a, 0), self._parts
+        variances = [variance(differences[part], counts[..., part]) for part in parts]
+        return Spread(np.array([part.mean() for part in parts]), np.stack(variances, axis=-1))
 
     def resampled(self, draws: np.random.Generator, times: int) -> Ints:
         """Return how often each episode counts, as in `statistics.resampled`, (1 + times, E), by halves."""

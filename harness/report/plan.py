@@ -1,0 +1,170 @@
+"""Plan a study of success: how many layouts find a difference, by what pilots show or by a stated rate."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from harness.core import noise
+from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable
+from harness.core.figures import known
+from harness.core.power import Spread
+from harness.core.statistics import Estimate, resampled_estimate
+from harness.report.compare.pair import pair
+from harness.runs.folder import Run, read
+from harness.runs.leading import lead_of
+from harness.runs.metrics import BASELINE, METRICS, SUCCESS, of_ends
+from harness.runs.records import Answer
+from harness.runs.success import Success
+
+RESAMPLES = 999
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What the answers of some layouts take; None where the pilots do not say."""
+
+    requests: float
+    tokens: float | None  # of prompts and answers
+    # of all answers, one after the other; known where some were asked alone, with `--batch-size 1`
+    minutes: float | None
+
+    def times(self, layouts: float) -> "Cost":
+        tokens, minutes = (each and each * layouts for each in (self.tokens, self.minutes))
+        return Cost(self.requests * layouts, tokens, minutes)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """What a difference needs under one condition."""
+
+    condition: str  # its name; empty for a stated rate
+    layouts: Estimate  # how many find it; the interval is over other pilots of as many layouts
+    finds: float  # the difference that as many layouts find as are asked about; NaN if none up to 1
+    cost: Cost | None  # of so many layouts under all conditions of the pilots; None for a stated rate
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Layouts for a difference, a row a condition."""
+
+    difference: str  # whose of what, in words
+    basis: str  # what must hold for it, in words
+    rows: tuple[Planned, ...]
+    layouts: int | None  # those of which `finds` is
+
+
+def from_rate(rate: float, correlation: float, detect: float, power: float, layouts: int | None) -> Plan:
+    """Plan by two successes near a rate whose outcomes correlate over layouts; one channel seed."""
+    variance = 2 * rate * (1 - rate) * (1 - correlation)
+    spread = Spread(np.ones(1), np.array([variance]))
+    needed = float(spread.episodes(detect, power))
+    finds = float(spread.difference(layouts, power)) if layouts else np.nan
+    row = Planned("", Estimate(needed, np.nan, np.nan, 0, 0), finds, None)
+    basis = f"both successes are near {100 * rate:g} %, correlated by {correlation:g} over layouts"
+    return Plan("success, B - A", basis, (row,), layouts)
+
+
+def from_pilots(pilots: Sequence[Path], detect: float, power: float, layouts: int | None) -> Plan:
+    """Plan by what one run shows of each condition's gain over the baseline, or two of their difference.
+
+    Raises UserError for runs that cannot be compared, one without the baseline or with no other condition, or
+    pilots of fewer than two layouts of a kind.
+    """
+    sides = _difference(*pilots) if len(pilots) > 1 else _gains(pilots[0])
+    success, n = sides.success, sides.success.dangerous.size
+    counts = success.resampled(noise.generator("plan"), RESAMPLES)
+    rows = []
+    for condition, (a, b) in sides.values.items():
+        spread = success.spread(a, b, counts)
+        needed = spread.episodes(detect, power)
+        if np.isinf(needed[0]):
+            kinds = " with a danger, and without" * (success.metric != SUCCESS)
+            raise UserError(
+                f"{sides.names}: {n} layouts do not show how far layouts differ; give pilots of two or more"
+                f"{kinds}"
+            )
+        finds = float(spread.difference(layouts or n, power)[0])
+        cost = sides.cost.times(needed[0])
+        rows.append(Planned(condition, resampled_estimate(needed, n), finds, cost))
+    seeds = len(next(iter(sides.values.values()))[0])
+    basis = f"layouts differ as in the pilots, {n} layouts × {seeds} seeds"
+    return Plan(f"{success.words}, {sides.whose}", basis, tuple(rows), layouts or n)
+
+
+@dataclass(frozen=True)
+class _Sides:
+    names: str  # the pilots, for an error
+    whose: str  # difference it is, in words
+    success: Success
+    values: dict[str, tuple[Floats, Floats]]  # successes (S, E) of both sides by condition
+    cost: Cost  # of one layout
+
+
+def _gains(path: Path) -> _Sides:
+    run = read(path)
+    if BASELINE not in run.conditions or len(run.conditions) < 2:
+        raise UserError(
+            f"{printable(path)} has not both {BASELINE} and another condition, so that it shows no gain; "
+            "give a second run, of another model or prompt, or a run with both"
+        )
+    by_condition = dict(zip(run.conditions, of_ends(METRICS[SUCCESS], run.grid, run.episodes), strict=True))
+    alone = by_condition.pop(BASELINE)
+    success = Success.of(run.episodes[: len(run.grid.episodes)], lead_of(run))
+    values = {name: (alone, b) for name, b in by_condition.items()}
+    return _Sides(printable(path), f"gain over {BASELINE}", success, values, _cost([run]))
+
+
+def _difference(a: Path, b: Path) -> _Sides:
+    both = pair(a, b)
+    first = both.conditions[0], both.seeds[0]
+    success = Success.of([both.a.ends[*first, e] for e in both.episodes], lead_of(both.a.run, both.b.run))
+    values = {
+        name: (both.values(both.a, SUCCESS, name).T, both.values(both.b, SUCCESS, name).T)
+        for name in both.conditions
+    }
+    cost = _cost([both.a.run, both.b.run])
+    return _Sides(f"{printable(a)} and {printable(b)}", "B - A", success, values, cost)
+
+
+def _cost(runs: Sequence[Run]) -> Cost:
+    """Return what the answers of one layout take, in all of the runs."""
+    costs = list(map(_cost_of, runs))
+    return Cost(
+        sum(each.requests for each in costs), _sum(each.tokens for each in costs),
+        _sum(each.minutes for each in costs),
+    )  # fmt: skip
+
+
+def _cost_of(run: Run) -> Cost:
+    answers, layouts = list(run.answers), len(run.grid.episodes)
+    timed = [answer.seconds for answer in answers if answer.seconds is not None]
+    minutes = float(np.mean(timed)) * len(answers) / 60 / layouts if timed else None
+    tokens = _sum(_tokens(answer) for answer in answers)
+    return Cost(len(answers) / layouts, tokens and tokens / layouts, minutes)
+
+
+def _tokens(answer: Answer) -> float | None:
+    return _sum((answer.prompt_tokens, answer.completion_tokens))
+
+
+def _sum(values: Iterable[float | None]) -> float | None:
+    stated = list(values)
+    return None if None in stated else float(sum(value for value in stated if value is not None))
+
+
+def as_mapping(plan: Plan, detect: float, power: float) -> dict[str, object]:
+    """Return a plan as plain values: differences from 0 to 1, what is not known as None."""
+    return {
+        "difference": plan.difference, "basis": plan.basis, "detect": detect, "power": power,
+        "finds_with": plan.layouts,
+        "conditions": [
+            {
+                "condition": row.condition or None, "layouts": row.layouts, "finds": known(row.finds),
+                **(vars(row.cost) if row.cost else dict.fromkeys(("requests", "tokens", "minutes"))),
+            }
+            for row in plan.rows
+        ],
+    }  # fmt: skip
