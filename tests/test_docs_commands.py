@@ -74,6 +74,8 @@ CUT_ENDS = {
     # Two episodes pass the gates that 240 fail.
     "harness compare reports/a reports/b"
     " --fail-if '6g:success_rate < -0.01' --fail-if '6g:unsafe_rate > 0.01'": 0,
+    # Of two episodes, each is the only one of its kind.
+    "harness plan reports/v2 reports/v4 --detect 5": 2,
     # The model that ships has 768 tokens; the page counts those of a Qwen.
     CHECKED: 1,
 }
