@@ -199,10 +199,10 @@ def test_what_a_run_lacks_has_an_entry(run: str) -> None:
     with (HERE / run / "episodes.csv").open() as file:
         head = next(csv.reader(file))
     condition = {*OperatingPoint.types()}
-    # Letters are a setting of the agent, and an adapter is stated where there is one.
-    card = {field.name for field in fields(Card)} - {"letters", "adapter"}
+    # Letters are a setting of the agent; an adapter, a price and a cost are stated where there is one.
+    card = {field.name for field in fields(Card)} - {"letters", "adapter", "price"}
     lacks = {
-        "SETTINGS": set(records.Manifest.__struct_fields__) - {*stated, *formats.AGENT},
+        "SETTINGS": set(records.Manifest.__struct_fields__) - {*stated, *formats.AGENT, "cost"},
         "AGENT": set(formats.AGENT) - {*stated},
         "MODEL": card - {*stated["model"]},
         "CONDITION": set.union(*(condition - {*point} for point in stated["conditions"])),

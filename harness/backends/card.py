@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from harness.backends.base import Letters
+from harness.backends.price import Price
 from harness.backends.registry import ENGINES
 from harness.backends.servers import Server
 from harness.backends.vision import Vision
@@ -25,10 +26,10 @@ Share = Annotated[float, Meta(ge=0, le=1, description="a share, 0 to 1")]
 
 # Keys that only some engines understand; a `Registration` says which.
 _ENGINE_KEYS = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation",
-                "failures", "privileged", "vision", "projector", "system", "adapter")  # fmt: skip
+                "failures", "privileged", "vision", "projector", "system", "adapter", "price")  # fmt: skip
 # Keys that a model may set again for each further engine.
 _PER_ENGINE = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
-               "server", "projector", "adapter")  # fmt: skip
+               "server", "projector", "adapter", "price")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,7 @@ class Card:
     # `raw` for a model that was trained on one order of the letters; None, or `cyclic`, averages a read-out
     # over their orders, unless `--letters` says otherwise.
     letters: Letters | None = None
+    price: Price | None = None  # what its tokens cost; None if it costs nothing, or nobody says
 
     @property
     def shown(self) -> str:
@@ -125,8 +127,9 @@ class Card:
         """Return the card as plain values, from which `convert` makes it again."""
         record = asdict(self)
         del record["letters"]  # the agent's settings say how its letters are read
-        if self.adapter is None:
-            del record["adapter"]
+        for name in ("adapter", "price"):
+            if record[name] is None:
+                del record[name]
         if self.server:
             server = {key: value for key, value in record["server"].items() if value is not None}
             if self.server.fields:
@@ -181,7 +184,7 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
     for key in _ENGINE_KEYS:
         lacking = key in engine.required_keys and key not in table
         if lacking or (key in table and key not in engine.allowed_keys):
-            shown = f"[{key}]" if key in ("server", "failures", "vision") else key
+            shown = f"[{key}]" if key in ("server", "failures", "vision", "price") else key
             takers = " or ".join(_engines_with(key))
             raise UserError(f"{where}: {shown} goes with engine = {takers}, and only with it")
     if "projector" in engine.allowed_keys and bool(card.vision) != bool(card.projector):

@@ -31,7 +31,7 @@ _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
 _SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
 # Keys that decide no answer, or whose effect is in the identity of the opened model.
 _PLACE = ("description", "latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
-          "licence", "projector", "letters", "adapter")  # fmt: skip
+          "licence", "projector", "letters", "adapter", "price")  # fmt: skip
 _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 
 

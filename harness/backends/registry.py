@@ -97,14 +97,14 @@ BUILT_IN: Mapping[str, Registration] = {
     "openai": Registration(
         "harness.backends.openai.backend:open",
         Capabilities(thinks="card", samples=True),
-        card_keys=("vision", "system"),
+        card_keys=("vision", "system", "price"),
         required_keys=("weights", "server"),
     ),
     **{
         wire: Registration(
             f"harness.backends.decisions.wires:open_{wire}",
             _DECIDES,
-            card_keys=("vision",),
+            card_keys=("vision", "price"),
             required_keys=("weights", "server"),
         )
         for wire in ("systemone", "decisions")

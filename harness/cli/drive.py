@@ -1,6 +1,7 @@
 """`harness drive`: a model with a prompt drives in the simulator."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -49,6 +50,7 @@ def command(
         rich_help_panel=OUTPUT,
     ),
     no_cache: options.NoCache = False,
+    max_cost: options.MaxCost = None,
     full: options.FullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
@@ -58,7 +60,7 @@ def command(
     If the run is stopped, the same command continues it.
     """
     from harness.backends.cache import default_file
-    from harness.evaluate import resolve
+    from harness.evaluate import costs, resolve
     from harness.evaluate.run import evaluate_shard
     from harness.world.scenarios import DEFAULT
 
@@ -80,20 +82,26 @@ def command(
     driven = len(source.numbers)
     in_range("--save-video", save_video, 0, driven)
     spec = resolve.spec(settings, source)
+    if max_cost is not None and not isinstance(who, int):
+        raise UserError(
+            f"--max-cost {max_cost:g}: the processes of a cluster do not add up what they spend; leave it out"
+        )
     silent = as_json or quiet
-    if part and out:
-        with bar(f"driving {printable(spec.ego.card.name, 30)}", quiet=silent) as progress:
-            mine = evaluate_shard(spec, out, part, progress, who)
-        if not silent:
-            options.say_shard(part, out, f"{mine} of {driven} episodes")
-        return
-    where = out or default_out(spec)
-    videos: list[Path] = []
+    with costs.budget(max_cost, [spec]) as limit:
+        spec = replace(spec, budget=limit)
+        if part and out:
+            with bar(f"driving {printable(spec.ego.card.name, 30)}", quiet=silent) as progress:
+                mine = evaluate_shard(spec, out, part, progress, who)
+            if not silent:
+                options.say_shard(part, out, f"{mine} of {driven} episodes")
+            return
+        where = out or default_out(spec)
+        videos: list[Path] = []
 
-    done, page = evaluate(
-        spec, where, cache=None if no_cache else default_file(), quiet=silent, workers=who, full=full,
-        then=lambda: videos.extend(write_failures(where, save_video, silent) if save_video else ()),
-    )  # fmt: skip
+        done, page = evaluate(
+            spec, where, cache=None if no_cache else default_file(), quiet=silent, workers=who, full=full,
+            then=lambda: videos.extend(write_failures(where, save_video, silent) if save_video else ()),
+        )  # fmt: skip
     tell(done, as_json, quiet)
     if silent:
         return

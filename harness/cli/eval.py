@@ -1,6 +1,7 @@
 """`harness eval`: a model with a prompt on a dataset."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ import typer
 
 from harness.cli import options, repeats, suite
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show
-from harness.cli.terminal import echo_json, echo_prompt_tokens
+from harness.cli.terminal import echo_cost, echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
 from harness.core.seeds import stated
 from harness.evaluate.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
@@ -47,6 +48,7 @@ def command(
         None, help="Folder to write the run to. Default: reports/<model>-<prompt>-<dataset>."
     ),
     no_cache: options.NoCache = False,
+    max_cost: options.MaxCost = None,
     dry_run: bool = typer.Option(
         False,
         "--dry-run",
@@ -64,7 +66,7 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.dataset import suites
-    from harness.evaluate import resolve
+    from harness.evaluate import costs, resolve
 
     world: Any = settings.world
     named = suites.named(world.dataset)
@@ -97,16 +99,18 @@ def command(
         return
     if workers is not None:
         _refuse_language_models(specs, workers)
-    silent, cache = as_json or quiet, None if no_cache else default_file()
-    who = options.workers_of(workers or "2")
-    evaluated = partial(evaluate, cache=cache, quiet=silent, workers=who, full=full)
-    if repeat is not None:
-        repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
-        return
-    if named:
-        suite.evaluate(named, specs, frozen, out, evaluated, quiet, as_json)
-        return
-    done, page = evaluated(specs[0], out or default_out(specs[0]))
+    with costs.budget(max_cost, specs) as limit:
+        specs = [replace(spec, budget=limit) for spec in specs]
+        silent, cache = as_json or quiet, None if no_cache else default_file()
+        who = options.workers_of(workers or "2")
+        evaluated = partial(evaluate, cache=cache, quiet=silent, workers=who, full=full)
+        if repeat is not None:
+            repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
+            return
+        if named:
+            suite.evaluate(named, specs, frozen, out, evaluated, quiet, as_json)
+            return
+        done, page = evaluated(specs[0], out or default_out(specs[0]))
     if as_json:
         echo_json(as_mapping(done))
     if silent:
@@ -153,3 +157,4 @@ def _show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
         "channel seeds; no model was called"
     )
     echo_prompt_tokens(counted["prompt_tokens"])
+    echo_cost(counted.get("cost", {}), counted.get("repeats", 1))

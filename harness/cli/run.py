@@ -265,6 +265,12 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: st
         low, half, high = (f"{1000 * s:.1f}" for s in (took.p5_s, took.median_s, took.p95_s))
         took_ms = f"{half} ms (5-95 %: {low} to {high}, n = {took.n})"
         yield f"{role_word(role)} answers took {took_ms}; not used as latency"
+    for model, cost in (m.cost or {}).items():
+        left_out = f", {cost.uncounted} of which are not in it" if cost.uncounted else ""
+        yield (
+            f"cost: {cost.amount:.4g} {printable(cost.currency)} for {cost.asked} questions to "
+            f"{printable(model, 40)}{left_out}"
+        )
     if m.cached_answers:
         yield f"{m.cached_answers} answers came from the cache (--no-cache asks the model again)"
     if m.engine_errors:

@@ -39,6 +39,17 @@ def echo_prompt_tokens(counted: Mapping[str, Mapping[str, Any]] | None) -> None:
         typer.echo("prompt tokens not counted: no tokenizer here; give --tokenizer (tokenizer.json or GGUF)")
 
 
+def echo_cost(counted: Mapping[str, Mapping[str, Any]], times: int) -> None:
+    """Print what a dry run says that so many repeats would cost, by model."""
+    for model, each in counted.items():
+        prompts = each["prompts"]
+        read = "prompts not counted" if prompts is None else f"{times * prompts:.4g} for prompts"
+        typer.echo(
+            f"cost of {printable(model, 40)}, {each['currency']}: {read}, {times * each['answers']:.4g} for "
+            "answers of the greatest length"
+        )
+
+
 def echo_each(
     things: Mapping[str, Thing | UserError], as_json: bool, plain: Callable[[Thing], dict[str, Any]],
     show: Callable[[str, Thing], None],

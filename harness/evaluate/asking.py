@@ -423,12 +423,21 @@ def _answer_chunks(
     """Yield the answers of each chunk as they come, by request id.
 
     Up to `calls` chunks are asked at the same time, so that no chunk waits for the last answer of another.
+    Raises Unanswered if nothing more may be asked, once what was asked already has come.
     """
     if calls == 1 or len(chunks) == 1:
         yield from map(work, chunks)
         return
+    refused: Unanswered | None = None
     with ThreadPool(min(calls, len(chunks))) as pool:  # its threads end with the program
-        yield from pool.imap_unordered(work, chunks)
+        coming = pool.imap_unordered(work, chunks)
+        for _ in chunks:
+            try:
+                yield next(coming)
+            except Unanswered as error:
+                refused = error
+    if refused:
+        raise refused
 
 
 def _heard_sets(

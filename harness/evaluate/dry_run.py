@@ -18,9 +18,11 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     """Return the settings, how many requests would be asked about the scenes, and the tokens of prompts.
 
     Who asks a helper depends on answers: unless all are asked, helpers are asked as often at most. So are
-    fusion calls, of which there is one for each set of helpers that may be heard.
+    fusion calls, of which there is one for each set of helpers that may be heard. `cost` has, by model with a
+    price, what the prompts cost, if their tokens can be counted, and answers of the greatest length; fusion
+    calls and repair turns are not in it.
     """
-    tokens_of = counter(tokenizer, spec.ego.card)
+    tokens_of, costs = counter(tokenizer, spec.ego.card), dict[str, dict[str, Any]]()
     sizes: dict[str, list[int]] = {}
     asked, scenes = Counter[str](), dataset.scenes(dataset.courses())
     intents = [point for point in spec.points if point.asks and point.content.asks_helpers]
@@ -29,16 +31,24 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     own = requests(spec, scenes, places=None if sighted else [EGO] * len(scenes))
     for request in chain(own, requests(spec, scenes, blind=True) if blind else ()):
         asked[request.role] += 1
+        card, tokens = spec.agents[request.agent].card, None
         if tokens_of:
-            vision = spec.agents[request.agent].card.vision if request.image else None
+            vision = card.vision if request.image else None
             tokens = tokens_of(request.messages) + (vision.tokens if vision else 0)
             sizes.setdefault(request.role, []).append(tokens)
+        if card.price:
+            times = 1 + len(request.orders) + len(request.flips)
+            of = costs.setdefault(
+                card.name, {"currency": card.price.currency, "prompts": 0.0, "answers": 0.0}
+            )
+            of["prompts"] = None if tokens is None else of["prompts"] + card.price.of(times * tokens, 0)
+            of["answers"] += card.price.of(0, times * request.max_tokens)
     if calls := sum(1 for scene in scenes for _ in _fusion_calls(spec, scene)):
         asked["fusion"] = calls
     stats = {role: summarize_counts(n) for role, n in sizes.items()}
     return {
         **spec.settings(), "requests": asked.total(), "requests_by_role": dict(asked),
-        "scenes": len(scenes), "prompt_tokens": stats or None,
+        "scenes": len(scenes), "prompt_tokens": stats or None, **({"cost": costs} if costs else {}),
     }  # fmt: skip
 
 

@@ -27,7 +27,7 @@ from harness.core.progress import Progress
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
-from harness.evaluate import device, servers, timing
+from harness.evaluate import costs, device, servers, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
@@ -208,7 +208,7 @@ def _frozen(
     begun = begin(spec, out, begun, identity, latency)
     chunks = _split(dataset.episodes, TREES_AT_ONCE)
     with work.working(out, begun, "run.json") as place:
-        backend = together(spec.cards, models, cache)
+        backend = together(spec.cards, costs.metered(spec.cards, models, place, spec.budget), cache)
         in_workers = len(chunks) > 1 and workers != 1 and _reproducible(spec) and not given
 
         def walk_here(chunk: Sequence[int]) -> dict[str, bytes]:
@@ -344,7 +344,8 @@ def _walk_chunk(
     kept = place and _answered_file(place, chunk)
 
     def backend() -> Backend:
-        combined = together(spec.cards, _open_all(spec), cache)
+        models = costs.metered(spec.cards, _open_all(spec), place, spec.budget)
+        combined = together(spec.cards, models, cache)
         if not same_model(begun.identity, combined.identity()):
             raise UserError(
                 f"a worker opens {another_model(spec)} than this run began with; give it the same"
@@ -374,6 +375,7 @@ def _gather(
     merged from.
     """
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
+    works = [place, *(shard / WORK for shard in folders)]
     names = tuple(condition["name"] for condition in settings["conditions"])
 
     def scored(chunk: Sequence[int], part: Path) -> tuple[list[Episode], Figures]:
@@ -403,11 +405,12 @@ def _gather(
             "engine_errors": sum(answer.error is not None for answer in answers),
             "retries": sum(answer.retries for answer in answers),
             "versions": begun.versions,
+            **({"cost": msgspec.to_builtins(cost)} if (cost := costs.total(settings, works)) else {}),
         }, Manifest)  # fmt: skip
         kept_sources.write(out, made_of, place)
         with suppress(UserError):  # a stranger's shard may state any command
             write_whole(out / FILE, text_of(of_words(begun.command)))
-        servers.write(out, [place, *(shard / WORK for shard in folders)])
+        servers.write(out, works)
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
         folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)

@@ -19,6 +19,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import sha256_file
 from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
+from harness.evaluate.costs import Budget
 from harness.evaluate.device import rows_of
 from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.evaluate.settings import DriveSettings, FrozenSettings, HelperSettings, Settings
@@ -105,6 +106,7 @@ class Spec:
     # which gives the same decisions
     ask: str = ASKS[0]
     ties: str = TIES[0]  # which of several likeliest actions is taken: one that is `drawn`, or the `first`
+    budget: Budget | None = None  # what may be spent on answers; it changes nothing in the run
 
     def __post_init__(self) -> None:
         if all(agent == self.ego for agent in self.helpers):

@@ -385,6 +385,17 @@ _CONDITION = defstruct(
 )
 
 
+class Cost(Struct, frozen=True):
+    """What a run's questions to one model cost, by the price that its card states."""
+
+    currency: str
+    amount: float
+    asked: int
+    uncounted: int  # of these, so many are not in the amount: nobody said how many tokens they had
+    read_tokens: int
+    written_tokens: int
+
+
 class Manifest(Struct, frozen=True, kw_only=True):
     """A run's settings and origin: `run.json`. `docs/files.md` has the meaning of each name."""
 
@@ -425,6 +436,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     cached_answers: int
     engine_errors: int
     retries: int = 0
+    cost: dict[str, Cost] | UnsetType = UNSET
     versions: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

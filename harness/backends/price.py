@@ -1,0 +1,23 @@
+"""The `[price]` table of a card: what a served model's tokens cost."""
+
+from dataclasses import dataclass
+from sys import float_info
+from typing import Annotated
+
+from msgspec import Meta
+
+_Amount = Annotated[float, Meta(ge=0, le=float_info.max, description="0 or more")]
+MILLION = 1e6
+
+
+@dataclass(frozen=True)
+class Price:
+    """What a million tokens cost, as its maker's price list says."""
+
+    input: _Amount  # of those that the model reads
+    output: _Amount  # of those that it writes, thoughts included
+    currency: Annotated[str, Meta(pattern=r"^[A-Z]{3}\Z", description="three capitals, such as USD")]
+
+    def of(self, read: float, written: float) -> float:
+        """Return what so many tokens cost."""
+        return (read * self.input + written * self.output) / MILLION

@@ -1,0 +1,157 @@
+"""What a run's questions cost, by the price in a card; and the most that a command may spend.
+
+Every completion that a model with a price is asked for counts, whatever becomes of it; one from the cache
+costs nothing. Each part of a run appends to a file in the working folder, so that a stopped run goes on
+counting.
+"""
+
+import math
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from harness.backends.base import Backend, Completion, Request
+from harness.backends.card import Card
+from harness.backends.price import Price
+from harness.core.errors import Unanswered, UserError, printable
+from harness.core.files import bytes_of
+from harness.runs.records import Cost
+
+if TYPE_CHECKING:
+    from harness.evaluate.spec import Spec
+
+FILE = "costs.jsonl"
+
+
+class Asked(msgspec.Struct, frozen=True):
+    """Some completions that a model was asked for together."""
+
+    model: str
+    asked: int
+    uncounted: int  # of these, so many whose tokens nobody says: failed ones, as a rule
+    read: int  # tokens of the others' prompts
+    written: int  # tokens of their answers
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The most that one command may spend, whose processes add up what they spent in a file."""
+
+    most: float
+    currency: str
+    file: Path
+
+    def spend(self, amount: float) -> None:
+        with self.file.open("a") as file:
+            file.write(f"{amount!r}\n")
+
+    def check(self) -> None:
+        """Raise Unanswered if it is spent."""
+        spent = math.fsum(map(float, self.file.read_text().split()))
+        if spent >= self.most:
+            raise Unanswered(
+                f"{spent:.4g} {self.currency} of --max-cost {self.most:g} are spent; all answers are kept, "
+                "and the same command goes on, and may spend as much again"
+            )
+
+
+@contextmanager
+def budget(most: float | None, specs: "Sequence[Spec]") -> Iterator[Budget | None]:
+    """Give the evaluations of a command what they may spend together; None for as much as they like.
+
+    Raises UserError if it is not above 0, or the models' cards state no price, or several currencies.
+    """
+    if most is None:
+        yield None
+        return
+    shown = f"--max-cost {most:g}"
+    if not (math.isfinite(most) and most > 0):
+        raise UserError(f"{shown}: give an amount above 0, in the currency of the card's [price]")
+    prices = {card.price for spec in specs for card in spec.cards if card.price}
+    if len(currencies := {price.currency for price in prices}) != 1:
+        names = ", ".join(sorted({printable(card.name) for spec in specs for card in spec.cards}))
+        reason = f"has prices in {' and '.join(sorted(currencies))}" if prices else "has no price"
+        raise UserError(f"{shown}: {names} {reason}; give its card a [price] with input, output and currency")
+    with tempfile.TemporaryDirectory(prefix="swarmdrive-") as folder:
+        file = Path(folder) / "spent"
+        file.touch()
+        yield Budget(most, currencies.pop(), file)
+
+
+def metered(
+    cards: Sequence[Card], backends: Sequence[Backend], work: Path | None, limit: Budget | None
+) -> list[Backend]:
+    """Put a meter before each backend whose card has a price.
+
+    It counts into a file of the working folder `work`; None counts for the limit alone.
+    """
+    return [
+        backend if card.price is None else Metered(backend, card.name, card.price, work, limit)
+        for card, backend in zip(cards, backends, strict=True)
+    ]
+
+
+class Metered:
+    """A backend whose completions are counted; it is like the backend in all else.
+
+    `complete` raises Unanswered, before it asks, if the budget is spent.
+    """
+
+    def __init__(
+        self, backend: Backend, model: str, price: Price, work: Path | None, limit: Budget | None
+    ) -> None:
+        self._backend, self._model, self._price = backend, model, price
+        self._work, self._limit = work, limit
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._backend, name)
+
+    def identity(self) -> dict[str, Any]:
+        return self._backend.identity()
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        if self._limit:
+            self._limit.check()
+        completions = self._backend.complete(requests)
+        counted = [
+            (each.prompt_tokens, each.completion_tokens) for each in completions
+            if each.prompt_tokens is not None and each.completion_tokens is not None
+        ]  # fmt: skip
+        read, written = (sum(n) for n in zip(*counted, strict=True)) if counted else (0, 0)
+        uncounted = len(completions) - len(counted)
+        if self._work:
+            with (self._work / FILE).open("ab") as file:
+                file.write(
+                    msgspec.json.encode(Asked(self._model, len(completions), uncounted, read, written))
+                    + b"\n"
+                )
+        if self._limit:
+            self._limit.spend(self._price.of(read, written))
+        return completions
+
+
+def total(settings: Mapping[str, Any], works: Iterable[Path]) -> dict[str, Cost]:
+    """Return what the working folders' questions cost, by model; none without a price or a question."""
+    prices = {}
+    for model in (settings["model"], *(helper["model"] for helper in settings["helpers"])):
+        if price := model.get("price"):
+            prices[model["name"]] = msgspec.convert(price, Price)
+    sums: dict[str, Counter[str]] = {}
+    for work in works:
+        for line in bytes_of(work / FILE, "rows").splitlines() if (work / FILE).is_file() else ():
+            with suppress(msgspec.MsgspecError):  # torn, if the run was killed
+                asked = msgspec.structs.asdict(msgspec.json.decode(line, type=Asked))
+                sums.setdefault(asked.pop("model"), Counter()).update(asked)
+    return {
+        name: Cost(
+            prices[name].currency, round(prices[name].of(n["read"], n["written"]), 9),
+            n["asked"], n["uncounted"], n["read"], n["written"],
+        )
+        for name, n in sums.items() if name in prices
+    }  # fmt: skip
