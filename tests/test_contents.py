@@ -501,7 +501,10 @@ def test_a_stranger_who_names_two_attacks_at_once_gets_both(small: Dataset, prox
     ("text", "wrong"),
     [
         ("6g:content=word", "unknown content 'word'"),
-        ("6g:content=objects,consensus=ego-prompt", "content is 'objects'; it must be intent, text or both"),
+        (
+            "6g:content=objects,consensus=ego-prompt",
+            "it must be intent, text, both or plan where",
+        ),
         ("6g:content=objects,attack=liar", "some of ghost, hide, shift and absent"),
         ("6g:attack=ghost", "one on intents where content lists no objects"),
         ("6g:content=oracle,attack=hide", "one on intents where content lists no objects"),

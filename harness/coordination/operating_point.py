@@ -125,17 +125,18 @@ class OperatingPoint:
                 raise wrong("defence", self.guard.defence, f"left out where consensus is not {EGO_PROMPT}")
             return
         where = f"where consensus is {EGO_PROMPT}"
-        if not self.content.asks_helpers:
-            allowed = f"intent, text or both {where}, which reads the helpers' words"
+        if not (self.content.asks_helpers or self.content.plan):
+            allowed = f"intent, text, both or {PLAN} {where}, which reads the helpers' words"
             raise wrong("content", self.ask.content, allowed)
         if self.radio.edge == FUSION:
             raise wrong("edge", FUSION, f"none or relay {where}: a unit has no model")
 
     def _check_plans(self, holds: str) -> None:
         """Raise ValueError for a rule that does not fit the content, and for what plans go without."""
-        if reads_plans(self.fusion.consensus) != self.content.plan:
+        asks_again = self.content.plan and self.fusion.consensus == EGO_PROMPT
+        if reads_plans(self.fusion.consensus) != self.content.plan and not asks_again:
             if self.content.plan:
-                able = ", ".join(name for name in names() if reads_plans(name))
+                able = ", ".join(name for name in names() if reads_plans(name) or name == EGO_PROMPT)
                 raise wrong("consensus", self.fusion.consensus, f"one of {able} where {holds}")
             raise wrong("content", self.ask.content, f"{PLAN} where consensus is {self.fusion.consensus}")
         if not self.content.plan:
@@ -150,6 +151,9 @@ class OperatingPoint:
             raise wrong("on_demand", True, f"false where {holds}: an agent plans in any case")
         if self.radio.edge == FUSION:
             raise wrong("edge", FUSION, f"none or relay where {holds}: a unit has no plan")
+        if self.guard.defence:
+            allowed = f"left out where {holds}, which is no advice and has no words"
+            raise wrong("defence", self.guard.defence, allowed)
 
     @classmethod
     def of(cls, name: str, profile: str | None = None, **settings: Any) -> "OperatingPoint":

@@ -127,13 +127,16 @@ class Agent:
             reasons_first=role in self.prompt.reasons_first,
         )  # fmt: skip
 
-    def chats(self, graph: SceneGraph, actions: tuple[str, ...], words: Mapping[str, str]) -> dict[str, Any]:
-        """Return the chat about a scene graph in the agent's answer mode, as fields of a request.
+    def chats(
+        self, graph: SceneGraph, actions: tuple[str, ...], words: Mapping[str, str],
+        heard: Sequence[Mapping[str, Any]] = (),
+    ) -> dict[str, Any]:  # fmt: skip
+        """Return the chat about a scene graph and what was heard in the agent's answer mode, for a request.
 
         They are the `messages`, those of the further `orders` and the `flips` of a read-out's letters, and
         the `question` of a decision.
         """
-        rendered = self.rendered(graph, actions, (), words)
+        rendered = self.rendered(graph, actions, heard, words)
         if self.answer != "decision":
             return self.in_orders(
                 actions, lambda order: in_mode(self.answer, self.prompt, rendered, graph, order, words)

@@ -14,14 +14,15 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from harness.backends.base import Backend, Completion, Request, Role, Served, served, window
+from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
-from harness.core.arrays import Bools, Ints
+from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import Unanswered
 from harness.core.files import canonical_bytes, sha256_bytes
 from harness.dataset.load import Scene
 from harness.evaluate import flip, repair, servers
-from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of, source_of
+from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of, plan_keys, source_of
 from harness.evaluate.kept_answers import KeptAnswers
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
@@ -105,12 +106,10 @@ def fusion_request(
     image = picture(spec, index, scene, scene.viewers[0])
     blank = _blank(spec, index, "ego").alike(id=fusion_id(scene, senders), image=image)
     if graph is None:
-        return blank.alike(messages=agent.rendered(own, spec.actions, heard, words))
+        return blank.alike(**agent.chats(own, spec.actions, words, heard))
     truth = truth_graph(scenario, scene.state) if agent.card.privileged else None
     blank = blank.alike(view=graph, truth=truth, scenario=scenario)
-    if heard:
-        return blank.alike(messages=agent.rendered(graph, spec.actions, heard, words))
-    return blank.alike(**agent.chats(graph, spec.actions, words))
+    return blank.alike(**agent.chats(graph, spec.actions, words, heard))
 
 
 def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
@@ -388,11 +387,30 @@ class Asker:
         ids = [fusion_id(*each) for each in sets]
         if not self.answers.keys() >= set(ids):
             self.answer(self.fusion_requests(scenes, codes, rewrites))
+        return FusionAnswers(codes, *self._after([scene for scene, _ in sets], ids)).at
+
+    def _after(self, scenes: Sequence[Scene], ids: Sequence[str]) -> tuple[Floats, Floats]:
+        """Return the intents (K, A) after the fusion calls of these ids in scenes, and their seconds (K,)."""
         answers = [self.answers[name] for name in ids]
-        models = [self._models(scene, 1)[0] for scene, _ in sets]
+        models = [self._models(scene, 1)[0] for scene in scenes]
         unknown = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or unknown for a in answers]).reshape(len(ids), len(unknown))
-        return FusionAnswers(codes, intents, fusion_s(self.latency, answers, models)).at
+        return intents, fusion_s(self.latency, answers, models)
+
+    def plan_call(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
+        return partial(self._of_plans, [scenes[n] for n in at.tolist()], intents)
+
+    def _of_plans(self, scenes: Sequence[Scene], intents: Intents, on_time: Bools) -> tuple[Floats, Floats]:
+        """Ask those who have heard plans, (n, H); return their intents and seconds, NaN for the others."""
+        after, seconds = np.full(intents.own.shape, np.nan), np.full(len(scenes), np.nan)
+        rows = np.flatnonzero(on_time.any(axis=1)).tolist()
+        sets = [(scenes[n], plan_keys(scenes[n].viewers[1:], intents, n, on_time[n])) for n in rows]
+        by_id = {fusion_id(*each): each for each in sets}
+        if not self.answers.keys() >= by_id.keys():
+            self.answer([fusion_request(self.spec, scene, {}, senders) for scene, senders in by_id.values()])
+        ids = [fusion_id(*each) for each in sets]
+        after[rows], seconds[rows] = self._after([scenes[n] for n in rows], ids)
+        return after, seconds
 
     def fusion_requests(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT

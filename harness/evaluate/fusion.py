@@ -1,7 +1,8 @@
 """Make fusion calls: the ego's model answers with the messages that arrived in its prompt.
 
 Who is heard depends on the channel and not on the fusion. So the sets of messages that any condition and seed
-hears are known before the first call, and each set needs one call.
+hears are known before the first call, and each set needs one call. What a plan says depends on the rounds
+before, so it stands in its sender's key, and equal plans are one question.
 """
 
 import json
@@ -13,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.attacks import Turn, attacks_of
-from harness.coordination.contents import OBJECTS, TEXT, TRUTH
+from harness.coordination.contents import OBJECTS, PLAN, TEXT, TRUTH
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import Rewrites
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import UserError, printable
 from harness.evaluate.repair import as_text
 from harness.runs.records import BLIND, REWRITTEN, Answer
 
@@ -83,6 +85,42 @@ def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> 
     return helper + BLIND * rewrites.blind + (REWRITTEN + "&".join(changed) if changed else "")
 
 
+def plan_keys(helpers: Sequence[str], intents: Intents, row: int, on_time: Bools) -> list[str]:
+    """Return the keys of the plans that an agent, the one of this row, has heard by `on_time`, (H,).
+
+    Such as `v2!plan:1:0.10,0.70,0.20:3.4:0.0`: its sender's number, its intent, and the seconds in which it
+    reaches the conflict, and that it has lost.
+    """
+    plans = intents.plans
+    assert plans is not None
+    keys = []
+    for h in np.flatnonzero(on_time).tolist():
+        intent = ",".join(f"{share:.2f}" for share in intents.helpers[row, h].tolist())
+        number, reaches_s, lost_s = (
+            each[row, 1 + h] for each in (plans.vehicle, plans.reaches_s, plans.lost_s)
+        )
+        keys.append(f"{helpers[h]}{REWRITTEN}{PLAN}:{number}:{intent}:{reaches_s:.1f}:{lost_s:.1f}")
+    return keys
+
+
+def _plan_of(key: str) -> dict[str, Any] | None:
+    """Return the plan of a sender's key as a prompt takes it; None for another message."""
+    sender, _, change = key.partition(REWRITTEN)
+    name, *parts = change.split(":")
+    if name != PLAN:
+        return None
+    try:
+        number, intent, reaches_s, lost_s = parts
+        return {
+            "sender": sender, "number": int(number), "intent": [float(share) for share in intent.split(",")],
+            "reaches_s": None if reaches_s == "inf" else float(reaches_s), "lost_s": float(lost_s),
+        }  # fmt: skip
+    except ValueError:
+        raise UserError(
+            f"answers.jsonl has an answer that heard {printable(key)!r}, which is no plan; make the run again"
+        ) from None
+
+
 def changes_of(key: str) -> list[str]:
     """Return how the message of a sender's key was changed, and what it holds if not an intent alone."""
     changes = key.partition(REWRITTEN)[2].split("&")
@@ -100,10 +138,14 @@ def messages_of(
 ) -> list[dict[str, Any]]:
     """Return these helpers' messages as a prompt takes them; `answers` are those of their scene, by key.
 
-    One that holds words alone has a `sender` and `evidence`, in one line.
+    One that holds words alone has a `sender` and `evidence`, in one line. An agent's plan has a `sender`, its
+    `number`, `intent`, `reaches_s` (None if it stands or has passed) and `lost_s`; it needs no answer.
     """
     messages = []
     for sender in senders:
+        if plan := _plan_of(sender):
+            messages.append(plan)
+            continue
         key, changes = sender.partition(REWRITTEN)[0], changes_of(sender)
         holds = {WORDS, TEXT, OBJECTS, TRUTH}.intersection(changes)
         if holds and holds.isdisjoint((WORDS, TEXT)):

@@ -3,7 +3,8 @@
 In seconds from the start of the decision: an agent that has decided by the window asks the same others once
 more. Each replies once it has decided itself, with its policy after the round before. What arrives in the
 window takes the place of the plan of the round before; who is not heard again is taken at its last word. The
-agent decides again by its own intent and by what it now knows.
+agent decides again by its own intent and by what it now knows. A fusion call delays what follows it, and who
+has heard nothing new makes no further one.
 """
 
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from harness.coordination.coordinate import Coordination
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
-from harness.core.arrays import count_of
+from harness.core.arrays import any_of, count_of
 from harness.evaluate.attackers import SentIntents
 from harness.radio.channel import Draws
 
@@ -38,10 +39,12 @@ def further_rounds(
         intents, draws = said.intents, said.draws
         assert intents.plans is not None
         senders = intents.plans.row
-        there, policy = senders >= 0, fused(heard, intents).fused
+        decided, there = fused(heard, intents), senders >= 0
+        policy = decided.fused
         # An attacker repeats what it said.
         newer = np.where(said.attackers[..., None], intents.helpers, policy[senders])
-        decided_s = heard.exchange_s
+        call_s = np.nan_to_num(decided.fusion_s)  # unknown where the inference is, which counts as 0
+        decided_s = heard.exchange_s + call_s
         helpers_s = np.where(there, decided_s[senders], np.nan)
         more = exchange(
             point,
@@ -52,7 +55,9 @@ def further_rounds(
         said = replace(
             said, intents=replace(intents, helpers=np.where(more.on_time[..., None], newer, intents.helpers))
         )
-        heard = _together(heard, more)
+        # The last decision's call ends the decision of whoever has heard nothing since.
+        repeated_s = np.where(any_of(more.on_time), 0.0, call_s)
+        heard = replace(_together(heard, more), exchange_s=more.exchange_s - repeated_s)
     return said, heard
 
 
@@ -65,7 +70,7 @@ def _of_round(draws: Draws, number: int) -> Draws:
 
 
 def _together(earlier: Exchange, later: Exchange) -> Exchange:
-    """Return the exchange of two rounds: what both cost, who was heard in either, and the later end."""
+    """Return the exchange of two rounds: what both cost, and who was heard in either."""
     return replace(
         earlier,
         requests=earlier.requests + later.requests,
@@ -75,6 +80,5 @@ def _together(earlier: Exchange, later: Exchange) -> Exchange:
         delivered=earlier.delivered | later.delivered,
         arrival_s=np.where(later.on_time, later.arrival_s, earlier.arrival_s),
         on_time=earlier.on_time | later.on_time,
-        exchange_s=later.exchange_s,
         repeats=earlier.repeats + count_of(later.asked),
     )

@@ -256,7 +256,7 @@ class Spec:
             )
         if not (point.has_fusion_call and point.rewrites.shows):
             return
-        reason = self.fusion_obstacle
+        reason = self._plan_obstacle if point.content.plan else self.fusion_obstacle
         if point.content.words and not ego.prompt.shows_words:
             version = ego.prompt.version
             reason = f"prompt {version} cannot show words without an intent; use --prompt v11 or v12"
@@ -302,6 +302,19 @@ class Spec:
                     f"prompt {version} fuses messages with a {form}, those of {prompt.version} have a "
                     f"{prompt.helper_answer}; use another --helper-prompt"
                 )
+        return None
+
+    @property
+    def _plan_obstacle(self) -> str | None:
+        """Why an agent cannot be asked again with the plans of others; None if all can."""
+        for agent in self.agents:
+            if not agent.can.language_model:
+                name = printable(agent.card.name)
+                return f"{name} is no language model and cannot read plans; use consensus=yield-by-time"
+            if not agent.prompt.shows_plans:
+                return f"prompt {agent.prompt.version} cannot show plans; use --prompt v13"
+        if self.device_profile:
+            return "no energy is known of answers to plans; leave --device-profile out"
         return None
 
     @property

@@ -4,7 +4,7 @@ There are three kinds of world: frozen scenes, the closed loop, and the calibrat
 They differ only in where their decision points come from and where an action leads.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Generic, Protocol, TypeVar
@@ -156,6 +156,10 @@ class Ask(Protocol[AskedPoint]):
         """Return the ego's answers to these sets of messages (`codes_of`), rewritten as `rewrites` says."""
         ...
 
+    def plan_call(self, points: Sequence[AskedPoint], /, at: Ints, intents: Intents) -> FusionCall:
+        """Return the call of agents, in the points `at` (n,), that hear the plans in `intents`, (n, ...)."""
+        ...
+
 
 def walk(
     world: World[DecisionPoint], points: Sequence[OperatingPoint], ask: Ask[DecisionPoint], ties: str
@@ -195,20 +199,20 @@ def walk(
         sent = {point: exchange(point, each.intents, each.draws) for point, each in broadcasts.items()}
         for point in (point for point in due if point.fusion.rounds > 1):
             fusion = FusionInputs(None, memories[point].recall(due[point]), tie_draws(due[point].draws, ties))
+            plan_call = partial(ask.plan_call, decision_points, due[point].at)
             broadcasts[point], sent[point] = further_rounds(
-                point, broadcasts[point], sent[point], partial(_decided, point, fusion)
+                point, broadcasts[point], sent[point], partial(_decided, point, fusion, plan_call)
             )
         calls = _fusion_calls(due, broadcasts, sent, decision_points, ask)
         decided = []
         for point, due_here in due.items():
-            broadcast = broadcasts[point]
-            call = (
-                calls[point.rewrites](
+            broadcast, call = broadcasts[point], None
+            if point.has_fusion_call and point.content.plan:
+                call = ask.plan_call(decision_points, due_here.at, broadcast.intents)
+            elif point.has_fusion_call:
+                call = calls[point.rewrites](
                     places_of(point, due_here, len(decision_points)), shown(point, broadcast)
                 )
-                if point.has_fusion_call
-                else None
-            )
             fusion = FusionInputs(call, memories[point].recall(due_here), tie_draws(due_here.draws, ties))
             result = fuse(point, sent[point], broadcast.intents, fusion)
             decided.append(Decided(point, decision_points, due_here, result, broadcast))
@@ -218,8 +222,12 @@ def walk(
         world.step(decided)
 
 
-def _decided(point: OperatingPoint, fusion: FusionInputs, heard: Exchange, intents: Intents) -> Coordination:
-    return fuse(point, heard, intents, fusion)
+def _decided(
+    point: OperatingPoint, fusion: FusionInputs, plan_call: Callable[[Intents], FusionCall],
+    heard: Exchange, intents: Intents,
+) -> Coordination:  # fmt: skip
+    call = plan_call(intents) if point.has_fusion_call else None
+    return fuse(point, heard, intents, replace(fusion, call=call))
 
 
 def _asked(
@@ -338,9 +346,11 @@ def _fusion_calls(
 ) -> dict[Rewrites, Fuses]:  # fmt: skip
     """Make one fusion call for each set of messages that any condition hears, and return them by rewrites.
 
-    This can happen before any decision, since who is heard does not depend on the fusion.
+    This can happen before any decision, since who is heard does not depend on the fusion. Plans are left out:
+    they may be of a later round.
     """
     calls = {}
+    due = {point: due_here for point, due_here in due.items() if not point.content.plan}
     for rewrites in dict.fromkeys(point.rewrites for point in due if point.has_fusion_call):
         alike = {point: due_here for point, due_here in due.items() if point.rewrites == rewrites}
         codes = heard_codes(alike, broadcasts, sent, len(decision_points))

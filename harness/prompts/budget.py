@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from harness.dataset.load import Dataset, Scene
-from harness.prompts.densest import densest_messages, densest_repair
+from harness.prompts.densest import densest_messages, densest_plans, densest_repair
 from harness.prompts.versions import ROLES, Prompt
 
 FUSION = "fusion"  # the ego's call with messages
@@ -61,8 +61,10 @@ def measure(
         ego, *helpers = scene.viewers
         for viewer in scene.viewers:
             render(scene, viewer)
-        dense = densest_messages(helpers, data.actions)
-        for n in range(1, len(dense) + 1):
-            render(scene, ego, dense[:n])
+        dense = [densest_messages(helpers, data.actions)]
+        dense += [densest_plans(helpers, data.actions)] if prompt.shows_plans else []
+        for messages in dense:
+            for n in range(1, len(messages) + 1):
+                render(scene, ego, messages[:n])
         progress(1)
     return sizes

@@ -29,6 +29,21 @@ def densest_messages(senders: Sequence[str], actions: Sequence[str]) -> list[Map
     ]  # fmt: skip
 
 
+def densest_plans(senders: Sequence[str], actions: Sequence[str]) -> list[Mapping[str, Any]]:
+    """Return a plan of each sender for `Prompt.render`, with numbers as long as they get."""
+    share = round(1 / len(actions), 2)
+    return [
+        {
+            "sender": sender,
+            "number": 10 + n,
+            "intent": (share,) * len(actions),
+            "reaches_s": 100.5,
+            "lost_s": 10.5,
+        }
+        for n, sender in enumerate(senders)
+    ]
+
+
 def densest_repair(
     prompt: Prompt, role: str, actions: tuple[str, ...], words: Mapping[str, str]
 ) -> tuple[Mapping[str, str], ...]:

@@ -74,6 +74,8 @@ class Prompt:
     extension: Mapping[str, str] = field(default_factory=dict)
     # whether the ego's template can show a message that holds words alone, a `sender` and `evidence`
     shows_words: bool = False
+    # whether the ego's template can show an agent's plan: `sender`, `number`, `intent`, `reaches_s`, `lost_s`
+    shows_plans: bool = False
     # picture before the user's text: what the viewer's `camera` sees; None if there is none
     image: Literal["camera"] | None = None
     # the text of each of its files by name, as they were read
@@ -144,8 +146,9 @@ class Prompt:
         The graph's `role` chooses the template. Examples follow the system message as earlier turns. A
         message with the key `image` has a picture before its text. `messages` are those of helpers to the
         ego, with `sender`, `evidence`, `risk`, `intent`, `recommended_maneuver` and `confidence`, or with
-        `sender` and `evidence` alone if the version `shows_words`; `words` are texts by which the scenario
-        describes itself. A `letter` is asked for in place of the block `question` (`readout.asked`).
+        `sender` and `evidence` alone if the version `shows_words`, or of agents, if it `shows_plans`: those
+        of `fusion.messages_of`. `words` are texts by which the scenario describes itself. A `letter` is asked
+        for in place of the block `question` (`readout.asked`).
         """
         system, user = self._render_graph(graph, actions, messages, words, letter, "system", "user")
         turns = self._turns(graph.role, actions, words, letter)

@@ -149,7 +149,7 @@ class CalibratedWorld:
         """Refuse: the intents of all are drawn, and nobody can be asked."""
         raise NotImplementedError
 
-    helpers = fusion_call = blind
+    helpers = fusion_call = plan_call = blind
 
     def due(self, point: OperatingPoint) -> Due:
         """Return every episode."""

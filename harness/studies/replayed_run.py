@@ -19,6 +19,7 @@ from harness.backends.cards import find_own
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
 from harness.coordination.calibrations import file_of
+from harness.coordination.coordinate import FusionCall
 from harness.coordination.exchange import Exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
@@ -298,6 +299,10 @@ class ReplayedRun:
         with self._writing():
             return self._asker.fusion_call(scenes, codes, rewrites)
 
+    def plan_call(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
+        """Return the call of agents that hear plans; a run of frozen scenes has none."""
+        return self._asker.plan_call(scenes, at, intents)
+
     @contextmanager
     def _writing(self) -> Iterator[None]:
         try:
@@ -386,6 +391,9 @@ class _Nearest:
 
     def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         return self._stored.fusion_call(scenes, codes, rewrites)
+
+    def plan_call(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
+        return self._stored.plan_call(scenes, at, intents)
 
 
 def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:

@@ -8,7 +8,7 @@ import pytest
 from evaluating import live_spec_of, run
 
 from harness.coordination.consensus import Messages
-from harness.coordination.coordinate import Coordination, fuse
+from harness.coordination.coordinate import Coordination, FusionInputs, fuse
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, named_point
@@ -134,6 +134,29 @@ def test_in_a_second_round_one_goes_since_the_one_before_it_waits() -> None:
     assert twice.airtime_s == pytest.approx(2 * once.airtime_s)
     assert twice.latency_s - 0.1 == pytest.approx(2 * (once.latency_s - 0.1))
     assert acted(point.changed(rounds=3)).action.tolist() == [2, 0, 1]
+
+
+def answered(point: OperatingPoint) -> Coordination:
+    """The last decision of three agents, whose model takes 0.1 s and always answers the same."""
+
+    def decided(heard, intents) -> Coordination:
+        answer = np.tile([0.2, 0.7, 0.1], (3, 1)), np.full(3, 0.1)
+        return fuse(point, heard, intents, FusionInputs(lambda on_time: answer))
+
+    said, heard = further_rounds(point, *three(point), decided)
+    return decided(heard, said.intents)
+
+
+def test_each_round_waits_for_the_answer_before_it() -> None:
+    once, twice, late = (
+        answered(named_point(f"{PLAN}ego-prompt,loss=0,{more}"))
+        for more in ("rounds=1", "rounds=2,window_s=0.6", "rounds=2")
+    )
+    exchange_s = once.exchange_s - 0.1
+    assert once.latency_s == pytest.approx(0.1 + exchange_s + 0.1)
+    assert twice.latency_s == pytest.approx(0.1 + 2 * (exchange_s + 0.1))
+    assert twice.messages.tolist() == [4, 4, 4]
+    assert late.latency_s == pytest.approx(once.latency_s), "the window is over, so nobody is asked again"
 
 
 def test_a_round_that_ends_after_the_window_is_not_heard_and_none_begins_after_it() -> None:

@@ -16,7 +16,7 @@ const distribution = (actions, p) => (p ? actions.map((a, n) => `${a} ${number(p
 const sender = (answer) => answer.viewer.replace("~blind", "");
 // Who answered, and whom it had heard: "v1 + v2 (objects) + v3 blind (objects), fusion".
 const heard = (key) =>
-  key.replaceAll("+", " + ").replaceAll("~blind", " blind").replace(/!([^ ]+)/g, (_, what) => ` (${what.replaceAll("&", ", ")})`);
+  key.replaceAll("+", " + ").replaceAll("~blind", " blind").replace(/!([^ ]+)/g, (_, what) => ` (${what.replaceAll("&", ", ").replace(/^plan:.*/, "plan")})`);
 const who = (answer) =>
   answer.role === "blind" ? `${sender(answer)}, blind helper`
     : `${heard(answer.viewer)}, ${answer.role === "merge" ? "fusion" : answer.role}`;
