@@ -94,8 +94,8 @@ def one_line(said: Said) -> str:
         (["eval", "--workers", "0"], "--workers 0: give 1 to 256 processes, or ray for a Ray cluster"),
         (
             ["eval", "--model", "swarm-tiny", "--workers", "2"],
-            "--workers 2: the answers of rules are spread over workers, and swarm-tiny is a language model; "
-            "give --batch-size, or several --server",
+            "--workers 2: rules and servers answer to several processes, and swarm-tiny is a language model "
+            "of one; give --batch-size",
         ),
         (["eval", "--thinking"], "--thinking: proxy cannot think; leave it out"),
         (["eval", "--device", "cuda"], "--device cuda: proxy has no weights here (engines transformers"),

@@ -9,7 +9,7 @@ import pytest
 
 from harness.core import extras
 from harness.core.errors import Unfinished, UserError
-from harness.core.parallel import TRIES, Ray, each, spread, workers_of
+from harness.core.parallel import TRIES, Ray, each, share, spread, workers_of
 
 
 def squared(number: int) -> int:
@@ -38,6 +38,27 @@ def test_a_result_is_taken_as_soon_as_it_is_there_by_who_asks(tmp_path: Path) ->
     each(partial(later, tmp_path / "last"), range(4), 2, lambda place, result: taken.append(place))
     assert sorted(taken) == [0, 1, 2, 3]
     assert taken[0] == 1, "the first item waits, and nobody for it"
+
+
+def shared(arrived: Path, total: int, number: int) -> tuple[int, int]:
+    """The share of a worker while all are at work; and, of the last item, once it works alone."""
+    first = share(total)
+    (arrived / str(number)).touch()
+    while len(list(arrived.iterdir())) < 3:
+        time.sleep(0.01)
+    until = time.monotonic() + 10
+    while number == 2 and share(total) < total and time.monotonic() < until:
+        time.sleep(0.01)
+    return first, share(total)
+
+
+@pytest.mark.parametrize("total", [9, 10, 11, 2])
+def test_workers_at_work_divide_what_may_be_used_and_the_last_one_has_all(total: int, tmp_path: Path) -> None:
+    first, last = zip(*spread(partial(shared, tmp_path, total), range(3), 3, lambda done: None), strict=True)
+    assert sum(first) == max(total, 3)
+    assert max(first) - min(first) <= 1
+    assert last[2] == total
+    assert share(total) == total, "no worker"
 
 
 def deadly(graves: Path, poison: int, deaths: int, number: int) -> int:

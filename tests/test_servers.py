@@ -20,7 +20,8 @@ from evaluating import FILES, same_decisions, same_files, spec_of, with_ego
 from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import Asked, Play, Server, completion, serving
-from served import served
+from msgspec import structs
+from served import answer, served
 
 from harness.backends.base import Request, Served
 from harness.backends.card import Card, Latency
@@ -34,8 +35,10 @@ from harness.core import resources
 from harness.core.errors import UserError
 from harness.core.work import tidy
 from harness.dataset.load import Dataset
+from harness.evaluate import run as run_module
 from harness.evaluate import servers
 from harness.evaluate.asking import Asker
+from harness.evaluate.kept_answers import read_kept
 from harness.evaluate.latency import PAPER
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
@@ -374,8 +377,8 @@ def served_spec(small: Dataset, *urls: str) -> Spec:
     return replace(with_ego(spec_of(small), card=mine), servers=urls, batch_size=4)
 
 
-def evaluated(spec: Spec, out: Path) -> Path:
-    done = evaluate(spec, out, lambda done: None)
+def evaluated(spec: Spec, out: Path, cache: Path | None = None, workers: int = 1) -> Path:
+    done = evaluate(spec, out, lambda done: None, cache, workers=workers)
     tidy(out)
     return done.out
 
@@ -416,6 +419,88 @@ def test_with_no_server_left_the_run_stops_and_goes_on_at_others(
     assert "\n" not in said
     with served() as url:
         assert same_files(evaluated(served_spec(small, url), tmp_path / "run"), whole)
+
+
+@pytest.fixture
+def parted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part of a run is one layout."""
+    monkeypatch.setattr(run_module, "TREES_AT_ONCE", 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cached", [False, True])
+def test_workers_ask_what_one_process_asks(
+    parted: None, small: Dataset, tmp_path: Path, cached: bool
+) -> None:
+    with served() as one, served() as other:
+        spec, runs = served_spec(small, one, other), {}
+        for workers in (1, 3):
+            runs[workers] = evaluated(
+                spec, tmp_path / f"{workers}", tmp_path / f"{workers}.sqlite" if cached else None, workers
+            )
+    assert same_decisions(runs[1], runs[3])
+    for name in ("episodes.csv", "summary.csv"):
+        assert (runs[1] / name).read_bytes() == (runs[3] / name).read_bytes()
+    assert same_but_alone(runs[1], runs[3])
+    ids = [[line["id"] for line in lines(out)] for out in runs.values()]
+    assert ids[0] == ids[1] == sorted(answer.id for answer in folder.read(runs[1]).answers)
+
+
+def test_workers_together_have_no_more_at_a_server_than_one_process_may(
+    parted: None, small: Dataset, tmp_path: Path
+) -> None:
+    busy, lock = [0], threading.Lock()
+
+    def play(asked: Asked) -> None:
+        with lock:
+            busy.append(busy[-1] + 1)
+        time.sleep(0.003)
+        with lock:
+            busy.append(busy[-1] - 1)
+        answer(asked)
+
+    with serving(play) as there:
+        evaluated(served_spec(small, there.url), tmp_path / "run", None, 3)
+    assert 2 < max(busy) <= 4, "the batch size"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("before", "after"), [(1, 3), (3, 1), (3, 2)])
+def test_a_run_that_workers_began_or_go_on_with_asks_nothing_twice(
+    parted: None, small: Dataset, tmp_path: Path, before: int, after: int
+) -> None:
+    def stop(done: int) -> None:
+        raise KeyboardInterrupt
+
+    with served() as url, pytest.raises(KeyboardInterrupt):
+        evaluate(served_spec(small, url), tmp_path / "run", stop, workers=before)
+    work = tmp_path / "run/.work"
+    kept = {name for file in work.rglob("*.jsonl") if file.name != servers.FILE for name in read_kept(file)}
+    assert kept
+    with served() as other:
+        out = evaluated(served_spec(small, other), tmp_path / "run", None, after)
+        whole = evaluated(served_spec(small, other), tmp_path / "whole")
+    asked = {line["id"] for line in lines(out) if line["server"] == other}
+    assert asked == {answer.id for answer in folder.read(whole).answers} - kept
+    assert same_decisions(out, whole)
+    assert same_but_alone(out, whole)
+
+
+@pytest.mark.slow
+def test_servers_that_fail_workers_are_one_line(parted: None, small: Dataset, tmp_path: Path) -> None:
+    with served(40) as url, pytest.raises(UserError) as caught:
+        evaluated(served_spec(small, url), tmp_path / "run", None, 3)
+    assert url.removeprefix("http://").partition(":")[0] in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def same_but_alone(one: Path, other: Path) -> bool:
+    """Whether runs have the same answers but for times: no process knows that it asks alone."""
+    answers = [
+        [structs.replace(answer, seconds=None, batch_size=1) for answer in folder.read(run).answers]
+        for run in (one, other)
+    ]
+    return answers[0] == answers[1]
 
 
 def lines(run: Path) -> list[dict[str, Any]]:

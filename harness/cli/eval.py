@@ -17,6 +17,7 @@ from harness.evaluate.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
 from harness.runs import leading
 
 if TYPE_CHECKING:
+    from harness.core.parallel import Workers
     from harness.evaluate.spec import Spec
 
 SUCCESS = Column("success % [95 % CI]", leading.SUCCESS, interval=True)
@@ -97,12 +98,13 @@ def command(
             for each in zip(specs, counted, strict=True):
                 _show_counted(*each)
         return
+    at_servers = any(agent.card.server for spec in specs for agent in spec.agents)
+    who = options.workers_of(workers or ("1" if at_servers else "2"))
     if workers is not None:
-        _refuse_language_models(specs, workers)
+        _refuse_language_models(specs, who, workers)
     with costs.budget(max_cost, specs) as limit:
         specs = [replace(spec, budget=limit) for spec in specs]
         silent, cache = as_json or quiet, None if no_cache else default_file()
-        who = options.workers_of(workers or "2")
         evaluated = partial(evaluate, cache=cache, quiet=silent, workers=who, full=full)
         if repeat is not None:
             repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
@@ -133,12 +135,19 @@ def command(
     typer.echo(f"wrote {page}")
 
 
-def _refuse_language_models(specs: "Sequence[Spec]", workers: str) -> None:
-    for agent in (agent for spec in specs for agent in spec.agents):
-        if agent.can.language_model:
+def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: str) -> None:
+    from harness.core.parallel import Ray
+
+    for agent in (agent for spec in specs for agent in spec.agents if agent.can.language_model):
+        if not agent.card.server:
             raise UserError(
-                f"--workers {printable(workers)}: the answers of rules are spread over workers, and "
-                f"{printable(agent.card.name)} is a language model; give --batch-size, or several --server"
+                f"--workers {printable(workers)}: rules and servers answer to several processes, and "
+                f"{printable(agent.card.name)} is a language model of one; give --batch-size"
+            )
+        if isinstance(who, Ray):
+            raise UserError(
+                f"--workers {printable(workers)}: {printable(agent.card.name)} is asked at servers, by "
+                "processes of this machine; give their number"
             )
 
 

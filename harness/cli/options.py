@@ -106,8 +106,9 @@ RuleWorkers = Annotated[
     str | None,
     Option(
         metavar="WHO",
-        help=f"Number of worker processes, {_RAY} For rules such as proxy only; used on more than 256 "
-        "layouts, and for the report of more than 5376 scenes. Default: 2.",
+        help=f"Number of worker processes, {_RAY} For rules such as proxy, and for processes that ask "
+        "servers; used on more than 256 layouts, and for the report of more than 5376 scenes. Default: 2, of "
+        "servers 1.",
         rich_help_panel=stated.ENGINE,
     ),
 ]

@@ -7,11 +7,12 @@ import os
 import re
 import signal
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, MutableSequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import parent_process
+from multiprocessing.sharedctypes import RawArray
 from threading import Thread
 from typing import Any, Protocol, TypeVar
 
@@ -33,6 +34,7 @@ class Ray:
     address: str | None = None
 
 
+Flags = MutableSequence[int]  # 0 or 1 for each worker
 Workers = int | Ray  # a number of processes, or a cluster
 
 
@@ -149,7 +151,7 @@ def _executor(
     repeatable: bool,
 ) -> Executor:
     if isinstance(workers, int):
-        return _Processes(work, workers)
+        return _Processes(work, workers, len(items))
     extras.need(f"--workers {workers.address or 'ray'}", "ray")
     from harness.core.ray_tasks import Tasks
 
@@ -159,41 +161,66 @@ def _executor(
 class _Processes:
     """An executor of processes. Each process is a pool of its own, so a death loses one item only."""
 
-    def __init__(self, work: Callable[[Any], Any], workers: int) -> None:
-        self._work, self._workers = work, workers
-        self._idle: list[ProcessPoolExecutor] = []
-        self._busy: dict[Future[Any], tuple[int, ProcessPoolExecutor]] = {}
+    def __init__(self, work: Callable[[Any], Any], workers: int, n_items: int) -> None:
+        self._work, self._waiting = work, n_items
+        n_processes = min(workers, n_items)
+        self._at_work: Flags = RawArray("b", [1] * n_processes)
+        self._idle: list[tuple[int, ProcessPoolExecutor | None]] = [(n, None) for n in range(n_processes)]
+        self._busy: dict[Future[Any], tuple[int, int, ProcessPoolExecutor]] = {}
 
     def room(self) -> bool:
-        return len(self._busy) < self._workers
+        return bool(self._idle)
 
     def give(self, place: int, item: Any) -> None:
-        pool = self._idle.pop() if self._idle else ProcessPoolExecutor(1, initializer=_begin)
-        self._busy[pool.submit(self._work, item)] = place, pool
+        number, pool = self._idle.pop()
+        pool = pool or ProcessPoolExecutor(1, initializer=_begin, initargs=(self._at_work, number))
+        self._busy[pool.submit(self._work, item)] = place, number, pool
+        self._waiting -= 1
 
     def take(self) -> tuple[int, Any]:
         future = wait(self._busy, return_when=FIRST_COMPLETED).done.pop()
         try:
             result = future.result()
         except BrokenProcessPool:
-            place, pool = self._busy.pop(future)
+            place, number, pool = self._busy.pop(future)
             pool.shutdown()
+            self._idle.append((number, None))
+            self._waiting += 1
             return place, WorkerDied()
-        place, pool = self._busy.pop(future)
-        self._idle.append(pool)
+        place, number, pool = self._busy.pop(future)
+        self._idle.append((number, pool))
+        if not self._waiting:
+            self._at_work[number] = 0
         return place, result
 
     def close(self) -> None:
-        pools = [pool for _, pool in self._busy.values()]
+        pools = [pool for _, _, pool in self._busy.values()]
         for pool in pools:
             for process in list((pool._processes or {}).values()):  # kill_workers() of Python 3.14
                 process.kill()
-        for pool in (*pools, *self._idle):
+        for pool in (*pools, *(pool for _, pool in self._idle if pool)):
             pool.shutdown(cancel_futures=True)
 
 
-def _begin() -> None:
+_shared: tuple[Flags, int] | None = None  # of a worker: which workers have work, and its own number
+
+
+def share(total: int) -> int:
+    """Return how many of `total` this process may use, which all workers at work divide; 1 at least.
+
+    It grows when another worker ends. Outside workers, and on a cluster, it is all.
+    """
+    if _shared is None:
+        return total
+    at_work, number = _shared
+    each_has, left_over = divmod(total, max(1, sum(at_work)))
+    return max(1, each_has + (sum(at_work[:number]) < left_over))
+
+
+def _begin(at_work: Flags, number: int) -> None:
     """Ignore signals in a worker: the parent handles them and kills its workers."""
+    global _shared
+    _shared = at_work, number
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     end_with_parent()

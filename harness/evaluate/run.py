@@ -31,7 +31,7 @@ from harness.evaluate import costs, device, servers, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
-from harness.evaluate.kept_answers import read_kept
+from harness.evaluate.kept_answers import KeptAnswers, read_kept
 from harness.evaluate.lifecycle import (
     Evaluated,
     RunStart,
@@ -90,8 +90,9 @@ def evaluate(
             loop); what an earlier, stopped run kept is included.
         cache: completion cache for language models, a file; None for no cache.
         more: called with the number of answers that are due next; frozen scenes only.
-        workers: processes or a cluster. They drive the closed loop, and walk frozen scenes if rules answer;
-            each worker opens its own backend. A language model answers frozen scenes in this process.
+        workers: processes or a cluster. They drive the closed loop, and walk frozen scenes if rules or served
+            models answer; each worker opens its own backend. Other models answer frozen scenes in this
+            process. The workers together have as many requests at once at a server as one would.
         opens: replaces `open_backend` for frozen scenes; it may return a backend that is open already.
         given: answers by request id that need not be asked for; frozen scenes only.
 
@@ -106,9 +107,7 @@ def evaluate(
     if not begun and spec.latency == latencies.MEASURED:
         timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
-        return _frozen(
-            spec, spec.source, out, begun, progress, cache, more, opens or open_backend, given, workers
-        )
+        return _frozen(spec, spec.source, out, begun, progress, cache, more, opens, given, workers)
     made_of = sources(spec)
     begun, chunks = _begin_driving(spec, out, begun, workers)
     with work.working(out, begun, "run.json") as place:
@@ -196,20 +195,21 @@ def _walk(
 
 def _frozen(
     spec: Spec, source: FrozenSource, out: Path, begun: RunStart | None, progress: Callable[[int], None],
-    cache: Path | None, more: Callable[[int], None], opens: Opens, given: Mapping[str, Answer],
+    cache: Path | None, more: Callable[[int], None], opens: Opens | None, given: Mapping[str, Answer],
     workers: Workers,
 ) -> Evaluated:  # fmt: skip
-    dataset = source.dataset
-    options = {"device": spec.device, "dtype": spec.dtype, "batch_size": spec.batch_size}
-    made_of = sources(spec)
-    models = open_each(spec.cards, partial(opens, **options))
-    identity = together(spec.cards, models).identity()
-    latency = _latency(spec, begun, models, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
+    made_of, chunks = sources(spec), _split(source.dataset.episodes, TREES_AT_ONCE)
+    spread_over = 1 if opens or given or len(chunks) == 1 else spreadable(spec, workers)
+    if in_workers := spread_over != 1:
+        models = list[Backend]()
+        identity, latency = _stated_in_worker(spec, begun, spread_over)
+    else:
+        options = {"device": spec.device, "dtype": spec.dtype, "batch_size": spec.batch_size}
+        opening: Opens = opens or open_backend
+        models = open_each(spec.cards, partial(opening, **options))
+        identity, latency = together(spec.cards, models).identity(), _latency(spec, begun, models)
     begun = begin(spec, out, begun, identity, latency)
-    chunks = _split(dataset.episodes, TREES_AT_ONCE)
     with work.working(out, begun, "run.json") as place:
-        backend = together(spec.cards, costs.metered(spec.cards, models, place, spec.budget), cache)
-        in_workers = len(chunks) > 1 and workers != 1 and _reproducible(spec) and not given
 
         def walk_here(chunk: Sequence[int]) -> dict[str, bytes]:
             before = read_kept(_answered_file(place, chunk))
@@ -230,11 +230,32 @@ def _frozen(
             progress(n_answers)
 
         if in_workers:
-            walk_chunk = partial(_walk_chunk, spec, begun, None, None)
-            _walk_missing(chunks, place, walk_chunk, report_kept, report_kept, workers)
+            _hand_over(place, chunks)
+            walk_chunk = partial(_walk_chunk, spec, begun, *_files(spec, cache, place, spread_over))
+            _walk_missing(chunks, place, walk_chunk, report_kept, report_kept, spread_over)
         else:
+            backend = together(spec.cards, costs.metered(spec.cards, models, place, spec.budget), cache)
             _walk_missing(chunks, place, walk_here, report_kept, lambda chunk: None)
         return _gather(out, as_finished(spec, begun), chunks, place, made_of)
+
+
+def spreadable(spec: Spec, workers: Workers) -> Workers:
+    """Return the workers that walk frozen scenes: 1 unless rules answer, or servers are asked by processes.
+
+    Of these there are no more than a server may have requests at once.
+    """
+    if _reproducible(spec):
+        return workers
+    asks_servers = all(agent.card.server or not agent.can.language_model for agent in spec.agents)
+    return min(workers, spec.batch_size) if asks_servers and isinstance(workers, int) else 1
+
+
+def _hand_over(place: Path, chunks: Sequence[Sequence[int]]) -> None:
+    """Keep the answers of a run that one process began as those of the chunk that it was at."""
+    if todo := [chunk for chunk in chunks if not (place / _folder_name(chunk)).is_dir()]:
+        for kept in place.glob("answers*.jsonl"):
+            KeptAnswers(_answered_file(place, todo[0])).append(list(read_kept(kept).values()))
+            kept.unlink()
 
 
 def _begin_driving(
@@ -246,11 +267,7 @@ def _begin_driving(
             f"--latency {latencies.MEASURED} is of one machine, and this is driven on several; measure on "
             "one, and declare that: ego=SECONDS,helper=SECONDS,fusion=SECONDS"
         )
-    # Each process opens its own engine: a forked process does not inherit an engine's threads.
-    load, exact = partial(_identity_and_latency, begun=begun), _reproducible(spec)
-    [(identity, latency)] = spread(
-        load, [spec], workers, lambda done: None, lambda each: f"the model {each.ego.card.name}", exact
-    )
+    identity, latency = _stated_in_worker(spec, begun, workers)
     return begin(spec, out, begun, identity, latency, shard), _chunks_of(spec.settings())
 
 
@@ -304,10 +321,18 @@ def _drive(
     def report(chunk: Sequence[int]) -> None:
         progress(len(chunk))
 
-    # These are files of this machine, which the nodes of a cluster cannot share.
-    files = (cache, None if _reproducible(spec) else place) if isinstance(workers, int) else (None, None)
-    walk_chunk = partial(_walk_chunk, spec, begun, *files)
+    walk_chunk = partial(_walk_chunk, spec, begun, *_files(spec, cache, place, workers))
     _walk_missing(chunks, place, walk_chunk, report, report, workers, _reproducible(spec))
+
+
+def _files(spec: Spec, cache: Path | None, place: Path, workers: Workers) -> tuple[Path | None, Path | None]:
+    """Return the completion cache of workers, and the folder where they keep answers; None if they have none.
+
+    These are files of this machine, which the nodes of a cluster cannot share.
+    """
+    if not isinstance(workers, int):
+        return None, None
+    return cache, None if _reproducible(spec) else place
 
 
 def _walk_missing(
@@ -416,26 +441,36 @@ def _gather(
     return Evaluated(out, manifest, summary)
 
 
+def _stated_in_worker(spec: Spec, begun: RunStart | None, workers: Workers) -> tuple[dict[str, Any], Latency]:
+    """Return what `_identity_and_latency` does, in a worker: a forked one inherits no engine's threads."""
+    state, exact = partial(_identity_and_latency, begun=begun), _reproducible(spec)
+    [stated] = spread(
+        state, [spec], workers, lambda done: None, lambda each: f"the model {each.ego.card.name}", exact
+    )
+    return stated
+
+
 def _identity_and_latency(spec: Spec, begun: RunStart | None) -> tuple[dict[str, Any], Latency]:
-    """Open a closed-loop run's models; return their identity and the latency of their decisions."""
-    models, source = _open_all(spec), cast("LiveSource", spec.source)
-    latency = _latency(spec, begun, models, lambda: [*source.trial(timing.SCENES, spec.ego_alone)])
-    return together(spec.cards, models).identity(), latency
+    """Open a run's models; return their identity and the latency of their decisions."""
+    models = _open_all(spec)
+    return together(spec.cards, models).identity(), _latency(spec, begun, models)
 
 
-def _latency(
-    spec: Spec, begun: RunStart | None, models: Sequence[Backend], trial: Callable[[], Sequence[Scene]]
-) -> Latency:
-    """Return the latency that a resumed run began with, or that of a new run.
-
-    `trial` returns the scenes to measure it in.
-    """
+def _latency(spec: Spec, begun: RunStart | None, models: Sequence[Backend]) -> Latency:
+    """Return the latency that a resumed run began with, or that of a new run."""
     if begun:
         return begun.latency
     if spec.device_profile:
         return device.of_device(spec.device_profile, spec.device_model, spec.agents)
     declared = latencies.known(spec.latency, spec.agents, models)
-    return declared or timing.measured(spec, together(spec.cards, models), trial())
+    return declared or timing.measured(spec, together(spec.cards, models), _trial(spec))
+
+
+def _trial(spec: Spec) -> Sequence[Scene]:
+    """Return the scenes in which a latency is measured."""
+    if isinstance(spec.source, FrozenSource):
+        return timing.spread_over(spec.source.dataset.scenes(spec.source.dataset.courses()))
+    return [*cast("LiveSource", spec.source).trial(timing.SCENES, spec.ego_alone)]
 
 
 def _open_all(spec: Spec) -> list[Backend]:

@@ -21,6 +21,7 @@ from harness.backends.openai.http import Client, Reply
 from harness.backends.openai.statements import Model, read_statement
 from harness.backends.servers import Server
 from harness.core.errors import Unanswered, UserError, printable
+from harness.core.parallel import share
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0  # wait before the first retry, doubled with each; and its limit
 BROKEN = 3  # failures in a row after which a server is set aside
@@ -68,7 +69,8 @@ class ServerPool:
     ) -> None:
         """Prepare a pool, which `open` connects.
 
-        One server gets `at_once` requests at most, each at the `path` behind its base URL.
+        One server gets `at_once` requests at most, from all workers together, each at the `path` behind its
+        base URL.
         """
         self._client, self._settings, self._name, self._weights = client, settings, printable(name), weights
         self._at_once, self._path = at_once, path
@@ -137,10 +139,10 @@ class ServerPool:
 
     def _hand_out(self) -> None:
         self._woken = False
-        available = [server for server in self._servers if not server.aside]
+        available, at_once = [server for server in self._servers if not server.aside], share(self._at_once)
         for take in (self._next, self._steal):  # first each server's own queue
             for server in available:
-                while server.busy < self._at_once and (pending := take(server)):
+                while server.busy < at_once and (pending := take(server)):
                     server.busy += 1
                     self._run(self._work(server, pending))
 
@@ -181,7 +183,7 @@ class ServerPool:
             nth, first = server.sent, server.busy == 1
             pending.begun_s = perf_counter() if pending.begun_s is None else pending.begun_s
             reply = await self._client.post(server.url, self._path, msgspec.json.encode(pending.body()))
-            alone = first and server.sent == nth
+            alone = first and server.sent == nth and share(self._at_once) == self._at_once
             reply = msgspec.structs.replace(
                 reply, retries=pending.failed[server], begun_s=pending.begun_s, alone=alone, url=server.url
             )
