@@ -7,7 +7,7 @@ decision that is still open when the next one is due continues, and the next one
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import product
 from typing import Any, ClassVar
 
@@ -232,12 +232,8 @@ class LiveWorld(SceneWorld):
         With several agents nobody is late: there is no such driver for all of them together.
         """
         if any(len(t.world.journeys) > 1 for t in self._ended):
-            alone_s = cache(alone)
-            return [
-                _swarm(t, course, alone_s(self.scenario, t.world.seed))
-                for t in self._ended
-                for course in t.courses
-            ]
+            alone_s = alone(self.scenario, list(dict.fromkeys(t.world.seed for t in self._ended)))
+            return [_swarm(t, course, alone_s[t.world.seed]) for t in self._ended for course in t.courses]
         numbers = sorted({t.number for t in self._ended if t.world.outcome.success})
         worlds = [World.start(self.scenario, self._first_seed + number) for number in numbers]
         outcomes = reference.finish(worlds, [PRIVILEGED] * len(numbers))

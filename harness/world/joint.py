@@ -17,11 +17,11 @@ import numpy as np
 from harness.core.arrays import Bools, Floats
 from harness.world import lockstep
 from harness.world.reference import take_turn
-from harness.world.scenario import Scenario
+from harness.world.scenario import Layout, Scenario
 from harness.world.seats import agents_of
 from harness.world.simulator import populated
 from harness.world.state import SIZES_M, separation_m
-from harness.world.swarm import on_seat
+from harness.world.swarm import by_scenario, on_seat
 from harness.world.world import Journey, World
 
 HORIZON = 5  # decisions of an agent that are planned; after them it takes FASTER
@@ -35,11 +35,25 @@ MOST_PLANS = 8  # that are driven for a layout until one keeps its promise
 class Rehearsal(World):
     """A world of one agent that keeps a record of where everybody was."""
 
+    agent: int = 0  # the agent's place in the layout
     record: tuple[Floats, ...] = ()  # poses after each frame, (frames, V, 4) each
     taken: tuple[str, ...] = ()  # the agent's actions
+    arrives_s: float = np.inf  # when the agent reached its goal, after which it drove on
 
     def passed(self, poses: Floats) -> None:
         self.record = (*self.record, poses.copy())
+
+    def decide(self, action: str) -> None:
+        super().decide(action)
+        self.taken = (*self.taken, action)
+
+    def parts(self, actions: Sequence[str]) -> list["Rehearsal"]:
+        """Return a world for each target that actions set; of those that set the same the last is taken."""
+        last = {self.target_after(action): action for action in actions}.values()
+        parts = [cast(Rehearsal, self.branch()) for _ in last]
+        for part, action in zip(parts, last, strict=True):
+            part.decide(action)
+        return parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,62 +84,84 @@ class Plan:
     def sum_s(self) -> float:
         return sum(min(time_s, NEVER_S) for time_s in self.arrives_s.values())
 
+    def turn(self, step: int) -> dict[int, str]:
+        """Return the action of each agent that has one at a step."""
+        return {agent: taken[step] for agent, taken in self.actions.items() if step < len(taken)}
+
     @property
     def exact(self) -> bool:
         """Whether no plan is better."""
         return self.bound_s >= self.sum_s - 1e-9
 
 
-def options(scenario: Scenario, seed: int) -> dict[int, Options]:
-    """Return what each agent of a layout can do, by its place."""
-    layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
-    traffic = [n for n, spawn in enumerate(layout.spawns) if spawn.part == "other"]
-    hz, ended = scenario.parameters.simulation_hz, dict[int, list[Rehearsal]]()
-    for agent in agents:
-        its, start = on_seat(scenario, layout, agent, traffic)
-        worlds = _courses(Rehearsal(its, seed, start, populated(its, start)))
-        ended[agent] = [w for w in worlds if w.outcome.result in ("cleared", "time_out")]
-    frames = max((w.frame for worlds in ended.values() for w in worlds), default=0)
-    able = {}
-    for agent, worlds in ended.items():
-        arrives_s = np.array([w.outcome.time_s if w.outcome.success else np.inf for w in worlds], dtype=float)
-        _drive_on([w for w in worlds if w.outcome.success], frames)
-        poses = np.empty((len(worlds), frames, 1 + len(traffic), 3))
-        for n, k in enumerate(order := np.argsort(arrives_s, kind="stable")):
-            known = np.concatenate(worlds[k].record)[:frames, :, :3]
-            poses[n, : len(known)], poses[n, len(known) :] = known, known[-1:]
-        sizes_m = np.array([SIZES_M[layout.spawns[n].kind] for n in (agent, *traffic)])
-        able[agent] = Options([worlds[k].taken for k in order], arrives_s[order], poses, sizes_m, hz)
+def options(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, Options]]:
+    """Return what each agent of some layouts can do, by a layout's seed and an agent's place."""
+    begun = [world for seed in seeds for world in rehearsals(scenario, seed)]
+    courses = [world for group in by_scenario(begun) for world in _courses(group)]
+    ended = [world for world in courses if world.outcome.result in ("cleared", "time_out")]
+    frames = dict.fromkeys(seeds, 0)
+    for world in ended:
+        frames[world.seed] = max(frames[world.seed], world.frame)
+    for group in by_scenario([world for world in ended if world.outcome.success]):
+        _drive_on(group, [frames[world.seed] for world in group])
+    worlds: dict[tuple[int, int], list[Rehearsal]] = {(world.seed, world.agent): [] for world in begun}
+    for world in ended:
+        worlds[world.seed, world.agent].append(world)
+    able: dict[int, dict[int, Options]] = {seed: {} for seed in seeds}
+    for world in begun:
+        its = worlds[world.seed, world.agent]
+        able[world.seed][world.agent] = _options(world.layout, its, frames[world.seed])
     return able
 
 
-def _courses(world: Rehearsal) -> list[Rehearsal]:
-    """Return a world for each course that the actions of its agent can lead to, until each is decided."""
-    p, going, ended = world.scenario.parameters, [world], list[Rehearsal]()
-    calm_last = sorted(world.actions, key=lambda action: action == "IDLE")
+def rehearsals(scenario: Scenario, seed: int) -> list[Rehearsal]:
+    """Return a world of each agent of a layout, with the other traffic."""
+    layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
+    traffic = [n for n, spawn in enumerate(layout.spawns) if spawn.part == "other"]
+    seats = {agent: on_seat(scenario, layout, agent, traffic) for agent in agents}
+    return [
+        Rehearsal(its, seed, start, populated(its, start), agent=agent)
+        for agent, (its, start) in seats.items()
+    ]
+
+
+def _options(layout: Layout, worlds: Sequence[Rehearsal], frames: int) -> Options:
+    arrives_s = np.array([world.arrives_s for world in worlds], dtype=float)
+    poses = np.empty((len(worlds), frames, len(layout.spawns), 3))
+    for n, k in enumerate(order := np.argsort(arrives_s, kind="stable")):
+        known = np.concatenate(worlds[k].record)[:frames, :, :3]
+        poses[n, : len(known)], poses[n, len(known) :] = known, known[-1:]
+    sizes_m = np.array([SIZES_M[spawn.kind] for spawn in layout.spawns])
+    hz = worlds[0].scenario.parameters.simulation_hz if worlds else 1
+    return Options([worlds[k].taken for k in order], arrives_s[order], poses, sizes_m, hz)
+
+
+def _courses(going: list[Rehearsal]) -> list[Rehearsal]:
+    """Return a world for each course that the actions of agents can lead to, until each is decided."""
+    p, ended = going[0].scenario.parameters, list[Rehearsal]()
+    calm_last = sorted(going[0].actions, key=lambda action: action == "IDLE")
     for step in range(p.decisions):
         lockstep.advance(going, [p.due_frame(step) + p.lag_frames] * len(going))
         ended += [each for each in going if each.ended]
-        parts = []
-        for each in (each for each in going if not each.ended):
-            free = calm_last if step < HORIZON else ("FASTER",)
-            for action in {each.target_after(action): action for action in free}.values():
-                branch = cast(Rehearsal, each.branch())
-                branch.taken = (*each.taken, action)
-                branch.take(action)
-                parts.append(branch)
-        lockstep.advance(parts, [p.due_frame(step + 1)] * len(parts))
-        ended += [each for each in parts if each.ended]
-        going = [each for each in parts if not each.ended]
+        going = [each for each in going if not each.ended]
+        if step < HORIZON:
+            going = [part for each in going for part in each.parts(calm_last)]
+        else:
+            for each in going:
+                each.decide("FASTER")
+        lockstep.advance(going, [p.due_frame(step + 1)] * len(going))
+        ended += [each for each in going if each.ended]
+        going = [each for each in going if not each.ended]
     return ended + going
 
 
-def _drive_on(worlds: Sequence[Rehearsal], until_frame: int) -> None:
+def _drive_on(worlds: Sequence[Rehearsal], until_frames: Sequence[int]) -> None:
     """Let agents that have reached their goals drive on."""
     for world in worlds:
+        world.arrives_s = cast(float, world.outcome.time_s)
         world.scenario = replace(world.scenario, cleared=_never)
         world.journeys = {0: Journey()}
-    lockstep.advance(worlds, [until_frame] * len(worlds))
+    lockstep.advance(worlds, until_frames)
 
 
 def _never(xy_m: Floats, approaches: object, parameters: object) -> Bools:
@@ -219,35 +255,42 @@ def _near(
     return near
 
 
-def plan(scenario: Scenario, seed: int) -> Plan | None:
-    """Return the best plan for all agents of a layout that keeps its promise; None if there is none."""
-    able = options(scenario, seed)
-    search = Search(list(able.values()))
+def plans(scenario: Scenario, seeds: Sequence[int]) -> dict[int, tuple[Plan, World]]:
+    """Return the best plan for all agents of each layout that keeps its promise, by the layout's seed.
+
+    With it comes the world after all have acted so. Layouts without such a plan are left out.
+    """
+    able, found = options(scenario, seeds), dict[int, tuple[Plan, World]]()
+    searches = {seed: Search(list(able[seed].values())) for seed in seeds}
     for _ in range(MOST_PLANS):
-        search.run()
-        if search.best is None:
-            return None
-        chosen = dict(zip(able, search.best, strict=True))
-        best = Plan(
-            {agent: able[agent].actions[n] for agent, n in chosen.items()},
-            {agent: float(able[agent].arrives_s[n]) for agent, n in chosen.items()},
-            search.bound_s,
-            search.nodes,
-        )
-        if kept(best, played(scenario, seed, best)):
-            return best
-        search.unfit.add(search.best)
-    return None
+        best = {seed: plan for seed, search in searches.items() if (plan := _best(search, able[seed]))}
+        worlds = played(scenario, best)
+        found |= {seed: (best[seed], worlds[seed]) for seed in best if kept(best[seed], worlds[seed])}
+        searches = {seed: searches[seed] for seed in best if seed not in found}
+    return found
 
 
-def played(scenario: Scenario, seed: int, it: Plan) -> World:
-    """Return the world of a layout after all agents have acted as planned."""
-    world = World.start(scenario, seed)
-    while not world.ended:
-        step = world.step
-        taken = {agent: actions[step] for agent, actions in it.actions.items() if step < len(actions)}
-        take_turn([world], [taken])
-    return world
+def _best(search: Search, able: Mapping[int, Options]) -> Plan | None:
+    """Return the best plan that was not returned before."""
+    search.run()
+    if search.best is None:
+        return None
+    search.unfit.add(search.best)
+    chosen = dict(zip(able, search.best, strict=True))
+    return Plan(
+        {agent: able[agent].actions[n] for agent, n in chosen.items()},
+        {agent: float(able[agent].arrives_s[n]) for agent, n in chosen.items()},
+        search.bound_s,
+        search.nodes,
+    )
+
+
+def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, World]:
+    """Return the world of each layout after all of its agents have acted as planned, by the layout's seed."""
+    worlds = {seed: World.start(scenario, seed) for seed in plans_by_seed}
+    while going := [world for world in worlds.values() if not world.ended]:
+        take_turn(going, [plans_by_seed[world.seed].turn(world.step) for world in going])
+    return worlds
 
 
 def kept(it: Plan, world: World) -> bool:

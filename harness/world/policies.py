@@ -66,13 +66,13 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]
     drivers = POLICIES[:-1]
     worlds = [World.start(scenario, seed) for seed in seeds for _ in drivers]
     reference.finish(worlds, drivers * len(seeds))
-    fates = []
+    alone_s, plans, fates = alone(scenario, seeds), joint.plans(scenario, seeds), list[dict[str, Fate]]()
     for n, seed in enumerate(seeds):
-        alone_s, plan = alone(scenario, seed), joint.plan(scenario, seed)
         by_driver = zip(drivers, worlds[n * len(drivers) :], strict=False)
-        fates.append({driver: fate(world, alone_s) for driver, world in by_driver})
-        if plan:
-            fates[-1][JOINT] = fate(joint.played(scenario, seed, plan), alone_s, plan.exact)
+        fates.append({driver: fate(world, alone_s[seed]) for driver, world in by_driver})
+        if seed in plans:
+            plan, world = plans[seed]
+            fates[-1][JOINT] = fate(world, alone_s[seed], plan.exact)
         else:
             fates[-1][JOINT] = Fate(0.0, False, False, np.nan, np.nan, np.nan)
     return fates

@@ -2,30 +2,43 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 from harness.world import lockstep
 from harness.world.scenario import Layout, Scenario
-from harness.world.seats import agents_of, seat_of
+from harness.world.seats import agents_of, places_by, seat_of
 from harness.world.simulator import populated
 from harness.world.world import Journey, World
 
+W = TypeVar("W", bound=World)
 GRAVEST = ("collision", "off_road", "time_out")
 
 
-def alone(scenario: Scenario, seed: int) -> dict[int, float]:
-    """Return when each agent of a layout would reach its goal alone on the road, in s, by its place.
+def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float]]:
+    """Return when each agent of some layouts would reach its goal alone on the road, in s.
 
-    It keeps the speed that it aims at in the beginning.
+    By a layout's seed and an agent's place. It keeps the speed that it aims at in the beginning.
     """
-    layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
-    cleared_s = {}
-    for agent in agents:
-        its, layout_alone = on_seat(scenario, layout, agent)
-        world = World(its, seed, layout_alone, populated(its, layout_alone))
-        p = its.parameters
-        lockstep.advance([world], [round(p.time_limit_s * p.simulation_hz)])
-        cleared_s[agent] = world.outcome.time_s if world.outcome.success else p.time_limit_s
-    return {agent: time_s or 0.0 for agent, time_s in cleared_s.items()}
+    worlds: dict[tuple[int, int], World] = {}
+    for seed in seeds:
+        layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
+        for agent in agents:
+            its, layout_alone = on_seat(scenario, layout, agent)
+            worlds[seed, agent] = World(its, seed, layout_alone, populated(its, layout_alone))
+    p = scenario.parameters
+    for group in by_scenario(list(worlds.values())):
+        lockstep.advance(group, [round(p.time_limit_s * p.simulation_hz)] * len(group))
+    cleared_s: dict[int, dict[int, float]] = {seed: {} for seed in seeds}
+    for (seed, agent), world in worlds.items():
+        time_s = world.outcome.time_s if world.outcome.success else p.time_limit_s
+        cleared_s[seed][agent] = time_s or 0.0
+    return cleared_s
+
+
+def by_scenario(worlds: Sequence[W]) -> list[list[W]]:
+    """Return worlds by their scenario: such that can be simulated together."""
+    groups = places_by(world.scenario for world in worlds).values()
+    return [[worlds[n] for n in places] for places in groups]
 
 
 def on_seat(

@@ -238,8 +238,8 @@ def test_a_page_lists_decisions_by_step_and_agent_and_has_the_prompts_that_were_
 
 def test_alone_on_the_road_an_agent_comes_as_soon_as_its_speed_takes_it() -> None:
     scenario = scenarios.get(ALL)
-    for seed in range(4):
-        world, cleared_s = World.start(scenario, seed), alone(scenario, seed)
+    for seed, cleared_s in alone(scenario, range(4)).items():
+        world = World.start(scenario, seed)
         assert cleared_s.keys() == world.journeys.keys()
         assert all(1 < time_s < scenario.parameters.time_limit_s for time_s in cleared_s.values())
 

@@ -19,17 +19,15 @@ TWO = "all-way-crossing:agent_share=1"
 @pytest.fixture(scope="module")
 def able() -> dict[int, Options]:
     """Return what the two agents of a layout can do."""
-    return joint.options(scenarios.get(TWO), 2)
+    return joint.options(scenarios.get(TWO), [2])[2]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_what_a_plan_promises_the_simulator_does(name: str) -> None:
     scenario = scenarios.get(name)
-    plan = joint.plan(scenario, 1)
-    assert plan
+    plan, world = joint.plans(scenario, [1])[1]
     assert plan.exact
-    world = joint.played(scenario, 1, plan)
     assert {agent: j.outcome.time_s for agent, j in world.journeys.items()} == plan.arrives_s
     assert all(j.outcome.success for j in world.journeys.values())
     assert plan.sum_s == pytest.approx(sum(plan.arrives_s.values()))
