@@ -58,7 +58,8 @@ SMALLEST = "--requests 80 --repeats 1 --seconds 0.005 --workers 2"
 TABLE = "--requests 1000 --repeats 3"
 NEEDS = "aiohttp"
 AIMS = {"of_ideal": 0.95, "cpu_ms": 0.25}
-TEXT = '{"action_distribution":{"SLOWER":0.20,"IDLE":0.70,"FASTER":0.10}}'
+EGO = '{"action_distribution":{"SLOWER":0.20,"IDLE":0.70,"FASTER":0.10}}'
+HELPER = f'{EGO[:-1]},"evidence":"a car comes from the left, 34 m away","risk":"high"}}'
 LISTED = {"data": [{"id": "m", "owned_by": "benchmark"}]}
 MOST = 1 << 13  # requests of a part, which memory holds at once: 256 layouts have some more
 assert client
@@ -217,7 +218,10 @@ def named(asked: Sequence[Request], part: range) -> list[Request]:
 
 def completed(backend: Backend, asked: Sequence[Request]) -> None:
     """Ask by `complete` alone."""
-    assert all(completion.text == TEXT for completion in backend.complete(asked))
+    completions = backend.complete(asked)
+    assert all(
+        c.text == (EGO if r.role == "ego" else HELPER) for r, c in zip(asked, completions, strict=True)
+    )
 
 
 def kept(spec: Spec, backend: Backend, asked: Sequence[Request]) -> None:
@@ -226,6 +230,7 @@ def kept(spec: Spec, backend: Backend, asked: Sequence[Request]) -> None:
         asker = Asker(spec, lambda: backend, PAPER, Path(folder) / "answers.jsonl")
         asker.ask(asked)
         assert len(asker.answers) == len(asked)
+        assert all(answer.status == "strict" for answer in asker.answers.values())
 
 
 async def bare(urls: Sequence[str], bodies: Iterator[bytes], at_once: int) -> None:
@@ -282,25 +287,27 @@ def serve(seconds: float, at_once: int) -> None:
 
 async def served(seconds: float, at_once: int) -> None:
     loop, counts = asyncio.get_running_loop(), {"answered": 0, "connections": 0, "busy": 0}
-    message = {"choices": [{"finish_reason": "stop", "message": {"content": TEXT}}], "usage": {}}
-    answer, listed = json.dumps(message).encode(), json.dumps(LISTED).encode()
-    waiting = deque[asyncio.Transport]()
+    messages = [
+        {"choices": [{"finish_reason": "stop", "message": {"content": text}}]} for text in (EGO, HELPER)
+    ]
+    answers, listed = [json.dumps(message).encode() for message in messages], json.dumps(LISTED).encode()
+    waiting = deque[tuple[asyncio.Transport, bytes]]()
 
     def reply(to: asyncio.Transport, data: bytes) -> None:
         to.write(b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n" + sized(data))
 
-    def work(to: asyncio.Transport) -> None:
+    def work(to: asyncio.Transport, answer: bytes) -> None:
         if counts["busy"] == at_once:
-            waiting.append(to)
+            waiting.append((to, answer))
         else:
             counts["busy"] += 1
-            loop.call_later(seconds, done, to)
+            loop.call_later(seconds, done, to, answer)
 
-    def done(to: asyncio.Transport) -> None:
+    def done(to: asyncio.Transport, answer: bytes) -> None:
         counts["busy"] -= 1
         counts["answered"] += 1
         if waiting:
-            work(waiting.popleft())
+            work(*waiting.popleft())
         reply(to, answer)
 
     class Connection(asyncio.Protocol):
@@ -324,7 +331,7 @@ async def served(seconds: float, at_once: int) -> None:
                 stated = {**counts, "cpu_s": process_time()}
                 reply(self.to, json.dumps(stated).encode() if b"/stats" in head else listed)
             else:
-                work(self.to)
+                work(self.to, answers[b"evidence" in rest])
 
     server = await loop.create_server(Connection, "127.0.0.1", 0, backlog=1000)
     print(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/v1", flush=True)
