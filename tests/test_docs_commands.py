@@ -92,6 +92,11 @@ NOT_RUN = {
         for line in TYPED
         if re.match(r"harness eval --model '?http://", line)
     },
+    "harness benchmark run v2v-safety-1.0 --model proxy --made-by 'Ada, of Example' --out reports/proxy": (
+        "takes 20 CPU seconds; tests/test_editions.py runs a small edition"
+    ),
+    "harness benchmark verify reports/proxy.zip": "as above",
+    "harness benchmark pack reports/proxy --made-by 'Ada, of Example' --out ada.zip": "as above",
     "harness model pull qwen3-4b": "fetches weights from a hub",
     "harness model pull smollm2-135m": "fetches weights from a registry; tests/test_packages.py does",
     "harness model check smollm2-135m": "needs those weights",

@@ -150,6 +150,14 @@ class Replay:
         return {**ours, "answers_sha256": answers_sha256, "of": model}
 
 
+class Kept(Replay):
+    """Has a run's answers and nobody else to ask, so that a stranger's run opens no model."""
+
+    def _model(self, role: str, requests: Sequence[Request]) -> Backend:
+        """Raise UserError: the run has no such answer."""
+        raise UserError(f"{printable(self._run.path)} holds no answer for {printable(requests[0].id)}")
+
+
 def _turn(whole: Completion, first: FirstTurn, again: bool) -> Completion:
     """Return one of an answer's two turns: the repair turn if `again`, else the first."""
     costs: dict[str, Any] = {}

@@ -11,6 +11,9 @@ COMMANDS = {
     "report": "report",
     "view": "view",
     "serve": "serve",
+    "benchmark run": "benchmark:run",
+    "benchmark pack": "benchmark:pack",
+    "benchmark verify": "benchmark:verify",
     "study sweep": "sweep",
     "study contents": "contents",
     "study trust": "trust",
@@ -62,6 +65,7 @@ COMMANDS = {
 }
 
 GROUPS = {
+    "benchmark": "Run an edition of the benchmark; pack and check its results.",
     "study": "Vary settings: sweeps, contents, attacks, schedules, grids.",
     "study schedule": "Compare schedules (whom to ask, and when), or learn one.",
     "run": "List finished runs; merge, export or film them.",
@@ -77,7 +81,7 @@ GROUPS = {
 PANELS = {
     "Evaluate": ("init", "eval", "drive"),
     "Look at results": ("compare", "report", "view"),
-    "More": ("plan", "serve", "study", "run", "model", "prompt", "dataset", "radio"),
+    "More": ("plan", "serve", "benchmark", "study", "run", "model", "prompt", "dataset", "radio"),
 }
 
 # Spellings of 0.2 and what replaces them; they work until 0.4.0, with a note.

@@ -39,7 +39,7 @@ def command(
     ),
     as_json: options.Json = False,
 ) -> None:
-    """Say how many layouts, requests, tokens and minutes a difference of success needs.
+    """Say how many layouts, requests and minutes a difference takes.
 
     A difference is found if its 95 % interval leaves out 0.
     """

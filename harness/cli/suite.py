@@ -50,8 +50,11 @@ def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
 def evaluate(
     suite: "Suite", specs: "Sequence[Spec]", datasets: "Sequence[Dataset]", out: Path | None,
     evaluated: Callable[..., Any], quiet: bool, as_json: bool,
-) -> None:  # fmt: skip
-    """Evaluate on every dataset, `evaluated` with one backend for all; write and print the means."""
+) -> Path:  # fmt: skip
+    """Evaluate on every dataset, `evaluated` with one backend for all; write and print the means.
+
+    Returns the suite's folder.
+    """
     from harness.backends.registry import open_backend
     from harness.report import suite as report
     from harness.runs.folder import read
@@ -77,6 +80,7 @@ def evaluate(
     elif not quiet:
         _show(done, lines)
         typer.echo(f"wrote {page}")
+    return folder
 
 
 def _mapping(done: "SuiteRun", lines: "Sequence[Line]") -> dict[str, Any]:

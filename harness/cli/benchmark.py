@@ -1,0 +1,165 @@
+"""`harness benchmark`: run an edition, pack its results into one file, and verify such files."""
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from harness.cli import options, suite
+from harness.cli.progress import bar
+from harness.cli.run import evaluate
+from harness.cli.terminal import echo_json, echo_text
+from harness.core.errors import UserError, printable
+from harness.core.formats import SUITE
+
+if TYPE_CHECKING:
+    from harness.evaluate.edition import Edition
+    from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.rescore import Rescored
+
+EDITION = "v2v-safety-1.0"  # taken if none is named
+
+MadeBy = Annotated[str, typer.Option(help="Who made the results, in your words; it stands on a board.")]
+To = Annotated[
+    Path | None, typer.Option(help="File to write. Default: the run's folder with .zip after its name.")
+]
+
+
+def run(
+    edition: Annotated[str, typer.Argument(help="Edition to run.")] = EDITION,
+    model: options.Model = "proxy",
+    engine: options.Engine = None,
+    prompt: options.ScenarioPrompt = None,
+    answer: options.Answer = "json",
+    thinking: options.Thinking = False,
+    batch_size: options.BatchSize = 8,
+    server: Annotated[list[str] | None, typer.Option(help=options.HELP["server"])] = None,
+    device: options.Device = None,
+    dtype: options.Dtype = None,
+    made_by: MadeBy = "",
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder to write the runs to. Default: reports/<model>-<prompts>-<edition>."),
+    ] = None,
+    no_cache: options.NoCache = False,
+    workers: options.RuleWorkers = None,
+    quiet: options.Quiet = False,
+) -> None:
+    """Evaluate a model on an edition, and pack the results.
+
+    Nothing is sent anywhere. If it is stopped, the same command continues it.
+    """
+    from harness.backends.cache import default_file
+    from harness.dataset.suites import Suite
+    from harness.evaluate import edition as editions
+    from harness.evaluate import resolve
+
+    of = editions.named(edition)
+    sources = {name: of.source(name) for name in of.datasets}
+    asked = {
+        "model": model, "engine": engine, "prompt": prompt, "answer": answer, "thinking": thinking,
+        "batch_size": batch_size, "server": tuple(server or ()), "device": device, "dtype": dtype,
+    }  # fmt: skip
+    specs = [resolve.spec(of.settings(name, **asked), source) for name, source in sources.items()]
+    for spec in specs:
+        if spec.ego.prompt.version not in of.prompts:
+            listed = ", ".join(of.prompts)
+            raise UserError(
+                f"--prompt {spec.ego.prompt.version}: {of.name} has prompts {listed}; give one of them"
+            )
+    datasets = Suite(of.name, of.description, tuple(sources))
+    suite.check(datasets, specs)
+    cache = None if no_cache else default_file()
+    evaluated = partial(evaluate, cache=cache, quiet=quiet, workers=options.workers_of(workers or "2"))
+    frozen = [source.dataset for source in sources.values()]
+    folder = suite.evaluate(datasets, specs, frozen, out, evaluated, quiet, as_json=False)
+    pack([folder], edition, made_by, None, quiet)
+
+
+def pack(
+    runs: options.Runs,
+    edition: Annotated[str, typer.Option(help="Edition that they are of.")] = EDITION,
+    made_by: MadeBy = "",
+    out: To = None,
+    quiet: options.Quiet = False,
+) -> None:
+    """Pack runs of an edition, or a suite's folder, into one file."""
+    from harness.evaluate import edition as editions
+    from harness.runs import folder, results
+    from harness.runs import suite as suites
+
+    of = editions.named(edition)
+    if len(runs) == 1 and (runs[0] / SUITE).is_file():
+        given = list(suites.read(runs[0]).runs.values())
+    else:
+        given = [folder.read(path) for path in runs]
+    entry = of.entry(given)
+    try:
+        contents = results.Contents(
+            format=results.FORMAT, edition=of.name, digest=of.digest, made_by=made_by, runs=tuple(entry)
+        )
+    except ValueError as error:
+        raise UserError(f"--made-by: {error}; give a shorter text") from None
+    file = out or runs[0].absolute().with_name(runs[0].absolute().name + ".zip")
+    results.pack(contents, entry, of.metrics, file)
+    if not quiet:
+        typer.echo(f"packed {printable(of.name)}, digest {of.digest[:12]}, into {printable(file)}")
+
+
+def verify(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Files of results.")],
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Compute results again from their answers; compare each figure.
+
+    No model is asked, and nothing in the file is run or believed. Exit code 1 means that a figure differs.
+    """
+    from harness.evaluate.rescore import sources_once
+
+    sources, lines = sources_once(), list[dict[str, Any]]()
+    for file in files:
+        with _rescored(file, sources, as_json or quiet) as done:
+            lines.append(_mapping(file, done))
+            if not (as_json or quiet):
+                _show(file, done)
+    if as_json:
+        echo_json(lines)
+    if not all(line["equal"] for line in lines):
+        raise typer.Exit(1)
+
+
+@contextmanager
+def _rescored(
+    file: Path, sources: "Callable[[Edition, str], FrozenSource]", silent: bool
+) -> "Iterator[Rescored]":
+    from harness.evaluate.rescore import rescored
+
+    with tempfile.TemporaryDirectory(prefix="harness-") as folder:
+        with bar(f"reading {printable(file.name, 30)}", quiet=silent, grows=True) as done:
+            computed = rescored(file, Path(folder), done, sources)
+        yield computed
+
+
+def _mapping(file: Path, done: "Rescored") -> dict[str, Any]:
+    return {
+        "file": str(file), "edition": done.edition.name, "digest": done.edition.digest,
+        "made_by": done.contents.made_by, "agents": str(done.suite.variant), "figures": done.compared,
+        "differing": done.differences, "equal": not any(done.differences.values()),
+    }  # fmt: skip
+
+
+def _show(file: Path, done: "Rescored") -> None:
+    by = f", made by {printable(done.contents.made_by)}" if done.contents.made_by else ""
+    typer.echo(f"{printable(file)}: {printable(done.suite.variant)}{by}")
+    typer.echo(f"{printable(done.edition.name)}, digest {done.edition.digest[:12]}, as it is here")
+    wrong = {name: found for name, found in done.differences.items() if found}
+    for name, found in wrong.items():
+        echo_text(f"{name}: {len(found)} differ: {', '.join(found)}")
+    layouts = sum(len(run.grid.episodes) for run in done.suite.runs.values())
+    of = f"{done.compared} figures of {layouts} layouts in {len(done.suite.runs)} families"
+    typer.echo(f"{'not ' * bool(wrong)}equal to the last digit: {of}")

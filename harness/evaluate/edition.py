@@ -1,0 +1,158 @@
+"""Read editions of a benchmark: all that a score is of, under one digest.
+
+`editions/NAME.toml` states datasets, prompts, conditions, channel seeds and the figures that count.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from msgspec import Meta, Struct
+
+from harness.backends.card import Card
+from harness.core.config import convert, toml
+from harness.core.errors import UserError, printable, unknown
+from harness.core.files import digest
+from harness.core.resources import find, names
+from harness.dataset import load
+from harness.dataset.select import Selection
+from harness.evaluate import resolve
+from harness.evaluate.agent import Agent
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.settings import FrozenSettings, Settings, parse_seeds
+from harness.evaluate.spec import Spec
+from harness.prompts import versions
+from harness.runs.folder import Run
+from harness.runs.metrics import METRICS
+from harness.runs.records import FrozenScenes, Manifest
+
+KIND = "editions"
+
+Names = Annotated[tuple[str, ...], Meta(min_length=1, description="a list of names, one or more")]
+Digests = Annotated[dict[str, str], Meta(min_length=1, description="a table of digests by name")]
+
+
+class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One edition."""
+
+    name: str  # of its file
+    digest: str  # of its tables, hex SHA-256
+    description: str  # its purpose
+    datasets: Digests  # digests of the datasets' manifests, by name, in the order of tables
+    prompts: Digests  # digests of the prompts that an entry may choose from, by version
+    condition: Names  # the operating points that are scored
+    ranked_by: str  # the one of them by which entries are ranked
+    seeds: str  # of the channel, as `--seeds` reads them
+    latency: str  # of every answer, as `--latency` reads it
+    ties: str  # how equally likely actions are taken, as `--ties` reads it
+    metrics: Names  # the figures that a file of results states
+
+    def settings(self, dataset: str, **asked: Any) -> Settings:
+        """Return the settings of an evaluation on one of the datasets; `asked` says who answers, and how."""
+        return Settings(
+            world=FrozenSettings(dataset=dataset), seeds=self.seeds, condition=self.condition,
+            latency=self.latency, ties=self.ties, **asked,
+        )  # fmt: skip
+
+    def source(self, dataset: str) -> FrozenSource:
+        """Return one of the datasets. Raises UserError if the one here is another."""
+        source = FrozenSource(load.load(load.find(dataset)), Selection())
+        if source.dataset.sha256 != self.datasets[dataset]:
+            raise self._differs(
+                f"dataset {printable(dataset)}", source.dataset.sha256, self.datasets[dataset]
+            )
+        return source
+
+    def entry(self, runs: Sequence[Run]) -> dict[str, Run]:
+        """Return the runs of one entry by dataset, in the edition's order.
+
+        Raises UserError unless each is of this edition, each dataset has one, and all are of one agent.
+        """
+        by_dataset: dict[str, Run] = {}
+        for run in runs:
+            mistakes = self._mistakes(run.manifest, by_dataset, _agent(runs[0].manifest))
+            if wrong := next(mistakes, None):
+                raise UserError(
+                    f"{printable(run.path)} is no run of {printable(self.name)}: {wrong}; make one with "
+                    f"`harness benchmark run {printable(self.name)}`"
+                )
+            by_dataset[str(getattr(run.manifest.world, "name", ""))] = run
+        if missing := [name for name in self.datasets if name not in by_dataset]:
+            raise UserError(f"{printable(self.name)} has dataset {printable(missing[0])}; add a run of it")
+        return {name: by_dataset[name] for name in self.datasets}
+
+    def _mistakes(self, m: Manifest, others: Collection[str], agent: dict[str, Any]) -> Iterator[str]:
+        world = m.world
+        if not isinstance(world, FrozenScenes) or self.datasets.get(world.name) != world.sha256:
+            yield f"its scenes are {printable(getattr(world, 'name', 'driven'), 40)}, none of its datasets"
+        elif world.limit is not None or world.selection:
+            yield f"it has {world.episodes} layouts that were selected, and all count"
+        elif world.name in others:
+            yield f"another is of {printable(world.name, 40)}, too"
+        if m.helpers:
+            yield "its helpers are of other models, and one model answers for all"
+        if changed := [key for key, value in _agent(m).items() if value != agent[key]]:
+            yield f"its {changed[0]} is another than that of {printable(next(iter(others), ''), 40)}"
+        version, sha256 = str(m.prompt["version"]), m.prompt["sha256"]
+        if self.prompts.get(version) != sha256:
+            yield f"its prompt is {printable(version, 40)}, none of its prompts"
+        conditions = tuple(str(condition["name"]) for condition in m.conditions)
+        for what, own, wanted in (
+            ("conditions", conditions, self.condition), ("seeds", m.seeds, parse_seeds(self.seeds)),
+            ("latency", m.latency_source, self.latency), ("ties", m.ties, self.ties),
+            ("device profile", m.device_profile and m.device_profile.name, None),
+        ):  # fmt: skip
+            if own != wanted:
+                yield f"its {what}: {printable(own)}, not {printable(wanted)}"
+
+    def spec(self, run: Run, source: FrozenSource) -> Spec:
+        """Return the evaluation that a run of this edition is; of the run it takes who answered, and how."""
+        m = run.manifest
+        prompt = versions.load(str(m.prompt["version"]))
+        if prompt.sha256 != self.prompts[prompt.version]:
+            raise self._differs(f"prompt {prompt.version}", prompt.sha256, self.prompts[prompt.version])
+        card = convert(m.model, Card, f"{printable(run.path)}: its model")
+        how: Any = (m.answer, m.thinking, m.image, m.letters, m.sums, m.flip)
+        return Spec(
+            Agent(card, prompt, *how), source, resolve.points(self.condition), parse_seeds(self.seeds),
+            batch_size=m.batch_size, temperature=m.temperature, sampling_seed=m.sampling_seed,
+            latency=self.latency, ask=m.ask, ties=self.ties,
+        )  # fmt: skip
+
+    def _differs(self, what: str, here: str, stated: str) -> UserError:
+        return UserError(
+            f"{what} has digest {here[:12]}…, and {printable(self.name)} is of {printable(stated, 13)}; "
+            "restore it, or install the release that has it"
+        )
+
+
+def _agent(m: Manifest) -> dict[str, Any]:
+    """Return who answered, and how; prompts may differ by family."""
+    stated = {**m.agent(0), "temperature": m.temperature}
+    return {key: value for key, value in stated.items() if key != "prompt"}
+
+
+def named(name: str) -> Edition:
+    """Return an edition, shipped or the project's. Raises UserError if there is none, or it is wrong."""
+    if name not in names(KIND):
+        raise unknown("edition", name, names(KIND))
+    return of_file(find(KIND, f"{name}.toml"))
+
+
+def of_file(file: Path) -> Edition:
+    """Read an edition's file. Raises UserError if it is wrong."""
+    where = f"edition {printable(file)}"
+    tables = toml(file, where)
+    try:
+        sha256 = digest(tables)
+    except (ValueError, TypeError) as error:  # a date, or a number without an end
+        raise UserError(f"{where}: {printable(error)}; give texts") from None
+    edition = convert(tables, Edition, where, name=file.stem, digest=sha256)
+    for what, stated, known in (
+        ("metric", edition.metrics, METRICS), ("ranked_by", (edition.ranked_by,), edition.condition),
+    ):  # fmt: skip
+        if strange := [each for each in stated if each not in known]:
+            raise unknown(f"{what} of {where}", strange[0], known)
+    parse_seeds(edition.seeds)
+    resolve.points(edition.condition)
+    return edition

@@ -1,0 +1,128 @@
+"""Pack a benchmark's results into one zip file, and unpack a stranger's.
+
+In it are `results.json`, and of each dataset's run a folder with its manifest, its answers, how its episodes
+ended, and the figures that its edition names. Its bytes follow from these.
+"""
+
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from zipfile import ZipFile, ZipInfo
+
+import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
+
+from harness.core.errors import UserError, printable
+from harness.core.files import BROKEN, LARGEST, bytes_of, opened, replacing, write_whole
+from harness.runs.folder import Run, csv_text, read
+from harness.runs.listing import own_name
+from harness.runs.records import FrozenScenes, Score
+
+FORMAT = "swarmdrive-results/1"
+CONTENTS = "results.json"
+FILES = {  # of each run, with the most bytes that each may have
+    "run.json": 16 << 20, "answers.jsonl": 1 << 30, "episodes.csv": 256 << 20, "summary.csv": 16 << 20,
+}  # fmt: skip
+MOST_RUNS = 100
+MOST_LETTERS = 200  # of who made it
+LARGEST_LIST = 1 << 20  # bytes of the archive's list of files
+END, END_64 = b"PK\5\6", b"PK\6\7"  # how the two records begin that stand after this list
+CHUNK = 1 << 20
+BROKEN_ZIP = (*BROKEN, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+
+
+class Contents(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The content of `results.json`."""
+
+    format: str
+    edition: str  # its name
+    digest: str  # the edition's digest
+    made_by: str  # who made the file, in their own words
+    runs: tuple[str, ...]  # names of the datasets, each with a run
+
+    def __post_init__(self) -> None:
+        if self.format != FORMAT:
+            raise ValueError(f"its format is not {FORMAT}")
+        if not 0 < len(self.runs) == len(set(self.runs)) <= MOST_RUNS or not all(map(_plain, self.runs)):
+            raise ValueError("runs: none, too many, one twice, or one with a name that is no folder's")
+        if len(self.made_by) > MOST_LETTERS:
+            raise ValueError(f"made_by has more than {MOST_LETTERS} letters")
+
+
+def figures(run: Run, metrics: Sequence[str]) -> list[Score]:
+    """Return a run's scores in some metrics."""
+    return [score for score in run.scores if score.metric in metrics]
+
+
+def pack(contents: Contents, runs: Mapping[str, Run], metrics: Sequence[str], out: Path) -> None:
+    """Write the runs, by dataset, to one file. What a run says of the machine's folders is left out."""
+    with replacing(out) as part, ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for name, data in _files(contents, runs, metrics):
+            member = ZipInfo(name)  # of 1980, so that the bytes follow from the content
+            member.compress_type, member.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+            archive.writestr(member, data)
+
+
+def _files(
+    contents: Contents, runs: Mapping[str, Run], metrics: Sequence[str]
+) -> Iterator[tuple[str, bytes]]:
+    yield CONTENTS, msgspec.json.format(msgspec.json.encode(contents), indent=1) + b"\n"
+    for name, run in runs.items():
+        world = run.manifest.world
+        assert isinstance(world, FrozenScenes)
+        manifest = replace(run.manifest, name=name, command="", tags=(), world=replace(world, path=name))
+        yield f"{name}/run.json", msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n"
+        for file in ("answers.jsonl", "episodes.csv"):
+            yield f"{name}/{file}", bytes_of(run.path / file, "rows")
+        yield f"{name}/summary.csv", csv_text(Score, figures(run, metrics), manifest.variant).encode()
+
+
+def unpack(file: Path, folder: Path) -> tuple[Contents, list[Run]]:
+    """Write a file's runs to a folder, and return them; their tables are read later.
+
+    Only the files that `results.json` calls for are written, each under a name that is made here and no
+    larger than `FILES` allows. Raises UserError if it is no such file, or has any other.
+    """
+    try:
+        _refuse_long_list(file)
+        with opened(file, "record") as whole, ZipFile(whole) as archive:
+            contents = msgspec.json.decode(_piece(archive, CONTENTS, CHUNK), type=Contents)
+            wanted = {f"{name}/{each}": most for name in contents.runs for each, most in FILES.items()}
+            if sorted(archive.namelist()) != sorted([CONTENTS, *wanted]):
+                raise ValueError("it has other files than it should, or one twice")
+            for name, most in wanted.items():
+                write_whole(folder / name, _piece(archive, name, most))
+    except BROKEN_ZIP as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(
+            f"{printable(file)} is no file of results ({printable(reason)}); give one that `harness "
+            "benchmark run` or `pack` wrote"
+        ) from None
+    return contents, [read(folder / name) for name in contents.runs]
+
+
+def _plain(name: str) -> bool:
+    return own_name(name) and name.isprintable() and "\\" not in name and 0 < len(name) <= 100
+
+
+def _refuse_long_list(file: Path) -> None:
+    """Raise ValueError for a list of files that would fill memory before one of them is looked at."""
+    with opened(file, "record") as whole:
+        end = whole.seek(0, 2)
+        whole.seek(max(0, end - 42))
+        tail = whole.read()
+    if len(tail) < 22 or tail[-22:-18] != END or tail[:4] == END_64:
+        raise ValueError(f"it does not end as a zip file of at most {LARGEST['record'] >> 20} MB does")
+    if int.from_bytes(tail[-10:-6], "little") > LARGEST_LIST:
+        raise ValueError("its list of files is too long")
+
+
+def _piece(archive: ZipFile, name: str, most: int) -> bytes:
+    """Return a file's content; never more than `most` bytes are unpacked."""
+    with archive.open(name) as packed:
+        data = packed.read(most + 1)
+    if len(data) > most:
+        raise ValueError(f"{name} is larger than {most >> 20} MB")
+    return data

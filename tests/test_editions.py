@@ -1,0 +1,365 @@
+"""An edition of the benchmark: run, packed into one file, and computed again from the answers in it."""
+
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from shutil import copytree
+from zipfile import ZipFile
+
+import pytest
+
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset, released
+from harness.evaluate.edition import named, of_file
+from harness.prompts import versions
+from harness.runs.results import CONTENTS, FILES
+
+Harness = Callable[..., tuple[int, str, str]]
+Once = Callable[[str, Callable[[Path], object]], Path]
+Change = Callable[[dict[str, bytes]], None]
+ROOT = Path(__file__).parent.parent
+SHIPPED = "05d1ef665f620c9ac8f294299cbabc9394d5af315b180746236c80cee918eb39"
+EDITION = """
+description = "A small one"
+condition = ["single-local", "6g"]
+ranked_by = "6g"
+seeds = "0:2"
+latency = "paper"
+ties = "drawn"
+metrics = ["success_rate", "success_gain_over_single-local", "failed_rate_ego"]
+[datasets]
+small = "{}"
+[prompts]
+v2 = "{}"
+"""
+
+
+@pytest.fixture
+def project(harness: Harness, tmp_path: Path, small_path: Path, small: Dataset) -> Harness:
+    """The command, typed in a project that has an edition of one dataset."""
+    (tmp_path / "swarmdrive.toml").touch()
+    for folder in ("datasets", "editions"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "datasets/small").symlink_to(small_path)
+    text = EDITION.format(small.sha256, versions.load("v2").sha256)
+    (tmp_path / "editions/mine-1.toml").write_text(text)
+    return harness
+
+
+@pytest.fixture
+def made(project: Harness, once: Once, tmp_path: Path) -> Path:
+    """A file of results of `proxy-faulty`, some of whose answers are repaired and some unreadable."""
+
+    def run(out: Path) -> None:
+        code, _, err = project(
+            "benchmark", "run", "mine-1", "--model", "proxy-faulty", "--quiet", "--out", out
+        )
+        assert (code, err) == (0, "")
+
+    folder = once("entry", run)
+    copytree(folder, tmp_path / "entry")
+    code, _, err = project("benchmark", "pack", "entry", "--edition", "mine-1", "--made-by", "A. N. Author")
+    assert (code, err) == (0, "")
+    return tmp_path / "entry.zip"
+
+
+def files_of(file: Path) -> dict[str, bytes]:
+    with ZipFile(file) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def write(file: Path, files: Mapping[str, bytes]) -> None:
+    with ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+
+
+def changed(file: Path, change: Change) -> None:
+    files = files_of(file)
+    change(files)
+    write(file, files)
+
+
+def answers(files: dict[str, bytes], change: Callable[[dict[str, object]], object]) -> None:
+    """Change each answer, or leave it out where `change` returns False."""
+    each = [json.loads(line) for line in files["small/answers.jsonl"].splitlines()]
+    kept = [answer for answer in each if change(answer) is not False]
+    files["small/answers.jsonl"] = b"".join(json.dumps(answer).encode() + b"\n" for answer in kept)
+
+
+def test_a_file_of_results_has_the_answers_and_the_editions_figures_and_is_computed_again(
+    project: Harness, made: Path
+) -> None:
+    files = files_of(made)
+    assert list(files) == [CONTENTS, *(f"small/{name}" for name in FILES)]
+    assert json.loads(files[CONTENTS])["made_by"] == "A. N. Author"
+    figures = {line.split(",")[5] for line in files["small/summary.csv"].decode().splitlines()[1:]}
+    assert figures == {"success_rate", "success_gain_over_single-local", "failed_rate_ego"}
+    code, out, err = project("benchmark", "verify", made)
+    assert (code, err) == (0, "")
+    assert out.splitlines() == [
+        f"{made}: proxy-faulty · v2 · json, made by A. N. Author",
+        f"mine-1, digest {named('mine-1').digest[:12]}, as it is here",
+        "equal to the last digit: 7 figures of 4 layouts in 1 families",
+    ]
+
+
+def test_a_file_says_nothing_of_the_machine_and_its_bytes_follow_from_the_runs(
+    project: Harness, made: Path, tmp_path: Path
+) -> None:
+    before = made.read_bytes()
+    assert not any(str(tmp_path.parent).encode() in data for data in files_of(made).values())
+    by = ("--edition", "mine-1", "--made-by", "A. N. Author")
+    code, _, _ = project("benchmark", "pack", "entry/small", *by, "--out", "again.zip")
+    assert code == 0
+    assert Path("again.zip").read_bytes() == before
+
+
+def test_a_stated_figure_that_the_answers_do_not_give_is_named(project: Harness, made: Path) -> None:
+    def better(files: dict[str, bytes]) -> None:
+        lines = files["small/summary.csv"].decode().splitlines(keepends=True)
+        at = next(n for n, line in enumerate(lines) if ",6g,success_rate," in line and "episodes" in line)
+        cells = lines[at].split(",")
+        cells[6] = "0.987654"
+        lines[at] = ",".join(cells)
+        files["small/summary.csv"] = "".join(lines).encode()
+
+    changed(made, better)
+    code, out, _ = project("benchmark", "verify", made)
+    assert code == 1
+    assert "small: 1 differ: 6g success_rate episodes" in out
+    assert "not equal to the last digit" in out
+
+
+def test_what_a_file_says_its_answers_mean_is_not_believed(project: Harness, made: Path) -> None:
+    believed = {"intent": [1.0, 0.0, 0.0], "status": "ok", "mass": 9.0}
+    changed(made, lambda files: answers(files, lambda a: a.update(believed)))
+    assert project("benchmark", "verify", made)[0] == 0, "texts are read again"
+
+    def brakes(answer: dict[str, object]) -> None:
+        answer["raw"] = '{"SLOWER": 1.0, "IDLE": 0.0, "FASTER": 0.0}'
+
+    changed(made, lambda files: answers(files, lambda a: brakes(a) if a["role"] == "ego" else None))
+    code, out, err = project("benchmark", "verify", made)
+    assert (code, out) == (2, "")
+    assert "holds no answer for" in err, "other answers lead to scenes in which nobody was asked"
+
+
+def drop(files: dict[str, bytes]) -> None:
+    answers(files, lambda answer: answer["role"] == "ego" or None)
+    answers(files, lambda answer: "-2-" not in str(answer["scene"]))
+
+
+def with_run(**changes: object) -> Change:
+    def change(files: dict[str, bytes]) -> None:
+        files["small/run.json"] = json.dumps(json.loads(files["small/run.json"]) | changes).encode()
+
+    return change
+
+
+def with_contents(**changes: object) -> Change:
+    def change(files: dict[str, bytes]) -> None:
+        files[CONTENTS] = json.dumps(json.loads(files[CONTENTS]) | changes).encode()
+
+    return change
+
+
+def renamed(name: str) -> Change:
+    """Have a run under a name that leads elsewhere."""
+
+    def change(files: dict[str, bytes]) -> None:
+        with_contents(runs=[name])(files)
+        for file in FILES:
+            files[f"{name}/{file}"] = files.pop(f"small/{file}")
+
+    return change
+
+
+def with_model(**changes: object) -> Change:
+    def change(files: dict[str, bytes]) -> None:
+        model = json.loads(files["small/run.json"])["model"]
+        with_run(model=model | changes)(files)
+
+    return change
+
+
+def another_card(files: dict[str, bytes]) -> None:
+    with_model(name="evil", engine="transformers", weights="/etc")(files)
+    drop(files)
+
+
+HOSTILE: dict[str, tuple[Change, str]] = {
+    "a name above the folder": (renamed("../../escaped"), "runs: none, too many, one twice"),
+    "an absolute name": (renamed("/tmp/escaped"), "runs: none, too many, one twice"),
+    "a hidden name": (renamed(".hidden"), "runs: none, too many, one twice"),
+    "a file too many": (lambda files: files.update({"small/x.py": b""}), "it has other files than it should"),
+    "a file too few": (lambda files: files.pop("small/episodes.csv"), "it has other files than it should"),  # type: ignore[dict-item]
+    "a bomb": (lambda files: files.update({"small/run.json": b" " * (17 << 20)}), "small/run.json is larger"),
+    "no contents": (lambda files: files.update({CONTENTS: b"{"}), "is no file of results"),
+    "another format": (with_contents(format="swarmdrive-results/9"), "its format is not"),
+    "another edition": (with_contents(edition="theirs-1"), "unknown edition 'theirs-1'"),
+    "an edition that has changed": (with_contents(digest="0" * 64), "has digest"),
+    "no run": (lambda files: files.update({"small/run.json": b"{}"}), "has format"),
+    "other seeds": (with_run(seeds=[5, 6]), "its seeds: (5, 6), not (0, 1)"),
+    "another prompt": (with_run(prompt={"version": "v9", "sha256": "0" * 64}), "none of its prompts"),
+    "another latency": (with_run(latency_source="card"), "its latency: card, not paper"),
+    "an engine that nobody has": (with_model(engine="evil"), "evil"),
+    "answers that are missing": (drop, "holds no answer for"),
+    "a model to open": (another_card, "holds no answer for"),
+    "broken answers": (lambda files: files.update({"small/answers.jsonl": b"{}\n"}), "is broken"),
+    "a number without measure": (
+        lambda files: answers(files, lambda a: a.update(prompt_tokens=10**40, slow_s=1e308)),
+        "holds no answer for",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_a_hostile_file_is_refused_in_one_line_and_leaves_nothing(
+    project: Harness, made: Path, tmp_path: Path, what: str
+) -> None:
+    change, message = HOSTILE[what]
+    changed(made, change)
+    before = {path for path in tmp_path.parent.rglob("*") if "__pycache__" not in path.parts}
+    code, out, err = project("benchmark", "verify", made)
+    assert (code, out) == (2, ""), err
+    assert (err[:9], err.count("\n")) == ("harness: ", 1)
+    assert message in err
+    assert {path for path in tmp_path.parent.rglob("*") if "__pycache__" not in path.parts} == before
+    assert not Path("/tmp/escaped").exists()
+
+
+def raw(data: bytes) -> Callable[[Path], object]:
+    return lambda file: file.write_bytes(data)
+
+
+def twice(file: Path) -> None:
+    with pytest.warns(UserWarning, match="Duplicate name"), ZipFile(file, "a") as archive:
+        archive.writestr(CONTENTS, b"{}")
+
+
+def listed_at_length(file: Path) -> None:
+    data = bytearray(file.read_bytes())
+    data[-10:-6] = (1 << 30).to_bytes(4, "little")
+    file.write_bytes(bytes(data))
+
+
+def locked(file: Path) -> None:
+    """Say of every file that it needs a password."""
+    data = bytearray(file.read_bytes())
+    for mark, flag in ((b"PK\1\2", 8), (b"PK\3\4", 6)):
+        at = -1
+        while (at := data.find(mark, at + 1)) >= 0:
+            data[at + flag] |= 1
+    file.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        raw(b""), raw(b"PK\5\6"), raw(b"\0" * 10_000), twice, listed_at_length, locked,
+        lambda file: file.write_bytes(file.read_bytes()[:-30]),
+        lambda file: file.unlink() or file.mkdir(),
+        lambda file: file.unlink(),
+    ],
+)  # fmt: skip
+def test_what_is_no_zip_file_of_ours_is_refused_in_one_line(
+    project: Harness, made: Path, harm: Callable[[Path], object]
+) -> None:
+    harm(made)
+    code, out, err = project("benchmark", "verify", made)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "is no file of results" in err or "entry.zip" in err
+
+
+@pytest.mark.slow
+def test_a_driver_is_computed_again_from_its_own_answers(project: Harness) -> None:
+    code, _, err = project("benchmark", "run", "mine-1", "--model", "uniform", "--quiet", "--out", "u")
+    assert (code, err) == (0, "")
+    assert project("benchmark", "verify", "u.zip", "--quiet")[:2] == (0, "")
+    changed(Path("u.zip"), lambda files: answers(files, lambda a: a.update(raw="SLOWER")))
+    assert project("benchmark", "verify", "u.zip", "--quiet")[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (("--limit", "2"), "it has 2 layouts that were selected, and all count"),
+        (("--latency", "card"), "its latency: card, not paper"),
+        (("--seeds", "1:3"), "its seeds: (1, 2), not (0, 1)"),
+        (("--helper-model", "uniform"), None),
+    ],
+)
+def test_runs_that_are_not_of_the_edition_are_not_packed(
+    project: Harness, options: tuple[str, ...], why: str | None
+) -> None:
+    usual = ("--seeds", "0:2", "--condition", "single-local", "--condition", "6g", "--latency", "paper")
+    code, _, err = project("eval", "--dataset", "small", *usual, *options, "--quiet", "--out", "run")
+    if why is None:
+        assert code == 2, "a driver is no helper"
+        return
+    assert (code, err) == (0, "")
+    code, out, err = project("benchmark", "pack", "run", "--edition", "mine-1")
+    assert (code, out) == (2, "")
+    assert why in err
+    assert err.count("\n") == 1
+    assert not Path("run.zip").exists()
+
+
+def test_an_edition_is_its_tables_and_not_their_layout(project: Harness) -> None:
+    file = Path("editions/mine-1.toml")
+    text, digest = file.read_text(), of_file(file).digest
+    file.write_text("# a remark\n" + text.replace('seeds = "0:2"', 'seeds   =   "0:2"'))
+    assert of_file(file).digest == digest
+    for old, new in (
+        ('"0:2"', '"0:3"'),
+        ('"drawn"', '"first"'),
+        ('v2 = "', 'v2 = "0'),
+        ('"6g"]', '"v2x", "6g"]'),
+    ):
+        assert old in text
+        file.write_text(text.replace(old, new))
+        assert of_file(file).digest != digest
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('ranked_by = "6g"', 'ranked_by = "7g"', "unknown ranked_by of edition"),
+        ('"success_rate"', '"success_rat"', "unknown metric of edition"),
+        ('seeds = "0:2"', 'seeds = "none"', "--seeds none"),
+        ('ties = "drawn"', "ties = 2020-01-01", "editions/mine-1.toml"),
+        ('ties = "drawn"', "", "ties"),
+    ],
+)
+def test_a_wrong_edition_is_one_line(project: Harness, old: str, new: str, message: str) -> None:
+    file = Path("editions/mine-1.toml")
+    file.write_text(file.read_text().replace(old, new))
+    code, _, err = project("benchmark", "run", "mine-1")
+    assert (code, err.count("\n")) == (2, 1)
+    assert message in err
+
+
+def test_a_dataset_that_is_not_the_editions_is_refused(project: Harness) -> None:
+    file = Path("editions/mine-1.toml")
+    file.write_text(file.read_text().replace('small = "', 'small = "f'))
+    code, _, err = project("benchmark", "run", "mine-1")
+    assert code == 2
+    assert "dataset small has digest" in err
+
+
+def test_a_shipped_edition_is_as_it_was_released_and_of_what_is_released() -> None:
+    edition = named("v2v-safety-1.0")
+    assert edition.digest == SHIPPED, "a released edition is never edited; make the next"
+    assert edition.datasets.items() <= released().items()
+    for version, sha256 in edition.prompts.items():
+        assert (versions.load(version).sha256, versions.load(version).released) == (sha256, True)
+
+
+def test_a_results_file_of_another_model_a_family_is_refused(project: Harness, made: Path) -> None:
+    from harness.runs.folder import read
+
+    run = read(Path("entry/small"))
+    with pytest.raises(UserError, match="another is of small, too"):
+        named("mine-1").entry([run, run])
