@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from harness.core import noise
+from harness.core.errors import UserError, printable
 from harness.core.parallel import Workers
 from harness.core.statistics import (
     Estimate,
@@ -21,6 +22,7 @@ from harness.world import joint, reference
 from harness.world.drivers import PRIVILEGED
 from harness.world.precedence import RULES
 from harness.world.scenario import Scenario
+from harness.world.seats import offsets
 from harness.world.swarm import alone, gravest
 from harness.world.world import World
 
@@ -84,7 +86,13 @@ def check(
     """Drive every policy through the same layouts; return the `summary` of each, and what `joint` left open.
 
     `unsolved` are the seeds without a joint plan in which all arrive, `inexact` those with a bound only.
+    Raises UserError where agents decide at times of their own.
     """
+    if len(offsets(scenario)) > 1:
+        raise UserError(
+            f"{printable(scenario.name)}: clock is apart, and a joint plan has one clock for all; "
+            "leave it out, or use `harness drive`"
+        )
     seeds = range(seed, seed + episodes)
     fates = reference.in_chunks(partial(drive_all, scenario), seeds, TOGETHER, workers, progress)
     best = [of[JOINT] for of in fates]

@@ -137,3 +137,11 @@ def test_agents_of_a_scenario_without_seats_are_refused_in_one_line(harness: Any
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
     assert "only the ego has a goal" in err
+
+
+def test_agents_with_clocks_of_their_own_have_no_joint_plan(harness: Any) -> None:
+    command = ("dataset", "scenario", "drive", "all-way-crossing:clock=apart", "--agents", "all")
+    code, out, err = harness(*command, "--episodes", 1)
+    assert (code, out) == (2, "")
+    assert "clock is apart, and a joint plan has one clock for all; leave it out" in err
+    assert err.count("\n") == 1
