@@ -195,6 +195,8 @@ class Details:
                 )
             if run.manifest.latency.speeds:
                 shown["took_s"] = None if answer.error else answer_s(run.speed(answer), answer)
+            elif run.manifest.helpers:
+                shown["took_s"] = run.seconds(answer)
             spans_read = _read_in(answer, run) if answer.repairs else []
             answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
         decisions: dict[Any, dict[str, Any]] = {}  # seeds with the same decision share an entry

@@ -187,9 +187,9 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         "names": runs.names,
         "runs": [
             {
-                "inference_s": {"ego": [latency.ego_s], "helper": latency.helper_times_s()},
+                "inference_s": {"ego": latency.ego_s, "helper": latency.helper_s},
                 "points": {
-                    c["name"]: {key: c.get(key) for key in ("window_s", "consensus", "messages")}
+                    c["name"]: {key: c.get(key) for key in ("window_s", "consensus", "messages", "content")}
                     for c in run.manifest.conditions
                 },
             }

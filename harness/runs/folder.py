@@ -159,6 +159,11 @@ class Run:
         """Return the speed of an answer's agent; only for a run with a device profile."""
         return self.manifest.latency.speed(self._viewer_place(answer))
 
+    def seconds(self, answer: Answer) -> float | None:
+        """Return the seconds that an answer of its agent takes, a repair turn included; None if unknown."""
+        usual_s = self.manifest.latency.seconds(self._viewer_place(answer))
+        return None if usual_s is None else usual_s * answer.turns + answer.slow_s
+
     def _viewer_place(self, answer: Answer) -> int:
         """Return the place of an answer's viewer, the ego at 0; also 0 if one agent answers for all."""
         if not self.manifest.helpers:

@@ -194,6 +194,11 @@ class Latency(Struct, frozen=True, omit_defaults=True):
         ego, *helpers = self.speeds
         return helpers[(place - 1) % len(helpers)] if place and helpers else ego
 
+    def seconds(self, place: int) -> Seconds | None:
+        """Return the seconds of an answer of who is at this place, as `speed`; None if its speed says."""
+        helpers = self.helper_times_s()
+        return helpers[(place - 1) % len(helpers)] if place and helpers else self.ego_s
+
 
 class Message(Struct, frozen=True, rename={"sender": "from"}):
     """A helper's reply: whether and when it arrived, and its weight in the policy."""

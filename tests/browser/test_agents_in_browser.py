@@ -10,8 +10,11 @@ from evaluating import live_spec_of, run
 from opening import wait
 from playwright.sync_api import expect
 
+from harness.backends import cards
 from harness.coordination.operating_point import named_point
+from harness.evaluate.agent import Agent
 from harness.evaluate.live_world import LiveSource
+from harness.prompts import versions
 from harness.report.page import render
 from harness.report.runs import gather
 
@@ -45,6 +48,26 @@ def test_one_clicks_from_vehicle_to_vehicle_of_a_step(tmp_path, opened):
     page.locator("#decision table[data-csv=agents] a", has_text="v4").click()
     expect(page.locator("#decision p strong")).to_have_text("v4 decides")
     expect(page.locator("#decision p", has_text="step 1;")).to_be_visible()
+
+
+def test_each_agent_is_shown_with_its_model_and_the_plans_that_were_heard(tmp_path, opened):
+    point = named_point("6g:schedule=always,content=plan,consensus=yield-by-time")
+    spec = live_spec_of(prompt="v4", points=(named_point("6g"),), seeds=(0,))
+    cruise = Agent(cards.resolve("cruise"), versions.load("v4"))
+    source = LiveSource(50_001, 1, "all-way-crossing:agent_share=1")
+    spec = replace(spec, source=source, points=(point,), helpers=(cruise,), latency="ego=0.1,helper=0.15")
+    run(spec, tmp_path / "run")
+    (tmp_path / "report.html").write_text(render(gather([tmp_path / "run"]), full=True))
+    page = opened(tmp_path / "report.html", "#decisions")
+    page.locator("#list tbody tr").nth(1).locator("a").click()
+    wait(page)
+    expect(page.locator("#decision p", has_text="v2 decides with cruise · v4 · json;")).to_be_visible()
+    agents = page.locator("#decision table[data-csv=agents] tbody tr")
+    assert [row.locator("small").first.inner_text() for row in agents.all()][:2] == [
+        "proxy · v4 · json", "cruise · v4 · json"
+    ]  # fmt: skip
+    charts = [chart.text_content() for chart in page.locator("#decision .chart svg").all()]
+    assert all("v1, plan" in text and "v1, helper" not in text for text in charts)
 
 
 def labels(page):

@@ -155,9 +155,10 @@ def test_a_vehicle_decides_with_its_own_model_and_takes_that_ones_time(tmp_path:
     spec = replace(spec, source=LiveSource(50_000, 3, ALL), helpers=(cruise,), latency="ego=0.1,helper=0.3")
     there = folder.read(run(spec, tmp_path / "run").out)
     egos = {World.start(scenarios.get(ALL), seed).vehicles[0].spawn.id for seed in range(50_000, 50_003)}
-    table = there.decisions
+    table, page = there.decisions, details(render(gather([tmp_path / "run"]), full=True))
     for d in table.records(0, len(table)):
         [answer] = [a for a in there.answers_by_scene[d.scene] if a.role == "ego"]
+        assert page[d.scene]["runs"][0]["answers"][0]["took_s"] == pytest.approx(d.latency_ms / 1000)
         model = there.agent(answer)["model"]["name"]
         assert d.latency_ms == {"proxy": 100.0, "cruise": 300.0}[model]
         assert d.action == "IDLE" or model == "proxy", "who never yields"

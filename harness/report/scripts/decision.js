@@ -48,14 +48,18 @@ function reply(m) {
 const acted = (d) => d.acts_at_s != null
   && h("small", {}, d.acted ? `acts at ${number(d.acts_at_s, 2, "s")}` : "not ready before the episode ended");
 
-// Second answers of the ego are in the fused policy. Under some conditions helpers are heard who were shown nothing.
-const first = (answers, point) => answers.filter((a) =>
-  a.role === "ego" || a.role === (point.messages === "blind" ? "blind" : "helper"));
+// Second answers of the ego are in the fused policy. Under some conditions helpers are heard who were shown nothing,
+// or agents, whose plans are the answers that they gave from their own seats.
+function first(record, point, together) {
+  const speaks = point.content === "plan" ? "plan" : point.messages === "blind" ? "blind" : "helper";
+  const plans = together.filter((each) => !each.here && each.own).map(({ own }) => ({ ...own, role: "plan" }));
+  return [...record.answers, ...plans].filter((a) => a.role === "ego" || a.role === speaks);
+}
 
-function policyRows(record, chosen, actions, run) {
+function policyRows(record, chosen, actions, run, together) {
   const rows = [];
   const add = (who, what, p) => actions.forEach((action, n) => rows.push({ who, what, action, p: p[n] }));
-  for (const a of first(record.answers, run.points[chosen.condition])) {
+  for (const a of first(record, run.points[chosen.condition], together)) {
     const message = chosen.messages.find((m) => m.from === sender(a));
     const weight = a.role === "ego" ? chosen.own_weight : message?.weight;
     const before = weight == null ? "before fusion" : `before fusion; weight ${number(weight, 3)}`;
@@ -66,14 +70,12 @@ function policyRows(record, chosen, actions, run) {
   return rows;
 }
 
-// Inference as the run took it: each answer's own time, one a role, or one each helper model, which take turns.
-function timelineRows(record, chosen, run) {
+// Inference as the run took it: an answer's own time, that of its agent's model, or with one model that of its role.
+function timelineRows(record, chosen, run, together) {
   const rows = [], point = run.points[chosen.condition], { latency_ms } = chosen;
-  let turn = 0;
-  for (const a of first(record.answers, point)) {
-    const times = run.inference_s[a.role === "ego" ? "ego" : "helper"];
-    const usual = a.took_s === undefined ? times[a.role === "ego" ? 0 : turn++ % times.length] : 0;
-    const ready = 1000 * (a.took_s ?? usual); // null where an answer never came
+  for (const a of first(record, point, together)) {
+    const usual = run.inference_s[a.role === "helper" || a.role === "blind" ? "helper" : "ego"];
+    const ready = 1000 * (a.took_s === undefined ? usual : a.took_s); // null where an answer never came
     const m = chosen.messages.find((m) => m.from === sender(a)), name = who(a);
     if (a.role !== "ego" && !m) continue;
     if (ready) rows.push({ who: name, what: "inference", from: 0, to: ready });
@@ -144,7 +146,10 @@ class DecisionPage {
     return [
       h("h3", {}, `What each agent decided in this step, under ${condition}`),
       table("agents", ["agent", "its own intent", "what it heard", "fused", "action"], this.together.map((each) => [
-        each.here ? h("strong", {}, each.id) : h("a", { href: each.href }, each.id),
+        [
+          each.here ? h("strong", {}, each.id) : h("a", { href: each.href }, each.id),
+          each.own?.agent && h("small", {}, each.own.agent),
+        ],
         distribution(actions, each.own?.intent),
         each.decision.messages.length ? each.decision.messages.map((m) => h("div", {}, reply(m))) : "asked nobody",
         distribution(actions, each.decision.fused),
@@ -194,9 +199,10 @@ class DecisionPage {
 
   title() {
     const [id, episode, step, danger, agent] = this.index.scenes[this.n], words = endWords(this.index.live);
+    const own = this.record?.answers.find((a) => a.role === "ego");
     return [
       h("h1", { tabindex: "-1" }, `${this.index.live ? "Decision point" : "Decision"} ${id}`),
-      h("p", {}, `Episode ${episode}, step ${step}; `, agent && [h("strong", {}, `${agent} decides`), "; "], `${danger ? `danger from ${danger}` : "no danger"}. `,
+      h("p", {}, `Episode ${episode}, step ${step}; `, agent && [h("strong", {}, `${agent} decides`), own?.agent && ` with ${own.agent}`, "; "], `${danger ? `danger from ${danger}` : "no danger"}. `,
         this.decisions.map((d) => {
           const [look, sign] = ENDS[d.end];
           return [h("span", { class: `verdict ${look}` }, `${d.condition}: ${d.action} ${sign} ${words[d.end]}`), " "];
@@ -298,7 +304,8 @@ class DecisionPage {
 
   async charts(policies, timeline) {
     const { record, chosen, run } = this, [id] = this.index.scenes[this.n];
-    const shares = policyRows(record, chosen, this.index.actions, run), times = timelineRows(record, chosen, run);
+    const shares = policyRows(record, chosen, this.index.actions, run, this.together);
+    const times = timelineRows(record, chosen, run, this.together);
     const window_s = run.points[chosen.condition].window_s, lines = new Set(times.map((row) => row.who)).size;
     await chart(policies, `policies-${id}`, { ...this.about.policies, height: 13 * shares.length }, { values: shares });
     await chart(timeline, `timeline-${id}`, { ...this.about.timeline, height: 22 * lines }, {
