@@ -11,6 +11,7 @@ from functools import cached_property
 from itertools import product
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 from msgspec import structs
 
@@ -34,7 +35,7 @@ from harness.world.outcome import Outcome, rating
 from harness.world.parameters import frames
 from harness.world.scenario import Scenario
 from harness.world.seats import offset_of, offsets, places_by
-from harness.world.swarm import alone, gravest
+from harness.world.swarm import alone, ends, gravest
 from harness.world.world import World
 
 
@@ -290,14 +291,12 @@ def _swarm(trajectory: Trajectory, course: Course, alone_s: Mapping[int, float])
     Its failure is the gravest of theirs, and of those the first; `alone_s` has when each would clear alone.
     """
     world = trajectory.world
-    journeys, ids = world.journeys, {n: v.spawn.id for n, v in enumerate(world.vehicles)}
-    outcomes = {n: journey.outcome for n, journey in journeys.items()}
+    journeys, its = world.journeys, ends(world, alone_s)
     failing = gravest(journeys)
-    worst = None if failing is None else outcomes[failing]
-    lost_s = {n: round((o.time_s or 0.0) - alone_s[n], 3) for n, o in outcomes.items() if o.success}
+    worst = None if failing is None else journeys[failing].outcome
+    lost_s = {end.agent: end.lost_s for end in its if end.lost_s is not None}
     most = max(lost_s, key=lost_s.__getitem__, default=None)
-    agents = {ids[n] for n in outcomes}
-    time_s = worst.time_s if worst else max(o.time_s or 0.0 for o in outcomes.values())
+    time_s = worst.time_s if worst else max(end.time_s or 0.0 for end in its)
     failure = worst.result if worst else ""
     return Episode(
         condition=course.point.name, seed=course.seed, episode=trajectory.number, layout_seed=world.seed,
@@ -305,11 +304,12 @@ def _swarm(trajectory: Trajectory, course: Course, alone_s: Mapping[int, float])
         outcome=rating(failure, world.scenario.parameters), time_s=time_s,
         partner=worst.partner if worst else None, striker=worst.striker if worst else None,
         fault=worst.fault if worst else None,
-        least_gap_m=round(min(o.least_gap_m for o in outcomes.values()), 3),
+        least_gap_m=round(min(journey.outcome.least_gap_m for journey in journeys.values()), 3),
         hard_brakings=sum(journey.hard_brakings for journey in journeys.values()),
         other_crashes=world.outcome.other_crashes, skipped=course.skipped,
-        agents=len(outcomes), arrived=len(lost_s), met=sum(o.partner in agents for o in outcomes.values()),
+        agents=len(its), arrived=len(lost_s), met=sum(end.met for end in its),
         agents_lost_s=round(sum(lost_s.values()), 3) if lost_s else None,
         most_lost_s=None if most is None else lost_s[most],
-        gave_way=ids[most] if most is not None and lost_s[most] > 0 else None,
+        gave_way=most if most is not None and lost_s[most] > 0 else None,
+        journeys=msgspec.json.encode(its).decode(),
     )  # fmt: skip

@@ -127,9 +127,11 @@ EPISODE: Mapping[str, Added] = {
         ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way"),
         Added("2026-11-27", None, "swarms; also missing where only egos decide"),
     ),
+    "journeys": Added("2026-11-27", None, "how each agent ended; also missing where only egos decide"),
 }  # fmt: skip
 
-SPARSE = ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way")  # missing if all unknown
+# Columns that are missing where no episode has a value.
+SPARSE = ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way", "journeys")
 
 
 def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:

@@ -281,13 +281,14 @@ class Episode(Struct, frozen=True, kw_only=True):
     # how many helpers have, or would have, the danger in sight at the first decision; None if not declared
     witnesses: int | None = None
     danger_radio: bool | None = None  # whether the danger sends beacons; None without one, or undeclared
-    agents: int | None = None  # how many vehicles decided; None if only the ego did, like the next five
+    agents: int | None = None  # how many vehicles decided; None if only the ego did, like the next six
     arrived: int | None = None  # how many of them reached their goal
     met: int | None = None  # how many collided with another of them
     # how much later than alone on the road, at their first speed, those who arrived did, in sum
     agents_lost_s: float | None = None
     most_lost_s: float | None = None  # the same of the one who lost most
     gave_way: str | None = None  # id of that one; None if nobody lost time
+    journeys: str | None = None  # how each of them ended: JSON, a list of `harness.world.swarm.End`
 
 
 class Variant(Struct, frozen=True):

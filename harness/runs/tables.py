@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
+from msgspec import structs
 
 from harness.core.files import bytes_of
 from harness.runs.folder import Run, read, whole
 from harness.runs.records import TURNS, Answer
+from harness.world.swarm import End
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,6 +48,25 @@ class Tables:
     def episodes(self) -> "pd.DataFrame":
         """One row for each episode, condition and seed: episodes.csv."""
         return self._csv("episodes.csv")
+
+    @cached_property
+    def agents(self) -> "pd.DataFrame":
+        """One row for each agent of an episode: `journeys` of episodes.csv; none where only the ego decides.
+
+        `gave_way` says whether it is the one that lost most.
+        """
+        import pandas as pd
+
+        columns = ["condition", "seed", "episode", *End.__struct_fields__, "gave_way"]
+        rows = whole(
+            self.path / "episodes.csv",
+            lambda file: [
+                (e.condition, e.seed, e.episode, *structs.astuple(end), end.agent == e.gave_way)
+                for e in self.source.episodes if e.journeys is not None
+                for end in msgspec.json.decode(e.journeys, type=tuple[End, ...])
+            ],
+        )  # fmt: skip
+        return pd.DataFrame(rows, columns=columns)
 
     @cached_property
     def decisions(self) -> "pd.DataFrame":

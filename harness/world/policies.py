@@ -23,7 +23,7 @@ from harness.world.drivers import PRIVILEGED
 from harness.world.precedence import RULES
 from harness.world.scenario import Scenario
 from harness.world.seats import offsets
-from harness.world.swarm import alone, gravest
+from harness.world.swarm import alone, ends, gravest
 from harness.world.world import World
 
 JOINT = "joint"
@@ -51,14 +51,12 @@ class Fate:
 
 def fate(world: World, alone_s: dict[int, float], exact: bool = True) -> Fate:
     """Return how the agents of a world that has ended fared; `alone_s` has when each would arrive alone."""
-    outcomes = {agent: journey.outcome for agent, journey in world.journeys.items()}
-    ids = {world.vehicles[agent].spawn.id for agent in outcomes}
-    worst = gravest(world.journeys)
-    times_s = np.array([(o.time_s or 0.0) if o.success else np.nan for o in outcomes.values()])
-    lost_s = times_s - np.array([alone_s[agent] for agent in outcomes])
+    its, worst = ends(world, alone_s), gravest(world.journeys)
+    lost_s = np.array([np.nan if end.lost_s is None else end.lost_s for end in its])
+    times_s = np.where(np.isnan(lost_s), np.nan, [end.time_s or 0.0 for end in its])
     return Fate(
-        float(np.mean(~np.isnan(times_s))), any(o.partner in ids for o in outcomes.values()),
-        worst is not None and outcomes[worst].result == "time_out",
+        float(np.mean(~np.isnan(lost_s))), any(end.met for end in its),
+        worst is not None and world.journeys[worst].outcome.result == "time_out",
         float(times_s.sum()), float(lost_s.sum()), float(lost_s.max()), exact,
     )  # fmt: skip
 

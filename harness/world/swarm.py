@@ -4,14 +4,27 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
+from msgspec import Struct
+
 from harness.world import lockstep
 from harness.world.scenario import Layout, Scenario
 from harness.world.seats import agents_of, places_by, seat_of
 from harness.world.simulator import populated
 from harness.world.world import Journey, World
 
-W = TypeVar("W", bound=World)
 GRAVEST = ("collision", "off_road", "time_out")
+W = TypeVar("W", bound=World)
+
+
+class End(Struct, frozen=True, array_like=True):
+    """How an agent's journey ended."""
+
+    agent: str  # its id
+    result: str  # `cleared` if it reached its goal, else how it failed
+    time_s: float | None  # when that was decided
+    lost_s: float | None  # how much later than alone on the road it arrived; None unless it did
+    partner: str | None  # the vehicle that it collided with
+    met: bool  # whether that is another agent
 
 
 def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float]]:
@@ -55,6 +68,20 @@ def on_seat(
             for spawn, (approach, route) in zip(spawns, names, strict=True)
         ]
     return its, Layout(tuple(spawns), layout.buildings, None, None)
+
+
+def ends(world: World, alone_s: Mapping[int, float]) -> tuple[End, ...]:
+    """Return how each agent of a world that has ended fared; `alone_s` has when each would arrive alone."""
+    outcomes = {agent: journey.outcome for agent, journey in world.journeys.items()}
+    ids = {agent: world.vehicles[agent].spawn.id for agent in outcomes}
+    return tuple(
+        End(
+            ids[agent], o.result, o.time_s,
+            round((o.time_s or 0.0) - alone_s[agent], 3) if o.success else None,
+            o.partner, o.partner in ids.values(),
+        )
+        for agent, o in outcomes.items()
+    )  # fmt: skip
 
 
 def gravest(journeys: Mapping[int, Journey]) -> int | None:

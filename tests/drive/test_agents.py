@@ -5,11 +5,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 from evaluating import FILES, live_spec_of, run
 from reading import details, packed
 
+from harness.api import load
 from harness.backends import cards
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
@@ -124,6 +126,28 @@ def test_a_run_says_who_decided_and_how_all_of_them_ended(driven: Path) -> None:
     scores = {(s.condition, s.metric): s.value for s in there.scores}
     mean = sum(e.arrived / e.agents for e in there.episodes if e.condition == "6g") / 6
     assert scores["6g", "arrived_rate"] == pytest.approx(mean)
+
+
+def test_a_run_has_a_table_of_its_agents_that_adds_up_to_its_episodes(driven: Path) -> None:
+    run = load(driven)
+    keys = ["condition", "seed", "episode"]
+    whole = run.episodes.set_index(keys)
+    assert len(run.agents) == whole.agents.sum()
+    sums = run.agents.assign(arrived=run.agents.result == "cleared").groupby(keys, sort=False)
+    assert (sums.arrived.sum() == whole.arrived).all()
+    assert (sums.met.sum() == whole.met).all()
+    assert sums.lost_s.sum().to_numpy() == pytest.approx(whole.agents_lost_s.fillna(0).to_numpy())
+    paying = run.agents[run.agents.gave_way].set_index(keys)
+    assert (paying.agent == whole.gave_way.dropna()).all()
+    assert (paying.lost_s == whole.most_lost_s[paying.index]).all()
+
+
+def test_a_broken_table_of_agents_is_named(driven: Path, tmp_path: Path) -> None:
+    copytree(driven, tmp_path / "run")
+    file = tmp_path / "run" / "episodes.csv"
+    file.write_text(file.read_text().replace('""cleared""', "1"))
+    with pytest.raises(UserError, match="is broken"):
+        _ = load(tmp_path / "run").agents
 
 
 @pytest.mark.slow
