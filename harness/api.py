@@ -1,7 +1,7 @@
 """Evaluate, load and compare runs from Python; results show themselves in a notebook (docs/python.md)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from io import BytesIO
 from os import PathLike
@@ -172,7 +172,7 @@ class Study:
 
 def run(
     *, out: str | PathLike[str] | None = None, cache: bool = True, workers: int = 1, quiet: bool = False,
-    **options: Any,
+    tracker: str | Sequence[str] = (), max_cost: float | None = None, **options: Any,
 ) -> Run:  # fmt: skip
     """Evaluate a model with a prompt, on frozen scenes or in closed loop, and return the run.
 
@@ -183,6 +183,8 @@ def run(
         cache: whether answers that an earlier run stored are taken.
         workers: processes; for rules on frozen scenes, and in closed loop.
         quiet: whether progress is left out.
+        tracker: names of trackers that keep the run as well, as `--tracker` takes them.
+        max_cost: what answers may cost before no more are asked for, as `--max-cost` says.
         options: settings of `harness eval`, or of `harness drive` if one of its own is among them, such as
             `scenario`: each by its name there, with `_` for `-`; a list where it is repeatable.
 
@@ -191,7 +193,7 @@ def run(
     """
     from harness.backends.cache import default_file
     from harness.cli.run import default_out, evaluate
-    from harness.evaluate import resolve, settings
+    from harness.evaluate import costs, hooks, resolve, settings
     from harness.evaluate.spec import Source
 
     names = {kind: {each.name: each for each in settings.options(kind)} for kind in settings.WORLDS.values()}
@@ -212,7 +214,10 @@ def run(
         source = resolve.driven(stated.world)
     spec = resolve.spec(stated, source)
     folder = default_out(spec) if out is None else Path(out)
-    evaluate(spec, folder, cache=default_file() if cache else None, quiet=quiet, workers=workers)
+    told, kept = hooks.chosen(_several(tracker)), default_file() if cache else None
+    with costs.budget(max_cost, [spec]) as limit:
+        spec = replace(spec, budget=limit)
+        evaluate(spec, folder, cache=kept, quiet=quiet, workers=workers, hooks=told)
     return load(folder)
 
 

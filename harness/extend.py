@@ -10,6 +10,7 @@ from harness.coordination.scheduling import Formula, ScheduleInputs
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
 from harness.core.figures import PERCENT, Unit
+from harness.evaluate.hooks import Hook
 from harness.radio.channel import Broadcast, Channel, Delivery, Draws, Links, Physical
 from harness.radio.constant import link_up
 from harness.runs.metrics import Metric
@@ -36,6 +37,7 @@ __all__ = [
     "Formula",
     "Fused",
     "Ground",
+    "Hook",
     "Intents",
     "Ints",
     "Lane",

@@ -104,7 +104,7 @@ def test_a_comparison_is_the_command_lines(folder: Path) -> None:
 def test_what_plug_ins_build_on_is_pinned() -> None:
     names = """
     Attack Backend Bools Broadcast Building Capabilities Card Channel Completion Delivery Draws Floats
-    Formula Fused Ground Intents Ints Lane Layout LayoutDraws Links Messages Metric PERCENT
+    Formula Fused Ground Hook Intents Ints Lane Layout LayoutDraws Links Messages Metric PERCENT
     Parameters Path PathKey Physical Pool Registration Request Road Rule Scenario ScheduleInputs Spawn Turn
     Unit UserError
     crossings ground linear_pool link_up straights to_the_left

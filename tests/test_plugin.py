@@ -47,7 +47,8 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def frozen(project: Path, small_path: Path) -> Tables:
     conditions = [f"--condition={name}" for name in FROZEN]
-    typed(project, "eval", "--model", "mine", "--dataset", small_path, *conditions, "--out", "frozen")
+    told = ("--tracker", "notebook", "--out", "frozen")
+    typed(project, "eval", "--model", "mine", "--dataset", small_path, *conditions, *told)
     return harness.load(project / "frozen")
 
 
@@ -106,6 +107,12 @@ def smoothed(run: Tables, decisions: pd.DataFrame) -> tuple[np.ndarray, np.ndarr
         policies.append(memory[episode] if heard else own)
         pools.append(now)
     return np.array(policies), np.array(pools)
+
+
+def test_the_hook_is_told_of_the_run(frozen: Tables, project: Path):
+    begin, *answered, end = (project / "noted.txt").read_text().splitlines()
+    assert (begin, end) == ("begin mine", "end frozen")
+    assert answered[-1] == f"answered {len(frozen.answers)}"
 
 
 def test_the_backend_answers_by_its_rule_on_what_each_viewer_sees(frozen: Tables, small: Dataset):

@@ -51,6 +51,7 @@ def command(
     ),
     no_cache: options.NoCache = False,
     max_cost: options.MaxCost = None,
+    tracker: options.Tracker = None,
     full: options.FullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
@@ -60,7 +61,7 @@ def command(
     If the run is stopped, the same command continues it.
     """
     from harness.backends.cache import default_file
-    from harness.evaluate import costs, resolve
+    from harness.evaluate import costs, hooks, resolve
     from harness.evaluate.run import evaluate_shard
     from harness.world.scenarios import DEFAULT
 
@@ -72,9 +73,10 @@ def command(
     name = options.scenario_name(world.scenario if world.scenario or env else DEFAULT, env, env_config)
     name = deciding(name, agents) if agents else name
     who, part = options.workers_of(workers), options.shard_of(shard)
-    if part and (out is None or save_video):
+    if part and (out is None or save_video or tracker):
         raise UserError(
-            f"--shard {part}: give --out with a folder for this shard alone, and leave --save-video out"
+            f"--shard {part}: give --out with a folder for this shard alone, and leave --save-video and "
+            "--tracker out"
         )
     if save_video:
         extras.need("--save-video", "matplotlib")
@@ -86,7 +88,7 @@ def command(
         raise UserError(
             f"--max-cost {max_cost:g}: the processes of a cluster do not add up what they spend; leave it out"
         )
-    silent = as_json or quiet
+    silent, told = as_json or quiet, hooks.chosen(tracker or ())
     with costs.budget(max_cost, [spec]) as limit:
         spec = replace(spec, budget=limit)
         if part and out:
@@ -101,6 +103,7 @@ def command(
         done, page = evaluate(
             spec, where, cache=None if no_cache else default_file(), quiet=silent, workers=who, full=full,
             then=lambda: videos.extend(write_failures(where, save_video, silent) if save_video else ()),
+            hooks=told,
         )  # fmt: skip
     tell(done, as_json, quiet)
     if silent:

@@ -57,6 +57,7 @@ def command(
         rich_help_panel=OUTPUT,
     ),
     tokenizer: options.Tokenizer = None,
+    tracker: options.Tracker = None,
     full: options.FullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
@@ -67,7 +68,7 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.dataset import suites
-    from harness.evaluate import costs, resolve
+    from harness.evaluate import costs, hooks, resolve
 
     world: Any = settings.world
     named = suites.named(world.dataset)
@@ -85,6 +86,8 @@ def command(
             )
         if full:
             raise UserError("--full: repeats have a page without decisions; leave it out")
+        if tracker:
+            raise UserError(f"--tracker {printable(tracker[0])}: repeats are no run of one; leave it out")
         repeats.check(specs[0], repeat)
     if dry_run:
         from harness.evaluate.dry_run import count
@@ -98,6 +101,7 @@ def command(
             for each in zip(specs, counted, strict=True):
                 _show_counted(*each)
         return
+    told = hooks.chosen(tracker or ())
     at_servers = any(agent.card.server for spec in specs for agent in spec.agents)
     who = options.workers_of(workers or ("1" if at_servers else "2"))
     if workers is not None:
@@ -105,7 +109,7 @@ def command(
     with costs.budget(max_cost, specs) as limit:
         specs = [replace(spec, budget=limit) for spec in specs]
         silent, cache = as_json or quiet, None if no_cache else default_file()
-        evaluated = partial(evaluate, cache=cache, quiet=silent, workers=who, full=full)
+        evaluated = partial(evaluate, cache=cache, quiet=silent, workers=who, full=full, hooks=told)
         if repeat is not None:
             repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
             return

@@ -141,6 +141,15 @@ NoCache = Annotated[
         rich_help_panel=stated.ENGINE,
     ),
 ]
+Tracker = Annotated[
+    list[str] | None,
+    Option(
+        metavar="NAME",
+        help="Keep the run in a tracker as well: mlflow, trackio, wandb, or one that a package adds. "
+        "Repeatable. Default: those in SWARMDRIVE_TRACKERS.",
+        rich_help_panel=stated.OUTPUT,
+    ),
+]
 MaxCost = Annotated[
     float | None,
     Option(

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, get_args
 
 import msgspec
@@ -19,6 +20,7 @@ from harness.runs import leading
 if TYPE_CHECKING:
     from harness.core.parallel import Workers
     from harness.evaluate.agent import Agent
+    from harness.evaluate.hooks import Hook
     from harness.evaluate.lifecycle import Evaluated
     from harness.evaluate.run import Opens
     from harness.evaluate.spec import Spec
@@ -69,13 +71,15 @@ def file_name(model: str) -> str:
 def evaluate(
     spec: "Spec", folder: Path, opens: "Opens | None" = None, *, cache: Path | None, quiet: bool,
     workers: "Workers", full: bool = False, then: "Callable[[], object]" = lambda: None,
+    hooks: "Mapping[str, Hook]" = MappingProxyType({}),
 ) -> "tuple[Evaluated, Path]":  # fmt: skip
     """Evaluate, frozen or in closed loop, with a progress bar; write the run and its page, `full` or not.
 
-    `then` adds files to the run; a run that is stopped there resumes there.
+    `then` adds files to the run; a run that is stopped there resumes there. `hooks` are told of it.
     """
     from harness.cli.report import write
     from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.hooks import telling
     from harness.evaluate.run import evaluate as evaluated
 
     name, dataset = printable(spec.ego.card.name, 30), None
@@ -84,12 +88,14 @@ def evaluate(
         progress = bar(f"asking {name}", quiet=quiet, grows=True)
     else:
         progress = bar(f"driving {name}", len(list(spec.source.layout_seeds)), quiet)
-    with progress as done:
-        run = evaluated(spec, folder, done, cache, done.more, workers, opens)
-    with work.going_on(folder):
-        page = write([folder], quiet=quiet, dataset=dataset, workers=workers if dataset else 1, full=full)
-        then()
-    work.tidy(folder)
+    with telling(hooks, folder, spec.settings()) as told:
+        with progress as done:
+            run = evaluated(spec, folder, told.counting(done), cache, done.more, workers, opens)
+        with work.going_on(folder):
+            page = write([folder], quiet=quiet, dataset=dataset, workers=workers if dataset else 1, full=full)
+            then()
+        work.tidy(folder)
+        told.end(run)
     return run, page
 
 

@@ -22,6 +22,9 @@ OPTIONAL = {
     "torch": ("torch", "transformers"),
     "transformers": ("transformers", "transformers"),
     "gepa": ("gepa", "gepa"),
+    "mlflow": ("mlflow-skinny", "mlflow"),
+    "trackio": ("trackio", "trackio"),
+    "wandb": ("wandb", "wandb"),
 }
 
 

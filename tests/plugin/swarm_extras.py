@@ -1,8 +1,9 @@
 """What a package adds to the harness without a change of it: one of each kind of plug-in."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from harness.extend import (
     Floats,
     Formula,
     Fused,
+    Hook,
     Intents,
     Links,
     Messages,
@@ -112,7 +114,26 @@ def opened(card: Card, **options: Any) -> Cautious:
     return Cautious()
 
 
+class Notebook:
+    """A hook that writes down what it is told."""
+
+    def begin(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        self._file = folder.with_name("noted.txt")
+        self._file.write_text(f"begin {settings['model']['name']}\n")
+
+    def answered(self, total: int) -> None:
+        self._note(f"answered {total}")
+
+    def end(self, done: Any) -> None:
+        self._note(f"end {done.manifest.name}")
+
+    def _note(self, line: str) -> None:
+        with self._file.open("a") as file:
+            file.write(line + "\n")
+
+
 SMOOTHING = Smoothing()
+NOTEBOOK: Hook = Notebook()
 FOG = Fog()
 MUMBLE = Mumble()
 NEAR = Formula(near, 0.5)

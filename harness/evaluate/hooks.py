@@ -1,0 +1,116 @@
+"""What is told of a run while it goes: hooks, of which a user chooses some by name.
+
+A package adds one by an entry point in the group `swarmdrive.hooks`. A hook that fails costs a run nothing:
+one line on stderr says so, and it is told no more of that run.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from harness.core import extras
+from harness.core.errors import one_line, printable, unknown
+from harness.core.plugins import Plugins
+from harness.evaluate.trackers.mlflow import Mlflow
+from harness.evaluate.trackers.trackio import Trackio
+from harness.evaluate.trackers.wandb import Wandb
+
+if TYPE_CHECKING:
+    from harness.evaluate.lifecycle import Evaluated
+
+CHOSEN = "SWARMDRIVE_TRACKERS"  # environment variable: names, with commas, where a command names none
+
+
+@runtime_checkable
+class Hook(Protocol):
+    """What is told of a command's runs, one run after the other; it may raise anything."""
+
+    def begin(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        """Take note of a run, before the first answer counts.
+
+        `settings` are plain values, as they stand in the run's `run.json`.
+        """
+        ...
+
+    def answered(self, total: int) -> None:
+        """Take note that there are so many answers, or in closed loop episodes, kept ones included."""
+        ...
+
+    def end(self, done: "Evaluated | None") -> None:
+        """Take note that the run is finished, with its page; None if it was stopped."""
+        ...
+
+
+BUILT_IN: Mapping[str, Hook] = {"mlflow": Mlflow(), "trackio": Trackio(), "wandb": Wandb()}
+HOOKS: Plugins[Hook] = Plugins("swarmdrive.hooks", Hook, BUILT_IN)
+
+
+def chosen(names: Iterable[str]) -> dict[str, Hook]:
+    """Return hooks by name: those that are typed, else those in `SWARMDRIVE_TRACKERS`.
+
+    Raises UserError if there is no such hook, or its package is not installed.
+    """
+    typed = tuple(names) or tuple(filter(None, map(str.strip, os.environ.get(CHOSEN, "").split(","))))
+    for name in typed:
+        if name not in HOOKS:
+            raise unknown("tracker", name, HOOKS)
+        if name in BUILT_IN:
+            extras.need(f"--tracker {name}", name)
+    return {name: HOOKS[name] for name in typed}
+
+
+class Told:
+    """Some hooks during one run. It begins for them with its first answer, or when it ends with none new."""
+
+    def __init__(self, hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]) -> None:
+        self._hooks, self._begun, self._total = dict(hooks), False, 0
+        self._folder, self._settings = folder, settings
+
+    def counting(self, progress: Callable[[int], None]) -> Callable[[int], None]:
+        """Return a function that counts answers, for the hooks as well."""
+
+        def count(new: int) -> None:
+            progress(new)
+            self._begin()
+            self._total += new
+            self._tell("answered", self._total)
+
+        return count if self._hooks else progress
+
+    def end(self, done: "Evaluated | None") -> None:
+        if done:
+            self._begin()
+        if self._begun:
+            self._tell("end", done)
+
+    def _begin(self) -> None:
+        if not self._begun:
+            self._begun = True
+            self._tell("begin", self._folder, self._settings)
+
+    def _tell(self, what: str, *about: Any) -> None:
+        for name, hook in list(self._hooks.items()):
+            try:
+                with redirect_stdout(sys.stderr):  # what a command prints may be read by a program
+                    getattr(hook, what)(*about)
+            except Exception as error:  # a stranger's code
+                shown = one_line(error) or type(error).__name__
+                print(
+                    f"harness: tracker {printable(name)}: {shown}; the run goes on without it",
+                    file=sys.stderr,
+                )
+                del self._hooks[name]
+
+
+@contextmanager
+def telling(hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]) -> Iterator[Told]:
+    """Tell hooks of a run; if it is stopped, that it ended so."""
+    told = Told(hooks, folder, settings)
+    try:
+        yield told
+    except BaseException:
+        told.end(None)
+        raise

@@ -1,0 +1,51 @@
+"""A run as trackers take it: flat settings, figures by name, and the files that go with them."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from harness.evaluate.lifecycle import Evaluated
+
+PROJECT = "swarmdrive-harness"
+_FILES = ("run.json", "summary.csv", "report.html")
+_TABLES = ("channels", "networks", "schedules", "calibrations")  # of which a condition has the names
+
+
+def params(settings: Mapping[str, Any]) -> dict[str, str | int | float | bool]:
+    """Return a run's settings by dotted names, without those that have no value; conditions by name."""
+    conditions = [point["name"] for point in settings["conditions"]]
+    some = {name: value for name, value in settings.items() if name not in _TABLES}
+    return dict(_leaves({**some, "conditions": conditions}, ""))
+
+
+def _leaves(table: Mapping[str, Any], above: str) -> Iterator[tuple[str, str | int | float | bool]]:
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{above}{name}.")
+        elif isinstance(value, list | tuple):
+            yield f"{above}{name}", json.dumps(value)
+        elif value is not None:
+            yield f"{above}{name}", value
+
+
+def figures(done: "Evaluated") -> dict[str, float]:
+    """Return figures: `CONDITION/METRIC`, with the ends of its 95 % interval and its n behind a dot."""
+    named: dict[str, float | None] = {}
+    for score in (score for score in done.scores if score.interval != "seed means"):
+        name = f"{score.condition}/{score.metric}"
+        named |= {
+            name: score.value,
+            f"{name}.low": score.low,
+            f"{name}.high": score.high,
+            f"{name}.n": score.n,
+        }
+    for model, cost in (done.manifest.cost or {}).items():
+        named[f"cost/{model}/{cost.currency}"] = cost.amount
+    return {name: value for name, value in named.items() if value is not None}
+
+
+def files(done: "Evaluated") -> list[Path]:
+    """Return the files of a run that a tracker keeps: settings, figures and the page."""
+    return [file for file in map(done.out.joinpath, _FILES) if file.is_file()]

@@ -1,0 +1,207 @@
+"""Hooks that are told of a run, and the trackers that are made of them, each with its own package offline."""
+
+import json
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from misbehaving import Asked, serving
+from served import answer
+
+from harness.core import plugins
+from harness.evaluate.hooks import HOOKS
+from harness.runs.folder import read
+
+Typed = Callable[..., tuple[int, str, str]]
+
+
+class Note:
+    """A hook that writes down what it is told."""
+
+    def __init__(self, fails_at: str = "") -> None:
+        self.told: list[tuple[Any, ...]] = []
+        self._fails_at = fails_at
+
+    def _note(self, what: str, *about: Any) -> None:
+        print("what a hook prints is no result")
+        self.told.append((what, *about))
+        if what == self._fails_at:
+            raise RuntimeError(f"{what}\nwent wrong")
+
+    def begin(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        self._note("begin", folder, settings)
+
+    def answered(self, total: int) -> None:
+        self._note("answered", total)
+
+    def end(self, done: Any) -> None:
+        self._note("end", done, done and (done.out / "report.html").is_file())
+
+
+@pytest.fixture
+def install(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Have a package register hooks by their names."""
+
+    def installed(**hooks: Any) -> None:
+        found = {
+            name: SimpleNamespace(load=lambda hook=hook: hook, value="x:y") for name, hook in hooks.items()
+        }
+        entries = plugins.entries
+        monkeypatch.setattr(
+            plugins, "entries", lambda group: found if group == HOOKS.group else entries(group)
+        )
+        monkeypatch.setattr(HOOKS, "_loaded", dict(HOOKS.built_in))
+
+    return installed
+
+
+def typed_eval(data: Path, *more: str) -> tuple[str | Path, ...]:
+    fixed = ("--condition", "6g", "--seeds", "0:2", "--limit", "1", "--out", "run")
+    return "eval", "--dataset", data, *fixed, *more
+
+
+def test_a_hook_is_told_when_a_run_begins_when_answers_arrive_and_when_it_ends(
+    two_path: Path, harness: Typed, install: Callable[..., None]
+) -> None:
+    note = Note()
+    install(mine=note)
+    code, out, _ = harness(*typed_eval(two_path, "--tracker", "mine", "--json"))
+    assert code == 0
+    assert json.loads(out)["run"] == "run", "what a hook prints is kept out of the result"
+    (begin, folder, settings), *counts, (end, done, has_page) = note.told
+    assert (begin, str(folder), settings["model"]["name"]) == ("begin", "run", "proxy")
+    assert {what for what, _ in counts} == {"answered"}
+    answers = len(Path("run/answers.jsonl").read_text().splitlines())
+    assert [total for _, total in counts] == sorted(total for _, total in counts)
+    assert counts[-1][1] == answers
+    assert (end, has_page, done.manifest.name) == ("end", True, "run")
+
+
+def test_a_hook_is_told_of_a_drive_from_the_environment(
+    harness: Typed, install: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    note = Note()
+    install(mine=note)
+    monkeypatch.setenv("SWARMDRIVE_TRACKERS", " mine,")
+    drive = ("--condition", "single-local", "--episodes", "2", "--seeds", "0:1", "--workers", "1", "--quiet")
+    assert harness("drive", *drive, "--out", "driven")[0] == 0
+    assert [told[:2] for told in note.told if told[0] == "answered"][-1] == ("answered", 2)
+    assert [told[0] for told in note.told][:: len(note.told) - 1] == ["begin", "end"]
+
+
+@pytest.mark.parametrize("fails_at", ["begin", "answered", "end"])
+def test_a_hook_that_fails_costs_a_run_one_line(
+    fails_at: str, two_path: Path, harness: Typed, install: Callable[..., None]
+) -> None:
+    bad, good = Note(fails_at), Note()
+    install(bad=bad, good=good)
+    code, _, said = harness(*typed_eval(two_path, "--tracker", "bad", "--tracker", "good", "--quiet"))
+    assert code == 0
+    assert said.count("tracker bad") == 1
+    assert f"harness: tracker bad: {fails_at} went wrong; the run goes on without it\n" in said
+    assert bad.told[-1][0] == fails_at
+    assert good.told[-1][0] == "end"
+    assert read(Path("run")).scores
+
+
+def test_a_hook_is_told_of_a_run_that_is_stopped(
+    small_path: Path, harness: Typed, install: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def dies(asked: Asked) -> None:
+        if asked.number < 70:
+            answer(asked)
+        else:
+            asked.reply({"error": "gone"}, 400)
+
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    note = Note()
+    install(mine=note)
+    with serving(dies, lambda asked: asked.reply({"data": [{"id": "m"}]})) as there:
+        typed = typed_eval(
+            small_path, "--tracker", "mine", "--model", there.url, "--ask", "all", "--no-cache"
+        )
+        assert harness(*typed, "--limit", "4")[0] == 3
+    assert [told[0] for told in note.told[:2]] == ["begin", "answered"]
+    assert note.told[-1] == ("end", None, None)
+
+
+def test_an_unknown_tracker_and_repeats_are_refused_before_anything(two_path: Path, harness: Typed) -> None:
+    code, _, said = harness(*typed_eval(two_path, "--tracker", "mlfow"))
+    assert (
+        code,
+        "unknown tracker 'mlfow'; did you mean 'mlflow'? known: mlflow, trackio, wandb" in said,
+    ) == (2, True)
+    code, _, said = harness(
+        *typed_eval(
+            two_path, "--tracker", "mlflow", "--repeats", "2", "--temperature", "1", "--model", "swarm-tiny"
+        )
+    )
+    assert (code, "--tracker mlflow: repeats" in said) == (2, True)
+    assert not Path("run").exists()
+
+
+@pytest.mark.skipif(find_spec("mlflow") is not None, reason="needs an environment without MLflow")
+def test_a_tracker_without_its_package_says_what_to_install(two_path: Path, harness: Typed) -> None:
+    code, _, said = harness(*typed_eval(two_path, "--tracker", "mlflow"))
+    assert code == 2
+    assert (
+        "--tracker mlflow needs mlflow-skinny, which is not installed; run `pip install 'swarmdrive" in said
+    )
+
+
+def success(run: str) -> float:
+    [score] = [s for s in read(Path(run)).scores if (s.metric, s.interval) == ("success_rate", "episodes")]
+    return score.value
+
+
+@pytest.mark.skipif(find_spec("mlflow") is None, reason="needs the extra mlflow")
+def test_mlflow_has_settings_figures_and_the_page(
+    two_path: Path, harness: Typed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import mlflow
+
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", (tmp_path / "kept").as_uri())
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
+    code, _, said = harness(*typed_eval(two_path, "--tracker", "mlflow", "--quiet"))
+    assert (code, said.count("harness: tracker")) == (0, 0), said
+    [run] = mlflow.MlflowClient().search_runs(["0"])
+    assert (run.info.status, run.info.run_name) == ("FINISHED", "run")
+    assert run.data.params["model.name"] == "proxy"
+    assert run.data.params["conditions"] == '["6g"]'
+    assert run.data.metrics["6g/success_rate"] == success("run")
+    assert {f.path for f in mlflow.MlflowClient().list_artifacts(run.info.run_id)} >= {
+        "report.html",
+        "run.json",
+    }
+
+
+@pytest.mark.skipif(find_spec("wandb") is None, reason="needs the extra wandb")
+def test_wandb_has_settings_and_figures_offline(
+    two_path: Path, harness: Typed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    code, _, said = harness(*typed_eval(two_path, "--tracker", "wandb", "--quiet"))
+    assert (code, said.count("harness: tracker")) == (0, 0), said
+    [kept] = (tmp_path / "wandb").glob("offline-run-*/run-*.wandb")
+    written = kept.read_bytes()
+    assert b"6g/success_rate" in written
+    assert b"model.name" in written
+
+
+@pytest.mark.skipif(find_spec("trackio") is None, reason="needs the extra trackio")
+def test_trackio_has_figures_on_this_machine(
+    two_path: Path, harness: Typed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sqlite3
+
+    monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
+    code, _, said = harness(*typed_eval(two_path, "--tracker", "trackio", "--quiet"))
+    assert (code, said.count("harness: tracker")) == (0, 0), said
+    kept = [*(tmp_path / "trackio").rglob("*.db")]
+    assert kept
+    with sqlite3.connect(kept[0]) as file:
+        rows = file.execute("SELECT metrics FROM metrics").fetchall()
+    assert any("6g/success_rate" in str(row) for row in rows)
