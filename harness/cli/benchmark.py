@@ -1,7 +1,7 @@
 """`harness benchmark`: run an edition, pack its results into one file, and verify such files."""
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -17,9 +17,7 @@ from harness.core.errors import UserError, printable
 from harness.core.formats import SUITE
 
 if TYPE_CHECKING:
-    from harness.evaluate.edition import Edition
-    from harness.evaluate.frozen_world import FrozenSource
-    from harness.evaluate.rescore import Rescored
+    from harness.evaluate.rescore import Here, Rescored
 
 EDITION = "v2v-safety-1.0"  # taken if none is named
 
@@ -57,8 +55,10 @@ def run(
     from harness.dataset.suites import Suite
     from harness.evaluate import edition as editions
     from harness.evaluate import resolve
+    from harness.evaluate.rescore import Here
 
     of = editions.named(edition)
+    Here().check(of)
     sources = {name: of.source(name) for name in of.datasets}
     asked = {
         "model": model, "engine": engine, "prompt": prompt, "answer": answer, "thinking": thinking,
@@ -119,11 +119,11 @@ def verify(
 
     No model is asked, and nothing in the file is run or believed. Exit code 1 means that a figure differs.
     """
-    from harness.evaluate.rescore import sources_once
+    from harness.evaluate.rescore import Here
 
-    sources, lines = sources_once(), list[dict[str, Any]]()
+    here, lines = Here(), list[dict[str, Any]]()
     for file in files:
-        with _rescored(file, sources, as_json or quiet) as done:
+        with _rescored(file, here, as_json or quiet) as done:
             lines.append(_mapping(file, done))
             if not (as_json or quiet):
                 _show(file, done)
@@ -134,14 +134,12 @@ def verify(
 
 
 @contextmanager
-def _rescored(
-    file: Path, sources: "Callable[[Edition, str], FrozenSource]", silent: bool
-) -> "Iterator[Rescored]":
+def _rescored(file: Path, here: "Here", silent: bool) -> "Iterator[Rescored]":
     from harness.evaluate.rescore import rescored
 
     with tempfile.TemporaryDirectory(prefix="harness-") as folder:
         with bar(f"reading {printable(file.name, 30)}", quiet=silent, grows=True) as done:
-            computed = rescored(file, Path(folder), done, sources)
+            computed = rescored(file, Path(folder), done, here)
         yield computed
 
 

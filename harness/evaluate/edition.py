@@ -32,6 +32,13 @@ Names = Annotated[tuple[str, ...], Meta(min_length=1, description="a list of nam
 Digests = Annotated[dict[str, str], Meta(min_length=1, description="a table of digests by name")]
 
 
+class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A small file of results, `editions/NAME.golden.zip`, whose figures pin how all figures are computed."""
+
+    sha256: str  # of the file
+    layouts: int  # how many of each dataset it has, from the first
+
+
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One edition."""
 
@@ -46,6 +53,15 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     latency: str  # of every answer, as `--latency` reads it
     ties: str  # how equally likely actions are taken, as `--ties` reads it
     metrics: Names  # the figures that a file of results states
+    golden: Golden | None = None  # None in a project's own edition that pins nothing
+
+    @property
+    def golden_file(self) -> Path:
+        return find(KIND, f"{self.name}.golden.zip")
+
+    def layouts(self, file_sha256: str) -> int | None:
+        """Return how many layouts of each dataset a file with this digest has; None for all."""
+        return self.golden.layouts if self.golden and self.golden.sha256 == file_sha256 else None
 
     def settings(self, dataset: str, **asked: Any) -> Settings:
         """Return the settings of an evaluation on one of the datasets; `asked` says who answers, and how."""
@@ -54,23 +70,24 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             latency=self.latency, ties=self.ties, **asked,
         )  # fmt: skip
 
-    def source(self, dataset: str) -> FrozenSource:
-        """Return one of the datasets. Raises UserError if the one here is another."""
-        source = FrozenSource(load.load(load.find(dataset)), Selection())
+    def source(self, dataset: str, limit: int | None = None) -> FrozenSource:
+        """Return one of the datasets, or its first layouts. Raises UserError if the one here is another."""
+        source = FrozenSource(load.load(load.find(dataset), limit), Selection(limit))
         if source.dataset.sha256 != self.datasets[dataset]:
             raise self._differs(
                 f"dataset {printable(dataset)}", source.dataset.sha256, self.datasets[dataset]
             )
         return source
 
-    def entry(self, runs: Sequence[Run]) -> dict[str, Run]:
+    def entry(self, runs: Sequence[Run], limit: int | None = None) -> dict[str, Run]:
         """Return the runs of one entry by dataset, in the edition's order.
 
         Raises UserError unless each is of this edition, each dataset has one, and all are of one agent.
+        `limit` is how many layouts they are of; None for all, as an entry is.
         """
         by_dataset: dict[str, Run] = {}
         for run in runs:
-            mistakes = self._mistakes(run.manifest, by_dataset, _agent(runs[0].manifest))
+            mistakes = self._mistakes(run.manifest, limit, by_dataset, _agent(runs[0].manifest))
             if wrong := next(mistakes, None):
                 raise UserError(
                     f"{printable(run.path)} is no run of {printable(self.name)}: {wrong}; make one with "
@@ -81,11 +98,13 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise UserError(f"{printable(self.name)} has dataset {printable(missing[0])}; add a run of it")
         return {name: by_dataset[name] for name in self.datasets}
 
-    def _mistakes(self, m: Manifest, others: Collection[str], agent: dict[str, Any]) -> Iterator[str]:
+    def _mistakes(
+        self, m: Manifest, limit: int | None, others: Collection[str], agent: dict[str, Any]
+    ) -> Iterator[str]:
         world = m.world
         if not isinstance(world, FrozenScenes) or self.datasets.get(world.name) != world.sha256:
             yield f"its scenes are {printable(getattr(world, 'name', 'driven'), 40)}, none of its datasets"
-        elif world.limit is not None or world.selection:
+        elif world.limit != limit or world.selection:
             yield f"it has {world.episodes} layouts that were selected, and all count"
         elif world.name in others:
             yield f"another is of {printable(world.name, 40)}, too"

@@ -2,15 +2,16 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import zip_longest
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from msgspec import structs
 
 from harness.backends.replay import Kept
 from harness.core import work
 from harness.core.errors import Unanswered, UserError, printable
+from harness.core.files import sha256_file
 from harness.evaluate import edition as editions
 from harness.evaluate.edition import Edition
 from harness.evaluate.frozen_world import FrozenSource
@@ -34,9 +35,38 @@ class Rescored:
     compared: int  # how many figures were
 
 
-def rescored(
-    file: Path, folder: Path, progress: Callable[[int], None], sources: Callable[[Edition, str], FrozenSource]
-) -> Rescored:
+class Here:
+    """This installation: its datasets, each of which is read once, and how it computes figures."""
+
+    def __init__(self) -> None:
+        self._sources: dict[tuple[str, str], FrozenSource] = {}
+        self._checked: set[str] = set()  # digests of editions
+
+    def source(self, edition: Edition, name: str) -> FrozenSource:
+        """Return a dataset of an edition. Raises UserError if the one here is another."""
+        key = edition.digest, name
+        if key not in self._sources:
+            self._sources[key] = edition.source(name)
+        return self._sources[key]
+
+    def check(self, edition: Edition) -> None:
+        """Raise UserError unless an edition's golden figures are computed here as it pins them."""
+        if edition.golden is None or edition.digest in self._checked:
+            return
+        file = edition.golden_file
+        if not file.is_file() or edition.layouts(sha256_file(file, "record")) is None:
+            raise UserError(f"{printable(file)} is not the file that {edition.name} pins; restore it")
+        with TemporaryDirectory(prefix="harness-") as folder:
+            done = rescored(file, Path(folder), lambda count: None, self)
+        if wrong := [f"{name}: {figure}" for name, found in done.differences.items() for figure in found]:
+            raise UserError(
+                f"this installation computes {len(wrong)} figures of {edition.name} otherwise than it pins, "
+                f"such as {printable(wrong[0])}; install a release that has that edition as it was"
+            )
+        self._checked.add(edition.digest)
+
+
+def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: Here) -> Rescored:
     """Compute a file's runs again under the edition that it names, in an empty folder.
 
     Of the file, only what the models wrote is used. No model is asked, and nothing of the file is run.
@@ -45,22 +75,25 @@ def rescored(
         file: the file of results.
         folder: where the runs are unpacked and computed.
         progress: called with the number of answers that were read again.
-        sources: the datasets of an edition by name, which several files share (`sources_once`).
+        here: this installation, which several files share.
 
     Raises UserError if the file is broken, too large or of another edition than the one here, or has not the
-    answer to every question, or one to another question.
+    answer to every question, or one to another question; or if figures are computed otherwise here.
     """
     try:
         contents, stated = unpack(file, folder / "stated")
         edition = editions.named(contents.edition)
-        if contents.digest != edition.digest:
+        limit = edition.layouts(sha256_file(file, "record"))
+        if contents.digest != edition.digest and limit is None:
             raise UserError(
                 f"{printable(edition.name)} has digest {edition.digest[:12]}… here, and the file is of "
                 f"{printable(contents.digest, 13)}; install the release that has that edition"
             )
+        if limit is None:
+            here.check(edition)
         runs, differences, compared = dict[str, Run](), dict[str, Sequence[str]](), 0
-        for name, run in edition.entry(stated).items():
-            source = sources(edition, name)
+        for name, run in edition.entry(stated, limit).items():
+            source = here.source(edition, name) if limit is None else edition.source(name, limit)
             ours = _computed(run, edition.spec(run, source), folder / "computed" / name, progress)
             runs[source.scenario.name] = ours
             differences[name] = [*differing(run, ours, edition.metrics)]
@@ -70,12 +103,6 @@ def rescored(
         raise UserError(f"{printable(file)}: {str(error).replace(where, '')}") from None
     suite = SuiteRun(folder / "computed", edition.name, edition.description, runs)
     return Rescored(contents, edition, suite, differences, compared)
-
-
-def sources_once() -> Callable[[Edition, str], FrozenSource]:
-    """Return what reads each dataset of an edition once."""
-    read_dataset = cache(lambda digest, edition, name: edition().source(name))
-    return lambda edition, name: read_dataset(edition.digest, lambda: edition, name)
 
 
 def _computed(stated: Run, spec: Spec, out: Path, progress: Callable[[int], None]) -> Run:
