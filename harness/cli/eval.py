@@ -89,6 +89,11 @@ def command(
         if tracker:
             raise UserError(f"--tracker {printable(tracker[0])}: repeats are no run of one; leave it out")
         repeats.check(specs[0], repeat)
+        if workers is not None:
+            raise UserError(
+                f"--workers {printable(workers)}: repeats are asked from one process; leave it out, or type "
+                "a command for each --sampling-seed"
+            )
     if dry_run:
         from harness.evaluate.dry_run import count
 

@@ -298,6 +298,10 @@ def test_the_command_prints_tables_and_json(
             ("--repeats", "3", "--temperature", "1", "--model", "proxy"),
             "proxy has nothing to sample; leave it",
         ),
+        (
+            ("--repeats", "3", "--temperature", "1", "--workers", "2"),
+            "--workers 2: repeats are asked from one process; leave it out",
+        ),
         pytest.param(
             ("--repeats", "3", "--temperature", "1", "--dataset", "suite:v2v-safety"),
             "--repeats 3: needs one dataset, and --dataset names a suite; give one of its datasets",
