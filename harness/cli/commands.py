@@ -52,6 +52,7 @@ COMMANDS = {
     "dataset build": "dataset:build",
     "dataset check": "dataset:check",
     "dataset show": "dataset:show",
+    "dataset export": "dataset:export",
     "dataset rank": "dataset:rank_drivers",
     "dataset scenario list": "scenario:list_scenarios",
     "dataset scenario show": "scenario:show",
@@ -72,7 +73,7 @@ GROUPS = {
     "model": "List, download, test and train models; list on-board computers.",
     "model device": "List on-board computers, show or check one, or measure energy.",
     "prompt": "List prompts; show, check, compare, improve or release them.",
-    "dataset": "Build, check, show and rank frozen datasets; list scenarios.",
+    "dataset": "Build, check, show, rank, export datasets; list scenarios.",
     "dataset scenario": "List scenarios, show one, drive or audit it.",
     "radio": "List radios, show or check one; show what messages take.",
 }

@@ -16,6 +16,7 @@ from harness.core.figures import shown
 
 if TYPE_CHECKING:
     from harness.core.statistics import Estimate
+    from harness.world.scenario import Scenario
 
 
 Dataset = Annotated[
@@ -136,6 +137,42 @@ def show(
             f"--out {printable(out)} cannot be written ({error.strerror}); give another path"
         ) from None
     typer.echo(f"wrote {printable(out)}")
+
+
+def export(
+    dataset: Annotated[
+        str,
+        typer.Argument(
+            help="Name of a shipped dataset, a dataset's folder, or suite:NAME.", metavar="DATASET"
+        ),
+    ],
+    out: Path = typer.Option(..., help="Folder to make."),
+    prompt: options.ScenarioPrompt = None,
+) -> None:
+    """Write a dataset as Parquet that other programs load.
+
+    A card and a Croissant file describe it. A row is a decision point, with what the ego is asked and how
+    safe each action is. Each dataset of a suite is a table.
+    """
+    from harness.dataset import load, suites
+    from harness.dataset.publish import Chat, publish
+    from harness.learning.asking import Asking
+
+    def ask(scenario: "Scenario") -> "tuple[str, Chat]":
+        asking = Asking.of(scenario, prompt, "json")
+        return asking.prompt.version, asking.chat
+
+    suite = suites.named(dataset)
+    folders = [load.find(name) for name in suites.datasets(dataset)]
+    try:
+        with bar(f"exporting {printable(dataset, 30)}") as progress:
+            tables = publish(folders, out, ask, progress, suite.name if suite else None)
+    except OSError as error:
+        raise UserError(
+            f"--out {printable(out)} cannot be written ({error.strerror}); give another folder"
+        ) from None
+    rows, size = sum(each.rows for each in tables), sum(each.bytes for each in tables)
+    typer.echo(f"wrote {printable(out)}: {rows} decision points, {size / 1e6:.1f} MB of Parquet")
 
 
 def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: options.Json = False) -> None:

@@ -1,0 +1,307 @@
+"""Describe published datasets: a card with metadata for hubs, and a Croissant file for programs.
+
+The card is Markdown after YAML (as the Hugging Face hub reads it), the other file JSON-LD (MLCommons
+Croissant 1.0).
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+
+from harness import __version__
+from harness.core.figures import shown
+from harness.core.seeds import Purpose, stated
+from harness.core.statistics import Estimate
+from harness.dataset.columns import COLUMNS, Column
+from harness.dataset.schema import Manifest
+
+README, CROISSANT = "README.md", "croissant.json"
+# How trainers name the parts of a dataset, by what its layout seeds are for.
+SPLITS: dict[Purpose, str] = {"tune": "validation", "train": "train", "report": "test"}
+TAGS = ("autonomous-driving", "cooperative-driving", "v2v", "decision-trees", "simulation", "benchmark")
+PAPER = "https://arxiv.org/abs/2604.22852"
+UNSTATED = "Not stated: whoever built the dataset decides. Write it here and above."
+LICENCE = "https://www.apache.org/licenses/LICENSE-2.0"
+SIZES = (1_000, 10_000, 100_000, 1_000_000, 10_000_000, 100_000_000)  # rows at which the hub's sizes end
+KINDS = {"string": "sc:Text", "int64": "sc:Integer", "double": "sc:Float", "bool": "sc:Boolean"}
+
+
+@dataclass(frozen=True)
+class Table:
+    """A published dataset as it was written."""
+
+    manifest: Manifest  # of the frozen dataset
+    dataset_sha256: str  # digest of the frozen dataset's manifest
+    title: str  # its scenario, for people
+    lag_s: float  # from the moment of a decision to its action
+    released: bool  # whether it is one of the harness's own
+    prompt: str  # the prompt version that its chats are of
+    rows: int  # its decision points
+    sha256: str  # digest of its Parquet file
+    bytes: int  # size of that file
+    references: Mapping[str, Estimate]  # success of the policies that need no model, over layouts
+
+    @property
+    def name(self) -> str:
+        return self.manifest.name
+
+    @property
+    def path(self) -> str:
+        return path_of(self.name)
+
+    @property
+    def split(self) -> str:
+        return SPLITS[self.manifest.purpose]
+
+    @property
+    def layouts(self) -> str:
+        return stated(self.manifest.seed, self.manifest.episodes)
+
+
+def path_of(name: str) -> str:
+    """Return the place of a table in its folder."""
+    return f"data/{name}.parquet"
+
+
+def readme(name: str, tables: Sequence[Table]) -> str:
+    """Return the card. Texts of a manifest stand in it quoted, so none of them adds a key or a heading."""
+    released = all(t.released for t in tables)
+    head = {
+        "license": "apache-2.0" if released else "unknown",
+        "pretty_name": name,
+        "language": ["en"],
+        "task_categories": ["text-generation", "reinforcement-learning", "robotics"],
+        "tags": [*TAGS, "croissant"],
+        "size_categories": [hub_size(sum(t.rows for t in tables))],
+        "configs": [
+            {"config_name": t.name, "data_files": [{"split": t.split, "path": t.path}]} for t in tables
+        ],
+    }
+    return _CARD.format(
+        head="\n".join(f"{key}: {json.dumps(value)}" for key, value in head.items()),
+        name=name,
+        first=tables[0],
+        rows=sum(t.rows for t in tables),
+        size=_megabytes(*tables),
+        tables=_lines(
+            _row(
+                f"`{t.name}`", _code(t.title), t.manifest.episodes, t.rows, t.layouts, t.split, _megabytes(t),
+                _code(t.prompt),
+            )
+            for t in tables
+        ),
+        columns=_lines(_row(f"`{c.name}`", f"`{c.kind}`", c.meaning) for c in COLUMNS),
+        references=_lines(_references(tables)),
+        limits=_lines(f"- {limit}" for limit in limits(tables)),
+        licence=f"[Apache-2.0]({LICENCE})." if released else UNSTATED,
+        version=__version__,
+        paper=PAPER,
+        sources=_lines(f"- `{t.name}`, manifest sha256 `{t.dataset_sha256}`" for t in tables),
+    )  # fmt: skip
+
+
+def limits(tables: Sequence[Table]) -> Iterator[str]:
+    """Yield what the tables are not good for, a sentence or two each."""
+    splits = {t.split for t in tables}
+    if SPLITS["report"] in splits:
+        yield (
+            "Rows of the split `test` are of report seeds, which results are quoted on. A model that has "
+            "learnt from them cannot be measured on them any more."
+        )
+    if splits - {SPLITS["report"]}:
+        yield "Rows of other splits than `test` are for tuning and training; quote no result on them."
+    yield (
+        "Rows of a layout are not independent: count layouts, not rows, as n, and keep a layout on one side "
+        "of any split. `layout_seed` says which rows belong together."
+    )
+    yield (
+        "A table holds every course, also such as no driver would take. A mean over rows is no success rate: "
+        "for that, walk from `step` 0 along `next_scene`."
+    )
+    yield (
+        "`danger_sector`, `danger_vehicle`, `safe` to `drivers` and `state` say what no car knows. A model "
+        "that reads them is told the answer."
+    )
+    yield (
+        "`prompt` asks the ego alone. What helpers say, and which of it a radio delivers, the harness "
+        "simulates; no table has it."
+    )
+    lags = " or ".join(dict.fromkeys(f"{1000 * t.lag_s:.0f}" for t in tables))
+    yield (
+        f"An action acts {lags} ms after the moment of its decision, whoever decides. The trees do not say "
+        "what becomes of a slower model."
+    )
+    yield (
+        "Scenes, traffic and drivers are of one simulator, and texts are English: nothing here shows that a "
+        "model is safe on a road."
+    )
+
+
+def croissant(name: str, tables: Sequence[Table]) -> str:
+    """Return the Croissant file: each Parquet file with its digest, and each column with its meaning."""
+    document = {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "name": name,
+        "description": "Decisions in cooperative driving, with the exact safety and value of every action.",
+        "url": PAPER,
+        "citeAs": PAPER,
+        "isLiveDataset": False,
+        "keywords": TAGS,
+        "rai:dataLimitations": list(limits(tables)),
+        "distribution": [
+            {
+                "@type": "cr:FileObject", "@id": t.path, "name": t.name,
+                "contentUrl": t.path, "contentSize": f"{t.bytes} B",
+                "encodingFormat": "application/x-parquet", "sha256": t.sha256,
+            }
+            for t in tables
+        ],
+        "recordSet": [
+            {
+                "@type": "cr:RecordSet", "@id": t.name, "name": t.name,
+                "description": f"{t.rows} decision points, {t.layouts}",
+                "field": [_field(t, column) for column in COLUMNS],
+            }
+            for t in tables
+        ],
+    }  # fmt: skip
+    if all(t.released for t in tables):
+        document["license"] = LICENCE
+    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+
+
+def _field(table: Table, column: Column) -> dict[str, Any]:
+    listed = pa.types.is_list(column.kind)
+    inner = column.kind.value_type if listed else column.kind
+    field: dict[str, Any] = {
+        "@type": "cr:Field", "@id": f"{table.name}/{column.name}", "name": column.name,
+        "description": column.meaning,
+        "source": {"fileObject": {"@id": table.path}, "extract": {"column": column.name}},
+    }  # fmt: skip
+    if listed:
+        field["repeated"] = True
+    if not pa.types.is_struct(inner):
+        return {**field, "dataType": KINDS[str(inner)]}
+    return {**field, "subField": [
+        {
+            "@type": "cr:Field", "@id": f"{field['@id']}/{part.name}", "name": part.name,
+            "dataType": KINDS[str(part.type)],
+            "source": {**field["source"], "transform": {"jsonPath": part.name}},
+        }
+        for part in inner
+    ]}  # fmt: skip
+
+
+def _references(tables: Sequence[Table]) -> Iterator[str]:
+    names = list(dict.fromkeys(name for t in tables for name in t.references))
+    yield _row("table", "n", *(f"`{name}`" for name in names))
+    yield _row(*["---"] * (2 + len(names)))
+    for t in tables:
+        cells = (shown(t.references[name]) if name in t.references else "" for name in names)
+        yield _row(f"`{t.name}`", t.manifest.episodes, *cells)
+
+
+def hub_size(rows: int) -> str:
+    """Return the hub's word for a number of rows, such as `10K<n<100K`."""
+    words = [f"{n // 10**6}M" if n >= 10**6 else f"{n // 1000}K" for n in SIZES]
+    bounds = [low for low, least in zip(words, SIZES, strict=True) if rows >= least]
+    if not bounds:
+        return f"n<{words[0]}"
+    return f"n>{words[-1]}" if len(bounds) == len(words) else f"{bounds[-1]}<n<{words[len(bounds)]}"
+
+
+def _row(*cells: object) -> str:
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _code(text: str) -> str:
+    """Return a text as code in a cell of a table, whatever is in it."""
+    return f"`{' '.join(text.replace('`', chr(39)).replace('|', chr(92) + '|').split())}`"
+
+
+def _megabytes(*tables: Table) -> str:
+    return f"{sum(t.bytes for t in tables) / 1e6:.1f}"
+
+
+def _lines(lines: Iterable[str]) -> str:
+    return "\n".join(lines)
+
+
+_CARD = """\
+---
+{head}
+---
+
+# {name}
+
+Decisions in cooperative driving, each with what every action leads to. A model decides for one car, the
+ego, which cannot see everything; cars around it, the helpers, see other parts of the scene. Every course
+that decisions can take was driven in a simulator beforehand, so the safety and the value of each action are
+exact.
+
+```python
+from datasets import load_dataset
+
+rows = load_dataset("PATH OF THIS FOLDER", "{first.name}", split="{first.split}")
+```
+
+{rows} decision points, {size} MB of Parquet. A table is a configuration:
+
+| table | scenario | layouts | rows | seeds | split | MB | prompt |
+|---|---|---|---|---|---|---|---|
+{tables}
+
+| column | type | meaning |
+|---|---|---|
+{columns}
+
+Lists have an entry for each of `viewers` (`scene_graphs`, `distance_m`, `range_m`) or for each of `actions`
+(`safe` to `result`). To play an episode, begin at its row with `step` 0 and follow `next_scene`; it succeeds
+if its last action is `safe`.
+
+## What needs no model
+
+Success in % of layouts [95 % interval over n layouts]. `full-view` sees everything, `local-view` what the
+ego sees; `uniform` draws every action with the same probability.
+
+{references}
+
+## Limits
+
+{limits}
+
+## Licence and source
+
+{licence}
+
+The scenes are simulated: no recording of a real road, vehicle or person is in them. `harness dataset
+export` of SwarmDrive Harness {version} wrote this folder, after the [SwarmDrive paper]({paper}), from:
+
+{sources}
+"""
+
+_WORDS = (
+    "citeAs", "column", "equivalentProperty", "extract", "field", "fileObject",
+    "fileProperty", "fileSet", "format", "includes", "isLiveDataset", "jsonPath", "key",
+    "md5", "parentField", "path", "recordSet", "references", "regex", "repeated",
+    "replace", "samplingRate", "separator", "source", "subField", "transform",
+)  # fmt: skip
+_CONTEXT = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "sc": "https://schema.org/",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "dct": "http://purl.org/dc/terms/",
+    "conformsTo": "dct:conformsTo",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    **{word: f"cr:{word}" for word in _WORDS},
+}
+"""The context that Croissant 1.0 prescribes."""
