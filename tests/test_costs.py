@@ -70,6 +70,7 @@ def test_a_run_states_what_its_questions_cost(
         }
     }  # fmt: skip
     assert f"cost: {asked * EACH:.4g} EUR for {asked} questions to mine" in said
+    assert f"{asked} questions to mine cost {asked * EACH:.4g} EUR." in Path("run/report.html").read_text()
     # What the cache has costs nothing.
     code, said, _ = harness(*typed_eval(two_path, "--limit", "1"), "--out", "again")
     assert (code, len(there.asked), cost_of("again")) == (0, asked, None)
@@ -151,6 +152,18 @@ def test_a_wrong_price_is_one_line(
     with pytest.raises(UserError, match=re.escape(words)) as raised:
         cards.load("mine")
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.slow
+def test_a_suite_costs_what_its_runs_cost(there: Server, harness: Typed) -> None:
+    code, said, error = harness(
+        "eval", "--model", "mine", "--dataset", "suite:v2v-safety-2", "--limit", "1", "--condition", "6g",
+        "--seeds", "0:1", "--no-cache", "--out", "suite",
+    )  # fmt: skip
+    assert code == 0, error
+    asked = len(there.asked)
+    assert sum(cost_of(f"suite/{run.name}")["mine"]["asked"] for run in Path("suite").glob("*-v*")) == asked
+    assert f"cost: {asked * EACH:.4g} EUR for {asked} questions to mine" in said
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Define the typed records of a run's files; docs/files.md has the meaning of each name."""
 
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any, Literal
 
@@ -391,6 +392,9 @@ _CONDITION = defstruct(
 )
 
 
+_SUMMED = ("amount", "asked", "uncounted", "read_tokens", "written_tokens")  # fields of a cost
+
+
 class Cost(Struct, frozen=True):
     """What a run's questions to one model cost, by the price that its card states."""
 
@@ -400,6 +404,16 @@ class Cost(Struct, frozen=True):
     uncounted: int  # of these, so many are not in the amount: nobody said how many tokens they had
     read_tokens: int
     written_tokens: int
+
+    @classmethod
+    def joined(cls, runs: "Iterable[Manifest]") -> "dict[str, Cost]":
+        """Return what several runs cost, by model; they asked it at one price."""
+        total: dict[str, Cost] = {}
+        for model, cost in (each for run in runs for each in (run.cost or {}).items()):
+            old = total.get(model)
+            sums = {name: getattr(cost, name) + (getattr(old, name) if old else 0) for name in _SUMMED}
+            total[model] = cls(cost.currency, **sums)
+        return total
 
 
 class Manifest(Struct, frozen=True, kw_only=True):

@@ -15,7 +15,7 @@ from harness.core.statistics import mean_of
 from harness.runs import folder
 from harness.runs.folder import Run, csv_text
 from harness.runs.listing import own_name
-from harness.runs.records import Manifest, Score, Variant
+from harness.runs.records import Cost, Manifest, Score, Variant
 
 FORMAT = "swarmdrive-suite/1"
 SUMMARY = "summary.csv"  # the means over families
@@ -50,7 +50,8 @@ class SuiteRun:
         counts = ("cached_answers", "engine_errors", "retries")
         totals = {name: sum(getattr(m, name) for m in manifests) for name in counts}
         latency = msgspec.structs.replace(manifests[0].latency, sample={})
-        return msgspec.structs.replace(manifests[0], latency=latency, answer_times={}, **totals)
+        cost = Cost.joined(manifests) or msgspec.UNSET
+        return msgspec.structs.replace(manifests[0], latency=latency, answer_times={}, cost=cost, **totals)
 
     @property
     def conditions(self) -> tuple[str, ...]:
