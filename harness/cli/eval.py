@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from harness.cli import options, repeats, suite
-from harness.cli.run import Column, as_mapping, default_out, evaluate, show
+from harness.cli.run import Column, as_mapping, default_out, evaluate, show, walked
 from harness.cli.terminal import echo_cost, echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
 from harness.core.seeds import stated
@@ -78,6 +78,9 @@ def command(
     specs = [resolve.spec(settings, source) for source in sources]
     if named:
         suite.check(named, specs)
+    several = f"--repeats {repeat}" if repeat is not None else f"suite {named.name}" if named else ""
+    if several and sources[0].until:
+        raise UserError(f"{several}: runs that stop early have other layouts each; leave --until-... out")
     if repeat is not None:
         if named:
             raise UserError(
@@ -122,6 +125,7 @@ def command(
             suite.evaluate(named, specs, frozen, out, evaluated, quiet, as_json)
             return
         done, page = evaluated(specs[0], out or default_out(specs[0]))
+    dataset = walked(frozen[0], done)
     if as_json:
         echo_json(as_mapping(done))
     if silent:
@@ -129,18 +133,18 @@ def command(
     from harness.report.references import BESIDE, in_trees, label, meaning
 
     selected = bool(sources[0].selection.given)
-    seeds_of = frozen[0].manifest.episodes if selected else len(frozen[0].episodes)
-    references = in_trees(frozen[0])
+    seeds_of = dataset.manifest.episodes if selected else len(dataset.episodes)
+    references = in_trees(dataset)
     gain = [of for of in [GAINS[leading.lead_of(done)]] if any(s.metric == of.metric for s in done.scores)]
     beside = {name: references[name] for name in BESIDE if name in references}
     notes = (
-        f"n = {len(frozen[0].episodes)} episodes × {len(specs[0].seeds)} channel seeds; "
-        f"{'of ' if selected else ''}{stated(frozen[0].manifest.seed, seeds_of)};",
+        f"n = {len(dataset.episodes)} episodes × {len(specs[0].seeds)} channel seeds; "
+        f"{'of ' if selected else ''}{stated(dataset.manifest.seed, seeds_of)};",
         "95 % intervals over episodes; msgs: per episode" + "; gain: over single-local, paired" * bool(gain),
         *map(meaning, beside),
     )
-    rows = {label(name, frozen[0].scenario): scores for name, scores in beside.items()}
-    show(done, frozen[0].name, (SUCCESS, *gain, *COLUMNS), notes, rows)
+    rows = {label(name, dataset.scenario): scores for name, scores in beside.items()}
+    show(done, dataset.name, (SUCCESS, *gain, *COLUMNS), notes, rows)
     typer.echo(f"wrote {page}")
 
 

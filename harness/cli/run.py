@@ -19,6 +19,7 @@ from harness.runs import leading
 
 if TYPE_CHECKING:
     from harness.core.parallel import Workers
+    from harness.dataset.load import Dataset
     from harness.evaluate.agent import Agent
     from harness.evaluate.hooks import Hook
     from harness.evaluate.lifecycle import Evaluated
@@ -91,12 +92,19 @@ def evaluate(
     with telling(hooks, folder, spec.settings()) as told:
         with progress as done:
             run = evaluated(spec, folder, told.counting(done), cache, done.more, workers, opens)
+        dataset = dataset and walked(dataset, run)
         with work.going_on(folder):
             page = write([folder], quiet=quiet, dataset=dataset, workers=workers if dataset else 1, full=full)
             then()
         work.tidy(folder)
         told.end(run)
     return run, page
+
+
+def walked(dataset: "Dataset", run: "Evaluated") -> "Dataset":
+    """Return the episodes that a run came to, which may have stopped early."""
+    numbers = dataset.episodes[: run.manifest.world.episodes]
+    return dataset if len(numbers) == len(dataset.episodes) else dataset.of_episodes(frozenset(numbers))
 
 
 def default_out(spec: "Spec") -> Path:

@@ -1,7 +1,7 @@
 """Walk frozen scenes: an episode is a walk through the decision tree of its layout."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any, ClassVar, NamedTuple
 
@@ -13,12 +13,13 @@ from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.schema import Edge
 from harness.dataset.select import ALL, Selection
 from harness.evaluate.draws import channel_draws
+from harness.evaluate.looks import Until
 from harness.evaluate.settings import FrozenSettings
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World, by_danger
-from harness.runs.records import Episode, FrozenScenes
+from harness.runs.records import Episode, FrozenScenes, Looks
 from harness.world.lookouts import radios
 from harness.world.outcome import rating
 from harness.world.parameters import ROUNDING_FRAMES
@@ -31,6 +32,7 @@ class FrozenSource:
 
     dataset: Dataset  # the dataset, cut to the selected episodes
     selection: Selection = ALL  # how they were selected
+    until: Until | None = None  # when they are enough; None if all are walked
     kind: ClassVar[World] = "frozen"
 
     @property
@@ -56,7 +58,21 @@ class FrozenSource:
             episodes=len(self.dataset.episodes), limit=self.selection.limit,
             delay_allowance_s=p.delay_allowance_s, decision_lag_s=p.decision_lag_s,
             path=str(self.dataset.path), selection=self.selection.given,
+            looks=self.until.record(len(self.dataset.episodes)) if self.until else None,
         )  # fmt: skip
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        """Numbers of the episodes that are walked at most."""
+        return self.dataset.episodes
+
+    def stopped(self, looks: Looks) -> "FrozenSource":
+        """Return what was walked when it was looked at last."""
+        numbers, selection = self.dataset.episodes[: looks.at[-1]], self.selection
+        if len(numbers) < looks.layouts:
+            selection = replace(selection, limit=len(numbers))
+        dataset, until = self.dataset.of_episodes(frozenset(numbers)), self.until and self.until.after(looks)
+        return FrozenSource(dataset, selection, until)
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
         """Yield the first decision point of each of up to `most` episodes, of whatever vehicles."""
@@ -66,7 +82,10 @@ class FrozenSource:
 
     def settings(self) -> FrozenSettings:
         given: dict[str, Any] = self.selection.given
-        return FrozenSettings(dataset=str(argument(self.dataset.path)), limit=self.selection.limit, **given)
+        return FrozenSettings(
+            dataset=str(argument(self.dataset.path)), limit=self.selection.limit, **given,
+            **(self.until.settings() if self.until else {}),
+        )  # fmt: skip
 
 
 class _Walks:

@@ -19,7 +19,7 @@ from harness.evaluate import latency as latencies
 from harness.evaluate.settings import difference, of_words, words
 from harness.evaluate.spec import Spec
 from harness.runs import folder, formats
-from harness.runs.records import Latency, Manifest, Score
+from harness.runs.records import Latency, Looks, Manifest, Score
 
 
 class RunStart(work.WorkStart, frozen=True, kw_only=True):
@@ -78,14 +78,22 @@ def another_model(spec: Spec) -> str:
     return f"another model behind {names} (its files, package versions or device differ)"
 
 
-def as_finished(spec: Spec, begun: RunStart) -> RunStart:
-    """Return the record of a run that finishes: tags of both commands, and where its dataset is now."""
+def as_finished(spec: Spec, begun: RunStart, looks: Looks | None = None) -> RunStart:
+    """Return the record of a run that finishes: tags of both commands, and where its dataset is now.
+
+    One that was looked at states the layouts that it stopped after; its command still says when to stop.
+    """
     spec = replace(spec, tags=tuple(dict.fromkeys((*begun.tags, *spec.tags))))
     if spec.latency == latencies.MEASURED:  # a repeat must not measure: other times would make other rows
         spec = replace(spec, latency=latencies.as_declared(begun.latency))
     return msgspec.structs.replace(
-        begun, settings=spec.settings(), tags=spec.tags, command=words(spec.stated()), versions=versions()
-    )
+        begun, settings=_stopped(spec, looks).settings(), tags=spec.tags, command=words(spec.stated()),
+        versions=versions(),
+    )  # fmt: skip
+
+
+def _stopped(spec: Spec, looks: Looks | None) -> Spec:
+    return spec if looks is None else replace(spec, source=spec.source.stopped(looks))
 
 
 def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
@@ -129,7 +137,8 @@ def refuse_finished(out: Path) -> None:
 
 def finished(spec: Spec, out: Path) -> Evaluated:
     """Return the finished run in a folder. Raises UserError if it is another run, or damaged."""
-    return finished_with(spec.settings(), out, partial(_options, spec))
+    looks = folder.read(out).manifest.world.looks if spec.source.until else None
+    return finished_with(_stopped(spec, looks).settings(), out, partial(_options, spec))
 
 
 def finished_with(

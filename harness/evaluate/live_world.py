@@ -6,7 +6,7 @@ decision that is still open when the next one is due continues, and the next one
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Any, ClassVar
@@ -24,10 +24,11 @@ from harness.dataset.select import drawn
 from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.draws import OF_ANOTHER_AGENT, channel_draws
+from harness.evaluate.looks import Until
 from harness.evaluate.settings import DriveSettings
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.runs import metrics
-from harness.runs.records import ClosedLoop, Episode
+from harness.runs.records import ClosedLoop, Episode, Looks
 from harness.world import conflict_measures, reference, scenarios
 from harness.world.drivers import PRIVILEGED
 from harness.world.lookouts import radios
@@ -51,6 +52,7 @@ class LiveSource:
     scenario_name: str = scenarios.DEFAULT
     sample: int | None = None
     sample_seed: int = 0
+    until: Until | None = None  # when they are enough; None if all are driven
     name: ClassVar[str] = "drive"
     kind: ClassVar[metrics.World] = "closed-loop"
 
@@ -82,12 +84,18 @@ class LiveSource:
             late_against="full-view driver, whose decisions act after decision_lag_s",
             selection={} if self.sample is None
             else {"of": self.episodes, "sample": self.sample, "sample_seed": self.sample_seed},
+            looks=self.until.record(self.episodes) if self.until else None,
         )  # fmt: skip
+
+    def stopped(self, looks: Looks) -> "LiveSource":
+        """Return what was driven when it was looked at last."""
+        return replace(self, episodes=looks.at[-1], until=self.until and self.until.after(looks))
 
     def settings(self) -> DriveSettings:
         return DriveSettings(
             scenario=scenarios.argument(self.scenario), episodes=self.episodes, first_seed=self.first_seed,
             sample=self.sample, sample_seed=0 if self.sample is None else self.sample_seed,
+            **(self.until.settings() if self.until else {}),
         )  # fmt: skip
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:

@@ -18,6 +18,7 @@ from harness.dataset import load
 from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.looks import until
 from harness.evaluate.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
@@ -51,7 +52,7 @@ def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
     """Return the selected episodes of a dataset, by its name or folder."""
     selection = Selection(world.limit, world.only, world.danger, world.sample, world.sample_seed)
     whole = load.load(load.find(dataset), None if selection.given else world.limit)
-    return FrozenSource(selection.of(whole), selection)
+    return FrozenSource(selection.of(whole), selection, until(world.until_width, world.until_decided))
 
 
 def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
@@ -71,7 +72,12 @@ def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
     in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     in_range("--first-seed", first_seed, 0, LAST_SEED)
     purpose(first_seed, episodes)
-    source = LiveSource(first_seed, episodes, name, world.sample, world.sample_seed)
+    enough = until(world.until_width, world.until_decided)
+    if enough and world.sample is not None:
+        raise UserError(
+            f"--sample {world.sample}: a run that stops takes layouts in their order; leave it out"
+        )
+    source = LiveSource(first_seed, episodes, name, world.sample, world.sample_seed, enough)
     if source.scenario.is_environment:
         examine(source.scenario, first_seed)
     return source

@@ -43,6 +43,7 @@ from harness.evaluate.lifecycle import (
     refuse_finished,
     unfinished,
 )
+from harness.evaluate.looks import looks
 from harness.evaluate.settings import FILE, of_words, text_of
 from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
@@ -53,7 +54,8 @@ from harness.runs import sources as kept_sources
 from harness.runs.decisions import Decisions
 from harness.runs.formats import FORMAT
 from harness.runs.metrics import Grid
-from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Manifest
+from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Looks, Manifest
+from harness.runs.success import any_time_scores
 from harness.runs.summary import Figures, counted
 from harness.runs.unanswered import Tally
 
@@ -111,8 +113,10 @@ def evaluate(
     made_of = sources(spec)
     begun, chunks = _begin_driving(spec, out, begun, workers)
     with work.working(out, begun, "run.json") as place:
-        _drive(spec, begun, chunks, place, progress, cache, workers)
-        return _gather(out, as_finished(spec, begun), chunks, place, made_of)
+        seen, looked = _walked(
+            spec, chunks, place, lambda some: _drive(spec, begun, some, place, progress, cache, workers)
+        )
+        return _gather(out, as_finished(spec, begun, looked), seen, place, made_of)
 
 
 def evaluate_shard(spec: Spec, out: Path, shard: Shard, progress: Progress, workers: Workers = 1) -> int:
@@ -122,6 +126,8 @@ def evaluate_shard(spec: Spec, out: Path, shard: Shard, progress: Progress, work
     Raises UserError as `evaluate`, or if the latency is to be measured.
     """
     refuse_finished(out)
+    if spec.source.until:
+        raise UserError(f"--shard {shard}: a run that stops when it has seen enough has no shards")
     made_of = sources(spec)
     begun, chunks = _begin_driving(spec, out, unfinished(spec, out, str(shard)), workers, str(shard))
     own_chunks = shard.part(chunks)
@@ -199,7 +205,8 @@ def _frozen(
     workers: Workers,
 ) -> Evaluated:  # fmt: skip
     made_of, chunks = sources(spec), _split(source.dataset.episodes, TREES_AT_ONCE)
-    spread_over = 1 if opens or given or len(chunks) == 1 else spreadable(spec, workers)
+    here = opens or given or source.until or len(chunks) == 1
+    spread_over = 1 if here else spreadable(spec, workers)
     if in_workers := spread_over != 1:
         models = list[Backend]()
         identity, latency = _stated_in_worker(spec, begun, spread_over)
@@ -229,14 +236,18 @@ def _frozen(
             more(n_answers)
             progress(n_answers)
 
-        if in_workers:
-            _hand_over(place, chunks)
-            walk_chunk = partial(_walk_chunk, spec, begun, *_files(spec, cache, place, spread_over))
-            _walk_missing(chunks, place, walk_chunk, report_kept, report_kept, spread_over)
-        else:
+        def walk_all(some: Sequence[Sequence[int]]) -> None:
+            if in_workers:
+                _hand_over(place, some)
+                walk_chunk = partial(_walk_chunk, spec, begun, *_files(spec, cache, place, spread_over))
+                _walk_missing(some, place, walk_chunk, report_kept, report_kept, spread_over)
+            else:
+                _walk_missing(some, place, walk_here, report_kept, lambda chunk: None)
+
+        if not in_workers:
             backend = together(spec.cards, costs.metered(spec.cards, models, place, spec.budget), cache)
-            _walk_missing(chunks, place, walk_here, report_kept, lambda chunk: None)
-        return _gather(out, as_finished(spec, begun), chunks, place, made_of)
+        seen, looked = _walked(spec, chunks, place, walk_all)
+        return _gather(out, as_finished(spec, begun, looked), seen, place, made_of)
 
 
 def spreadable(spec: Spec, workers: Workers) -> Workers:
@@ -311,6 +322,34 @@ def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> N
 def _label(chunk: Sequence[int]) -> str:
     whole = chunk == range(chunk[0], chunk[-1] + 1)
     return f"episodes {chunk[0]} to {chunk[-1]}" if whole else f"episodes {', '.join(map(str, chunk))}"
+
+
+def _walked(
+    spec: Spec, chunks: Sequence[Sequence[int]], place: Path,
+    walk_all: Callable[[Sequence[Sequence[int]]], None],
+) -> tuple[Sequence[Sequence[int]], Looks | None]:  # fmt: skip
+    """Walk the chunks, or as many layouts as are enough; return the chunks of these, and the looks.
+
+    A resumed run looks at the same layouts again, and so stops where it would have.
+    """
+    until = spec.source.until
+    if until is None:
+        walk_all(chunks)
+        return chunks, None
+    numbers, most = spec.source.numbers, max(map(len, chunks))
+    names, done, ended = tuple(point.name for point in spec.points), list[Sequence[int]](), list[Episode]()
+    enough, at = False, list[int]()
+    for layouts in looks(len(numbers)):
+        new = _split(numbers[at[-1] if at else 0 : layouts], most)
+        walk_all(new)
+        parts = [place / _folder_name(chunk) for chunk in new]
+        _settle(parts, chain.from_iterable(map(folder.facts_of, parts)))
+        done, at = [*done, *new], [*at, layouts]
+        ended += chain.from_iterable(map(folder.ends_of, parts))
+        grid = Grid(names, spec.seeds, tuple(numbers[:layouts]))
+        if enough := until.enough(grid, grid.ordered(ended)):
+            break
+    return done, msgspec.structs.replace(until.record(len(numbers)), at=tuple(at), enough=enough)
 
 
 def _drive(
@@ -421,6 +460,8 @@ def _gather(
             episode for cell in range(cells) for chunk, of_part in zip(chunks, by_part, strict=True)
             for episode in of_part[cell * len(chunk) : (cell + 1) * len(chunk)]
         ]  # fmt: skip
+        if settings["world"].get("looks"):
+            summary = [*summary, *any_time_scores(whole.grid, episodes)]
         manifest = msgspec.convert({
             "format": FORMAT, "name": out.name, "created": begun.created,
             "command": shlex.join([*begun.command, "--out", str(out)]), "tags": begun.tags, **settings,

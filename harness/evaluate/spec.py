@@ -1,6 +1,6 @@
 """Hold and check the complete settings of an evaluation: enough to run it again."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
@@ -22,12 +22,13 @@ from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.costs import Budget
 from harness.evaluate.device import rows_of
 from harness.evaluate.latency import MEASURED, NAMES, declared
+from harness.evaluate.looks import Until
 from harness.evaluate.settings import DriveSettings, FrozenSettings, HelperSettings, Settings
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
 from harness.runs.devices import Device
 from harness.runs.metrics import World
-from harness.runs.records import ClosedLoop, FrozenScenes
+from harness.runs.records import ClosedLoop, FrozenScenes, Looks
 from harness.world.perception.graph import truth_graph
 from harness.world.scenario import Scenario
 from harness.world.seats import agent_share
@@ -58,6 +59,20 @@ class Source(Protocol):
 
     @property
     def scenario(self) -> Scenario: ...
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        """Numbers of the episodes that are walked at most."""
+        ...
+
+    @property
+    def until(self) -> Until | None:
+        """When the episodes are enough; None if all are walked."""
+        ...
+
+    def stopped(self, looks: Looks) -> "Source":
+        """Return what was walked when it was looked at last."""
+        ...
 
     @property
     def layout_seeds(self) -> Iterable[int]: ...
@@ -152,6 +167,9 @@ class Spec:
         self._check_device()
         for point in self.points:
             self._check_point(point)
+        if until := self.source.until:
+            names = [point.name for point in self.points]
+            until.check(self.source.record(), self.source.numbers, names, self.seeds)
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
             if value is not None and not any(agent.can.has_weights for agent in self.agents):
                 engines = [

@@ -37,7 +37,28 @@ def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
     """Return sentences for a run's headline; none for a language model whose answers could be read."""
     first = [*unread(scores), *no_prompt([manifest]), *findings_of(manifest), *moved_system(manifest)]
     first += by_letter(scores)
-    return [*first, *beyond_sources(manifest), *on_device(manifest)]
+    return [*first, *beyond_sources(manifest), *on_device(manifest), *looked_at(manifest)]
+
+
+def looked_at(manifest: Manifest) -> Iterator[str]:
+    """Yield when a run was looked at, and which of its intervals hold though it may have stopped early."""
+    looks = manifest.world.looks
+    if looks is None:
+        return
+    what = (
+        f"success is known within {100 * looks.width:g} points"
+        if looks.width is not None
+        else f"success differs from that of {printable(looks.against, 40)}"
+    )
+    how = (
+        f"It stopped after {looks.at[-1]} of {looks.layouts} layouts, when"
+        if looks.enough
+        else f"It took all {looks.layouts} layouts, and still it is not so that"
+    )
+    yield (
+        f"{how} {what} in every condition. It was looked at {len(looks.at)} times: intervals of success and "
+        "of its gain hold at every look; all others are for a number of layouts fixed before, and too narrow."
+    )
 
 
 def merged(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:

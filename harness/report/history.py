@@ -8,7 +8,7 @@ from pathlib import Path
 
 from harness.core.errors import UserError, printable, unknown
 from harness.report.compare.page import Place, beside
-from harness.report.compare.pair import scenes_of, where
+from harness.report.compare.pair import where
 from harness.report.document import Section, Table, document, forest, linked, reach
 from harness.report.page import save
 from harness.report.words import cell
@@ -66,7 +66,9 @@ def history(
             except UserError as error:
                 wrong(listing.name, error)
                 continue
-            lines.setdefault(repr(scenes_of(run)), []).append(Line(listing.name, listing.date, run, None))
+            lines.setdefault(repr(run.manifest.world.pinned), []).append(
+                Line(listing.name, listing.date, run, None)
+            )
     if not lines:
         raise UserError(f"no finished runs in {printable(folder)}; `harness eval` makes one")
     runs = [line.run for of in lines.values() for line in of]

@@ -36,6 +36,7 @@ from harness.runs.answers import Answered, Answers
 from harness.runs.attribution import Attribution
 from harness.runs.decisions import DecisionFiles, Decisions, arrow_file
 from harness.runs.devices import Speed
+from harness.runs.leading import ANY_TIME
 from harness.runs.metrics import Grid, World
 from harness.runs.records import (
     Answer,
@@ -183,11 +184,15 @@ class Run:
         return self._read(attribution.FILE, attribution.load) if exists else None
 
     def score(self, condition: str, metric: str) -> Score | None:
-        """Return a metric's score in one condition; of several intervals, the one over episodes."""
+        """Return a metric's score in one condition; of several intervals, one that holds at every look.
+
+        Else it is the one over episodes.
+        """
         candidates = [
             s for s in self.scores if (s.condition, s.metric) == (condition, metric) and s.value is not None
         ]
-        return min(candidates, key=lambda s: s.interval != "episodes", default=None)
+        order = {ANY_TIME: 0, "episodes": 1}
+        return min(candidates, key=lambda s: order.get(s.interval, 2), default=None)
 
     def _scores(self, file: Path) -> tuple[Score, ...]:
         scores = _records(file, Score)
@@ -315,6 +320,11 @@ def read_part(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Epis
 def facts_of(part: Path) -> list[AnswerFacts]:
     """Read a part's answers, without their texts. Raises UserError if it is broken."""
     return whole(part, lambda part: _FACTS.decode_lines(bytes_of(part / "answers.jsonl", "rows")))
+
+
+def ends_of(part: Path) -> tuple[Episode, ...]:
+    """Read how a part's episodes ended. Raises UserError if it is broken."""
+    return whole(part, lambda part: _records(part / "episodes.csv", Episode))
 
 
 def _read_tables(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...]]:

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from harness.runs.records import Score
 
 SUCCESS, BALANCED = "success_rate", "balanced_success_rate"
+ANY_TIME = "any time"  # the kind of an interval over episodes that holds at every look
 IN_WORDS = {SUCCESS: "success", BALANCED: "balanced success"}
 
 

@@ -15,7 +15,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import BROKEN, opened, text_of
 from harness.core.formats import CONFIG, SOURCES, SUITE, WORK
 from harness.runs import formats
-from harness.runs.leading import BALANCED, SUCCESS, leading
+from harness.runs.leading import ANY_TIME, BALANCED, SUCCESS, leading
 
 DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
@@ -176,7 +176,9 @@ def _with_summary(path: str, listed: Listed) -> Listed:
         ]
     table = list(csv.DictReader([head, *lines]))
     metric = leading({row["metric"] for row in table})
-    rows = [row for row in table if (row["metric"], row["interval"]) == (metric, "episodes")]
+    kinds = {row["interval"] for row in table if row["metric"] == metric}
+    kind = ANY_TIME if ANY_TIME in kinds else "episodes"
+    rows = [row for row in table if (row["metric"], row["interval"]) == (metric, kind)]
     best = max(rows, key=lambda row: _number(row["value"]) or 0.0)
     value, low, high = (_number(best[key]) for key in ("value", "ci_low", "ci_high"))
     unread = next((_number(row["value"]) for row in table if row["metric"] == FAILED), None)

@@ -12,6 +12,7 @@ from harness.core.errors import UserError
 from harness.core.statistics import Estimate
 from harness.runs.devices import Device, Speed
 from harness.world import scenarios
+from harness.world.parameters import DIALS
 
 Role = Literal["ego", "helper", "merge", "blind"]
 
@@ -319,7 +320,9 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
     high: float | None  # its upper end
     n: int  # number of units
     n_excluded: int  # units without a value
-    interval: str  # what the units are: `episodes`, `seed means` or `answers`
+    # what the units are: `episodes`, `seed means` or `answers`; `any time` for episodes and an interval that
+    # holds at every look
+    interval: str
 
     @classmethod
     def of(cls, condition: str, metric: str, e: Estimate, interval: str) -> "Score":
@@ -331,6 +334,17 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
     def estimate(self) -> Estimate:
         value, low, high = (float("nan") if x is None else x for x in (self.value, self.low, self.high))
         return Estimate(value, low, high, self.n, self.n_excluded)
+
+
+class Looks(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """When a run was looked at, and what was to stop it: one of a width and another run."""
+
+    layouts: int  # how many there were
+    width: float | None = None  # of each condition's interval of success, as a share
+    against: str | None = None  # the name of the run from which every condition is to differ
+    against_sha256: str | None = None  # digest of that run's episodes.csv
+    at: tuple[int, ...] = ()  # after how many layouts it was looked; empty while it runs
+    enough: bool = False  # whether the last look was enough
 
 
 class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True, omit_defaults=True):
@@ -345,6 +359,12 @@ class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=
     decision_lag_s: float
     path: str
     selection: dict[str, int | str] = {}
+    looks: Looks | None = None  # None for a run of as many episodes as were asked for
+
+    @property
+    def pinned(self) -> Any:
+        """What pins its scenes: the dataset's digest."""
+        return self.sha256
 
 
 class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True, omit_defaults=True):
@@ -359,11 +379,18 @@ class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_on
     episodes: int
     late_against: str
     selection: dict[str, int] = {}
+    looks: Looks | None = None  # None for a run of as many episodes as were asked for
 
     def __post_init__(self) -> None:
         name, parameters = self.scenario.get("name"), self.scenario.get("parameters")
         if not isinstance(name, str) or not isinstance(parameters, dict):
             raise ValueError("the scenario has no name, or no parameters")
+
+    @property
+    def pinned(self) -> Any:
+        """What pins its scenes: the scenario's layouts, of any beacons."""
+        parameters = {k: v for k, v in self.scenario["parameters"].items() if k not in DIALS}
+        return self.scenario["name"], parameters, self.first_seed
 
     @property
     def title(self) -> str:

@@ -3,7 +3,7 @@
 All that picks, orders or tests by success of single episodes does so here.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +11,12 @@ import numpy as np
 from harness.core import multiplicity
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.power import Spread, variance
+from harness.core.sequences import any_time
 from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of, resampled
 from harness.runs import metrics
-from harness.runs.leading import BALANCED, IN_WORDS, SUCCESS
-from harness.runs.metrics import over_episodes
-from harness.runs.records import Episode
+from harness.runs.leading import ANY_TIME, BALANCED, IN_WORDS, SUCCESS
+from harness.runs.metrics import BASELINE, GAINS, METRICS, Grid, of_ends, over_episodes
+from harness.runs.records import Episode, Score
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,14 @@ class Success:
         """Return success a - b, both (S, E), paired by episode."""
         return self._mean(lambda part: metrics.difference(SUCCESS, a[:, part].T, b[:, part].T, level))
 
+    def any_time(self, success: Floats) -> Estimate:
+        """Return mean success, (S, E), with an interval over episodes that holds at every look."""
+        return any_time([known_mean(success, 0)[part] for part in self._parts])
+
+    def any_time_difference(self, a: Floats, b: Floats) -> Estimate:
+        """Return success a - b, both (S, E), paired by episode, with an interval that holds at every look."""
+        return any_time([known_mean(a - b, 0)[part] for part in self._parts], -1.0)
+
     def p_value(self, a: Floats, b: Floats) -> float | None:
         """Return the p-value of no such difference; None without an interval."""
         return multiplicity.p_value(lambda level: self.difference(a, b, level))
@@ -87,6 +96,24 @@ class Success:
     def _mean(self, estimate: Callable[[Bools], Estimate]) -> Estimate:
         parts = self._parts
         return mean_of([*map(estimate, parts)]) if len(parts) > 1 else estimate(parts[0])
+
+
+def by_condition(grid: Grid, episodes: Sequence[Episode]) -> tuple[Success, dict[str, Floats]]:
+    """Return how success of a run's episodes counts, and success (S, E) by condition; in the grid's order."""
+    values = dict(zip(grid.conditions, of_ends(METRICS[SUCCESS], grid, episodes), strict=True))
+    return Success.of(episodes[: len(grid.episodes)], BALANCED), values
+
+
+def any_time_scores(grid: Grid, episodes: Sequence[Episode]) -> Iterator[Score]:
+    """Yield the scores of success, and of gains in it, whose intervals hold at every look."""
+    success, values = by_condition(grid, episodes)
+    for counting in dict.fromkeys((success.plain.metric, success.metric)):
+        by = success if counting == success.metric else success.plain
+        for name, of_condition in values.items():
+            yield Score.of(name, counting, by.any_time(of_condition), ANY_TIME)
+            if BASELINE in values and name != BASELINE:
+                gain = by.any_time_difference(of_condition, values[BASELINE])
+                yield Score.of(name, GAINS[counting], gain, ANY_TIME)
 
 
 def alike(successes: Sequence[Success]) -> list[Success]:

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -26,15 +25,6 @@ SETTINGS = (
     "model", "prompt", "answer", "thinking", "image", "letters", "sums", "flip", "temperature",
     "sampling_seed", "helpers", "ties", "dtype", "latency", "identity", "versions",
 )  # fmt: skip
-
-
-def scenes_of(run: Run) -> Any:
-    """Return what pins a run's scenes: the dataset's digest or the scenario's layouts, of any beacons."""
-    world = run.manifest.world
-    if isinstance(world, FrozenScenes):
-        return world.sha256
-    parameters = {k: v for k, v in world.scenario["parameters"].items() if k not in DIALS}
-    return world.scenario["name"], parameters, world.first_seed
 
 
 def where(run: Run) -> str:
@@ -113,7 +103,7 @@ def pair(a: Path, b: Path) -> Pair:
             "see `harness study fidelity`"
         )
     side_a, side_b = _side(first), _side(second)
-    if scenes_of(first) != scenes_of(second):
+    if first.manifest.world.pinned != second.manifest.world.pinned:
         scenes = " and ".join(printable(where(run), 60) for run in (first, second))
         raise UserError(f"{shown} are not of the same scenes ({scenes}); make both on the same")
     seeds_a, seeds_b = (sorted(run.manifest.seeds) for run in (first, second))

@@ -1,21 +1,23 @@
 """A comparison in words and numbers, as its table, its Markdown and its page all say them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from harness.core.errors import printable
+from harness.core.figures import POINTS, shown
 from harness.core.multiplicity import LEVEL
 from harness.prompts.difference import marked
 from harness.prompts.versions import as_it_was
-from harness.report.caveats import no_prompt, void
+from harness.report.caveats import looked_at, no_prompt, void
 from harness.report.compare.difference import LOST_BY, Comparison, DecisionFlip, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.words import p_value, pace
-from harness.runs.leading import IN_WORDS, leading
+from harness.runs.leading import IN_WORDS, SUCCESS, lead_of, leading
 from harness.runs.metrics import entry
 from harness.runs.records import role_word
+from harness.runs.success import Success
 
 BETTER, WORSE, HINT = "better", "worse", "hint"
 SIGNS = {BETTER: "✓", WORSE: "✗", HINT: "?", "": ""}
@@ -134,7 +136,21 @@ def caveats(pair: Pair) -> list[str]:
     return [
         *(f"{name}: {text}" for name, run in sides for text in void(run)),
         *no_prompt(run.manifest for _, run in sides),
+        *(f"{name}: {text}" for name, run in sides for text in looked_at(run.manifest)),
+        *_any_time(pair),
     ]
+
+
+def _any_time(pair: Pair) -> Iterator[str]:
+    """Yield each difference of success with an interval that holds at every look, if a run was looked at."""
+    if all(side.run.manifest.world.looks is None for side in (pair.a, pair.b)):
+        return
+    for condition in pair.conditions:
+        ends = [pair.a.ends[condition, pair.seeds[0], episode] for episode in pair.episodes]
+        success = Success.of(ends, lead_of(pair.a.run, pair.b.run))
+        a, b = (pair.values(side, SUCCESS, condition).T for side in (pair.a, pair.b))
+        change = shown(success.any_time_difference(b, a), POINTS, "+")
+        yield f"{printable(condition)}: {success.words} B - A {change} points, by an interval of every look"
 
 
 def paired(pair: Pair) -> str:

@@ -1,0 +1,66 @@
+"""Intervals of means that hold at every look at once, so that a run may stop when it has seen enough.
+
+Each value from 0 to 1 is a bet for or against a mean m: capital that never grows on average if m is the mean.
+By Ville's inequality it exceeds 20 with a probability of 5 % at most, whenever one looks, and so the means at
+which it does not are a 95 % confidence sequence: Waudby-Smith and Ramdas 2024, Estimating means of bounded
+random variables by betting, J. R. Stat. Soc. B 86(1), the hedged capital with a grid of bets. How often a run
+that stops holds the truth is simulated by `benchmarks/looks.py`.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.core.statistics import LEVEL, Estimate
+
+# Shares of what may be bet: any are valid, and these are good for 20 to 5000 values.
+BETS = np.geomspace(0.01, 0.8, 10)
+MEANS = np.linspace(0.0, 1.0, 1001)  # the means that are tried; ends are the next one outwards
+
+
+def any_time(parts: Sequence[Floats], least: float = 0.0) -> Estimate:
+    """Return the mean of means of parts, with an interval that holds at every look.
+
+    Values of one or two parts are independent, of one mean a part, from `least` to 1, (E,); NaN is left out.
+    The capital of two is the product of theirs; the interval has every mean of means that it does not refute.
+    """
+    values = [part[~np.isnan(part)] for part in parts]
+    n, n_excluded = sum(map(len, values)), sum(map(len, parts)) - sum(map(len, values))
+    if not all(map(len, values)):
+        return Estimate(math.nan, math.nan, math.nan, n, n_excluded)
+    capitals = [_log_capital((part - least) / (1 - least)) for part in values]
+    low, high = _least_mean(capitals), 1 - _least_mean([capital[::-1] for capital in capitals])
+    value = float(np.mean([part.mean() for part in values]))
+    return Estimate(value, least + (1 - least) * low, least + (1 - least) * high, n, n_excluded)
+
+
+def _log_capital(values: Floats) -> Floats:
+    """Return the logarithm of the capital after these values for each of `MEANS`, (M,).
+
+    Half of it is bet on a greater mean and half on a smaller one, spread evenly over `BETS`. It does not
+    depend on the order of the values, and is log-convex in the mean.
+    """
+    distinct, count = np.unique(values, return_counts=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = [
+            np.where(side == mean, 1.0, side / mean)
+            for side, mean in ((distinct, MEANS[:, None]), (1 - distinct, 1 - MEANS[:, None]))
+        ]
+        logs = [np.log1p(BETS[:, None] * (ratio[:, None, :] - 1)) @ count for ratio in ratios]
+    return np.asarray(np.logaddexp.reduce(np.hstack(logs), axis=1) - math.log(2 * len(BETS)))
+
+
+def _least_mean(capitals: Sequence[Floats]) -> float:
+    """Return the least mean of one or two parts' means that their capital together does not refute."""
+    most, first = -math.log(1 - LEVEL), capitals[0]
+    if len(capitals) == 1:
+        return float(MEANS[max(np.flatnonzero(first < most)[0] - 1, 0)])
+    second = capitals[1]
+    lowest = int(np.argmin(second))
+    # Left of its lowest capital falls with the mean: the least mean there that what is left does not refute.
+    place = lowest - np.searchsorted(second[lowest::-1], most - first, side="left") + 1
+    possible = most - first > second[lowest]
+    means = (MEANS + MEANS[np.clip(place - 1, 0, None)]) / 2
+    return float(max(np.min(means[possible]) - MEANS[1] / 2, 0.0))

@@ -1,0 +1,235 @@
+"""Runs that stop when they have seen enough: intervals hold at every look, and the record says when."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluating import figure, live_spec_of, run, spec_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from harness.backends.base import Backend
+from harness.backends.registry import open_backend
+from harness.coordination.operating_point import POINTS
+from harness.core.errors import UserError
+from harness.core.sequences import BETS, any_time
+from harness.core.shards import Shard
+from harness.dataset.load import Dataset
+from harness.dataset.select import Selection
+from harness.evaluate import looks
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.looks import Until
+from harness.evaluate.run import evaluate, evaluate_shard
+from harness.evaluate.spec import Spec
+from harness.report.caveats import caveats
+from harness.report.compare.pair import pair
+from harness.report.compare.words import caveats as of_pair
+from harness.runs.folder import read
+from harness.runs.leading import ANY_TIME
+
+ALONE = {"points": (POINTS["single-local"],), "seeds": (0,)}
+Typed = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of four layouts are looked at after two, three and four."""
+    monkeypatch.setattr(looks, "FIRST", 2)
+
+
+def until(spec: Spec, until: Until, limit: int | None = None) -> Spec:
+    assert isinstance(spec.source, FrozenSource)
+    return replace(spec, source=FrozenSource(spec.source.dataset, Selection(limit), until))
+
+
+def capital(values: list[float], mean: float) -> float:
+    """One bet after the other, as the paper has it."""
+    up, down = np.ones(len(BETS)), np.ones(len(BETS))
+    for value in values:
+        up *= 1 + BETS / mean * (value - mean)
+        down *= 1 - BETS / (1 - mean) * (value - mean)
+    return float(np.mean([up, down]))
+
+
+@given(st.lists(st.sampled_from([0.0, 0.2, 0.6, 1.0]), min_size=1, max_size=40))
+@settings(max_examples=20)
+def test_the_interval_ends_where_capital_bet_in_turn_refutes_a_mean(values: list[float]) -> None:
+    e = any_time([np.array(values)])
+    assert e.low <= e.value <= e.high
+    for outside, inside in ((e.low - 0.001, e.low + 0.002), (e.high + 0.001, e.high - 0.002)):
+        assert not 0 < outside < 1 or capital(values, outside) >= 20
+        assert not 0 < inside < 1 or capital(values, inside) <= 20 or e.high - e.low < 0.01
+
+
+@given(st.integers(0, 6), st.integers(0, 9))
+@settings(max_examples=8)
+def test_of_two_parts_no_pair_of_means_outside_is_left(first: int, second: int) -> None:
+    parts = [np.arange(6) < first, np.arange(9) < second]
+    e = any_time([part.astype(float) for part in parts])
+    means = np.arange(0.02, 1, 0.02)
+    tables = [np.array([capital(part.tolist(), mean) for mean in means]) for part in parts]
+    left = tables[0][:, None] * tables[1] < 20
+    mean_of_means = (means[:, None] + means) / 2
+    assert e.low <= mean_of_means[left].min() <= e.low + 0.021
+    assert e.high - 0.021 <= mean_of_means[left].max() <= e.high
+
+
+def test_differences_are_bets_from_minus_one_to_one() -> None:
+    differences = np.array([1.0] * 20 + [0.0] * 30 + [-1.0] * 2)
+    e, scaled = any_time([differences], -1.0), any_time([(differences + 1) / 2])
+    assert (e.low, e.high, e.value) == pytest.approx(
+        (2 * scaled.low - 1, 2 * scaled.high - 1, differences.mean())
+    )
+    assert e.low > 0
+    assert np.isnan(any_time([np.array([]), differences]).low)
+
+
+def test_the_truth_is_held_at_every_look_of_nearly_all_runs() -> None:
+    rng, held = np.random.default_rng(1), 0
+    for _ in range(60):
+        values = (rng.random(150) < 0.8).astype(float)
+        spans = [any_time([values[:n]]) for n in (20, 40, 60, 80, 110, 150)]
+        held += all(span.low <= 0.8 <= span.high for span in spans)
+    assert held >= 55  # 57 at a coverage of 95 %; it is simulated by benchmarks/looks.py
+
+
+def test_looks_are_a_quarter_more_each_and_end_with_all_layouts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    assert looks.looks(60) == [20, 25, 32, 40, 50, 60]
+    assert looks.looks(7) == [7]
+
+
+def test_a_run_stops_when_its_interval_is_narrow_and_says_so(small: Dataset, tmp_path: Path) -> None:
+    spec = until(spec_of(small, "constant", **ALONE), Until(width=0.999))
+    done = run(spec, tmp_path / "run")
+    assert done.manifest.world.looks is not None
+    at = done.manifest.world.looks.at
+    assert at == (2,)
+    assert done.manifest.world.looks.enough
+    assert done.manifest.world.episodes == at[-1]
+    row = figure(done, "single-local", "success_rate", ANY_TIME)
+    assert row.low is not None
+    assert row.high is not None
+    assert row.high - row.low <= 0.999
+    assert read(tmp_path / "run").score("single-local", "success_rate") == row
+    assert f"stopped after {at[-1]} of 4 layouts" in " ".join(caveats(done.manifest, done.scores))
+    whole = run(
+        spec_of(Dataset.of_episodes(small, frozenset(small.episodes[: at[-1]])), "constant", **ALONE),
+        tmp_path / "whole",
+    )
+    for name in ("episodes.csv", "answers.jsonl"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    assert whole.manifest.world.looks is None
+
+
+def test_a_run_that_is_never_sure_takes_all_layouts(small: Dataset, tmp_path: Path) -> None:
+    done = run(until(spec_of(small, "constant", **ALONE), Until(width=0.1)), tmp_path / "run")
+    world = done.manifest.world
+    assert world.looks is not None
+    assert (world.episodes, world.looks.at, world.looks.enough) == (4, (2, 3, 4), False)
+    assert "took all 4 layouts" in " ".join(caveats(done.manifest, done.scores))
+
+
+def test_a_run_stopped_by_force_goes_on_and_is_the_same(small: Dataset, tmp_path: Path) -> None:
+    spec = until(spec_of(small, "constant", **ALONE), Until(width=0.999))
+    asked = 0
+
+    def breaks(*args: object, **options: object) -> Backend:
+        backend = open_backend(*args, **options)  # type: ignore[arg-type]
+        complete = backend.complete
+
+        def once(*some: object, **more: object) -> object:
+            nonlocal asked
+            asked += 1
+            if asked == 3:
+                raise KeyboardInterrupt
+            return complete(*some, **more)  # type: ignore[arg-type]
+
+        backend.complete = once  # type: ignore[method-assign, assignment]
+        return backend
+
+    whole = run(spec, tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(spec, tmp_path / "run", lambda done: None, opens=breaks)
+    assert not (tmp_path / "run" / "run.json").exists()
+    evaluate(spec, tmp_path / "run", lambda done: None)
+    again = evaluate(spec, tmp_path / "run", lambda done: None)  # its page was not written yet
+    assert again.manifest.world == whole.manifest.world
+    for name in ("episodes.csv", "answers.jsonl", "summary.csv", "decisions.parquet"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_a_driven_run_stops_as_well(tmp_path: Path) -> None:
+    spec = live_spec_of("constant", 4, points=(POINTS["single-local"],), seeds=(0,))
+    spec = replace(spec, source=replace(spec.source, until=Until(width=0.999)))
+    done = run(spec, tmp_path / "run")
+    assert done.manifest.world.episodes == 2
+    assert "--episodes 4" in done.manifest.command
+    assert "--until-width 99.9" in done.manifest.command
+    with pytest.raises(UserError, match="has no shards"):
+        evaluate_shard(spec, tmp_path / "shard", Shard(1, 2), lambda done: None)  # type: ignore[arg-type]
+
+
+def test_a_run_stops_when_it_differs_from_another(small: Dataset, tmp_path: Path) -> None:
+    run(spec_of(small, "constant", **ALONE), tmp_path / "base")
+    against = Until(against=read(tmp_path / "base"), folder=tmp_path / "base")
+    done = run(until(spec_of(small, "constant", **ALONE), against), tmp_path / "same")
+    world = done.manifest.world
+    assert world.looks is not None
+    assert (world.looks.against, world.looks.enough, world.episodes) == ("base", False, 4)
+    said = " ".join(of_pair(pair(tmp_path / "base", tmp_path / "same")))
+    assert "B: It took all 4 layouts" in said
+    assert "by an interval of every look" in said
+
+
+@pytest.mark.parametrize(
+    ("base", "spec", "says"),
+    [
+        ({"limit": 2}, {}, "lacks 2 of the 4 layouts"),
+        ({}, {"seeds": (0, 1)}, r"has the seeds \[0\]"),
+        ({}, {"points": (POINTS["6g"],)}, "has no condition 6g"),
+    ],
+)
+def test_what_another_run_lacks_is_one_line(
+    base: dict[str, int], spec: dict[str, object], says: str, small: Dataset, tmp_path: Path
+) -> None:
+    few = small.of_episodes(frozenset(small.episodes[: base.get("limit")]))
+    run(spec_of(few, "constant", **ALONE), tmp_path / "base")
+    against = Until(against=read(tmp_path / "base"), folder=tmp_path / "base")
+    with pytest.raises(UserError, match=says):
+        until(spec_of(small, "constant", **{**ALONE, **spec}), against)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("eval", "--until-width", "0"), "--until-width 0 is out of range; give 0.1 to 99 points"),
+        (("eval", "--until-width", "4", "--until-decided", "x"), "give one of them"),
+        (("eval", "--until-decided", "nowhere"), "nowhere"),
+        (
+            ("eval", "--until-width", "4", "--dataset", "suite:v2v-safety-2"),
+            "suite v2v-safety-2: runs that stop",
+        ),
+        (("drive", "--until-width", "4", "--sample", "3"), "--sample 3: a run that stops takes layouts"),
+    ],
+)
+def test_bad_input_is_one_line(words: tuple[str, ...], says: str, harness: Typed) -> None:
+    code, out, err = harness(*words)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert says in err
+
+
+def test_typed_it_is_in_the_command_and_the_table(harness: Typed, small_path: Path) -> None:
+    code, out, _ = harness(
+        "eval", "--model", "constant", "--dataset", small_path, "--condition", "single-local",
+        "--seeds", "0:1", "--until-width", "99", "--out", "run",
+    )  # fmt: skip
+    stated = json.loads(Path("run/run.json").read_text())
+    n = stated["world"]["looks"]["at"][-1]
+    assert code == 0
+    assert ("It stopped after" if n < 4 else "It took all 4 layouts") in out
+    assert f"n = {n} episodes" in out
+    assert "until_width = 99.0" in Path("run/run.toml").read_text()
