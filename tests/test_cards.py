@@ -218,6 +218,15 @@ def test_what_was_said_of_one_engines_weights_says_nothing_of_anothers(shelf: Pa
     assert cards.load("mine").latency == cards.load("mine:llama-cpp").latency
 
 
+def test_an_adapter_changes_the_weights_on_every_engine_that_can_take_one(shelf: Path) -> None:
+    write_card(shelf, TWO_ENGINES.replace("[latency]", 'adapter = "taught"\n[latency]'))
+    assert (cards.load("mine").adapter, cards.load("mine:llama-cpp").adapter) == ("taught", "taught")
+    write_card(
+        shelf, TWO_ENGINES.replace("[latency]", 'adapter = "taught"\n[latency]') + 'adapter = "other"\n'
+    )
+    assert cards.load("mine:llama-cpp").adapter == "other"
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
