@@ -6,7 +6,7 @@ look*: runs whose interval holds the truth at all looks. *Stop*: at the look whe
 looks, by the interval for a number of layouts fixed before. *Layouts*: the median after which runs stop.
 *Planned*: what the same width, or a power of 80 %, needs without looking.
 
-    python benchmarks/looks.py [--runs 1000] [--layouts 1000] [--seed 0]
+    python benchmarks/looks.py [--runs 1000] [--layouts 1000] [--seed 0] [--only TEXT]
 """
 
 import argparse
@@ -152,6 +152,7 @@ def main() -> None:
     arguments.add_argument("--runs", type=int, default=1000)
     arguments.add_argument("--layouts", type=int, default=1000)
     arguments.add_argument("--seed", type=int, default=0)
+    arguments.add_argument("--only", default="", help="only truths whose name holds this text")
     given = arguments.parse_args()
     print(
         f"{given.runs} runs of {given.layouts} layouts at most, {len(looks(given.layouts))} looks; they stop "
@@ -164,7 +165,7 @@ def main() -> None:
         + "".join(f"{head:>9}" for head in heads[3:])
     )
     cells = []
-    for case in cases():
+    for case in (case for case in cases() if given.only in case.truth):
         cell = measure(case, given.layouts, given.runs, given.seed)
         cells.append(cell)
         shares = (cell.every_look, cell.stop, cell.fixed)
