@@ -6,7 +6,7 @@ import re
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from shutil import copytree
+from shutil import copyfile, copytree
 from zipfile import ZipFile
 
 import evaluating
@@ -423,3 +423,41 @@ def test_an_installation_that_computes_a_figure_otherwise_says_so(project: Harne
     assert (code, err.count("\n")) == (2, 1)
     assert "computes 1 figures of mine-1 otherwise than it pins" in err
     assert "such as small: 6g success_rate episodes" in err
+
+
+@pytest.mark.slow
+def test_a_board_ranks_files_and_says_who_made_them_and_what_was_computed_again(
+    project: Harness, made: Path
+) -> None:
+    for model in ("uniform", "full-view"):
+        by = ("--made-by", "<script>alert(1)</script>\u202e")
+        assert project("benchmark", "run", "mine-1", "--model", model, "--quiet", "--out", model, *by)[0] == 0
+    copyfile(made, "twin.zip")
+    copyfile(made, "forged.zip")
+    changed(Path("forged.zip"), better)
+    Path("broken.zip").write_bytes(b"no zip")
+    files = ("uniform.zip", made, "twin.zip", "full-view.zip", "forged.zip")
+    code, out, err = project("benchmark", "board", *files, "--json")
+    assert (code, err) == (0, "")
+    board = json.loads(out)
+    success = [line["success"]["6g"]["value"] for line in board]
+    assert success == sorted(success, reverse=True)
+    assert [line["rank"] for line in board if line["agents"] == "full-view · a rule"] == [None]
+    same = [line for line in board if line["agents"] == "proxy-faulty · a rule"]
+    assert [line["rank"] for line in same] == [1, 1, 1], "nobody is clearly better than itself"
+    assert sorted(line["equal"] for line in same) == [False, True, True]
+    assert len({json.dumps(line["success"]) for line in same}) == 1, "the figures are those computed here"
+    page = Path("board.html").read_text()
+    assert "<script>alert" not in page
+    assert "⟨U+202E⟩" in page
+    assert "1 figures differ" in page
+
+    code, out, err = project("benchmark", "board", made, "broken.zip", "--out", "b.html")
+    assert code == 1
+    assert err.count("\n") == 1
+    assert "left out: broken.zip is no file of results" in err
+    assert max(map(len, out.splitlines())) <= 80
+    assert "Left out: broken.zip" in Path("b.html").read_text()
+    code, _, err = project("benchmark", "board", "broken.zip", "--out", "none.html")
+    assert (code, Path("none.html").exists()) == (2, False)
+    assert "a board is of one edition" in err

@@ -1,8 +1,8 @@
-"""`harness benchmark`: run an edition, pack its results into one file, and verify such files."""
+"""`harness benchmark`: run an edition, pack its results into one file, verify and rank such files."""
 
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,16 +12,19 @@ import typer
 from harness.cli import options, suite
 from harness.cli.progress import bar
 from harness.cli.run import evaluate
-from harness.cli.terminal import echo_json, echo_text
+from harness.cli.terminal import echo_json, echo_text, table
 from harness.core.errors import UserError, printable
+from harness.core.figures import shown
 from harness.core.formats import SUITE
 
 if TYPE_CHECKING:
     from harness.evaluate.rescore import Here, Rescored
+    from harness.report.board import Line
 
 EDITION = "v2v-safety-1.0"  # taken if none is named
 
 MadeBy = Annotated[str, typer.Option(help="Who made the results, in your words; it stands on a board.")]
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Files of results.")]
 To = Annotated[
     Path | None, typer.Option(help="File to write. Default: the run's folder with .zip after its name.")
 ]
@@ -111,7 +114,7 @@ def pack(
 
 
 def verify(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Files of results.")],
+    files: Files,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -161,3 +164,55 @@ def _show(file: Path, done: "Rescored") -> None:
     layouts = sum(len(run.grid.episodes) for run in done.suite.runs.values())
     of = f"{done.compared} figures of {layouts} layouts in {len(done.suite.runs)} families"
     typer.echo(f"{'not ' * bool(wrong)}equal to the last digit: {of}")
+
+
+def board(
+    files: Files,
+    out: Annotated[Path, typer.Option(help="Page to write.")] = Path("board.html"),
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Rank files of results on a page, each computed again.
+
+    Entries share a rank where the layouts do not tell them apart. The page works offline. Exit code 1 means
+    that a file was left out.
+    """
+    from harness.evaluate.rescore import Here
+    from harness.report import board as boards
+
+    here, entries, left_out = Here(), list["Rescored"](), list[str]()
+    with ExitStack() as stack:
+        for file in dict.fromkeys(files):
+            try:
+                entries.append(stack.enter_context(_rescored(file, here, as_json or quiet)))
+            except UserError as error:
+                typer.echo(f"harness: left out: {error}", err=True)
+                left_out.append(str(error))
+        lines = boards.lines(entries)
+        page = boards.write(lines, left_out, out)
+        if as_json:
+            echo_json([
+                {"rank": line.rank, "agents": line.name, "gain": line.gain,
+                 "made_by": line.entry.contents.made_by, "success": line.success,
+                 "equal": not any(line.entry.differences.values())}
+                for line in lines
+            ])  # fmt: skip
+        elif not quiet:
+            _show_board(lines)
+            typer.echo(f"wrote {printable(page)}")
+    if left_out:
+        raise typer.Exit(1)
+
+
+def _show_board(lines: "Sequence[Line]") -> None:
+    from harness.runs.metrics import BASELINE
+
+    by = next(iter(lines[0].success))
+    rows = []
+    for line in lines:
+        scores = (line.success[by], line.gain)
+        rank = "-" if line.rank is None else str(line.rank)
+        cells = ("-" if score is None else shown(score) for score in scores)
+        rows.append((printable(line.name, 40), rank, *cells))
+    table(("entry", "rank", by, f"gain over {BASELINE}"), rows)
+    typer.echo("success in % [95 % CI], balanced where dangers are known; means over families")

@@ -14,6 +14,7 @@ COMMANDS = {
     "benchmark run": "benchmark:run",
     "benchmark pack": "benchmark:pack",
     "benchmark verify": "benchmark:verify",
+    "benchmark board": "benchmark:board",
     "study sweep": "sweep",
     "study contents": "contents",
     "study trust": "trust",
@@ -66,7 +67,7 @@ COMMANDS = {
 }
 
 GROUPS = {
-    "benchmark": "Run an edition of the benchmark; pack and check its results.",
+    "benchmark": "Run an edition of the benchmark; check and rank results.",
     "study": "Vary settings: sweeps, contents, attacks, schedules, grids.",
     "study schedule": "Compare schedules (whom to ask, and when), or learn one.",
     "run": "List finished runs; merge, export or film them.",

@@ -80,8 +80,9 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
     Raises UserError if the file is broken, too large or of another edition than the one here, or has not the
     answer to every question, or one to another question; or if figures are computed otherwise here.
     """
+    contents = unpack(file, folder / "stated")
     try:
-        contents, stated = unpack(file, folder / "stated")
+        stated = [read(folder / "stated" / name) for name in contents.runs]
         edition = editions.named(contents.edition)
         limit = edition.layouts(sha256_file(file, "record"))
         if contents.digest != edition.digest and limit is None:

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from harness.core.errors import UserError, printable
 from harness.core.files import BROKEN, LARGEST, bytes_of, opened, replacing, write_whole
-from harness.runs.folder import Run, csv_text, read
+from harness.runs.folder import Run, csv_text
 from harness.runs.listing import own_name
 from harness.runs.records import FrozenScenes, Score
 
@@ -79,8 +79,8 @@ def _files(
         yield f"{name}/summary.csv", csv_text(Score, figures(run, metrics), manifest.variant).encode()
 
 
-def unpack(file: Path, folder: Path) -> tuple[Contents, list[Run]]:
-    """Write a file's runs to a folder, and return them; their tables are read later.
+def unpack(file: Path, folder: Path) -> Contents:
+    """Write a file's runs to a folder, by dataset, and return what the file says of itself.
 
     Only the files that `results.json` calls for are written, each under a name that is made here and no
     larger than `FILES` allows. Raises UserError if it is no such file, or has any other.
@@ -100,7 +100,7 @@ def unpack(file: Path, folder: Path) -> tuple[Contents, list[Run]]:
             f"{printable(file)} is no file of results ({printable(reason)}); give one that `harness "
             "benchmark run` or `pack` wrote"
         ) from None
-    return contents, [read(folder / name) for name in contents.runs]
+    return contents
 
 
 def _plain(name: str) -> bool:
