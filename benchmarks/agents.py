@@ -153,15 +153,18 @@ def details(made: Sequence[Driven], plans: Mapping[str, Plans]) -> Iterator[str]
     """Yield a table for each run in which all decide."""
     for each in (each for each in made if each.share == 1):
         run, n, seeds = each.run, len(each.run.grid.episodes), len(each.run.grid.seeds)
+        silent = CONDITIONS["nothing"]
         yield f"**{each.scene}, {each.driver.model}**, n = {n} layouts × {seeds} channel seeds:"
         rows = [
             (
-                name, estimate(run, point, "success_rate"), less_than_plan(run, point, plans[each.scene]),
+                name, estimate(run, point, "success_rate"),
+                DASH if point == silent else more(success(run, point), success(run, silent)),
+                more(success(run, point), plans[each.scene]),
                 *(estimate(run, point, metric) for metric in FIGURES.values()),
             )
             for name, point in CONDITIONS.items()
         ]  # fmt: skip
-        yield markdown(("they hear", "success %", "less than the plan's", *FIGURES), rows)
+        yield markdown(("they hear", "success %", "above nothing", "above the plan", *FIGURES), rows)
 
 
 def by_share(made: Sequence[Driven]) -> Iterator[str]:
@@ -188,14 +191,19 @@ def estimate(run: Run, condition: str, metric: str) -> str:
     return DASH
 
 
-def less_than_plan(run: Run, condition: str, plan: Plans) -> str:
-    """Return by how much success differs from the joint plan's, in points, over layouts that both have."""
-    success = defaultdict[int, list[bool]](list)
+def success(run: Run, condition: str) -> dict[int, float]:
+    """Return the share of channel seeds with which an episode succeeds, by layout seed."""
+    seen = defaultdict[int, list[bool]](list)
     for episode in run.episodes:
-        if episode.condition == condition and episode.layout_seed in plan:
-            success[episode.layout_seed].append(episode.success)
-    pair = np.array([(np.mean(each), plan[layout]) for layout, each in success.items()], dtype=float)
-    return shown(rate_difference(*pair.T), sign="+") if success else DASH
+        if episode.condition == condition:
+            seen[episode.layout_seed].append(episode.success)
+    return {layout: float(np.mean(each)) for layout, each in seen.items()}
+
+
+def more(own: Mapping[int, float], other: Mapping[int, float]) -> str:
+    """Return by how many points one success is above another, over the layouts that both have."""
+    pair = np.array([(own[layout], other[layout]) for layout in own if layout in other], dtype=float)
+    return shown(rate_difference(*pair.T), sign="+") if len(pair) else DASH
 
 
 if __name__ == "__main__":
