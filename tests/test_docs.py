@@ -1,5 +1,6 @@
 """What the documents list is what the program has."""
 
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import get_args
@@ -58,3 +59,11 @@ def test_every_schedule_is_documented(name: str) -> None:
 @pytest.mark.parametrize("metric", [name for name, m in METRICS.items() if m.compared])
 def test_every_metric_that_runs_are_compared_by_is_documented(metric: str) -> None:
     assert f"`{metric}`" in (ROOT / "docs/comparing.md").read_text()
+
+
+def test_the_overview_for_language_models_leads_to_pages_that_exist_under_their_titles() -> None:
+    docs = ROOT / "docs"
+    links = re.findall(r"^- \[(.+)\]\((.+)\): ", (docs / "llms.txt").read_text(), re.MULTILINE)
+    assert {"commands.md", "files.md", "first-evaluation.md"} <= {page for _, page in links}
+    for title, page in links:
+        assert (docs / page).read_text().startswith(f"# {title}\n"), page

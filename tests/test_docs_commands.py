@@ -140,6 +140,9 @@ OTHER_PROGRAMS = {
     "source": "the tests are in an environment already",
     "pip": "as above",
     "ray": "starts a cluster; tests/test_ray.py has one of its own",
+    "uv": "fetches packages; tests/test_wheel.py installs the same wheel",
+    "uvx": "as above",
+    "podman": "fetches an image of Python",
     "pre-commit": "tests/test_hooks.py reads what it would run",
 }
 
