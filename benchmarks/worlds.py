@@ -7,18 +7,23 @@ has it.
     python benchmarks/worlds.py [--layouts 500] [--worlds 128] [--scenarios NAME ...]
                                 [--sizes 16 64 128 512] [--frozen 8] [--envpool PYTHON]
     python benchmarks/worlds.py --trees     # only what a decision point costs that is frozen, together
+    python benchmarks/worlds.py --joint 4 --scenarios all-way-crossing narrow-passage --frozen 10
+        # only how many states two agents can bring about together, with so many decisions each
 """
 
 import argparse
+import gzip
 import subprocess
 from collections.abc import Sequence
+from itertools import product
 from time import process_time
 from typing import Any
 
+import msgspec
 import numpy as np
 from rows import Row, finish
 
-from harness.dataset.freeze import freeze
+from harness.dataset.freeze import freeze, scene_id
 from harness.world import lockstep, scenarios
 from harness.world.scenario import Scenario
 from harness.world.world import World
@@ -51,7 +56,12 @@ def main() -> None:
     arguments.add_argument("--envpool", help="a Python interpreter that has EnvPool")
     arguments.add_argument("--frozen", type=int, default=8, help="layouts of each scenario that are frozen")
     arguments.add_argument("--trees", action="store_true", help="measure only freezing, together")
+    arguments.add_argument("--joint", type=int, help="measure only joint trees, of so many decisions")
     given = arguments.parse_args()
+    if given.joint:
+        for name in given.scenarios:
+            print(f"{name}: {joint_tree(scenarios.get(f'{name}:agent_share=1'), given.frozen, given.joint)}")
+        return
     if given.trees:
         for name in given.scenarios:
             ms = tree_ms(scenarios.get(name), given.frozen, given.frozen)
@@ -175,6 +185,49 @@ def tree_ms(scenario: Scenario, trees: int, at_once: int) -> float:
         frozen = freeze(scenario, {k: FIRST_SEED + k for k in range(n, min(n + at_once, trees))})
         points += sum(len(level) for tree in frozen for level in tree.scenes)
     return (process_time() - start) * 1e3 / points
+
+
+def joint_tree(scenario: Scenario, layouts: int, decisions: int) -> str:
+    """States after each decision of two agents, zipped bytes of the edges, and CPU time, a layout.
+
+    Layouts are the first that have two agents.
+    """
+    worlds = (World.start(scenario, seed) for seed in range(FIRST_SEED, FIRST_SEED + 100 * layouts))
+    level = [world for world in worlds if len(world.journeys) == 2][:layouts]
+    if not level:
+        return "no layout has two agents"
+    p, n, start = scenario.parameters, len(level), process_time()
+    states, edges = [1.0], list[list[int]]()  # of each edge, the number of the state that it leads to
+    for step in range(decisions):
+        lockstep.advance(level, [p.due_frame(step) + p.lag_frames] * len(level))
+        parts = [part for world in level for part in joint_parts(world)]
+        lockstep.advance(parts, [p.due_frame(step + 1)] * len(parts))
+        following: dict[str, World] = {}
+        ids = [scene_id(0, part.state()) for part in parts]
+        for name, part in zip(ids, parts, strict=True):
+            following.setdefault(name, part)
+        number = {name: n for n, name in enumerate(following)}
+        edges.append([number[name] for name in ids])
+        level = [part for part in following.values() if not part.ended]
+        states.append(len(level) / n)
+    spent_s, size = process_time() - start, len(gzip.compress(msgspec.json.encode(edges)))
+    return f"{n} layouts, states {states}, {size / n:.0f} B, {spent_s / n:.2f} CPU s"
+
+
+def joint_parts(world: World) -> list[World]:
+    """A world for each choice of the targets of all agents that are under way."""
+    free = [
+        [(agent, action) for action in {world.target_after(a, agent): a for a in world.actions}.values()]
+        for agent, journey in world.journeys.items() if not journey.outcome.ended
+    ]  # fmt: skip
+    parts = []
+    for choice in product(*free):
+        part = world.branch()
+        for agent, action in choice:
+            part.take(action, agent)
+        part.step += 1
+        parts.append(part)
+    return parts
 
 
 if __name__ == "__main__":
