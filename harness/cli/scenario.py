@@ -174,10 +174,18 @@ def _swarm_tables(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
             for policy, of in policies.items()
         ],
     )  # fmt: skip
+    table(
+        ("driver of all agents", "best decisions %", "arrival given away %", "regret s"),
+        [
+            (policy, *(shown(of[k]) for k in ("best_decisions", "gave_away")), shown(of["regret_s"], seconds))
+            for policy, of in policies.items()
+        ],
+    )
     text = console()
     text.print(
         f"n = {episodes} episodes, {stated(seed, episodes)}; times where all arrive;\n"
-        "price of anarchy: summed time of trips against joint's, on the n that both clear"
+        "price of anarchy: summed time of trips against joint's, on the n that both clear;\n"
+        "regret: of an agent's first decisions, had the others done what they did"
     )
     for what, seeds in (("without a joint plan", "unsolved"), ("not searched to the end", "inexact")):
         named = ", ".join(map(str, outcomes[seeds][:10])) + (", …" if len(outcomes[seeds]) > 10 else "")

@@ -24,6 +24,8 @@ from harness.world.state import SIZES_M, separation_m
 from harness.world.swarm import by_scenario, on_seat
 from harness.world.world import Journey, World
 
+Scripts = Mapping[int, Sequence[str]]  # actions of each agent, by its place
+
 HORIZON = 5  # decisions of an agent that are planned; after them it takes FASTER
 MARGIN_M = 0.1  # least gap between two agents of a plan
 NEVER_S = 1000.0  # cost of an agent that never arrives: more than all times of a layout
@@ -36,6 +38,7 @@ class Rehearsal(World):
     """A world of one agent that keeps a record of where everybody was."""
 
     agent: int = 0  # the agent's place in the layout
+    script: Sequence[str] | None = None  # the actions that it takes; None for all that there are
     record: tuple[Floats, ...] = ()  # poses after each frame, (frames, V, 4) each
     taken: tuple[str, ...] = ()  # the agent's actions
     arrives_s: float = np.inf  # when the agent reached its goal, after which it drove on
@@ -47,11 +50,16 @@ class Rehearsal(World):
         super().decide(action)
         self.taken = (*self.taken, action)
 
-    def parts(self, actions: Sequence[str]) -> list["Rehearsal"]:
-        """Return a world for each target that actions set; of those that set the same the last is taken."""
-        last = {self.target_after(action): action for action in actions}.values()
-        parts = [cast(Rehearsal, self.branch()) for _ in last]
-        for part, action in zip(parts, last, strict=True):
+    def parts(self, step: int) -> list["Rehearsal"]:
+        """Return a world for each action of a step; of those that set the same target one counts."""
+        calm_last = sorted(self.actions, key=lambda action: action == "IDLE")
+        to = {self.target_after(action): action for action in calm_last}
+        if self.script is None:
+            free = list(to.values()) if step < HORIZON else ["FASTER"]
+        else:
+            free = [to[self.target_after(action)] for action in self.script[step : step + 1]]
+        parts = [self, *(cast(Rehearsal, self.branch()) for _ in free[1:])]
+        for part, action in zip(parts, free, strict=False):
             part.decide(action)
         return parts
 
@@ -97,8 +105,10 @@ class Plan:
 def options(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, Options]]:
     """Return what each agent of some layouts can do, by a layout's seed and an agent's place."""
     begun = [world for seed in seeds for world in rehearsals(scenario, seed)]
-    courses = [world for group in by_scenario(begun) for world in _courses(group)]
-    ended = [world for world in courses if world.outcome.result in ("cleared", "time_out")]
+    ended = [
+        world for group in by_scenario(begun) for world in _courses(group)
+        if world.outcome.result in ("cleared", "time_out")
+    ]  # fmt: skip
     frames = dict.fromkeys(seeds, 0)
     for world in ended:
         frames[world.seed] = max(frames[world.seed], world.frame)
@@ -112,6 +122,29 @@ def options(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, Opt
         its = worlds[world.seed, world.agent]
         able[world.seed][world.agent] = _options(world.layout, its, frames[world.seed])
     return able
+
+
+def courses(
+    scenario: Scenario, able: Mapping[int, Mapping[int, Options]], taken: Sequence[tuple[int, Scripts]]
+) -> list[dict[int, Options]]:
+    """Return the course of each agent that took some actions, by its place, as its only option.
+
+    `taken` are layouts' seeds, with the actions of each agent; `able` are the `options` of the layouts.
+    """
+    begun = [rehearsals(scenario, seed) for seed, _ in taken]
+    for worlds, (_, scripts) in zip(begun, taken, strict=True):
+        for world in worlds:
+            world.script = scripts.get(world.agent, ())
+    every = [world for worlds in begun for world in worlds]
+    for group in by_scenario(every):
+        _courses(group)
+    frames = {seed: max(its.poses.shape[1] for its in of.values()) for seed, of in able.items()}
+    for group in by_scenario([world for world in every if world.outcome.success]):
+        _drive_on(group, [frames[world.seed] for world in group])
+    return [
+        {world.agent: _options(world.layout, [world], frames[world.seed]) for world in worlds}
+        for worlds in begun
+    ]
 
 
 def rehearsals(scenario: Scenario, seed: int) -> list[Rehearsal]:
@@ -139,16 +172,10 @@ def _options(layout: Layout, worlds: Sequence[Rehearsal], frames: int) -> Option
 def _courses(going: list[Rehearsal]) -> list[Rehearsal]:
     """Return a world for each course that the actions of agents can lead to, until each is decided."""
     p, ended = going[0].scenario.parameters, list[Rehearsal]()
-    calm_last = sorted(going[0].actions, key=lambda action: action == "IDLE")
     for step in range(p.decisions):
         lockstep.advance(going, [p.due_frame(step) + p.lag_frames] * len(going))
         ended += [each for each in going if each.ended]
-        going = [each for each in going if not each.ended]
-        if step < HORIZON:
-            going = [part for each in going for part in each.parts(calm_last)]
-        else:
-            for each in going:
-                each.decide("FASTER")
+        going = [part for each in going if not each.ended for part in each.parts(step)]
         lockstep.advance(going, [p.due_frame(step + 1)] * len(going))
         ended += [each for each in going if each.ended]
         going = [each for each in going if not each.ended]
@@ -232,13 +259,13 @@ def together(own: Options, n: int, other: Options) -> Bools:
     ends = np.minimum(np.maximum(own.arrives_s[n], other.arrives_s) * own.hz, frames)
     under_way = np.arange(1, frames + 1) <= ends[:, None] + 0.5
     own_m, other_m = own.sizes_m, other.sizes_m
-    near = _near(mine[:, :, :1], own_m[:1], its[:, :, :1], other_m[:1], MARGIN_M, under_way)
-    near |= _near(mine[:, :, :1], own_m[:1], its[:, :, 1:], other_m[1:], 0.0, under_way)
-    near |= _near(mine[:, :, 1:], own_m[1:], its[:, :, :1], other_m[:1], 0.0, under_way)
-    return ~near
+    meet = near(mine[:, :, :1], own_m[:1], its[:, :, :1], other_m[:1], MARGIN_M, under_way)
+    meet |= near(mine[:, :, :1], own_m[:1], its[:, :, 1:], other_m[1:], 0.0, under_way)
+    meet |= near(mine[:, :, 1:], own_m[1:], its[:, :, :1], other_m[:1], 0.0, under_way)
+    return ~meet
 
 
-def _near(
+def near(
     some: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats, margin_m: float, counts: Bools
 ) -> Bools:
     """Return whether any of some vehicles (1, F, A, 3) comes as near to any of the others (n, F, B, 3), (n,).
@@ -250,18 +277,19 @@ def _near(
     close = (dx * dx + dy * dy <= reach_m * reach_m) & counts[:, :, None, None]
     n, frame, a, b = np.nonzero(close)
     gap_m = separation_m(some[0, frame, a], sizes_m[a], others[n, frame, b], their_sizes_m[b])
-    near = np.zeros(len(others), dtype=bool)
-    near[n[gap_m <= margin_m]] = True
-    return near
+    meet = np.zeros(len(others), dtype=bool)
+    meet[n[gap_m <= margin_m]] = True
+    return meet
 
 
-def plans(scenario: Scenario, seeds: Sequence[int]) -> dict[int, tuple[Plan, World]]:
+def plans(scenario: Scenario, able: Mapping[int, Mapping[int, Options]]) -> dict[int, tuple[Plan, World]]:
     """Return the best plan for all agents of each layout that keeps its promise, by the layout's seed.
 
-    With it comes the world after all have acted so. Layouts without such a plan are left out.
+    `able` are the `options`. With a plan comes the world after all have acted so. Layouts without one are
+    left out.
     """
-    able, found = options(scenario, seeds), dict[int, tuple[Plan, World]]()
-    searches = {seed: Search(list(able[seed].values())) for seed in seeds}
+    found = dict[int, tuple[Plan, World]]()
+    searches = {seed: Search(list(of.values())) for seed, of in able.items()}
     for _ in range(MOST_PLANS):
         best = {seed: plan for seed, search in searches.items() if (plan := _best(search, able[seed]))}
         worlds = played(scenario, best)

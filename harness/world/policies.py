@@ -21,6 +21,7 @@ from harness.core.statistics import (
 from harness.world import joint, reference
 from harness.world.drivers import PRIVILEGED
 from harness.world.precedence import RULES
+from harness.world.regret import Regret, regret
 from harness.world.scenario import Scenario
 from harness.world.seats import offsets
 from harness.world.swarm import alone, ends, gravest
@@ -30,6 +31,7 @@ JOINT = "joint"
 POLICIES = ("cruise", "local-view", PRIVILEGED, *RULES, JOINT)  # every agent drives by it
 TOGETHER = 8  # layouts that are driven together
 RESAMPLES = 2000
+UNKNOWN = Regret(np.nan, np.nan, np.nan)
 
 
 @dataclass(frozen=True)
@@ -43,13 +45,14 @@ class Fate:
     lost_s: float  # how much later than alone on the road, in sum; NaN unless all arrived
     most_lost_s: float  # the same of the one who loses most
     exact: bool = True  # whether no plan is better, of a joint plan
+    cost: Regret = UNKNOWN  # of its agents' decisions
 
     @property
     def success(self) -> bool:
         return self.arrived == 1
 
 
-def fate(world: World, alone_s: dict[int, float], exact: bool = True) -> Fate:
+def fate(world: World, alone_s: dict[int, float], exact: bool, cost: Regret) -> Fate:
     """Return how the agents of a world that has ended fared; `alone_s` has when each would arrive alone."""
     its, worst = ends(world, alone_s), gravest(world.journeys)
     lost_s = np.array([np.nan if end.lost_s is None else end.lost_s for end in its])
@@ -57,7 +60,7 @@ def fate(world: World, alone_s: dict[int, float], exact: bool = True) -> Fate:
     return Fate(
         float(np.mean(~np.isnan(lost_s))), any(end.met for end in its),
         worst is not None and world.journeys[worst].outcome.result == "time_out",
-        float(times_s.sum()), float(lost_s.sum()), float(lost_s.max()), exact,
+        float(times_s.sum()), float(lost_s.sum()), float(lost_s.max()), exact, cost,
     )  # fmt: skip
 
 
@@ -65,17 +68,19 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]
     """Drive layouts under every policy."""
     drivers = POLICIES[:-1]
     worlds = [World.start(scenario, seed) for seed in seeds for _ in drivers]
-    reference.finish(worlds, drivers * len(seeds))
-    alone_s, plans, fates = alone(scenario, seeds), joint.plans(scenario, seeds), list[dict[str, Fate]]()
-    for n, seed in enumerate(seeds):
-        by_driver = zip(drivers, worlds[n * len(drivers) :], strict=False)
-        fates.append({driver: fate(world, alone_s[seed]) for driver, world in by_driver})
-        if seed in plans:
-            plan, world = plans[seed]
-            fates[-1][JOINT] = fate(world, alone_s[seed], plan.exact)
-        else:
-            fates[-1][JOINT] = Fate(0.0, False, False, np.nan, np.nan, np.nan)
-    return fates
+    actions = reference.turns(worlds, drivers * len(seeds))
+    able, alone_s = joint.options(scenario, seeds), alone(scenario, seeds)
+    plans = joint.plans(scenario, able)
+    where = [(seed, driver) for seed in seeds for driver in drivers] + [(seed, JOINT) for seed in plans]
+    worlds += [world for _, world in plans.values()]
+    taken = [*actions, *(plan.actions for plan, _ in plans.values())]
+    courses = joint.courses(scenario, able, [(seed, of) for (seed, _), of in zip(where, taken, strict=True)])
+    unsolved = Fate(0.0, False, False, np.nan, np.nan, np.nan)
+    fates = {seed: dict.fromkeys(POLICIES, unsolved) for seed in seeds}
+    for (seed, policy), world, its in zip(where, worlds, courses, strict=True):
+        exact = policy != JOINT or plans[seed][0].exact
+        fates[seed][policy] = fate(world, alone_s[seed], exact, regret(able[seed], its))
+    return list(fates.values())
 
 
 def check(
@@ -106,12 +111,14 @@ def summary(fates: Sequence[Fate], best: Sequence[Fate], policy: str) -> dict[st
 
     `anarchy` is the summed time of trips divided by that of the plan, where all arrive under both: the price
     of anarchy (Koutsoupias and Papadimitriou 1999), of the mean and not of the worst case. Its interval is
-    that of a bootstrap over layouts. `less_than_joint` is the difference of success.
+    that of a bootstrap over layouts. `less_than_joint` is the difference of success. The figures of `Regret`
+    are means over layouts.
     """
 
-    def each(of: Sequence[Fate], name: str) -> Any:
+    def each(of: Sequence[object], name: str) -> Any:
         return np.array([float(getattr(one, name)) for one in of])
 
+    costs = [each_of.cost for each_of in fates]
     trips_s, least_s = each(fates, "trips_s"), each(best, "trips_s")
     both = ~np.isnan(trips_s) & ~np.isnan(least_s)
     n = int(both.sum())
@@ -120,6 +127,8 @@ def summary(fates: Sequence[Fate], best: Sequence[Fate], policy: str) -> dict[st
     return {
         **{name: rate_interval(each(fates, name)) for name in ("success", "arrived", "met", "stuck")},
         **{name: episode_interval(each(fates, name)) for name in ("lost_s", "most_lost_s")},
+        **{name: rate_interval(each(costs, name)) for name in ("best_decisions", "gave_away")},
+        "regret_s": episode_interval(each(costs, "regret_s")),
         "anarchy": resampled_estimate(anarchy, n),
         "less_than_joint": rate_difference(each(fates, "success"), each(best, "success")),
     }

@@ -50,11 +50,21 @@ def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
 
     The worlds are of one scenario.
     """
-    going = list(zip(worlds, drivers, strict=True))
-    while going := [(world, driver) for world, driver in going if not world.ended]:
-        driven = [world for world, _ in going]
-        take_turn(driven, decide(driven, [driver for _, driver in going]))
+    turns(worlds, drivers)
     return [world.outcome for world in worlds]
+
+
+def turns(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, list[str]]]:
+    """Do what `finish` says; return each world's actions of each agent, by its place."""
+    taken: list[dict[int, list[str]]] = [{agent: [] for agent in world.journeys} for world in worlds]
+    while going := [n for n, world in enumerate(worlds) if not world.ended]:
+        driven = [worlds[n] for n in going]
+        actions = decide(driven, [drivers[n] for n in going])
+        for n, chosen in zip(going, actions, strict=True):
+            for agent, action in chosen.items():
+                taken[n][agent].append(action)
+        take_turn(driven, actions)
+    return taken
 
 
 def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> None:

@@ -1,0 +1,70 @@
+"""What an agent's decisions cost it, had the others done exactly what they did.
+
+An agent's courses are those of `joint`: its first `HORIZON` decisions are free, then it takes `FASTER`. The
+others take the actions that they took, whatever it does: who would have reacted does not, and who was hit by
+it drives on. So the times of the others stay, and a second that it loses is one that all lose together. What
+it could have been is exact, but for other traffic, which brakes for it and for nobody else.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats
+from harness.world.joint import HORIZON, Options, near
+from harness.world.outcome import ROUNDING_S
+
+
+@dataclass(frozen=True)
+class Regret:
+    """What the first decisions of a layout's agents cost; NaN where there is nothing to judge."""
+
+    best_decisions: float  # share of decisions after which an agent can arrive as soon as before
+    gave_away: (
+        float  # share of agents after one of whose decisions they could no longer arrive, but before it
+    )
+    regret_s: float  # how much later the others arrive at the soonest after their decisions, mean
+
+
+def regret(able: Mapping[int, Options], courses: Mapping[int, Options]) -> Regret:
+    """Return what decisions of a layout's agents cost.
+
+    `able` is what each can do and `courses` the one that each took, by its place. Decisions count while their
+    agent can still arrive.
+    """
+    delays, spent_s = list[Floats](), list[float]()
+    for agent, its in able.items():
+        others = [course for other, course in courses.items() if other != agent]
+        arrives_s = soonest_s(its, courses[agent], others)
+        if np.isfinite(arrives_s[0]):
+            delays.append(np.diff(arrives_s[: np.isfinite(arrives_s).sum() + 1]))
+            spent_s.append(arrives_s[-1] - arrives_s[0])
+    if not delays:
+        return Regret(np.nan, np.nan, np.nan)
+    lost = np.isinf(spent_s)
+    seconds = np.array(spent_s)[~lost]
+    best = float(np.mean(np.concatenate(delays) <= ROUNDING_S))
+    return Regret(best, float(lost.mean()), float(seconds.mean()) if len(seconds) else np.nan)
+
+
+def soonest_s(able: Options, course: Options, others: Sequence[Options]) -> Floats:
+    """Return when an agent can arrive at the soonest, before its first decision and after each one, in s.
+
+    inf for never. The decisions are the first `HORIZON` of its course. How it went on is one of its options.
+    """
+    arrives_s, its_s = (np.where(passes(of, others), of.arrives_s, np.inf) for of in (able, course))
+    first = list(course.actions[0][:HORIZON])
+    like = [[list(actions[:k]) == first[:k] for actions in able.actions] for k in range(len(first) + 1)]
+    return np.array([arrives_s[rows].min(initial=its_s[0]) for rows in np.array(like, dtype=bool)])
+
+
+def passes(able: Options, others: Sequence[Options]) -> Bools:
+    """Return with which options an agent touches none of some others before it arrives, (n,)."""
+    frame = np.arange(1, able.poses.shape[1] + 1)
+    under_way = frame <= np.minimum(able.arrives_s * able.hz, len(frame))[:, None] + 0.5
+    free = np.ones(len(able.actions), dtype=bool)
+    for other in others:
+        its, sizes_m = other.poses[:, :, :1], other.sizes_m[:1]
+        free &= ~near(its, sizes_m, able.poses[:, :, :1], able.sizes_m[:1], 0.0, under_way)
+    return free
