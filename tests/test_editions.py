@@ -461,3 +461,37 @@ def test_a_board_ranks_files_and_says_who_made_them_and_what_was_computed_again(
     code, _, err = project("benchmark", "board", "broken.zip", "--out", "none.html")
     assert (code, Path("none.html").exists()) == (2, False)
     assert "a board is of one edition" in err
+
+
+def test_published_seeds_are_those_that_an_edition_committed_to(project: Harness) -> None:
+    seeds, edition = Path("seeds.toml"), Path("editions/mine-1.toml")
+    text = f'edition = "mine-1"\nsalt = "{"0f" * 32}"\nfirst_seed = 123456789\nlayouts = 100\n'
+    seeds.write_text(text)
+    before = edition.read_text()
+    code, out, _ = project("benchmark", "verify", seeds)
+    assert code == 1
+    assert "layout seeds 123456789 to 123456888 (report)" in out
+    assert "not as mine-1 committed to: none" in out
+    digest = next(line for line in out.splitlines() if line.startswith("its digest: ")).split()[-1]
+    edition.write_text(f'sealed = "{digest}"\n{before}')
+    seeds.write_text("# published today\n" + text)
+    code, out, _ = project("benchmark", "verify", seeds, "--json")
+    assert (code, json.loads(out)[0]["equal"]) == (0, True)
+    for old, new in (("123456789", "123456788"), ("= 100", "= 99"), ("0f0f", "0f0e")):
+        seeds.write_text(text.replace(old, new, 1))
+        assert project("benchmark", "verify", seeds, "--quiet")[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("first_seed = 200000", "first_seed = 5"), ("layouts = 9", "layouts = 0"),
+        ('salt = "', 'salt = "short"  # '), ("layouts = 9", 'layouts = 9\nmore = "x"'), ("mine-1", "theirs"),
+        ("layouts = 9", "layouts = 2020-01-01"),
+    ],
+)  # fmt: skip
+def test_a_wrong_file_of_seeds_is_one_line(project: Harness, old: str, new: str) -> None:
+    text = f'edition = "mine-1"\nsalt = "{"0f" * 32}"\nfirst_seed = 200000\nlayouts = 9\n'
+    Path("seeds.toml").write_text(text.replace(old, new))
+    code, out, err = project("benchmark", "verify", "seeds.toml")
+    assert (code, out, err.count("\n")) == (2, "", 1)

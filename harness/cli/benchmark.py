@@ -120,12 +120,16 @@ def verify(
 ) -> None:
     """Compute results again from their answers; compare each figure.
 
-    No model is asked, and nothing in the file is run or believed. Exit code 1 means that a figure differs.
+    No model is asked, and nothing in the file is run or believed. Exit code 1 means that a figure differs. A
+    .toml file has layout seeds; it is compared with what its edition committed to.
     """
     from harness.evaluate.rescore import Here
 
     here, lines = Here(), list[dict[str, Any]]()
     for file in files:
+        if file.suffix == ".toml":
+            lines.append(_seeds(file, as_json or quiet))
+            continue
         with _rescored(file, here, as_json or quiet) as done:
             lines.append(_mapping(file, done))
             if not (as_json or quiet):
@@ -134,6 +138,25 @@ def verify(
         echo_json(lines)
     if not all(line["equal"] for line in lines):
         raise typer.Exit(1)
+
+
+def _seeds(file: Path, silent: bool) -> dict[str, Any]:
+    """Compare a file of layout seeds with what its edition committed to."""
+    from harness.core.seeds import stated
+    from harness.evaluate import edition as editions
+
+    seeds = editions.seeds_of(file)
+    edition = editions.named(seeds.edition)
+    equal = seeds.digest == edition.sealed
+    if not silent:
+        committed = edition.sealed or "none"
+        typer.echo(f"{printable(file)}: {stated(seeds.first_seed, seeds.layouts)}")
+        typer.echo(f"its digest: {seeds.digest}")
+        echo_text(f"{'as' if equal else 'not as'} {edition.name} committed to: {printable(committed)}")
+    return {
+        "file": str(file), "edition": edition.name, "first_seed": seeds.first_seed,
+        "layouts": seeds.layouts, "digest": seeds.digest, "committed": edition.sealed, "equal": equal,
+    }  # fmt: skip
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import digest
 from harness.core.resources import find, names
+from harness.core.seeds import FIRST, LAST_EPISODE, LAST_SEED
 from harness.dataset import load
 from harness.dataset.select import Selection
 from harness.evaluate import resolve
@@ -39,6 +40,16 @@ class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     layouts: int  # how many of each dataset it has, from the first
 
 
+class Seeds(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Layout seeds that an edition committed to, in a file that is published once the edition closes."""
+
+    edition: str  # its name
+    salt: Annotated[str, Meta(min_length=32)]  # drawn by chance, so that nobody finds the seeds by trying
+    first_seed: Annotated[int, Meta(ge=FIRST["report"], le=LAST_SEED)]  # of the layouts, the others follow
+    layouts: Annotated[int, Meta(ge=1, le=LAST_EPISODE + 1)]  # how many
+    digest: str  # of the file's tables, hex SHA-256
+
+
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One edition."""
 
@@ -54,6 +65,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ties: str  # how equally likely actions are taken, as `--ties` reads it
     metrics: Names  # the figures that a file of results states
     golden: Golden | None = None  # None in a project's own edition that pins nothing
+    sealed: str | None = None  # digest of the file of `Seeds` that is still secret; None without one
 
     @property
     def golden_file(self) -> Path:
@@ -158,14 +170,26 @@ def named(name: str) -> Edition:
     return of_file(find(KIND, f"{name}.toml"))
 
 
+def seeds_of(file: Path) -> Seeds:
+    """Read a file of layout seeds. Raises UserError if it is wrong."""
+    where = f"file of seeds {printable(file)}"
+    tables, sha256 = _tables(file, where)
+    return convert(tables, Seeds, where, digest=sha256)
+
+
+def _tables(file: Path, where: str) -> tuple[dict[str, Any], str]:
+    """Return the tables of a file and their digest, which does not depend on how they are laid out."""
+    tables = toml(file, where)
+    try:
+        return tables, digest(tables)
+    except (ValueError, TypeError) as error:  # a date, or a number without an end
+        raise UserError(f"{where}: {printable(error)}; give texts and whole numbers") from None
+
+
 def of_file(file: Path) -> Edition:
     """Read an edition's file. Raises UserError if it is wrong."""
     where = f"edition {printable(file)}"
-    tables = toml(file, where)
-    try:
-        sha256 = digest(tables)
-    except (ValueError, TypeError) as error:  # a date, or a number without an end
-        raise UserError(f"{where}: {printable(error)}; give texts") from None
+    tables, sha256 = _tables(file, where)
     edition = convert(tables, Edition, where, name=file.stem, digest=sha256)
     for what, stated, known in (
         ("metric", edition.metrics, METRICS), ("ranked_by", (edition.ranked_by,), edition.condition),
