@@ -95,7 +95,10 @@ class Tables:
             **{key: [(answer.message or {}).get(key) for answer in answers] for key in MESSAGE},
         })  # fmt: skip
         table = table.astype(dict.fromkeys(table.columns[table.isna().all()], float))
-        places = self.decisions[PLACE].drop_duplicates("scene").astype({"scene": str})
+        places = self.decisions[[*PLACE, "agent"]].rename(columns={"agent": "decider"})
+        if places.decider.isna().all():  # only the ego decides
+            places = places.drop(columns="decider")
+        places = places.drop_duplicates("scene").astype({"scene": str})
         return places.merge(table, "right", "scene")
 
     def _csv(self, name: str) -> "pd.DataFrame":

@@ -142,6 +142,14 @@ def test_a_run_has_a_table_of_its_agents_that_adds_up_to_its_episodes(driven: Pa
     assert (paying.lost_s == whole.most_lost_s[paying.index]).all()
 
 
+def test_the_table_of_answers_says_who_decided_with_them(driven: Path) -> None:
+    answers = load(driven).answers
+    own = answers.role == "ego"
+    assert (answers.decider == answers.viewer)[own].all()
+    assert (answers.decider != answers.viewer)[answers.role == "helper"].all()
+    assert 0 < own.sum() < len(answers)
+
+
 def test_a_broken_table_of_agents_is_named(driven: Path, tmp_path: Path) -> None:
     copytree(driven, tmp_path / "run")
     file = tmp_path / "run" / "episodes.csv"
