@@ -5,8 +5,7 @@ How a backend batches or threads inside is its own matter; the rest of the progr
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 
 from harness.core.files import canonical_json
 from harness.core.image import Image
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from harness.world.scenario import Scenario
     from harness.world.scene_graph import SceneGraph
 
+T = TypeVar("T")
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout", "decision"]
 BARE: tuple[AnswerMode, ...] = ("readout", "decision")  # whose answer is a bare distribution
@@ -89,9 +89,15 @@ class Request:
         return self.image.sha256 if self.image else None
 
 
-def split_by_scenario(requests: Sequence[Request]) -> list[list[Request]]:
-    """Split requests into parts of one scenario each, in their order; those of a run are one part."""
-    return [list(part) for _, part in groupby(requests, key=lambda request: id(request.scenario))]
+def by_scenario(requests: Sequence[Request], answer: Callable[[Sequence[Request]], Sequence[T]]) -> list[T]:
+    """Answer the requests of each scenario together; return the answers in the order of the requests."""
+    places: dict[int, list[int]] = {}
+    for n, request in enumerate(requests):
+        places.setdefault(id(request.scenario), []).append(n)
+    answers: dict[int, T] = {}
+    for at in places.values():
+        answers |= zip(at, answer([requests[n] for n in at]), strict=True)
+    return [answers[n] for n in range(len(requests))]
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from harness.backends.base import Completion, Request, split_by_scenario
+from harness.backends.base import Completion, Request, by_scenario
 from harness.backends.card import Card
 from harness.backends.registry import BUILT_IN
 from harness.core.errors import UserError, printable, unknown
@@ -28,7 +28,7 @@ class DriverBackend:
         self.driver = driver
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        return [completion for part in split_by_scenario(requests) for completion in self._complete(part)]
+        return by_scenario(requests, self._complete)
 
     def _complete(self, requests: Sequence[Request]) -> list[Completion]:
         scenario = requests[0].scenario

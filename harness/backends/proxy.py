@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from harness.backends.base import Completion, FinishReason, Request, split_by_scenario
+from harness.backends.base import Completion, FinishReason, Request, by_scenario
 from harness.backends.card import Card, Failures
 from harness.backends.registry import BUILT_IN
 from harness.core import noise
@@ -63,7 +63,7 @@ class Proxy:
 
 def answers(requests: Sequence[Request]) -> list[str]:
     """Return the texts of the answers to some requests."""
-    return [text for part in split_by_scenario(requests) for text in _answers(part)]
+    return by_scenario(requests, _answers)
 
 
 def _answers(requests: Sequence[Request]) -> list[str]:

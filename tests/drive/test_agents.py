@@ -13,10 +13,12 @@ from reading import details, packed
 
 from harness.api import load
 from harness.backends import cards
+from harness.backends.registry import open_backend
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.dataset.build import build
 from harness.evaluate.agent import Agent
+from harness.evaluate.asking import EGO, requests
 from harness.evaluate.live_world import LiveSource, looks
 from harness.evaluate.replay import played, scenes_of, stills
 from harness.evaluate.run import evaluate
@@ -195,6 +197,18 @@ def test_a_vehicle_decides_with_its_own_model_and_takes_that_ones_time(tmp_path:
         assert d.latency_ms == {"proxy": 100.0, "cruise": 300.0}[model]
         assert d.action == "IDLE" or model == "proxy", "who never yields"
         assert (model == "proxy") == (d.agent in egos)
+
+
+@pytest.mark.parametrize("model", ["proxy", "right-hand"])
+def test_a_rule_answers_agents_of_several_seats_together_as_each_alone(model: str) -> None:
+    spec = replace(live_spec_of(prompt="v4"), ego=Agent(cards.resolve(model), versions.load("v4")))
+    spec = replace(spec, points=(named_point("single-local"),), source=LiveSource(50_000, 2, ALL))
+    worlds = [World.start(spec.scenario, seed) for seed in (50_000, 50_001)]
+    scenes = looks([(world, agent, 0) for world in worlds for agent in world.journeys], 0, spec.ego_alone)
+    asked = list(requests(spec, scenes, places=[EGO] * len(scenes)))
+    assert len({id(request.scenario) for request in asked}) == 4
+    backend = open_backend(spec.ego.card)
+    assert backend.complete(asked) == [backend.complete([request])[0] for request in asked]
 
 
 @pytest.mark.slow
