@@ -136,7 +136,7 @@ def of_run(run: Run) -> Iterator[str]:
     if retries:
         yield f"The engine had errors: {retries} attempts were repeated."
     for control, heard in _CONTROLS.items():
-        if names := [c["name"] for c in run.manifest.conditions if c.get("messages") == control]:
+        if names := _controls(run.manifest, control):
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
     yield from lost_at_once(run)
     yield from findings_of(run.manifest)
@@ -144,8 +144,7 @@ def of_run(run: Run) -> Iterator[str]:
     yield from moved_system(run.manifest)
     yield from beyond_sources(run.manifest)
     yield from on_device(run.manifest)
-    off = [c for c in run.conditions if (s := run.score(c, "off_lag_rate")) and (s.value or 0.0) >= OFF_LAG]
-    if off:
+    if off := _off_lag(run):
         yield (
             f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
             "closed-loop success may differ. harness study fidelity compares the two."
@@ -156,6 +155,32 @@ def of_run(run: Run) -> Iterator[str]:
             f"Time to collision and post-encroachment time are unknown: this {older} is older than these "
             "measures."
         )
+
+
+def doubted(*runs: Run) -> set[str]:
+    """Return the conditions that a warning is about: controls, another lag, a radio beyond its source."""
+    names = {c for run in runs for c in _off_lag(run)}
+    for manifest in (run.manifest for run in runs):
+        names.update(*(_controls(manifest, control) for control in _CONTROLS))
+        names |= {name for name, _ in _beyond(manifest)}
+    return names
+
+
+def _controls(manifest: Manifest, control: str) -> list[str]:
+    return [c["name"] for c in manifest.conditions if c.get("messages") == control]
+
+
+def _off_lag(run: Run) -> list[str]:
+    scores = {c: run.score(c, "off_lag_rate") for c in run.conditions}
+    return [c for c, score in scores.items() if score and (score.value or 0.0) >= OFF_LAG]
+
+
+def _beyond(manifest: Manifest) -> Iterator[tuple[str, str]]:
+    for condition in manifest.conditions:
+        if record := manifest.channels.get(condition.get("profile") or ""):
+            settings = {**record.parameters, **pairs(condition.get("radio", ""))}
+            for sentence in outside(settings, record.limits):
+                yield condition["name"], sentence
 
 
 def findings_of(manifest: Manifest) -> Iterator[str]:
@@ -226,11 +251,8 @@ def on_device(manifest: Manifest) -> Iterator[str]:
 
 def beyond_sources(manifest: Manifest) -> Iterator[str]:
     """Yield conditions whose radio has settings that its model's source never held against anything."""
-    for condition in manifest.conditions:
-        if record := manifest.channels.get(condition.get("profile") or ""):
-            settings = {**record.parameters, **pairs(condition.get("radio", ""))}
-            for sentence in outside(settings, record.limits):
-                yield f"{printable(condition['name'])}: {sentence}"
+    for name, sentence in _beyond(manifest):
+        yield f"{printable(name)}: {sentence}"
 
 
 def no_prompt(manifests: Iterable[Manifest]) -> list[str]:

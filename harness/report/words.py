@@ -10,6 +10,7 @@ from harness.core.errors import printable
 from harness.core.figures import PLAIN, Unit
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import mean_of
+from harness.report.caveats import doubted
 from harness.runs import metrics
 from harness.runs.folder import Run
 from harness.runs.leading import IN_WORDS, lead_of
@@ -55,7 +56,8 @@ def headline(run: Run | SuiteRun) -> str:
         text += ": {} with a danger, {} without".format(*parts)
     if not base:
         several = len(run.conditions) > 1
-        return text + (", and no other condition does better." if several else ".")
+        of = " without a warning" if doubted(*_runs(run)) else ""
+        return text + (f", and no other condition{of} does better." if several else ".")
     text += f"; under {base}, {_shown(run, base, lead)}"
     gain = run.score(best, GAINS[lead]) if base == BASELINE else None
     if gain is not None and gain.low is not None:
@@ -69,11 +71,14 @@ def headline(run: Run | SuiteRun) -> str:
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
     """Return the best condition, and the one that it is held against: the one without V2V, or the worst.
 
-    Empty where there is none.
+    The best is of those that no warning is about, where there is one besides that without V2V. Empty where
+    there is none.
     """
     lead = lead_of(run)
     scores = {c: s.value or 0.0 for c in run.conditions if (s := run.score(c, lead)) is not None}
-    best = max(scores, key=lambda c: scores[c], default="")
+    radios = {c["name"] for c in run.manifest.conditions if c.get("profile") is not None}
+    trusted = scores.keys() - doubted(*_runs(run))
+    best = max(trusted if trusted & radios else scores, key=lambda c: scores[c], default="")
     alone = [c["name"] for c in run.manifest.conditions if c.get("profile") is None and c["name"] in scores]
     base = alone[0] if alone else min(scores, key=lambda c: scores[c], default="")
     return best, "" if base == best else base
@@ -99,7 +104,7 @@ def figures(run: Run) -> list[dict[str, str]]:
 
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
     """Return p of each other condition's gain over `base`, in what leads; of a suite the mean gain's."""
-    runs = [*run.runs.values()] if isinstance(run, SuiteRun) else [run]
+    runs = _runs(run)
     lead = lead_of(run)
     counting = [Success.of(of.episodes[: len(of.grid.episodes)], lead) for of in runs]
     successes = [of_ends(METRICS[SUCCESS], of.grid, of.episodes) for of in runs]
@@ -122,6 +127,10 @@ def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
 def p_value(p: float) -> str:
     """Return what stands behind `p`: `= 0.012`, or `< 0.001`, since no p-value is 0."""
     return "< 0.001" if p < 0.001 else f"= {p:.3f}"
+
+
+def _runs(run: Run | SuiteRun) -> list[Run]:
+    return [*run.runs.values()] if isinstance(run, SuiteRun) else [run]
 
 
 def _shown(run: Run | SuiteRun, condition: str, metric: str) -> str:

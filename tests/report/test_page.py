@@ -358,6 +358,33 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
     ]
 
 
+def test_the_headline_and_the_figures_are_of_the_best_condition_that_no_warning_is_about(run, tmp_path):
+    rates = (("single-local", 0.6), ("v2x", 0.9), ("6g", 0.7))
+    found = scored(
+        run,
+        tmp_path,
+        *((condition, "success_rate", rate, None, None) for condition, rate in rates),
+        ("v2x", "off_lag_rate", 0.9, None, None),
+    )
+    assert headline(found).startswith(
+        "Under 6g, rule-of-thumb clears 70.0 % of the episodes; under single-local"
+    )
+    assert [figure["value"] for figure in figures(found)] == ["70.0 %"]
+
+
+def test_where_only_a_doubted_condition_beats_driving_alone_the_headline_does_not_deny_it(run, tmp_path):
+    rates = (("single-local", 0.7), ("v2x", 0.9), ("6g", 0.6))
+    found = scored(
+        run,
+        tmp_path,
+        *((condition, "success_rate", rate, None, None) for condition, rate in rates),
+        ("v2x", "off_lag_rate", 0.9, None, None),
+    )
+    assert headline(found).endswith(
+        "70.0 % of the episodes, and no other condition without a warning does better."
+    )
+
+
 def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run, tmp_path):
     found = scored(
         run,
