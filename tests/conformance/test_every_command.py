@@ -21,10 +21,12 @@ from evaluating import live_spec_of, spec_of
 from evaluating import run as evaluate
 from misbehaving import Asked, Server, completion, serving
 from starlette.testclient import TestClient
+from test_editions import EDITION
 
 from harness import cli
 from harness.coordination.operating_point import POINTS
-from harness.dataset.load import Dataset
+from harness.dataset.load import Dataset, load
+from harness.prompts import versions
 
 Said = tuple[int, str, str]
 SECRET = "sk-canary-0123456789"
@@ -91,7 +93,7 @@ class Strangers:
     def __init__(self, asked: Server, mine: Server, base: Path) -> None:
         shutil.copytree(base, ".", dirs_exist_ok=True)
         Path("swarmdrive.toml").touch()
-        for kind in ("models", "channels", "prompts", "reports", "datasets"):
+        for kind in ("models", "channels", "prompts", "reports", "datasets", "editions"):
             Path(kind).mkdir(exist_ok=True)
         self._cards(asked.url, mine.url)
         self._weights()
@@ -124,6 +126,9 @@ class Strangers:
         for name, scenario in (("module", ENV), ("traffic", TRAFFIC)):
             shutil.copytree("base/dataset", f"datasets/{name}")
             change(Path(f"datasets/{name}/manifest.json"), scenario=scenario)
+        shutil.copytree("base/dataset", "datasets/small")
+        small, prompt = load(Path("datasets/small")).sha256, versions.load("v2").sha256
+        Path("editions/small.toml").write_text(EDITION.format(small, prompt))
 
     def _runs(self, url: str) -> None:
         run, driven = Path("base/run"), Path("base/driven")
@@ -176,7 +181,8 @@ HOSTILE: dict[str, Sequence[str]] = {
     "dataset": DATASETS, "model": MODELS, "helper_model": ["evil", "mine"], "prompt": ["evil"],
     "helper_prompt": ["evil"], "version": ["evil"], "condition": ["evil"], "env_config": ["evil.json"],
     "against": ["evil.csv"], "tokenizer": ["models/evil-weights"], "base": ["models/evil-weights"],
-    "file": ["evil.txt"], "eval file": list(SETTINGS), "drive file": list(SETTINGS), "names": ["evil"],
+    "file": ["evil.txt"], "files": ["evil.txt", "reports/served"], "pilots": RUNS,
+    "eval file": list(SETTINGS), "drive file": list(SETTINGS), "names": ["evil"],
     "study grid model": ["proxy,evil", "proxy,models/evil-weights"], "study closed-loop model": ["evil"],
     "run history dataset": [],
     "radio show name": ["evil"], "radio check name": ["evil"], "model check name": ["evil", "mine"],
@@ -187,11 +193,12 @@ PLAIN: dict[str, str] = {
     "run": "reports/served", "runs": "reports/served", "a": "base/run", "b": "base/run",
     "folders": "reports/served", "tune": "reports/served", "folder": "reports", "dataset": "base/dataset",
     "version": "v2", "file": "evil.txt", "episode": "0", "scenario": "occluded-intersection",
-    "names": "evil", "scene": "00000-0",
+    "names": "evil", "scene": "00000-0", "files": "evil.txt", "rate": "75",
     "prompt compare a": "v2", "prompt compare b": "v4", "init folder": "new",
     "dataset build name": "occluded-intersection",
     "dataset scenario show name": "do-not-pass", "dataset scenario drive name": "do-not-pass",
     "dataset scenario audit name": "do-not-pass", "radio show name": "6g", "radio check name": "mode4",
+    "edition": "small",
     "model check name": "proxy", "model pull name": "proxy", "model device show name": "laptop-cpu",
     "model device check name": "laptop-cpu", "model parity model": "models/evil-weights", "port": "0",
     "serve model": "mine", "budget": "1", "limit": "1", "episodes": "1", "seeds": "0:1", "workers": "1",
