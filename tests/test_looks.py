@@ -232,4 +232,5 @@ def test_typed_it_is_in_the_command_and_the_table(harness: Typed, small_path: Pa
     assert code == 0
     assert ("It stopped after" if n < 4 else "It took all 4 layouts") in out
     assert f"n = {n} episodes" in out
+    assert "intervals of success and of its gain hold at every look" in Path("run/report.html").read_text()
     assert "until_width = 99.0" in Path("run/run.toml").read_text()

@@ -126,6 +126,7 @@ def _pieces(
     alone = len(runs.names) == 1
     by_name = dict(zip(runs.names, runs.runs, strict=True))
     void = caveats.merged(by_name, caveats.void)
+    looked = caveats.merged(by_name, lambda run: caveats.looked_at(run.manifest))
     warnings = [
         sentence
         for of in (ignores_input, caveats.causes, caveats.of_run)
@@ -136,7 +137,7 @@ def _pieces(
         title=runs.names[0] if alone else f"{len(runs.names)} runs",
         policy=library.policy(library.vega(), library.script()),
         lacks=" ".join(decisions.lacks()),
-        warnings=[*void, *caveats.no_prompt(run.manifest for run in runs.runs), *warnings],
+        warnings=[*void, *caveats.no_prompt(run.manifest for run in runs.runs), *looked, *warnings],
         void=len(void),
         size=contents.size(runs),
         headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),
