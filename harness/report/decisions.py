@@ -16,7 +16,7 @@ from harness.runs.sources import lacking
 AT_ONCE = 32 * BLOCK  # scenes of a part, which are in memory together
 FRAMES = 400  # cameras' pictures in a page, each some 3.5 kB of it
 REPLAYED = 60  # decision points of a closed-loop run that are replayed, for their picture and prompts
-ABSENT = "-"
+ABSENT, UNREAD = "-", "?"
 
 
 class Decisions:
@@ -110,7 +110,26 @@ class Decisions:
             "conditions": run.conditions, "seeds": run.manifest.seeds, **index,
             "statuses": [sum(1 << statuses.index(s) for s in of if s in statuses) for of in met],
             "first": [place[scene] for scene in first_failures],
+            **(self._own(run) if len(self._runs.runs) > 1 else {}),
         }  # fmt: skip
+
+    def _own(self, run: Run) -> dict[str, Any]:
+        """Return the ego's own answers, to be read beside those of other runs.
+
+        `said` has a letter a scene, the likeliest action; `sure` its probability in percent.
+        """
+        own = [
+            next((answer for answer in run.answers_by_scene.get(scene, ()) if answer.role == "ego"), None)
+            for scene in self.ids
+        ]
+        intents = [answer.intent if answer else None for answer in own]
+        likeliest = [str(intent.index(max(intent))) if intent else UNREAD for intent in intents]
+        return {
+            "said": "".join(
+                letter if answer else ABSENT for letter, answer in zip(likeliest, own, strict=True)
+            ),
+            "sure": [round(100 * min(max(intent), 1.0)) if intent else 0 for intent in intents],
+        }
 
     def lacks(self) -> dict[str, str]:
         """Return what these scenes could show and do not, in a word, and why."""

@@ -5,6 +5,7 @@ import re
 import sys
 from urllib.parse import parse_qsl
 
+import numpy as np
 import pytest
 
 pytest.importorskip("playwright", reason="needs the dev extra")
@@ -16,6 +17,7 @@ from playwright.sync_api import expect
 from reading import packed
 
 from harness import cli
+from harness.runs.folder import read
 
 pytestmark = pytest.mark.slow
 
@@ -228,6 +230,29 @@ def test_runs_that_disagree_are_found(opened, report, index):
         for n in range(len(index["scenes"]))
     )
     assert 0 < count(page) == disagree
+
+
+def test_answers_of_runs_stand_side_by_side_and_are_found_where_they_differ(opened, report, index):
+    page = opened(report, "#decisions=&differ=answers")
+    first, *others = index["runs"]
+    every = len(first["conditions"]) * len(first["seeds"])
+    differ = [
+        n
+        for n in range(len(index["scenes"]))
+        if any(letter != "-" for letter in first["acted"][n * every : (n + 1) * every : len(first["seeds"])])
+        and len({run["said"][n] for run in (first, *others)} - {"-"}) > 1
+    ]
+    assert 0 < count(page) == len(differ)
+    scene = index["scenes"][differ[0]][0]
+    row = page.locator("#list tbody tr").first
+    assert row.locator("th").inner_text() == scene
+    page.wait_for_function("!document.querySelector('#list .own:not(:has(small))')")
+    runs = [read(report.parent / f"{model}-{prompt}") for model, prompt in RUNS]
+    answers = [a for run in runs for a in run.answers_by_scene.get(scene, ()) if a.role == "ego"]
+    for own, answer in zip(row.locator(".own").all(), answers, strict=True):
+        likeliest = runs[0].actions[int(np.argmax(answer.intent))] if answer.intent else "not readable"
+        assert own.inner_text().startswith(likeliest)
+        assert own.locator("small").inner_text().startswith(" ".join(answer.raw.split())[:40])
 
 
 def test_a_text_is_searched_in_names_at_once_and_in_answers_on_enter(opened, report, index):

@@ -1,6 +1,7 @@
 // The list of all decisions: filters, search, pages. Its state is in the page's address.
 
 const PAGE = 20;
+const RAW = 160; // characters of an answer
 const FILTERS = ["q", "run", "seed", "condition", "agent", "outcome", "danger", "status", "differ", "asked", "page"];
 
 class List {
@@ -54,7 +55,8 @@ class List {
       filter("danger", "danger", same(index.scenes.map(([, , , danger]) => danger ?? "none"))),
       filter("answers", "status", same(index.statuses.filter((_, n) => met & (1 << n)))),
       filter("differ", "differ", [
-        ["conditions", "conditions disagree"], ...(several ? [["runs", "runs disagree"]] : []),
+        ["conditions", "conditions disagree"],
+        ...(several ? [["runs", "runs disagree"], ["answers", "the egos' own answers differ"]] : []),
       ]),
       filter("helpers", "asked", [["1", "asked"], ["0", "not asked"]]),
       h("button", { type: "reset", onclick: () => setTimeout(change) }, "Clear"));
@@ -107,6 +109,8 @@ class List {
       outcome: () => (state.outcome === "first" ? this.first.has(n) : any("ended", state.outcome)),
       differ: () => (state.differ === "conditions"
         ? actions(here.map((c) => this.action(n, run, c, seed))) > 1
+        : state.differ === "answers"
+          ? new Set(this.index.runs.map(({ said }) => said?.[n] ?? "-").filter((letter) => letter !== "-")).size > 1
         : here.some((c) => actions(this.index.runs.map((_, r) => this.action(n, r, c, seed))) > 1)),
     };
     return here.length > 0 && Object.entries(tests).every(([name, passes]) => !state[name] || passes());
@@ -126,8 +130,12 @@ class List {
     const here = this.found.length > PAGE ? `, ${page * PAGE + 1} to ${page * PAGE + shown.length} here` : "";
     const what = this.live ? "decision points" : "decisions";
     this.count.textContent = `${this.found.length} of ${this.index.scenes.length} ${what}${here}; seed ${state.seed}`;
-    const heads = ["scene", ...(this.agents.length ? ["decides"] : []), "danger", ...this.run.conditions, "not strict"];
+    const egos = this.index.runs.length > 1 ? this.about.names.map((name) => `ego of ${name}`) : [];
+    if (egos.length) this.count.textContent += `; conditions of ${visible(this.about.names[state.run])}`;
+    const first = ["scene", ...(this.agents.length ? ["decides"] : []), "danger", ...egos];
+    const heads = [...first, ...this.run.conditions, "not strict"];
     this.rows.replaceChildren(table("decisions", heads, shown.map((n) => this.row(n, state))));
+    this.texts();
     const to = (n, text) => h("a", { href: `#${new URLSearchParams({ ...this.kept(state), decisions: "", page: n })}` }, text);
     this.pages.replaceChildren();
     fill(this.pages, {}, [page > 0 && to(page - 1, "← previous"), " ", page < last && to(page + 1, "next →")]);
@@ -143,7 +151,28 @@ class List {
       return [action, " ", end, asked && h("span", { class: "quiet" }, " asked")];
     };
     const link = h("a", { href: this.link(n, state), "data-n": n }, id);
-    return [link, ...(this.agents.length ? [agent ?? "ego"] : []), danger ?? "none", ...this.run.conditions.map(cell), odd.join(", ")];
+    const own = this.index.runs.length > 1 ? this.index.runs.map((of, r) => this.own(n, r)) : [];
+    const first = [link, ...(this.agents.length ? [agent ?? "ego"] : []), danger ?? "none"];
+    return [...first, ...own, ...this.run.conditions.map(cell), odd.join(", ")];
+  }
+
+  // What a run's ego answered before fusion: the likeliest action, and room for its text.
+  own(n, run) {
+    const { said, sure } = this.index.runs[run], letter = said[n];
+    if (letter === "-") return "–";
+    const read = letter === "?" ? h("span", { class: "bad" }, "not readable") : `${this.index.actions[letter]} ${sure[n]} %`;
+    return h("div", { class: "own", "data-n": n, "data-run": run }, read);
+  }
+
+  // The texts of the answers that are shown; not kept, as those of a search are not.
+  async texts() {
+    const parts = new Map(), { block: size } = this.index;
+    for (const place of this.rows.querySelectorAll(".own")) {
+      const { n, run } = place.dataset, part = Math.floor(n / size);
+      if (!parts.has(part)) parts.set(part, JSON.parse(await unpacked(`block-${part}`)));
+      const raw = parts.get(part)[n % size].runs[run]?.answers.find((answer) => answer.role === "ego")?.raw ?? "";
+      fill(place, {}, [h("small", {}, raw.length > RAW ? `${raw.slice(0, RAW)}…` : raw || "nothing")]);
+    }
   }
 
   // Who else decides in the same step of an episode, and this decision point, by agent.
