@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import threading
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -122,6 +123,16 @@ def test_two_runs_are_compared_and_the_older_is_a(browser: TestClient) -> None:
         page = browser.get(f"/compare?{query}").text
         assert "A: proxy · prompt v2 · json<br>B: cruise · prompt v2 · json" in page
         assert "latency_p95_ms" in page
+
+
+def test_a_comparison_leads_to_the_same_with_a_and_b_swapped_and_to_all_answers(browser: TestClient) -> None:
+    page = browser.get("/compare?path=first&path=second").text
+    links = {text: unescape(href) for href, text in re.findall('<a href="([^"]+)">([^<]+)</a>', page)}
+    swapped = browser.get(links["Swap A and B"]).text
+    assert "A: cruise · prompt v2 · json<br>B: proxy · prompt v2 · json" in swapped
+    assert 'href="/compare?path=second&amp;path=first&amp;a=first">Swap A and B' in swapped
+    side_by_side, _, where = links["Answers side by side"].partition("#")
+    assert (side_by_side, where) == ("/report?path=first&path=second", "decisions=&differ=answers")
 
 
 @pytest.mark.parametrize(

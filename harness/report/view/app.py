@@ -22,6 +22,7 @@ from functools import partial
 from pathlib import Path
 from threading import Thread
 
+from markupsafe import Markup
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import MutableHeaders
@@ -141,12 +142,14 @@ class View:
         return FileResponse(file, headers=policy, media_type=PICTURES[file.suffix])
 
     async def compare(self, request: Request) -> Response:
-        """Compare two runs; the older is A."""
+        """Compare two runs; the older is A, unless the address names another."""
         picked = await run_in_threadpool(self._picked, request)
         if len(picked) != 2:
             raise UserError(f"{len(picked)} runs are picked; pick two to compare them")
-        older, newer = self._whole(sorted(picked, key=lambda o: o.date))
-        return await self._drawn(request, partial(pages.compared, self.folder, older, newer))
+        first = request.query_params.get("a")
+        a, b = sorted(picked, key=lambda each: (each.name != first, each.date))
+        page = partial(pages.compared, self.folder, *self._whole([a, b]))
+        return await self._drawn(request, page, pages.around(a.name, b.name))
 
     async def report(self, request: Request) -> Response:
         picked = await run_in_threadpool(self._picked, request)
@@ -199,7 +202,9 @@ class View:
             return _shown(page)
         return HTMLResponse(pages.study(run, pictures(self.folder, run.name)))
 
-    async def _drawn(self, request: Request, page: Callable[[], str]) -> Response:
+    async def _drawn(
+        self, request: Request, page: Callable[[], str], links: Sequence[tuple[str, str]] = ()
+    ) -> Response:
         drawn: Future[str] = Future()
         drawn.set_running_or_notify_cancel()
 
@@ -214,13 +219,15 @@ class View:
                 return Response(status_code=204)
             # No pool: Ctrl-C would wait for the threads of one.
             Thread(target=make, daemon=True).start()
-            return _with_way_back(await asyncio.wrap_future(drawn))
+            return _with_way_back(await asyncio.wrap_future(drawn), links)
 
 
 def _shown(page: Path) -> Response:
     return _with_way_back(pages.whole_text(page))
 
 
-def _with_way_back(page: str) -> Response:
-    """Return a page of a run, with a link to the list before all that it says itself."""
-    return HTMLResponse(page.replace("<body>", f"<body>\n{WAY_BACK}", 1), headers=OF_RUNS)
+def _with_way_back(page: str, links: Sequence[tuple[str, str]] = ()) -> Response:
+    """Return a page of a run, with links to the list and elsewhere before all that it says itself."""
+    more = "".join(Markup(' · <a href="{}">{}</a>').format(href, text) for text, href in links)
+    way_back = WAY_BACK.replace("</p>", f"{more}</p>")
+    return HTMLResponse(page.replace("<body>", f"<body>\n{way_back}", 1), headers=OF_RUNS)

@@ -43,6 +43,16 @@ def compared(folder: Path, a: Path, b: Path) -> str:
     return comparison.render(compare(pair(a, b)), (), LISTED_OF_EACH, partial(_place, folder))
 
 
+def around(a: str, b: str) -> list[tuple[str, str]]:
+    """Return links of a comparison, each with its text: A and B swapped, and all answers of both."""
+    both = [("path", a), ("path", b)]
+    differing = urlencode({"decisions": "", "differ": "answers"})
+    return [
+        ("Swap A and B", f"/compare?{urlencode([*both, ('a', b)])}"),
+        ("Answers side by side", f"/report?{urlencode(both)}#{differing}"),
+    ]
+
+
 def suite(folder: Path, path: Path) -> str:
     """Return the page of a suite's runs, in a folder of it."""
     done = read(path)
