@@ -77,8 +77,9 @@ def compared(run: Run | SuiteRun) -> tuple[str, str]:
     lead = lead_of(run)
     scores = {c: s.value or 0.0 for c in run.conditions if (s := run.score(c, lead)) is not None}
     radios = {c["name"] for c in run.manifest.conditions if c.get("profile") is not None}
-    trusted = scores.keys() - doubted(*_runs(run))
-    best = max(trusted if trusted & radios else scores, key=lambda c: scores[c], default="")
+    warned = doubted(*_runs(run))
+    trusted = [c for c in scores if c not in warned]  # in their order, which decides between equal ones
+    best = max(trusted if radios & {*trusted} else scores, key=lambda c: scores[c], default="")
     alone = [c["name"] for c in run.manifest.conditions if c.get("profile") is None and c["name"] in scores]
     base = alone[0] if alone else min(scores, key=lambda c: scores[c], default="")
     return best, "" if base == best else base
