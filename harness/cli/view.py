@@ -7,13 +7,17 @@ from threading import Thread
 import typer
 
 from harness.cli import options
-from harness.core.errors import in_range
+from harness.cli.progress import bar
+from harness.core.errors import UserError, in_range, printable
 
 
 def command(
     folder: options.Reports = Path("reports"),
     port: int = typer.Option(7654, help="Port on 127.0.0.1; 0 picks a free one."),
     open_browser: bool = typer.Option(False, "--open", help="Also open the page in the browser."),
+    export: Path | None = typer.Option(
+        None, help="Serve nothing; write the list and the runs' pages to this new folder."
+    ),
 ) -> None:
     """List, open and compare runs and studies in a browser.
 
@@ -30,12 +34,27 @@ def command(
             Thread(target=webbrowser.open, args=[_leading_to(url, Path(private))], daemon=True).start()
 
     in_range("--port", port, 0, 65535)
-    runs(folder)  # says what is wrong with the folder
+    listed = runs(folder)  # says what is wrong with the folder
+    if export:
+        if open_browser:
+            raise UserError("--export and --open: give one of them")
+        _export(folder, export, len(listed))
+        return
     with TemporaryDirectory(prefix="harness-view-") as private:  # which only this user can read
         try:
             serve(folder, port, listening)
         except KeyboardInterrupt:
             return
+
+
+def _export(folder: Path, out: Path, count: int) -> None:
+    from harness.report.view.export import INDEX, export
+
+    with bar("drawing pages", count) as progress:
+        left = export(folder, out, progress)
+    for line in left:
+        typer.echo(f"left out {line}", err=True)
+    typer.echo(f"wrote {printable(out / INDEX)}")
 
 
 def _leading_to(url: str, folder: Path) -> str:

@@ -17,6 +17,10 @@ import pytest
 import uvicorn
 
 from harness.report.view.access import cookie
+from harness.report.words import cell
+from harness.runs.folder import read
+from harness.runs.leading import lead_of
+from harness.runs.metrics import GAINS
 
 Said = tuple[int, str, str]
 LISTENS = "0A"  # of /proc/net/tcp
@@ -93,6 +97,9 @@ def listeners(port: int) -> list[str]:
         (["--port", "65536"], "--port 65536 is out of range; give 0 to 65535"),
         (["nowhere"], "nowhere is no folder; give one that holds runs, or make a run with `harness eval`"),
         (["--host", "0.0.0.0"], "No such option: --host"),
+        (["--export", "reports"], "--export reports is there already; give a new folder"),
+        (["--export", "site"], "reports has no run that can be shown; make one with `harness eval`"),
+        (["--export", "site", "--open"], "--export and --open: give one of them"),
     ],
 )
 def test_bad_input_is_one_line(args: list[str], said: str, harness: Callable[..., Said]) -> None:
@@ -100,6 +107,29 @@ def test_bad_input_is_one_line(args: list[str], said: str, harness: Callable[...
     code, out, err = harness("view", *args)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err
+
+
+def test_an_exported_folder_has_a_list_and_a_page_of_each_run_and_no_path_of_this_machine(
+    reports: Path, harness: Callable[..., Said], tmp_path: Path
+) -> None:
+    (reports / "second/report.html").write_text(f"<body>{tmp_path} is not for others")
+    code, out, err = harness("view", str(reports), "--export", str(tmp_path / "site"))
+    assert (code, out) == (0, f"wrote {tmp_path / 'site/index.html'}\n")
+    assert "left out first/sweep-tau: a sweep; its folder can be published as it is" in err
+    site = {
+        str(file.relative_to(tmp_path / "site")): file.read_text()
+        for file in (tmp_path / "site").rglob("*.html")
+    }
+    assert set(site) == {"index.html", "first/report.html", "second/report.html"}
+    assert re.findall('<a href="([^"]+)"', site["index.html"]) == ["second/report.html", "first/report.html"]
+    assert all(
+        '<a href="../index.html">← All runs</a>' in site[name] for name in site if name != "index.html"
+    )
+    run = read(reports / "first")
+    lead = lead_of(run)
+    figures = [cell(run.score("6g", metric)) for metric in (lead, GAINS[lead], "unsafe_rate")]
+    assert "".join(f"<td>{figure}</td>" for figure in figures) in site["index.html"]
+    assert not any(str(tmp_path) in page for page in site.values())
 
 
 def test_a_port_in_use_is_one_line(harness: Callable[..., Said]) -> None:

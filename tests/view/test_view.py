@@ -22,7 +22,8 @@ from viewing import configure, names, said
 from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.report.view import pages
-from harness.report.view.app import WAY_BACK, View
+from harness.report.view.app import View
+from harness.report.view.pages import WAY_BACK
 from harness.runs.folder import read
 
 

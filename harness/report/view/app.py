@@ -22,7 +22,6 @@ from functools import partial
 from pathlib import Path
 from threading import Thread
 
-from markupsafe import Markup
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import MutableHeaders
@@ -39,7 +38,6 @@ from harness.report.view import pages
 from harness.report.view.access import Access
 from harness.report.view.folder import PICTURES, own_file, pictures, whole
 from harness.runs.listing import Listed, runs
-from harness.runs.suite import contents_of
 
 HOSTS = ("127.0.0.1", "localhost")
 HEADERS = {
@@ -57,10 +55,6 @@ OF_RUNS = {  # in the place of those above, for what a run's folder holds
     "sandbox allow-scripts allow-downloads",
     "Cross-Origin-Opener-Policy": "unsafe-none",
 }
-
-WAY_BACK = (  # a report's navigation begins at the top of its page and would lie over the link
-    '<style>.way-back + nav { margin-top: 0; }</style>\n<p class="way-back"><a href="/">← All runs</a></p>'
-)
 
 
 def app(folder: Path, token: str) -> ASGIApp:
@@ -120,7 +114,7 @@ class View:
                 f"{printable(run.name)} is {run.state} ({printable(run.why)}); it has no page yet"
             )
         if run.kind == "suite":
-            return await self._drawn(request, partial(self._suite, run))
+            return await self._drawn(request, partial(pages.suite, self.folder, run.name))
         if run.kind not in pages.RUNS:
             return await run_in_threadpool(self._study, run)
         written, drawn = (own_file(self.folder, run.name, name) for name in ("report.html", "run.json"))
@@ -190,12 +184,6 @@ class View:
     def _whole(self, picked: Sequence[Listed]) -> Sequence[Path]:
         return [whole(self.folder, run.name) for run in picked]
 
-    def _suite(self, run: Listed) -> str:
-        path = self.folder / run.name
-        for name in contents_of(path).families.values():
-            whole(self.folder, f"{run.name}/{name}")
-        return pages.suite(self.folder, path)
-
     def _study(self, run: Listed) -> Response:
         page = own_file(self.folder, run.name, "index.html")
         if page:
@@ -227,7 +215,4 @@ def _shown(page: Path) -> Response:
 
 
 def _with_way_back(page: str, links: Sequence[tuple[str, str]] = ()) -> Response:
-    """Return a page of a run, with links to the list and elsewhere before all that it says itself."""
-    more = "".join(Markup(' · <a href="{}">{}</a>').format(href, text) for text, href in links)
-    way_back = WAY_BACK.replace("</p>", f"{more}</p>")
-    return HTMLResponse(page.replace("<body>", f"<body>\n{way_back}", 1), headers=OF_RUNS)
+    return HTMLResponse(pages.with_way_back(page, links), headers=OF_RUNS)

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
+from markupsafe import Markup
+
 from harness.core.files import bytes_of, text_of
 from harness.report import suite as suites
 from harness.report.compare import page as comparison
@@ -15,14 +17,18 @@ from harness.report.compare.pair import pair
 from harness.report.page import render, with_decision
 from harness.report.runs import gather
 from harness.report.templating import environment
+from harness.report.view.folder import whole
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD, Listed, runs
-from harness.runs.suite import read
+from harness.runs.suite import SuiteRun, contents_of, read
 
 RUNS = ("eval", "drive")
 TEMPLATES = Path(__file__).parent / "templates"
 LISTED_OF_EACH = 10  # episodes and requests, in a comparison
 NEWEST = "-date"
+WAY_BACK = (  # a report's navigation begins at the top of its page and would lie over the link
+    '<style>.way-back + nav { margin-top: 0; }</style>\n<p class="way-back"><a href="/">← All runs</a></p>'
+)
 COLUMNS = ("name", "kind", "model", "prompt", "success", "date")
 
 
@@ -31,6 +37,13 @@ def report(folders: Sequence[Path], written: Path | None = None, scene: str | No
     runs = gather(folders)
     page = render(runs) if written is None else whole_text(written)
     return page if scene is None else with_decision(page, runs, scene)
+
+
+def with_way_back(page: str, links: Sequence[tuple[str, str]] = (), home: str = "/") -> str:
+    """Return a page of a run with links before all that it says itself: to the list, and more with texts."""
+    more = "".join(Markup(' · <a href="{}">{}</a>').format(href, text) for text, href in links)
+    way_back = WAY_BACK.replace('"/"', f'"{home}"').replace("</p>", f"{more}</p>")
+    return page.replace("<body>", f"<body>\n{way_back}", 1)
 
 
 def whole_text(page: Path) -> str:
@@ -53,9 +66,16 @@ def around(a: str, b: str) -> list[tuple[str, str]]:
     ]
 
 
-def suite(folder: Path, path: Path) -> str:
+def suite_of(folder: Path, name: str) -> SuiteRun:
+    """Read a listed suite, every file of which may be read. Raises UserError if one may not."""
+    for family in contents_of(folder / name).families.values():
+        whole(folder, f"{name}/{family}")
+    return read(folder / name)
+
+
+def suite(folder: Path, name: str) -> str:
     """Return the page of a suite's runs, in a folder of it."""
-    done = read(path)
+    done = suite_of(folder, name)
     return suites.render([(done, suites.lines(done))], partial(_place, folder))
 
 
