@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from html import unescape
 from pathlib import Path
 from shutil import copytree, rmtree
 from typing import Any
@@ -225,6 +226,22 @@ def test_a_loss_has_one_minus_on_the_page(project: Harness) -> None:
     page = (DONE / "report.html").read_text()
     shown = re.findall(r'<span class="gain \w*">(?:[✓✗] )?([^<]*)<', page)
     assert f"{100 * min(gains):.1f} points" in shown
+
+
+def test_what_bounds_a_suites_numbers_stands_above_them(evaluated: Harness) -> None:
+    page = unescape((DONE / "report.html").read_text())
+    assert (
+        page.index("reads no prompt") < page.index("episodes: the interval of a rate") < page.index("Under ")
+    )
+
+
+def test_an_exported_suite_leads_to_the_pages_of_its_runs(evaluated: Harness) -> None:
+    assert evaluated("view", "reports", "--export", "site")[0] == 0
+    for page in (Path("site/index.html"), Path("site") / DONE.name / "report.html"):
+        links = re.findall('<a href="([^"#]+)"', page.read_text())
+        assert len(links) == 3
+        assert all((page.parent / link).is_file() for link in links)
+    rmtree("site")
 
 
 @pytest.mark.slow
