@@ -10,18 +10,22 @@ from shutil import copyfile, copytree
 from zipfile import ZipFile
 
 import evaluating
+import numpy as np
 import pytest
+from run_on_disk import Row, made_up
 
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.dataset.load import Dataset, released
 from harness.evaluate import resolve
 from harness.evaluate.edition import named, of_file
-from harness.evaluate.rescore import Here
+from harness.evaluate.rescore import Here, Rescored
 from harness.prompts import versions
+from harness.report import board
 from harness.runs import results
 from harness.runs.folder import Run, read
-from harness.runs.results import CONTENTS, FILES
+from harness.runs.results import CONTENTS, FILES, FORMAT, Contents
+from harness.runs.suite import SuiteRun
 
 Harness = Callable[..., tuple[int, str, str]]
 Once = Callable[[str, Callable[[Path], object]], Path]
@@ -416,6 +420,9 @@ def test_an_installation_that_computes_a_figure_otherwise_says_so(project: Harne
     assert "is not the file that mine-1 pins" in err
     make_golden("mine-1", file, tmp_path / "made")
     assert project("benchmark", "verify", golden, "--quiet") == (0, "", "")
+    code, out, err = project("benchmark", "board", golden)
+    assert (code, out, err.count("\n")) == (2, "", 2)
+    assert "editions/mine-1.golden.zip pins mine-1 and is no entry" in err
     Here().check(named("mine-1"))
     changed(golden, better)
     pin(file, golden)
@@ -439,11 +446,11 @@ def test_a_board_ranks_files_and_says_who_made_them_and_what_was_computed_again(
     files = ("uniform.zip", made, "twin.zip", "full-view.zip", "forged.zip")
     code, out, err = project("benchmark", "board", *files, "--json")
     assert (code, err) == (0, "")
-    board = json.loads(out)
-    success = [line["success"]["6g"]["value"] for line in board]
+    ranked = json.loads(out)
+    success = [line["success"]["6g"]["value"] for line in ranked]
     assert success == sorted(success, reverse=True)
-    assert [line["rank"] for line in board if line["agents"] == "full-view · a rule"] == [None]
-    same = [line for line in board if line["agents"] == "proxy-faulty · a rule"]
+    assert [line["rank"] for line in ranked if line["agents"] == "full-view · a rule"] == [None]
+    same = [line for line in ranked if line["agents"] == "proxy-faulty · a rule"]
     assert [line["rank"] for line in same] == [1, 1, 1], "nobody is clearly better than itself"
     assert sorted(line["equal"] for line in same) == [False, True, True]
     assert len({json.dumps(line["success"]) for line in same}) == 1, "the figures are those computed here"
@@ -461,6 +468,45 @@ def test_a_board_ranks_files_and_says_who_made_them_and_what_was_computed_again(
     code, _, err = project("benchmark", "board", "broken.zip", "--out", "none.html")
     assert (code, Path("none.html").exists()) == (2, False)
     assert "a board is of one edition" in err
+
+
+def entry_that_loses(folder: Path, *lost: int) -> Rescored:
+    """An entry of 60 layouts, half of them with a danger, that fails in some of them under 6g."""
+
+    def end(row: Row) -> None:
+        row["danger"] = "left" if row["episode"] % 2 else "none"
+        if row["condition"] == "6g" and row["episode"] in lost:
+            row |= {"success": False, "failure": "late"}
+
+    run = read(made_up(folder, episode=end, episodes=60))
+    edition = named("v2v-safety-1.0")
+    contents = Contents(
+        format=FORMAT, edition=edition.name, digest="", made_by=folder.name, runs=("made-up",)
+    )
+    suite = SuiteRun(folder, edition.name, edition.description, {"made-up": run})
+    return Rescored(contents, edition, suite, {"made-up": ()}, 0)
+
+
+def test_a_rank_is_one_more_than_the_entries_that_are_clearly_better(tmp_path: Path) -> None:
+    """Layouts are drawn again here, of both kinds, to say by other means who is clearly better than whom."""
+    lost = {"best": [0, 1], "near": [2, 3, 4], "worse": [*range(30)], "worst": [*range(55)]}
+    entries = [entry_that_loses(tmp_path / name, *each) for name, each in reversed(lost.items())]
+    ordered = board.lines(entries)
+    assert [(line.entry.contents.made_by, line.rank) for line in ordered] == [
+        *(("best", 1), ("near", 1), ("worse", 3), ("worst", 4)),
+    ]
+
+    rng = np.random.default_rng(0)
+    drawn = np.stack([2 * rng.integers(0, 30, (2000, 30)) + kind for kind in (0, 1)])
+    wins = {name: ~np.isin(np.arange(60), each) for name, each in lost.items()}
+    for line in ordered:
+        name = line.entry.contents.made_by
+        more = [wins[other].astype(float) - wins[name] for other in lost]
+        clearly = [np.quantile(each[drawn].mean(axis=(0, 2)), 0.025) > 0 for each in more]
+        assert line.rank == 1 + sum(clearly)
+        success = line.success["6g"]
+        assert success is not None
+        assert success.value == pytest.approx(wins[name].mean())  # as many layouts of both kinds
 
 
 def test_published_seeds_are_those_that_an_edition_committed_to(project: Harness) -> None:

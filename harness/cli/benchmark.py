@@ -207,7 +207,10 @@ def board(
     with ExitStack() as stack:
         for file in dict.fromkeys(files):
             try:
-                entries.append(stack.enter_context(_rescored(file, here, as_json or quiet)))
+                entry = stack.enter_context(_rescored(file, here, as_json or quiet))
+                if entry.golden:
+                    raise UserError(f"{printable(file)} pins {entry.edition.name} and is no entry")
+                entries.append(entry)
             except UserError as error:
                 typer.echo(f"harness: left out: {error}", err=True)
                 left_out.append(str(error))

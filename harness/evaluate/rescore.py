@@ -33,6 +33,7 @@ class Rescored:
     # what differs from the figures in the file, by dataset, in words; none where all are equal
     differences: Mapping[str, Sequence[str]]
     compared: int  # how many figures were
+    golden: bool = False  # whether the file is the one that pins the edition, of a few layouts, and no entry
 
 
 class Here:
@@ -103,7 +104,7 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
         where = f"{folder / 'stated'}/"
         raise UserError(f"{printable(file)}: {str(error).replace(where, '')}") from None
     suite = SuiteRun(folder / "computed", edition.name, edition.description, runs)
-    return Rescored(contents, edition, suite, differences, compared)
+    return Rescored(contents, edition, suite, differences, compared, golden=limit is not None)
 
 
 def _computed(stated: Run, spec: Spec, out: Path, progress: Callable[[int], None]) -> Run:
