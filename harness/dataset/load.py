@@ -54,7 +54,7 @@ class Scene:
     notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
     seat: Scenario | None = None  # the scenario of who decides, if that is an agent on a seat
     agent: int = 0  # its place among the vehicles that answer; the ego is at 0
-    deciders: int = 1  # how many vehicles decide in this world
+    several: bool = False  # whether vehicles beside the ego can decide in this scenario
 
     @property
     def id(self) -> str:
@@ -87,9 +87,8 @@ class Scene:
         return viewer if viewer > self.agent else viewer - 1
 
     def changed(self, **fields: Any) -> "Scene":
-        return Scene(
-            structs.replace(self.record, **fields), seat=self.seat, agent=self.agent, deciders=self.deciders
-        )
+        record = structs.replace(self.record, **fields)
+        return Scene(record, seat=self.seat, agent=self.agent, several=self.several)
 
 
 def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Mapping[Scenario, list[int]]:

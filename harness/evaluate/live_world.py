@@ -35,7 +35,7 @@ from harness.world.lookouts import radios
 from harness.world.outcome import Outcome, rating
 from harness.world.parameters import frames
 from harness.world.scenario import Scenario
-from harness.world.seats import offset_of, offsets, places_by
+from harness.world.seats import agent_share, offset_of, offsets, places_by
 from harness.world.swarm import alone, ends, gravest
 from harness.world.world import World
 
@@ -170,7 +170,7 @@ class LiveWorld(SceneWorld):
         return senders
 
     def plans(self) -> Plans | None:
-        if all(scene.deciders == 1 for scene in self.scenes):
+        if not agent_share(self.scenario):
             return None
         road, vehicles = self.scenario.road(), [t.world.vehicles[agent] for t, agent in self._deciding]
         spawns, egos = [v.spawn for v in vehicles], [scene.state.ego for scene in self.scenes]
@@ -238,9 +238,9 @@ class LiveWorld(SceneWorld):
     def episodes(self) -> list[Episode]:
         """Return how each ended; late is against a full-view driver whose decisions act after the lag.
 
-        With several agents nobody is late: there is no such driver for all of them together.
+        Where several can decide nobody is late: there is no such driver for all of them together.
         """
-        if any(len(t.world.journeys) > 1 for t in self._ended):
+        if agent_share(self.scenario):
             alone_s = alone(self.scenario, list(dict.fromkeys(t.world.seed for t in self._ended)))
             return [_swarm(t, course, alone_s[t.world.seed]) for t in self._ended for course in t.courses]
         numbers = sorted({t.number for t in self._ended if t.world.outcome.success})
@@ -269,7 +269,7 @@ def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) 
         for n, record in zip(places, records_of(scenario, seen), strict=True):
             world, agent, _ = points[n]
             place, seat = (world.answering.index(agent), scenario) if agent else (0, None)
-            scenes[n] = Scene(record, seat=seat, agent=place, deciders=len(world.journeys))
+            scenes[n] = Scene(record, seat=seat, agent=place, several=agent_share(world.scenario) > 0)
     return [scenes[n] for n in range(len(points))]
 
 

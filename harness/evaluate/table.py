@@ -95,7 +95,7 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
         "scene": _labels(ids, at),
         "danger": _labels([s.record.danger.sector for s in scenes], at),
         "condition": Labels(point, points),
-        "agent": _labels([s.viewers[0] if s.deciders > 1 else None for s in scenes], at),
+        "agent": _labels([s.viewers[0] if s.several else None for s in scenes], at),
         "action": Labels(np.concatenate([part.result.action for part in decided]), actions),
         **{f"helper_{h + 1}": _labels([row[h] for row in senders], at, asked[:, h]) for h in range(helpers)},
     }

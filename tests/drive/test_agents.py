@@ -130,6 +130,25 @@ def test_a_run_says_who_decided_and_how_all_of_them_ended(driven: Path) -> None:
     assert scores["6g", "arrived_rate"] == pytest.approx(mean)
 
 
+def test_an_episode_in_which_nobody_beside_the_ego_decides_is_one_of_the_swarm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = named_point("6g"), named_point("6g:schedule=always,content=plan,consensus=auction")
+    source = LiveSource(200_003, 2, "all-way-crossing:agent_share=0.2")
+    spec = replace(live_spec_of(prompt="v4", seeds=(0,)), source=source, points=points)
+    run(spec, tmp_path / "together")
+    there = load(tmp_path / "together")
+    assert (there.episodes.groupby("episode").agents.first() == [1, 2]).all()
+    assert there.decisions.agent.notna().all()
+    assert len(there.agents) == there.episodes.agents.sum()
+
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)
+    run(spec, tmp_path / "each")
+    assert {name: (tmp_path / "each" / name).read_bytes() for name in FILES} == {
+        name: (tmp_path / "together" / name).read_bytes() for name in FILES
+    }
+
+
 def test_a_run_has_a_table_of_its_agents_that_adds_up_to_its_episodes(driven: Path) -> None:
     run = load(driven)
     keys = ["condition", "seed", "episode"]
