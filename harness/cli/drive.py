@@ -121,7 +121,9 @@ def deciding(scenario: str, agents: str) -> str:
 
     share = {"ego": "0", ALL: "1"}.get(agents, agents)
     if not re.fullmatch(r"[01]|0?\.\d+|[01]\.0*", share):
-        raise UserError(f"--agents is {printable(agents)!r}; give ego, all, or a share from 0 to 1")
+        raise UserError(
+            f"--agents is {printable(agents)!r}; give ego, all, or a share from 0 to 1, written as 0.5"
+        )
     if SHARE in scenario:
         raise UserError(f"--agents {agents}: {printable(scenario)} states {SHARE} already; give one of them")
     if share != "0" and SHARE not in scenarios.get(scenario).dials:

@@ -319,6 +319,15 @@ def test_what_has_one_ego_says_so_of_a_scenario_of_several(tmp_path: Path) -> No
         Roads(scenario, (100,))
 
 
+@pytest.mark.parametrize("agents", ["1e-9", "2", "nan", "-1", "half"])
+def test_a_share_that_is_none_is_said_with_how_to_write_one(
+    harness: Callable[..., tuple[int, str, str]], agents: str
+) -> None:
+    code, _, err = harness("drive", "--scenario", "all-way-crossing", "--agents", agents)
+    assert code == 2
+    assert f"--agents is '{agents}'; give ego, all, or a share from 0 to 1, written as 0.5" in err
+
+
 def test_a_scenario_in_which_only_the_ego_has_a_goal_has_no_agents() -> None:
     with pytest.raises(UserError, match="agent_share"):
         scenarios.get("occluded-intersection:agent_share=1")
