@@ -19,7 +19,7 @@ from harness.core.files import sha256_file
 from harness.dataset.load import Dataset, released
 from harness.evaluate import resolve
 from harness.evaluate.edition import named, of_file
-from harness.evaluate.rescore import Here, Rescored
+from harness.evaluate.rescore import Here, Rescored, rescored
 from harness.prompts import versions
 from harness.report import board
 from harness.runs import results
@@ -468,6 +468,27 @@ def test_a_board_ranks_files_and_says_who_made_them_and_what_was_computed_again(
     code, _, err = project("benchmark", "board", "broken.zip", "--out", "none.html")
     assert (code, Path("none.html").exists()) == (2, False)
     assert "a board is of one edition" in err
+
+
+def test_a_board_does_not_take_the_place_of_a_file_that_it_ranks(project: Harness, made: Path) -> None:
+    before = made.read_bytes()
+    Path("link.html").symlink_to(made)
+    for out in ("entry.zip", "./entry.zip", "link.html"):
+        code, _, err = project("benchmark", "board", made, "--out", out)
+        assert (code, err.count("\n")) == (2, 1)
+        assert "is one of the files to rank; name another file" in err
+    assert made.read_bytes() == before
+
+
+def test_a_check_that_is_interrupted_promises_no_folder(project: Harness, made: Path, tmp_path: Path) -> None:
+    """A run says which folder keeps what is done; that of a check is deleted."""
+
+    def stop(answers: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        rescored(made, tmp_path / "check", stop, Here())
+    assert not stopped.value.__notes__
 
 
 def entry_that_loses(folder: Path, *lost: int) -> Rescored:

@@ -4,6 +4,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from os.path import realpath
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -203,6 +204,8 @@ def board(
     from harness.evaluate.rescore import Here
     from harness.report import board as boards
 
+    if realpath(out) in map(realpath, files):
+        raise UserError(f"--out {printable(out)} is one of the files to rank; name another file")
     here, entries, left_out = Here(), list["Rescored"](), list[str]()
     with ExitStack() as stack:
         for file in dict.fromkeys(files):

@@ -108,7 +108,11 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
 
 
 def _computed(stated: Run, spec: Spec, out: Path, progress: Callable[[int], None]) -> Run:
-    evaluate(spec, out, progress, opens=lambda card, **options: Kept(stated))
+    try:
+        evaluate(spec, out, progress, opens=lambda card, **options: Kept(stated))
+    except KeyboardInterrupt as stop:
+        stop.__notes__ = []  # that the folder keeps what is done: it is deleted
+        raise
     work.tidy(out)
     return read(out)
 
