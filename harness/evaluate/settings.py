@@ -509,8 +509,8 @@ def _as_driven(settings: Settings, run: Path) -> Settings:
     world = run_of(run).manifest.world
     if not isinstance(world, ClosedLoop) or world.scenario["name"] != name:
         return settings
-    then = scenarios.stated(name, world.scenario["parameters"]).parameters
-    scenes = [f"{key}={getattr(then, key)}" for key in missing]
+    its = scenarios.stated(name, world.scenario["parameters"])
+    scenes = [f"{key}={getattr(its.parameters, key)}" for key in missing if key in its.dials]
     return changed(settings, {"scenario": f"{name}:{','.join([*([typed] if typed else []), *scenes])}"})
 
 

@@ -149,6 +149,14 @@ def test_an_episode_in_which_nobody_beside_the_ego_decides_is_one_of_the_swarm(
     }
 
 
+def test_the_settings_of_a_run_of_agents_drive_it_again(
+    driven: Path, tmp_path: Path, harness: Callable[..., tuple[int, str, str]]
+) -> None:
+    copytree(driven, tmp_path / "run")
+    assert harness("drive", "run", "--quiet", "--out", "again")[0] == 0
+    assert (tmp_path / "again" / "episodes.csv").read_bytes() == (driven / "episodes.csv").read_bytes()
+
+
 def test_a_run_has_a_table_of_its_agents_that_adds_up_to_its_episodes(driven: Path) -> None:
     run = load(driven)
     keys = ["condition", "seed", "episode"]
