@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from misbehaving import Server, serving
+from misbehaving import Asked, Server, completion, serving
 from served import answer
 
 from harness.backends import cards
@@ -96,6 +96,28 @@ def test_a_limit_stops_before_more_is_asked_and_the_same_command_goes_on(
     ids = [json.loads(line) for line in Path("run/answers.jsonl").read_text().splitlines()]
     assert len(ids) == len(there.asked) > first, "no question was asked twice"
     assert cost_of("run")["mine"]["asked"] == len(there.asked)
+
+
+def test_a_limit_that_no_tokens_could_reach_stops_the_run(
+    tmp_path: Path, small_path: Path, harness: Typed
+) -> None:
+    """A server that states no `usage` would be asked without end."""
+
+    def mute(asked: Asked) -> None:
+        asked.reply({key: value for key, value in completion().items() if key != "usage"})
+
+    with serving(mute) as server:
+        (tmp_path / "models" / "mine.toml").write_text(CARD.replace("URL", server.url))
+        typed = typed_eval(small_path, "--no-cache")
+        code, _, said = harness(*typed, "--max-cost", "1")
+        first = len(server.asked)
+        assert (code, said.count("\n")) == (3, 1)
+        assert "mine does not say how many tokens its answers take, so --max-cost cannot hold" in said
+        assert 0 < first <= 3 * 64
+        assert harness(*typed)[0] == 0
+        assert len(server.asked) > first
+    cost = cost_of("run")["mine"]
+    assert cost["asked"] == cost["uncounted"] == len(server.asked), "no question was asked twice"
 
 
 def test_a_dry_run_says_what_it_would_cost(there: Server, two_path: Path, harness: Typed) -> None:

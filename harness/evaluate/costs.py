@@ -100,7 +100,8 @@ def metered(
 class Metered:
     """A backend whose completions are counted; it is like the backend in all else.
 
-    `complete` raises Unanswered, before it asks, if the budget is spent.
+    `complete` raises Unanswered, before it asks, if the budget is spent, or if nobody said how many tokens
+    the last answers took, which a budget would never notice.
     """
 
     def __init__(
@@ -108,6 +109,7 @@ class Metered:
     ) -> None:
         self._backend, self._model, self._price = backend, model, price
         self._work, self._limit = work, limit
+        self._unsaid = False  # whether all of the last answers are without their tokens
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
@@ -118,6 +120,11 @@ class Metered:
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         if self._limit:
             self._limit.check()
+            if self._unsaid:
+                raise Unanswered(
+                    f"{printable(self._model)} does not say how many tokens its answers take, so --max-cost "
+                    "cannot hold; all answers are kept, and the same command without it goes on"
+                )
         completions = self._backend.complete(requests)
         counted = [
             (each.prompt_tokens, each.completion_tokens) for each in completions
@@ -125,6 +132,7 @@ class Metered:
         ]  # fmt: skip
         read, written = (sum(n) for n in zip(*counted, strict=True)) if counted else (0, 0)
         uncounted = len(completions) - len(counted)
+        self._unsaid = not counted and any(each.error is None for each in completions)
         if self._work:
             with (self._work / FILE).open("ab") as file:
                 file.write(
