@@ -24,7 +24,7 @@ def command(
         "- A.",
         metavar="PILOT",
     ),
-    detect: float = typer.Option(5.0, help="Difference of success to find, in points: above 0, below 100."),
+    detect: float = typer.Option(5.0, help="Difference of success to find, in points: 0.1 to 99."),
     power: float = typer.Option(80.0, help="Chance to find it, in percent: 50 to 99."),
     layouts: int | None = typer.Option(
         None, help="Also say which difference so many layouts find. Default: as many as the pilots have."
