@@ -20,7 +20,7 @@ from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.price import Price
 from harness.core.errors import Unanswered, UserError, printable
-from harness.core.files import bytes_of
+from harness.core.files import bytes_of, text_of
 from harness.runs.records import Cost
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class Budget:
 
     def check(self) -> None:
         """Raise Unanswered if it is spent."""
-        spent = math.fsum(map(float, self.file.read_text().split()))
+        spent = math.fsum(map(float, text_of(self.file, "rows").split()))
         if spent >= self.most:
             raise Unanswered(
                 f"{spent:.4g} {self.currency} of --max-cost {self.most:g} are spent; all answers are kept, "
