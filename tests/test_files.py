@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from harness.core.files import canonical_json, digest, read_once
+from harness.core.files import canonical_json, digest, read_once, write_whole
 
 
 @pytest.mark.parametrize(
@@ -64,3 +64,12 @@ def test_a_file_is_read_again_only_after_it_was_written_again(tmp_path: Path) ->
         with pytest.raises(FileNotFoundError):
             text(file)
     assert len(reads) == 4
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a /proc, as Linux has")
+@pytest.mark.parametrize("path", ["/proc/x.zip", "/proc/x/y.zip"])
+def test_where_no_file_can_be_made_is_no_missing_file(path: str) -> None:
+    """A missing file is a bug, with a traceback; this is one line to the user."""
+    with pytest.raises(PermissionError, match="no file can be made there") as refused:
+        write_whole(Path(path), "x")
+    assert refused.value.filename == path

@@ -149,15 +149,20 @@ def digest(value: Any) -> str:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary file to write to; it replaces `path` on success and is deleted on an error.
 
-    Temporary files of killed processes are deleted as well.
+    Temporary files of killed processes are deleted as well. Raises OSError if `path` cannot be written, which
+    is never FileNotFoundError.
     """
     if path.is_dir():  # fail now, and not only after all is written
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    forget_halves(path.parent, escape(path.name))
     # Arrow takes a relative path with a colon, such as `6g:loss=0/x`, for an address.
     part = path.absolute().with_name(f".{path.name}.{os.getpid()}.part")
-    part.unlink(missing_ok=True)  # it may be a link, or left by an earlier process with this id
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        forget_halves(path.parent, escape(path.name))
+        part.unlink(missing_ok=True)  # it may be a link, or left by an earlier process with this id
+        part.touch()
+    except FileNotFoundError:  # what /proc says to whoever makes a file there
+        raise PermissionError(errno.EACCES, "no file can be made there", str(path)) from None
     try:
         with alone(part):
             yield part
