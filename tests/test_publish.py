@@ -114,6 +114,7 @@ def test_the_size_of_a_dataset_is_the_hubs_word(rows: int, word: str) -> None:
 def test_a_second_export_has_the_same_bytes_and_needs_another_folder(
     harness: Harness, published: Path, small_path: Path, tmp_path: Path
 ) -> None:
+    (tmp_path / ".again.99998.part/data").mkdir(parents=True)  # of an export that was killed
     code, out, _ = harness("dataset", "export", small_path, "--out", "again")
     assert (code, "decision points" in out) == (0, True)
     before = files(tmp_path / "again")

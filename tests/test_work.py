@@ -12,7 +12,7 @@ from pyarrow import csv as pacsv
 
 from harness.core import work
 from harness.core.errors import UserError
-from harness.core.files import alone, replacing, write_whole
+from harness.core.files import alone, making, replacing, write_whole
 
 BEGUN = work.WorkStart(settings={"seed": 1})
 
@@ -25,6 +25,19 @@ def test_what_a_killed_process_left_half_written_goes_and_what_another_writes_st
         write_whole(tmp_path / "table.csv", "whole")
     assert {p.name for p in tmp_path.iterdir()} == {"table.csv", written.name}
     assert written.read_text() == "half"
+
+
+def test_a_folder_that_a_killed_process_left_half_made_goes_and_what_another_makes_stays(
+    tmp_path: Path,
+) -> None:
+    left, made, theirs = (tmp_path / f".site.{pid}.part" for pid in (99998, 99999, "old"))
+    for folder in (left, made, theirs):
+        (folder / "data").mkdir(parents=True)
+    with alone(made), making(tmp_path / "site") as part, making(tmp_path / "other"):
+        (part / "page").write_text("whole")
+    assert {p.name for p in tmp_path.iterdir()} == {"site", "other", made.name, theirs.name}
+    assert (made / "data").is_dir()
+    assert (tmp_path / "site/page").read_text() == "whole"
 
 
 def test_no_link_is_followed_where_a_file_is_written(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import errno
 import hashlib
 import json
 import os
+import shutil
 import stat
 import time
 from collections.abc import Callable, Iterator
@@ -173,11 +174,29 @@ def replacing(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
+@contextmanager
+def making(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder to fill; it becomes `folder` on success and is deleted on an error.
+
+    Temporary folders of killed processes are deleted as well. Raises OSError if it cannot be made.
+    """
+    whole = folder.absolute()
+    forget_halves(whole.parent, escape(whole.name))
+    part = whole.with_name(f".{whole.name}.{os.getpid()}.part")
+    try:
+        part.mkdir(parents=True)
+        with alone(part):
+            yield part
+            part.rename(whole)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
 def forget_halves(folder: Path, name: str = "*") -> None:
-    """Delete temporary files that killed processes left (they are not locked); `name` is a glob pattern."""
-    for part in folder.glob(f".{name}.*.part"):
+    """Delete what killed processes left half written (it is not locked); `name` is a glob pattern."""
+    for part in folder.glob(f".{name}.[0-9]*.part"):
         with suppress(OSError), alone(part):
-            part.unlink()
+            shutil.rmtree(part) if part.is_dir() else part.unlink()
 
 
 def write_whole(path: Path, data: str | bytes) -> None:
@@ -188,7 +207,7 @@ def write_whole(path: Path, data: str | bytes) -> None:
 
 @contextmanager
 def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
-    """Hold an exclusive lock on a file, which is created if missing. A killed process releases its lock.
+    """Hold an exclusive lock on a folder or file; a missing file is created. A killed process releases it.
 
     On a system without such locks (Windows) nothing is locked. Raises BlockingIOError if another process
     still holds it after `patience_s` seconds, and OSError if the file is a link or cannot be opened.
@@ -198,7 +217,8 @@ def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
     except ImportError:
         yield
         return
-    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+    how = os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT
+    file = os.open(path, how | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
     try:
         deadline_s = time.monotonic() + patience_s
         while True:

@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import pyarrow.parquet as pq
 
 from harness.core.errors import UserError, printable
 from harness.core.figures import known
-from harness.core.files import sha256_file, write_whole
+from harness.core.files import making, sha256_file, write_whole
 from harness.core.progress import Progress
 from harness.core.statistics import rate_interval
 from harness.dataset.card import CROISSANT, README, Table, croissant, path_of, readme
@@ -60,17 +59,11 @@ def publish(
             "a letter or digit first"
         )
     progress.more(sum(manifest.episodes for manifest in manifests))
-    whole = out.absolute()
-    part = whole.with_name(f".{whole.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        (part / "data").mkdir(parents=True)
+    with making(out) as part:
+        (part / "data").mkdir()
         tables = [_table(load(folder), part, ask, progress) for folder in folders]
         write_whole(part / README, readme(name, tables))
         write_whole(part / CROISSANT, croissant(name, tables))
-        part.rename(whole)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return tables
 
 

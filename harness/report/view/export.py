@@ -1,14 +1,13 @@
 """A folder of pages to publish: the list of finished runs, and the page of each. Nothing serves it."""
 
 import os
-import shutil
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
 from harness.core.errors import UserError, printable
-from harness.core.files import write_whole
+from harness.core.files import making, write_whole
 from harness.report import caveats, words
 from harness.report import suite as suites
 from harness.report.document import Section, Table, document, linked
@@ -54,36 +53,32 @@ def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[s
     if os.path.lexists(out):
         raise UserError(f"--export {printable(out)} is there already; give a new folder")
     listed = runs(folder)
-    complete = out.absolute()
-    part = complete.with_name(f".{complete.name}.{os.getpid()}.part")
     rows, warnings, left = [], [], []
     try:
-        part.mkdir(parents=True)
-        for run in listed:
-            try:
-                page, done = _page(folder, run)
-            except UserError as error:
-                left.append(f"{printable(run.name)}: {error}")
-            else:
-                at = part / run.name / PAGE
-                write_whole(at, with_way_back(page, home=quote(os.path.relpath(part / INDEX, at.parent))))
-                rows.append(_row(run, done))
-                warnings += [f"{run.name}: {text}" for text in caveats.merged(_parts(done), caveats.void)]
-            progress(1)
-        if not rows:
-            why = f" ({left[0]})" if left else ""
-            raise UserError(
-                f"{printable(folder)} has no run that can be shown{why}; make one with `harness eval`"
-            )
-        table = Table("Finished runs, the newest first", HEADS, rows, NOTE, left=True)
-        write_whole(part / INDEX, document([Section("Runs", tables=[table], warnings=warnings)]))
-        part.rename(complete)
+        with making(out) as part:
+            for run in listed:
+                try:
+                    page, done = _page(folder, run)
+                except UserError as error:
+                    left.append(f"{printable(run.name)}: {error}")
+                else:
+                    at = part / run.name / PAGE
+                    home = quote(os.path.relpath(part / INDEX, at.parent))
+                    write_whole(at, with_way_back(page, home=home))
+                    rows.append(_row(run, done))
+                    warnings += [f"{run.name}: {text}" for text in caveats.merged(_parts(done), caveats.void)]
+                progress(1)
+            if not rows:
+                why = f" ({left[0]})" if left else ""
+                raise UserError(
+                    f"{printable(folder)} has no run that can be shown{why}; make one with `harness eval`"
+                )
+            table = Table("Finished runs, the newest first", HEADS, rows, NOTE, left=True)
+            write_whole(part / INDEX, document([Section("Runs", tables=[table], warnings=warnings)]))
     except OSError as error:
         raise UserError(
             f"--export {printable(out)} cannot be written ({error.strerror}); give another folder"
         ) from None
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return left
 
 
