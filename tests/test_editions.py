@@ -480,6 +480,12 @@ def test_a_board_does_not_take_the_place_of_a_file_that_it_ranks(project: Harnes
     assert made.read_bytes() == before
 
 
+def test_a_board_for_a_folder_is_refused_before_a_file_is_read(project: Harness) -> None:
+    code, out, err = project("benchmark", "board", "missing.zip", "--out", "editions")
+    assert (code, out) == (2, "")
+    assert err == "harness: --out editions is a folder; name a file in it\n"
+
+
 def test_a_check_that_is_interrupted_promises_no_folder(project: Harness, made: Path, tmp_path: Path) -> None:
     """A run says which folder keeps what is done; that of a check is deleted."""
 

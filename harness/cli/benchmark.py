@@ -206,6 +206,8 @@ def board(
 
     if realpath(out) in map(realpath, files):
         raise UserError(f"--out {printable(out)} is one of the files to rank; name another file")
+    if out.is_dir():
+        raise UserError(f"--out {printable(out)} is a folder; name a file in it")
     here, entries, left_out = Here(), list["Rescored"](), list[str]()
     with ExitStack() as stack:
         for file in dict.fromkeys(files):
