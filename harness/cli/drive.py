@@ -38,7 +38,7 @@ def command(
     settings: Settings,
     env: options.Env = None,
     env_config: options.EnvConfig = None,
-    agents: options.Agents = "",
+    agents: options.Agents = None,
     workers: options.ModelWorkers = "2",
     out: Path | None = typer.Option(
         None, help="Folder to write the run to. Default: reports/<model>-<prompt>-drive."
@@ -71,7 +71,7 @@ def command(
             raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
         settings = changed(settings, {"condition": ()})
     name = options.scenario_name(world.scenario if world.scenario or env else DEFAULT, env, env_config)
-    name = deciding(name, agents) if agents else name
+    name = name if agents is None else deciding(name, agents)
     who, part = options.workers_of(workers), options.shard_of(shard)
     if part and (out is None or save_video or tracker):
         raise UserError(

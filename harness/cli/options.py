@@ -80,7 +80,7 @@ RunsDataset = Annotated[
 Dataset = Annotated[str, Option(help="Name of a shipped dataset, or a dataset's folder.")]
 Seeds = Annotated[str, Option(help=HELP["seeds"])]
 Agents = Annotated[
-    str,
+    str | None,
     Option(
         help="Who decides: ego, all, or the share of the others that do, as 0.5. Default: ego.",
         rich_help_panel=stated.EPISODES,

@@ -56,7 +56,7 @@ def drive(
     name: options.Scenario,
     episodes: int = typer.Option(500, help="Number of episodes; every driver drives each."),
     seed: options.FirstSeed = 0,
-    agents: options.Agents = "",
+    agents: options.Agents = None,
     workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
@@ -67,7 +67,7 @@ def drive(
     """
     from harness.cli.drive import deciding
 
-    name = deciding(name, agents) if agents else name
+    name = name if agents is None else deciding(name, agents)
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     from harness.world import policies, scenarios
     from harness.world import reference as live

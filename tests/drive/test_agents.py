@@ -327,7 +327,7 @@ def test_what_has_one_ego_says_so_of_a_scenario_of_several(tmp_path: Path) -> No
         Roads(scenario, (100,))
 
 
-@pytest.mark.parametrize("agents", ["1e-9", "2", "nan", "-1", "half"])
+@pytest.mark.parametrize("agents", ["1e-9", "2", "nan", "-1", "half", ""])
 def test_a_share_that_is_none_is_said_with_how_to_write_one(
     harness: Callable[..., tuple[int, str, str]], agents: str
 ) -> None:
