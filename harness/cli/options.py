@@ -191,6 +191,7 @@ def takes(
         def typed(file: Path | None = None, **values: Any) -> Any:
             given = {name: values.pop(name) for name in names}
             given = {name: value for name, value in given.items() if value is not None}
+            given |= {name: ",".join(given[name]) for name in listed & given.keys()}
             if "scenario" in given:
                 typed_scenario(given["scenario"])
             if file:
@@ -203,6 +204,7 @@ def takes(
             if each.name not in without
         ]
         names = [each.name for each in settings]
+        listed = {each.name for each in stated.options(world) if each.listed}
         file = inspect.Parameter(
             "file",
             inspect.Parameter.KEYWORD_ONLY,
@@ -237,7 +239,7 @@ def _parameter(option: stated.Option) -> inspect.Parameter:
             help=option.help + usual,
             rich_help_panel=option.panel or None,
         ),
-        annotation=option.kind | None,
+        annotation=(list[str] if option.listed else option.kind) | None,
     )
 
 

@@ -23,9 +23,12 @@ CONDITIONS, EPISODES, ANSWERS = "Conditions", "Episodes", "How models answer"
 HELPERS, ENGINE, LATENCY, OUTPUT = "Helpers", "Engines and servers", "Latency", "Output"
 
 
-def option(text: str, panel: str = "", only: str = "") -> Meta:
-    """Describe a setting: its help, its panel (by default the first), the world that alone has it."""
-    return Meta(extra={"help": text, "panel": panel, "only": only})
+def option(text: str, panel: str = "", only: str = "", listed: bool = False) -> Meta:
+    """Describe a setting: its help, its panel (by default the first), the world that alone has it.
+
+    One that is `listed` is a text of several names with commas, and may be typed once for each.
+    """
+    return Meta(extra={"help": text, "panel": panel, "only": only, "listed": listed})
 
 
 class HelperSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -34,9 +37,10 @@ class HelperSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     model: Annotated[
         str | None,
         option(
-            "Model of the helpers. Several, such as a,b,c, are assigned to the helpers in turn. "
+            "Model of the helpers. Several, such as a,b,c, are assigned to the helpers in turn. Repeatable. "
             "Default: the ego's model.",
             HELPERS,
+            listed=True,
         ),
     ] = None
     prompt: Annotated[
@@ -327,6 +331,7 @@ class Option(NamedTuple):
     default: Any
     help: str
     panel: str
+    listed: bool  # whether it may be typed several times, which are joined by commas
 
     @property
     def flag(self) -> str:
@@ -369,7 +374,10 @@ def _options(
         if meta.extra["only"] in ("", only):
             name = f"helper_{field.name}" if table == "helpers" else field.name
             path = (table, field.name) if table else (field.name,)
-            yield Option(path, name, _kind(plain), field.default, meta.extra["help"], meta.extra["panel"])
+            extra = meta.extra
+            yield Option(
+                path, name, _kind(plain), field.default, extra["help"], extra["panel"], extra["listed"]
+            )
 
 
 def _kind(plain: Any) -> Any:
