@@ -144,13 +144,28 @@ def test_an_unknown_tracker_and_repeats_are_refused_before_anything(two_path: Pa
     assert not Path("run").exists()
 
 
+def test_an_unknown_tracker_of_the_environment_is_said_to_stand_there(
+    two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SWARMDRIVE_TRACKERS", "mlfow")
+    code, _, said = harness(*typed_eval(two_path))
+    assert (code, said.count("\n")) == (2, 1)
+    assert said.endswith("known: mlflow, trackio, wandb; it stands in SWARMDRIVE_TRACKERS\n")
+    assert "--tracker" not in said
+
+
 @pytest.mark.skipif(find_spec("mlflow") is not None, reason="needs an environment without MLflow")
-def test_a_tracker_without_its_package_says_what_to_install(two_path: Path, harness: Typed) -> None:
+def test_a_tracker_without_its_package_says_what_to_install(
+    two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
     code, _, said = harness(*typed_eval(two_path, "--tracker", "mlflow"))
     assert code == 2
     assert (
         "--tracker mlflow needs mlflow-skinny, which is not installed; run `pip install 'swarmdrive" in said
     )
+    monkeypatch.setenv("SWARMDRIVE_TRACKERS", "mlflow")
+    code, _, said = harness(*typed_eval(two_path))
+    assert (code, "harness: SWARMDRIVE_TRACKERS=mlflow needs mlflow-skinny" in said) == (2, True)
 
 
 def success(run: str) -> float:

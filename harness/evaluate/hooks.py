@@ -53,12 +53,15 @@ def chosen(names: Iterable[str]) -> dict[str, Hook]:
 
     Raises UserError if there is no such hook, or its package is not installed.
     """
-    typed = tuple(names) or tuple(filter(None, map(str.strip, os.environ.get(CHOSEN, "").split(","))))
+    typed, where, hint = tuple(names), "--tracker ", ""
+    if not typed:
+        typed = tuple(filter(None, map(str.strip, os.environ.get(CHOSEN, "").split(","))))
+        where, hint = f"{CHOSEN}=", f"; it stands in {CHOSEN}"
     for name in typed:
         if name not in HOOKS:
-            raise unknown("tracker", name, HOOKS)
+            raise unknown("tracker", name, HOOKS, hint)
         if name in BUILT_IN:
-            extras.need(f"--tracker {name}", name)
+            extras.need(f"{where}{name}", name)
     return {name: HOOKS[name] for name in typed}
 
 
