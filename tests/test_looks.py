@@ -131,6 +131,11 @@ def test_a_run_that_is_never_sure_takes_all_layouts(small: Dataset, tmp_path: Pa
     assert world.looks is not None
     assert (world.episodes, world.looks.at, world.looks.enough) == (4, (2, 3, 4), False)
     assert "took all 4 layouts" in " ".join(caveats(done.manifest, done.scores))
+    one = small.of_episodes(frozenset(small.episodes[:1]))
+    done = run(until(spec_of(one, "constant", **ALONE), Until(width=0.1)), tmp_path / "one")
+    [said] = (s for s in caveats(done.manifest, done.scores) if "looked at" in s)
+    assert said.startswith("It took the only layout, and still")
+    assert "It was looked at 1 time: " in said
 
 
 def test_a_run_stopped_by_force_goes_on_and_is_the_same(small: Dataset, tmp_path: Path) -> None:
@@ -188,7 +193,7 @@ def test_a_run_stops_when_it_differs_from_another(small: Dataset, tmp_path: Path
 @pytest.mark.parametrize(
     ("base", "spec", "says"),
     [
-        ({"limit": 2}, {}, "lacks 2 of the 4 layouts"),
+        ({"limit": 2}, {}, "lacks 2 of the 4 layouts;"),
         ({}, {"seeds": (0, 1)}, r"has the seeds \[0\]"),
         ({}, {"points": (POINTS["6g"],)}, "has no condition 6g"),
     ],

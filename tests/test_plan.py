@@ -142,7 +142,7 @@ def test_a_stated_rate_plans_without_a_run(harness: Harness) -> None:
         (("RUN", "--power", "100"), "--power 100 is out of range; give 50 to 99"),
         (("RUN", "--layouts", "1"), "--layouts 1 is out of range"),
         (("nowhere",), "nowhere"),
-        (("ONE",), "1 layouts do not show how far layouts differ"),
+        (("ONE",), "1 layout cannot show how far layouts differ"),
         (("ALONE",), "has not both single-local and another condition"),
     ],
 )

@@ -70,6 +70,11 @@ def shown(bounded: Bounded, unit: Unit = PERCENT, sign: str = "") -> str:
     return unit.interval(bounded.value, bounded.low, bounded.high, sign)
 
 
+def amount(n: int, noun: str) -> str:
+    """Write how many there are: `1 layout`, `2 layouts`."""
+    return f"{n} {noun}{'s' * (n != 1)}"
+
+
 def known(value: float | None) -> float | None:
     """Return the number; None if it is NaN."""
     return None if value is None or math.isnan(value) else value

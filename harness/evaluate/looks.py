@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.core.errors import UserError, printable
+from harness.core.figures import amount
 from harness.core.files import sha256_file
 from harness.core.statistics import Estimate
 from harness.runs.folder import Run, read
@@ -67,7 +68,7 @@ class Until:
             )
         if lacking := sum(number not in run.grid.episodes for number in numbers):
             raise UserError(
-                f"{where} lacks {lacking} of the {len(numbers)} layouts; use fewer, or a longer run"
+                f"{where} lacks {lacking} of the {amount(len(numbers), 'layout')}; use fewer, or a longer run"
             )
 
     def enough(self, grid: Grid, episodes: Sequence[Episode]) -> bool:

@@ -8,6 +8,7 @@ from harness.backends.base import BARE
 from harness.backends.registry import reads_prompts
 from harness.core.config import pairs
 from harness.core.errors import printable
+from harness.core.figures import amount
 from harness.evaluate.examine import MOST_SHARE, recall_findings
 from harness.parsing.status import Status
 from harness.radio.profiles import outside
@@ -50,14 +51,16 @@ def looked_at(manifest: Manifest) -> Iterator[str]:
         if looks.width is not None
         else f"success differs from that of {printable(looks.against, 40)}"
     )
+    every = f"all {looks.layouts} layouts" if looks.layouts > 1 else "the only layout"
     how = (
-        f"It stopped after {looks.at[-1]} of {looks.layouts} layouts, when"
+        f"It stopped after {looks.at[-1]} of {amount(looks.layouts, 'layout')}, when"
         if looks.enough
-        else f"It took all {looks.layouts} layouts, and still it is not so that"
+        else f"It took {every}, and still it is not so that"
     )
     yield (
-        f"{how} {what} in every condition. It was looked at {len(looks.at)} times: intervals of success and "
-        "of its gain hold at every look; all others are for a number of layouts fixed before, and too narrow."
+        f"{how} {what} in every condition. It was looked at {amount(len(looks.at), 'time')}: intervals of "
+        "success and of its gain hold at every look; all others are for a number of layouts fixed before, "
+        "and too narrow."
     )
 
 

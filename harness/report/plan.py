@@ -9,7 +9,7 @@ import numpy as np
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
-from harness.core.figures import known
+from harness.core.figures import amount, known
 from harness.core.power import Spread
 from harness.core.statistics import Estimate, resampled_estimate
 from harness.report.compare.pair import pair
@@ -83,14 +83,14 @@ def from_pilots(pilots: Sequence[Path], detect: float, power: float, layouts: in
         if np.isinf(needed[0]):
             kinds = " with a danger, and without" * (success.metric != SUCCESS)
             raise UserError(
-                f"{sides.names}: {n} layouts do not show how far layouts differ; give pilots of two or more"
-                f"{kinds}"
+                f"{sides.names}: {amount(n, 'layout')} cannot show how far layouts differ; give pilots of "
+                f"two or more{kinds}"
             )
         finds = float(spread.difference(layouts or n, power)[0])
         cost = sides.cost.times(needed[0])
         rows.append(Planned(condition, resampled_estimate(needed, n), finds, cost))
     seeds = len(next(iter(sides.values.values()))[0])
-    basis = f"layouts differ as in the pilots, {n} layouts × {seeds} seeds"
+    basis = f"layouts differ as in the pilots, {amount(n, 'layout')} × {amount(seeds, 'seed')}"
     return Plan(f"{success.words}, {sides.whose}", basis, tuple(rows), layouts or n)
 
 
