@@ -137,6 +137,17 @@ def test_a_dry_run_says_what_it_would_cost(there: Server, two_path: Path, harnes
     assert there.asked == []
 
 
+def test_a_limit_says_whose_answers_it_does_not_count(
+    there: Server, tmp_path: Path, two_path: Path, harness: Typed
+) -> None:
+    priced = (tmp_path / "models" / "mine.toml").read_text()
+    (tmp_path / "models" / "other.toml").write_text(re.sub(r"\[price\]\n(.+\n)+", "", priced))
+    typed = typed_eval(two_path, "--limit", "1", "--max-cost", "99", "--no-cache", "--quiet")
+    says = "harness: --max-cost 99: other has no price and is not counted\n"
+    assert harness(*typed, "--helper-model", "other") == (0, "", says)
+    assert harness(*typed, "--helper-model", "proxy", "--out", "rule") == (0, "", ""), "a rule costs nothing"
+
+
 @pytest.mark.parametrize(
     ("model", "amount", "words"),
     [

@@ -6,6 +6,7 @@ counting.
 """
 
 import math
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -65,7 +66,8 @@ class Budget:
 def budget(most: float | None, specs: "Sequence[Spec]") -> Iterator[Budget | None]:
     """Give the evaluations of a command what they may spend together; None for as much as they like.
 
-    Raises UserError if it is not above 0, or the models' cards state no price, or several currencies.
+    Says on stderr which servers' models it does not count, since their cards state no price. Raises UserError
+    if it is not above 0, or no card states a price, or several currencies.
     """
     if most is None:
         yield None
@@ -78,6 +80,9 @@ def budget(most: float | None, specs: "Sequence[Spec]") -> Iterator[Budget | Non
         names = ", ".join(sorted({printable(card.name) for spec in specs for card in spec.cards}))
         reason = f"has prices in {' and '.join(sorted(currencies))}" if prices else "has no price"
         raise UserError(f"{shown}: {names} {reason}; give its card a [price] with input, output and currency")
+    cards = {card.name: card for spec in specs for card in spec.cards}
+    if free := sorted(printable(name) for name, card in cards.items() if card.server and not card.price):
+        print(f"harness: {shown}: {', '.join(free)} has no price and is not counted", file=sys.stderr)
     with tempfile.TemporaryDirectory(prefix="swarmdrive-") as folder:
         file = Path(folder) / "spent"
         file.touch()
