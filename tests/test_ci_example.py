@@ -1,11 +1,13 @@
 """The workflow of `examples/ci.yml`: its steps in a repository with a pull request, GitHub's part played."""
 
+import json
 import os
 import re
 import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from shutil import which
 from typing import Any
 from xml.etree import ElementTree
 
@@ -15,14 +17,36 @@ import yaml
 ROOT = Path(__file__).parents[1]
 WORKFLOW = yaml.safe_load((ROOT / "examples/ci.yml").read_text())
 STEPS = {step["name"]: step for step in WORKFLOW["jobs"]["prompt"]["steps"] if "run" in step}
-GH = """#!/bin/sh
-echo "$@" >> "$TOLD/gh.txt"
-cp "$5" "$TOLD/comment.md"
+# A pull request's comments, as GitHub's API lists them: of others, and of a stranger who typed the mark.
+COMMENTS: list[dict[str, Any]] = [
+    {"id": 1, "user": {"login": "github-actions[bot]"}, "body": "of another workflow"},
+    {"id": 2, "user": {"login": "stranger"}, "body": "<!-- swarmdrive mine -->"},
+    {"id": 3, "user": {"login": "github-actions[bot]"}, "body": "<!-- swarmdrive another -->"},
+]
+GH = """
+import json, os, subprocess, sys
+from pathlib import Path
+
+file = Path(os.environ["COMMENTS"])
+comments = json.loads(file.read_text())
+match sys.argv[1:]:
+    case ["api", "--paginate", "repos/me/it/issues/7/comments", "--jq", query]:
+        subprocess.run(["jq", "--raw-output", query], input=json.dumps(comments), text=True, check=True)
+    case ["api", "--method", "PATCH", path, "--field", field, "--silent"]:
+        [comment] = [each for each in comments if path == f"repos/me/it/issues/comments/{each['id']}"]
+        comment["body"] = Path(field.removeprefix("body=@")).read_text()
+    case ["pr", "comment", "7", "--body-file", body]:
+        new = {"user": {"login": "github-actions[bot]"}, "body": Path(body).read_text()}
+        comments.append({"id": 1 + len(comments), **new})
+    case typed:
+        sys.exit(f"gh {typed}")
+file.write_text(json.dumps(comments))
 """
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(find_spec("llama_cpp") is None, reason="needs the extra llama-cpp"),
+    pytest.mark.skipif(which("jq") is None, reason="needs jq, which stands in for the one in gh"),
 ]
 
 
@@ -37,7 +61,8 @@ def repo(tmp_path: Path) -> Path:
     """A project in a repository, and beside it the programs that a runner has."""
     folder, programs = tmp_path / "repo", tmp_path / "programs"
     programs.mkdir()
-    (programs / "gh").write_text(GH)
+    (programs / "gh").write_text(f"#!{sys.executable}\n{GH}")
+    (tmp_path / "comments.json").write_text(json.dumps(COMMENTS))
     (programs / "harness").write_text(f'#!/bin/sh\nexec "{sys.executable}" -m harness "$@"\n')
     for program in programs.iterdir():
         program.chmod(0o755)
@@ -50,7 +75,8 @@ def repo(tmp_path: Path) -> Path:
 
 def environment(place: Path) -> dict[str, str]:
     return os.environ | {
-        "PATH": f"{place / 'programs'}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT), "TOLD": str(place),
+        "PATH": f"{place / 'programs'}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT),
+        "COMMENTS": str(place / "comments.json"), "GITHUB_REPOSITORY": "me/it",
         "RUNNER_TEMP": str(place / "temp"), "GITHUB_STEP_SUMMARY": str(place / "summary.md"),
     }  # fmt: skip
 
@@ -67,6 +93,11 @@ def played(step: str, repo: Path, github: dict[str, str]) -> int:
     return subprocess.run(command, cwd=repo, env=environment(repo.parent) | more, check=False).returncode
 
 
+def github_of(base: str) -> dict[str, str]:
+    pull = "github.event.pull_request"
+    return {f"{pull}.base.sha": base, f"{pull}.number": "7", "github.token": "none"}
+
+
 @pytest.mark.parametrize("breaks", [False, True])
 def test_the_workflow_guards_a_prompt(breaks: bool, repo: Path, tmp_path: Path) -> None:
     base = git(repo, "rev-parse", "HEAD")
@@ -74,8 +105,7 @@ def test_the_workflow_guards_a_prompt(breaks: bool, repo: Path, tmp_path: Path) 
     asks_nothing = "{% block system %}Say hello.{% endblock %}{% block user %}Hello?{% endblock %}"
     prompt.write_text(asks_nothing if breaks else prompt.read_text() + "\n")
     git(repo, "commit", "--quiet", "--all", "--message", "as a pull request has it")
-    pull = "github.event.pull_request"
-    github = {f"{pull}.base.sha": base, f"{pull}.number": "7", "github.token": "none"}
+    github = github_of(base)
     install, evaluate, compare, *says = STEPS
     assert STEPS[install]["run"].startswith("pip install 'swarmdrive-harness[")
     assert played(evaluate, repo, github) == 0
@@ -85,9 +115,26 @@ def test_the_workflow_guards_a_prompt(breaks: bool, repo: Path, tmp_path: Path) 
     comparison = (repo / "comparison.md").read_text()
     assert "fallback" in comparison if breaks else comparison
     assert (tmp_path / "summary.md").read_text() == comparison
-    assert (tmp_path / "comment.md").read_text() == comparison
-    told = (tmp_path / "gh.txt").read_text()
-    assert told == "pr comment 7 --body-file comment.md --edit-last --create-if-none\n"
+    *others, mine = json.loads((tmp_path / "comments.json").read_text())
+    assert (others, mine["body"]) == (COMMENTS, f"<!-- swarmdrive mine -->\n{comparison}")
+    (repo / "comparison.md").write_text("of a second push")
+    assert played(says[-1], repo, github) == 0
+    *others, mine = json.loads((tmp_path / "comments.json").read_text())
+    assert (others, mine["body"]) == (COMMENTS, "<!-- swarmdrive mine -->\nof a second push")
     failures = ElementTree.parse(repo / "gates.xml").findall(".//failure")
     assert bool(failures) == breaks
     assert (repo / "comparison.html").is_file()
+
+
+def test_a_prompt_that_is_new_is_compared_with_nothing_and_that_is_said(repo: Path, tmp_path: Path) -> None:
+    git(repo, "rm", "-r", "--quiet", "prompts/mine")
+    git(repo, "commit", "--quiet", "--message", "before it was there")
+    base = git(repo, "rev-parse", "HEAD")
+    git(repo, "revert", "--no-edit", base)
+    _, *steps = STEPS
+    assert [played(step, repo, github_of(base)) for step in steps] == [0] * len(steps)
+    assert (repo / "reports/guarded/run.json").is_file()
+    said = "`mine` is new here: there is nothing to compare it with, and no gate was checked.\n"
+    assert (tmp_path / "summary.md").read_text() == said
+    assert json.loads((tmp_path / "comments.json").read_text())[-1]["body"].endswith(f"-->\n{said}")
+    assert not (repo / "gates.xml").exists()
