@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from harness.coordination.operating_point import POINTS, named_point
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import Evaluated
-from harness.report.caveats import caveats, no_prompt, of_run
+from harness.report.caveats import caveats, no_prompt, of_run, unheard
 from harness.runs import folder
 from harness.runs.records import Manifest, Score
 
@@ -158,3 +158,18 @@ def test_a_page_says_what_else_bounds_its_numbers(small: Dataset, tmp_path: Path
         "Under v2x, most decisions take longer than these frozen scenes assume: closed-loop success may "
         "differ. harness study fidelity compares the two.",
     ]
+
+
+def test_a_window_that_no_reply_keeps_is_said(small: Dataset, tmp_path: Path) -> None:
+    """A lost reply is no late one, and one that is heard is enough."""
+    points = [named_point(name) for name in ("6g", "6g:loss=1", "6g:window_s=0.01,loss=0")]
+    run = folder.read(evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path / "run").out)
+    scheduled = run.score(points[-1].name, "message_count")
+    assert scheduled
+    assert scheduled.value
+    [said] = unheard(run)
+    assert said == (
+        f"Under {points[-1].name}, nobody is heard: of {scheduled.value:.0f} messages that arrived, none "
+        "came within the decision window, so that the ego decided alone."
+    )
+    assert said in list(of_run(run))

@@ -141,6 +141,7 @@ def of_run(run: Run) -> Iterator[str]:
     for control, heard in _CONTROLS.items():
         if names := _controls(run.manifest, control):
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
+    yield from unheard(run)
     yield from lost_at_once(run)
     yield from findings_of(run.manifest)
     yield from by_letter(run.scores)
@@ -208,6 +209,20 @@ def by_letter(scores: Sequence[Score]) -> Iterator[str]:
                 f"{100 * (share.value or 0.0):.0f} % of what {whose} read-outs say follows the letter and "
                 f"not the action: one letter is the likeliest in every order in {hits} of {follows.n}. The "
                 "average over the orders cancels that, and adds no judgement."
+            )
+
+
+def unheard(run: Run) -> Iterator[str]:
+    """Yield the conditions under which replies arrive, and every one of them too late to be heard."""
+    d = run.decisions
+    delivered, on_time = (d.of_messages(name) == 1.0 for name in ("delivered", "on_time"))
+    conditions = d.codes("condition", run.conditions)
+    for place, name in enumerate(run.conditions):
+        arrived = int(delivered[conditions == place].sum())
+        if arrived and not on_time[conditions == place].any():
+            yield (
+                f"Under {printable(name)}, nobody is heard: of {arrived} messages that arrived, none came "
+                "within the decision window, so that the ego decided alone."
             )
 
 
