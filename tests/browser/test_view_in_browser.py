@@ -1,8 +1,10 @@
 """`harness view` in a real browser: what is picked is compared, and a run's page works in its sandbox."""
 
 import re
+import shutil
 import subprocess
 import sys
+from threading import Event, Thread
 
 import pytest
 
@@ -16,6 +18,8 @@ from opening import NARROW, WIDE, picture, wait
 from playwright.sync_api import expect
 
 from harness.coordination.operating_point import POINTS
+from harness.core.work import tidy
+from harness.evaluate.run import evaluate as evaluation
 from harness.report.page import write_report
 from harness.report.runs import gather
 
@@ -27,13 +31,19 @@ fetch("/").then(() => { document.title = "read" }, () => { document.title = "ref
 
 
 @pytest.fixture(scope="module")
-def address(small, tmp_path_factory):
-    """Where the real command serves two runs and a page that spies."""
+def folder(small, tmp_path_factory):
+    """Two runs and a page that spies."""
     folder = tmp_path_factory.mktemp("viewed") / "reports"
     for name, model in (("first", "proxy"), ("second", "cruise"), ("spy", "brake")):
         evaluate(spec_of(small, model, points=(POINTS["6g"],), tags=(name,)), folder / name)
     write_report(gather([folder / "first"]), folder / "first/report.html")
     (folder / "spy/report.html").write_text(SPY)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(folder):
+    """Where the real command serves them."""
     command = [sys.executable, "-m", "harness", "view", str(folder), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -160,3 +170,50 @@ def test_a_page_that_spies_reads_nothing_else(browser, address):
     page.wait_for_function("document.title != 'not told'")
     assert page.title() == "refused at null"
     page.close()
+
+
+def test_the_list_follows_a_run_to_its_end_without_a_new_page(page, address, folder, small):
+    """A real run that waits in the middle, in the folder that the real command serves."""
+    seen, go_on = Event(), Event()
+
+    def wait_for_the_page(done):
+        seen.set()
+        assert go_on.wait(60)
+
+    def go():
+        spec = spec_of(small, points=(POINTS["6g"],), tags=("goes on",), batch_size=1)
+        evaluation(spec, folder / "third", wait_for_the_page)
+        tidy(folder / "third")
+
+    going = Thread(target=go, daemon=True)
+    going.start()
+    try:
+        assert seen.wait(60)
+        page.goto(address)
+        row = page.locator("tr", has_text="third")
+        expect(row).to_contain_text(
+            re.compile(r"unfinished going on now: 0 of 4 episodes, \d+ answers for the")
+        )
+        assert Axe().run(page).response["violations"] == []
+        for size, name in ((WIDE, "view-going"), (NARROW, "view-going-narrow")):
+            page.set_viewport_size(size)
+            assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+            picture(page, name)
+        page.get_by_label("Pick second").check()
+        page.get_by_label("Pick first").focus()
+        page.evaluate("self.kept = true")
+        go_on.set()
+        expect(row.get_by_role("link", name="third")).to_be_visible(timeout=60_000)
+        expect(row).to_contain_text(" %")
+        expect(page.get_by_role("status")).to_have_text(re.compile("^No run is going on"))
+        assert page.evaluate("self.kept"), "the page is the same"
+        assert page.get_by_label("Pick second").is_checked()
+        expect(page.get_by_label("Pick first")).to_be_focused()
+        requests = []
+        page.on("request", lambda request: requests.append(request.url))
+        page.wait_for_timeout(2500)
+        assert requests == [], "nothing is asked once no run goes on"
+    finally:
+        go_on.set()
+        going.join(60)
+        shutil.rmtree(folder / "third")

@@ -10,7 +10,7 @@ from viewing import TOKEN, said
 from harness.report.view.access import cookie
 from harness.report.view.app import app
 
-PAGES = ["/", "/style.css", "/run?path=first", "/picture?path=first/sweep-tau&name=sweep.svg",
+PAGES = ["/", "/progress", "/style.css", "/run?path=first", "/picture?path=first/sweep-tau&name=sweep.svg",
          "/compare?path=first&path=second", "/report?path=first", "/nowhere"]  # fmt: skip
 
 

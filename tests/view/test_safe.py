@@ -163,7 +163,7 @@ def test_both_names_of_this_machine_are_answered(host: str, browser: TestClient)
     assert browser.get("/", headers={"host": host}).status_code == 200
 
 
-@pytest.mark.parametrize("page", ["/", "/run?path=first", "/picture", "/compare", "/report", "/style.css"])
+@pytest.mark.parametrize("page", ["/", "/run?path=first", "/picture", "/compare", "/report", "/progress"])
 def test_nothing_can_be_sent_to_it(page: str, browser: TestClient) -> None:
     for method in ("POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE"):
         assert browser.request(method, page).status_code == 405
@@ -173,8 +173,8 @@ def test_nothing_can_be_sent_to_it(page: str, browser: TestClient) -> None:
 
 @pytest.mark.parametrize(
     ("page", "status"),
-    [("/", 200), ("/style.css", 200), ("/run?path=first/sweep-tau", 200), ("/run?path=nowhere", 404),
-     ("/nowhere", 404), ("/compare", 400)],
+    [("/", 200), ("/progress", 200), ("/style.css", 200), ("/run?path=first/sweep-tau", 200),
+     ("/run?path=nowhere", 404), ("/nowhere", 404), ("/compare", 400)],
 )  # fmt: skip
 def test_every_page_of_the_list_has_the_strict_policy(page: str, status: int, browser: TestClient) -> None:
     answers = [browser.get(page)]

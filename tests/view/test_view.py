@@ -41,7 +41,9 @@ def test_the_list_tells_finished_unfinished_and_broken_runs_apart(browser: TestC
     assert opened == {"first", "second", "first%2Fsweep-tau"}
     rows = {name: row for row in re.findall("<tr class.*?</tr>", page, re.S) for name in names(row)}
     assert all(word in rows["first"] for word in ("tag of first", "proxy", "v2", "json", "2026-01-01", " %"))
-    assert "unfinished</strong> <small>the same command continues it" in rows["killed"]
+    shown = 'unfinished</strong> <small data-run="killed">stopped: 0 of '
+    assert shown in rows["killed"]
+    assert "the same command continues it" in rows["killed"]
     assert "half" in rows["killed"]
     assert 'class="bad">broken</strong> <small>summary.csv' in rows["spoilt"]
 

@@ -7,11 +7,11 @@ prompt and its dataset, is read as by `harness report`: shown only if it has the
 
 Nobody without the token gets anything (`access.py`), and other sites get nothing: names other than this
 machine's are refused, which ends DNS rebinding, and no page may be framed, embedded or posted to. The list
-runs no script. A run's page is as untrusted as the run's author, so pages are kept apart from the list and
-from each other: `sandbox` gives them an origin of their own, from which they can read nothing here, and they
-may load nothing. Their inline scripts may run as far as their own policy lets them, and save files if they
-are clicked. Browsers show no page that is both in a sandbox and `same-origin` with its opener, so these are
-not.
+runs no script but, while a run goes on, one of its own that asks how far that is. A run's page is as
+untrusted as the run's author, so pages are kept apart from the list and from each other: `sandbox` gives them
+an origin of their own, from which they can read nothing here, and they may load nothing. Their inline scripts
+may run as far as their own policy lets them, and save files if they are clicked. Browsers show no page that
+is both in a sandbox and `same-origin` with its opener, so these are not.
 """
 
 import asyncio
@@ -29,11 +29,12 @@ from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from harness.core.errors import UserError, printable
+from harness.report.library import digest
 from harness.report.view import pages
 from harness.report.view.access import Access
 from harness.report.view.folder import PICTURES, own_file, pictures, whole
@@ -49,6 +50,11 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+# Of the list while a run goes on: it may run the one script that asks here how far that is.
+OF_LIST = {
+    "Content-Security-Policy": f"{HEADERS['Content-Security-Policy']}; "
+    f"script-src 'sha256-{digest(pages.script())}'; connect-src 'self'",
+}
 OF_RUNS = {  # in the place of those above, for what a run's folder holds
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:; font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; "
@@ -61,8 +67,8 @@ def app(folder: Path, token: str) -> ASGIApp:
     """Return the application for one folder of runs, for who has the token."""
     view = View(folder)
     routes = {
-        "/": view.index, "/style.css": view.style, "/run": view.run, "/picture": view.picture,
-        "/compare": view.compare, "/report": view.report,
+        "/": view.index, "/progress": view.progress, "/style.css": view.style, "/run": view.run,
+        "/picture": view.picture, "/compare": view.compare, "/report": view.report,
     }  # fmt: skip
     return _Guarded(
         Starlette(
@@ -102,7 +108,13 @@ class View:
 
     def index(self, request: Request) -> Response:
         query = request.query_params
-        return HTMLResponse(pages.listed(self.folder, query.get("q", ""), query.get("sort", "")))
+        page = pages.listed(self.folder, query.get("q", ""), query.get("sort", ""))
+        return HTMLResponse(page, headers=OF_LIST if "<script>" in page else None)
+
+    def progress(self, request: Request) -> Response:
+        """Return what changes in the list while runs go."""
+        every = runs(self.folder)
+        return JSONResponse(pages.now(every, pages.extents(self.folder, every)))
 
     def style(self, request: Request) -> Response:
         return Response(pages.style(), media_type="text/css")

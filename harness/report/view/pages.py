@@ -1,6 +1,7 @@
 """The pages as text. A run's text is hostile: the report's templates escape it all."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -9,18 +10,19 @@ from urllib.parse import urlencode
 
 from markupsafe import Markup
 
-from harness.core.files import bytes_of, text_of
+from harness.core.files import bytes_of, sha256_bytes, text_of
 from harness.report import suite as suites
 from harness.report.compare import page as comparison
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
 from harness.report.page import render, with_decision
 from harness.report.runs import gather
-from harness.report.templating import environment
+from harness.report.templating import environment, visible
 from harness.report.view.folder import whole
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD, Listed, runs
 from harness.runs.suite import SuiteRun, contents_of, read
+from harness.runs.unfinished import Extent, extent
 
 RUNS = ("eval", "drive")
 TEMPLATES = Path(__file__).parent / "templates"
@@ -84,18 +86,55 @@ def _place(folder: Path, run: Run) -> str:
 
 
 def listed(folder: Path, words: str, order: str) -> str:
-    """The runs that have all of these words somewhere, sorted by a column; `-` before it turns it around."""
+    """The runs that have all of these words somewhere, sorted by a column; `-` before it turns it around.
+
+    While one of them is going, the page runs `script`, and is allowed it by the digest of that alone.
+    """
     every = runs(folder)
+    how_far = extents(folder, every)
     order = order if order.removeprefix("-") in COLUMNS else NEWEST
     shown = sort([run for run in every if _has(run, words)], order)
     links = {
         column: urlencode({"sort": _next(column, order), **({"q": words} if words else {})})
         for column in COLUMNS
     }
+    going = any(run.name in how_far and how_far[run.name].going for run in shown)
     return _page(
         "list.html.j2", folder=str(folder), every=len(every), runs=shown, words=words, order=order,
-        links=links, kinds=RUNS, unread=UNREAD,
+        links=links, kinds=RUNS, unread=UNREAD, now=now(every, how_far),
+        going=going, script=Markup(script()),
     )  # fmt: skip
+
+
+def extents(folder: Path, every: Sequence[Listed]) -> dict[str, Extent]:
+    """Return how far the unfinished ones of these runs are, by name."""
+    return {run.name: extent(folder / run.name) for run in every if run.state == "unfinished"}
+
+
+def now(every: Sequence[Listed], how_far: Mapping[str, Extent]) -> dict[str, Any]:
+    """Return what changes in the list while runs go on.
+
+    Returns:
+        `listed`, another text once a run begins or ends, `going`, whether one goes on, and `unfinished`, by
+        the name that the list shows how far each is.
+    """
+    states = json.dumps([(run.name, run.state) for run in every])
+    return {
+        "listed": sha256_bytes(states.encode()),
+        "going": any(extent.going for extent in how_far.values()),
+        "unfinished": {
+            visible(run.name): progress(run, how_far[run.name]) for run in every if run.name in how_far
+        },
+    }
+
+
+def progress(run: Listed, extent: Extent) -> str:
+    """Say how far an unfinished run is."""
+    due = "" if extent.due is None else f" of {'at most ' * extent.early}{extent.due}"
+    text = f"{extent.done}{due} episodes"
+    if extent.answers:
+        text += f", {extent.answers} answers for the next"
+    return f"going on now: {text}" if extent.going else f"stopped: {text}; {run.why}"
 
 
 def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
@@ -119,6 +158,11 @@ def wrong(reason: str) -> str:
 def style() -> str:
     """Return the report's style, and the list's own."""
     return environment().get_template("style.css").render() + text_of(TEMPLATES / "list.css")
+
+
+def script() -> str:
+    """Return the one script of the list."""
+    return text_of(TEMPLATES / "list.js")
 
 
 def _page(template: str, **values: Any) -> str:

@@ -1,0 +1,95 @@
+"""How far an unfinished run is, read from its working folder while another process may be writing there."""
+
+import csv
+import json
+import os
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from io import TextIOWrapper
+from pathlib import Path
+
+from harness.core.files import BROKEN, opened, text_of
+from harness.core.formats import CONFIG, WORK
+from harness.core.work import LOCK
+
+
+@dataclass(frozen=True)
+class Extent:
+    """What an unfinished run has done."""
+
+    going: bool  # whether a process works on it now
+    done: int  # episodes that are at their end in all conditions and seeds
+    due: int | None  # how many the run has; None for a shard, which has some of them
+    early: bool  # whether the run may stop before, once it has seen enough
+    answers: int  # answers that are kept for the episodes which are not at their end
+
+
+def extent(run: Path) -> Extent:
+    """Return how far an unfinished run is. What is broken, or a link, counts as not done.
+
+    An episode counts once its part of the run is written, which has many; so the answers for the parts that
+    are not written are counted, too.
+    """
+    work = run / WORK
+    names = sorted(os.listdir(work)) if _own(work) else []
+    parts = [name for name in names if name.startswith("episodes-")]
+    done = sum(_episodes(work / name) for name in parts if _own(work / name))
+    kept = [name for name in names if name.endswith(".jsonl") and name.startswith(("answers", "episodes-"))]
+    due, early = _due(work)
+    return Extent(_locked(work / LOCK), done, due, early, sum(_lines(work / name) for name in kept))
+
+
+def _own(folder: Path) -> bool:
+    return folder.is_dir() and not folder.is_symlink()
+
+
+def _due(work: Path) -> tuple[int | None, bool]:
+    try:
+        config = json.loads(text_of(work / CONFIG, "record"))
+        world = config["settings"]["world"]
+        return None if config.get("shard") else int(world["episodes"]), bool(world.get("looks"))
+    except (*BROKEN, AttributeError):
+        return None, False
+
+
+def _episodes(part: Path) -> int:
+    """Count the episodes of a part, which is whole and does not change."""
+    file = part / "episodes.csv"
+    try:
+        return 0 if file.is_symlink() else _numbers(file, file.stat().st_mtime_ns)
+    except (*BROKEN, csv.Error):
+        return 0
+
+
+@lru_cache(maxsize=1 << 16)
+def _numbers(file: Path, written_ns: int) -> int:
+    with opened(file, "rows") as data, TextIOWrapper(data, "utf-8-sig", newline="") as text:
+        rows = csv.reader(text)
+        at = next(rows, []).index("episode")
+        return len({row[at] for row in rows})
+
+
+def _lines(file: Path) -> int:
+    if file.is_symlink():
+        return 0
+    with suppress(OSError), opened(file, "rows") as lines:  # it may be gone by now
+        return sum(1 for line in lines if line.endswith(b"\n"))
+    return 0
+
+
+def _locked(lock: Path) -> bool:
+    """Return whether a process holds a lock; where there are no such locks (Windows), none is known to."""
+    try:
+        import fcntl
+    except ImportError:
+        return False
+    try:
+        # Shared, and on a file that is not made here: a run that begins at this moment tries again.
+        with opened(lock, "text") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
