@@ -521,6 +521,10 @@ def test_the_command_prints_writes_and_gates(
     for row in written["rows"]:
         of = [p for p in pairs if (p["twin"], p["role"]) == (row["twin"], row["role"])]
         assert row["invariance_rate"]["value"] == pytest.approx(np.mean([p["holds"] for p in of]))
+    drawn = (tmp_path / "faulty" / "twins.svg").read_text()
+    assert {f">{row[part]}<" for row in written["rows"] for part in ("twin", "role")} <= set(
+        re.findall(">[a-z-]+<", drawn)
+    )
     links = Links()
     links.feed((tmp_path / "faulty" / "index.html").read_text())
     assert links.targets

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from harness.backends.registry import open_backend
 from harness.coordination.trigger import entropy_nats
@@ -29,9 +30,11 @@ from harness.evaluate.spec import Spec
 from harness.report.caveats import caveats, merged
 from harness.report.compare.page import beside
 from harness.report.document import Table
+from harness.report.drawing.colours import conditions
 from harness.runs.folder import Run
 from harness.runs.metrics import ALL, METRICS, SUCCESS, by_episode, in_range
 from harness.runs.records import Score
+from harness.studies.figures.points import Rows, intervals
 from harness.studies.study import Study
 
 RESAMPLES = 4000
@@ -230,6 +233,7 @@ def _doubt(p: Floats) -> tuple[float, float]:
 
 MARKER, FIGURES, PAGE = "repeats.json", "repeats.csv", "index.html"
 MOST_POINTS = 12  # of those at which repeats disagree
+MOST_DRAWN = 5  # of j of pass^j and any@j, besides the last
 NATS = Unit("nats", 2)
 
 
@@ -265,8 +269,25 @@ def repeats_study(repeats: Repeats) -> Study:
         caveats=merged(
             {run.path.name: run for run in repeats.runs}, lambda run: caveats(run.manifest, run.scores)
         ),
-        more=Markup("\n").join(links),
+        more=Markup("\n").join(links), figures={"repeats": _figure(repeats)},
     )  # fmt: skip
+
+
+def _figure(repeats: Repeats) -> Figure:
+    """Draw how often decisions stay the same, and what is left of success over several repeats."""
+    most = [j for j in range(2, repeats.k + 1) if j <= MOST_DRAWN or j == repeats.k]
+    parts = {
+        "share, %": {"decisions flip": FLIPS, "same in all": STABLE, "variance between": BETWEEN},
+        "episodes, %": {f"any@{j}": f"any@{j}" for j in reversed(most)} | {"succeed": SUCCESS}
+        | {f"pass^{j}": f"pass^{j}" for j in most},
+    }  # fmt: skip
+    panels = [
+        Rows(quantity, list(rows), {
+            c: [repeats.estimate(c, metric) for metric in rows.values()] for c in repeats.conditions
+        })
+        for quantity, rows in parts.items()
+    ]  # fmt: skip
+    return intervals(panels, conditions(repeats.conditions))
 
 
 def _tables(repeats: Repeats) -> Iterator[Table]:

@@ -238,6 +238,11 @@ def test_the_folder_has_a_page_and_all_figures(small: Dataset, tmp_path: Path, w
     assert page.index("decides differently in 55.6 [") < page.index("<table")
     assert "pass^3" in page
     assert "2 × SLOWER, 2 × IDLE" in page
+    assert page.index("<img") < page.index("<table")
+    drawn = (of.path / "repeats.svg").read_text()
+    assert all(
+        f">{row}<" in drawn for row in ("decisions flip", "any@3", "succeed", "pass^2", *of.conditions)
+    )
     lines = (tmp_path / "repeats/repeats.csv").read_text().splitlines()
     assert len(lines) == 1 + len(of.scores)
     found = {listed.name: (listed.kind, listed.state) for listed in runs(tmp_path)}

@@ -1,4 +1,4 @@
-"""Points with intervals, and fronts: what one quantity costs in another."""
+"""Points with intervals, on their own or one quantity over another, and fronts: what one costs in another."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,9 +8,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from harness.core.statistics import Estimate
 from harness.report.drawing.colours import GREY, INK, MARKERS, conditions
 from harness.report.drawing.pictures import styled
-from harness.studies.figures.axes import plain
+from harness.studies.figures.axes import lettered, plain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,6 +26,51 @@ class Steps:
     y: Sequence[float]
     look: Mapping[str, Any] = field(default_factory=dict)
     name: str = ""  # beside the last place
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a panel, each with an estimate or none of every series."""
+
+    quantity: str  # along the panel, with its unit
+    names: Sequence[str]  # of the rows, from top to bottom
+    series: Mapping[str, Sequence[Estimate | None]]
+    scale: float = 100.0  # what an estimate is multiplied with: 100 for percent
+
+
+@styled
+def intervals(panels: Sequence[Rows], colours: Mapping[str, str]) -> Figure:
+    """Draw estimates with their 95 % intervals along rows.
+
+    A series has a colour, and a marker that says it again. Where an interval is not known, the point stands
+    alone.
+    """
+    heights = [len(panel.names) * (0.1 + 0.1 * len(panel.series)) + 0.5 for panel in panels]
+    # One below the other, as a telephone can show them.
+    figure = Figure(figsize=(3.9, sum(heights) + 0.3), layout="constrained")
+    drawn = figure.subplots(len(panels), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, panel in zip(drawn, panels, strict=True):
+        for n, (name, estimates) in enumerate(panel.series.items()):
+            shift = 0.7 * ((n + 0.5) / len(panel.series) - 0.5)
+            known = [
+                (y + shift, each) for y, each in enumerate(estimates) if each and not np.isnan(each.value)
+            ]
+            ends = np.array([(each.value, each.low, each.high) for _, each in known]).reshape(-1, 3)
+            value, low, high = panel.scale * ends.T
+            axes.errorbar(
+                value, [y for y, _ in known], xerr=np.nan_to_num([value - low, high - value]),
+                fmt=MARKERS[n % len(MARKERS)], color=colours[name], label=name, markersize=4, capsize=2,
+                linewidth=1, clip_on=False,
+            )  # fmt: skip
+        axes.set_yticks(range(len(panel.names)), panel.names)
+        axes.set(xlabel=panel.quantity, ylim=(len(panel.names) - 0.5, -0.5))
+        axes.axvspan(0, panel.scale, color="none")  # the whole range, so that small differences look small
+        axes.tick_params(axis="y", length=0)
+        plain(axes, "x")
+    lettered(drawn)
+    handles, labels = drawn[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=7)
+    return figure
 
 
 @styled

@@ -3,11 +3,13 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from difflib import SequenceMatcher
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from markupsafe import Markup, escape
+from matplotlib.figure import Figure
 
 from harness.core.figures import PERCENT, Unit, as_mapping, shown
 from harness.core.files import write_whole
@@ -15,11 +17,13 @@ from harness.core.versions import versions
 from harness.report.compare.gate import Verdict
 from harness.report.compare.words import judged
 from harness.report.document import Table
+from harness.report.drawing.colours import ROLES as COLOUR_OF_ROLE
 from harness.report.templating import environment, visible
+from harness.studies.figures.points import Rows, intervals
 from harness.studies.study import Study
 from harness.studies.twins.asking import Questions, lack
 from harness.studies.twins.declared import TWINS, Twin
-from harness.studies.twins.scoring import METRICS, Pair, Row, headline
+from harness.studies.twins.scoring import METRICS, ROLES, Pair, Row, headline
 
 EXAMPLES = 3  # of each row
 DISTANCE = Unit(decimals=2)
@@ -60,8 +64,26 @@ def twins_study(
             "holds that always gives the same answer, and so reads nothing.", terminal=range(7),
         )],
         {}, {**answer, "versions": versions()}, answer, caveats=notes(questions, rows, unanswered),
-        more=_examples(spec.actions, rows),
+        more=_examples(spec.actions, rows), figures={"twins": _figure(rows)},
     )  # fmt: skip
+
+
+def _figure(rows: Sequence[Row]) -> Figure:
+    """Draw how often each twin holds, and how far apart both answers are, by who was asked."""
+    names = list(dict.fromkeys(row.twin.name for row in rows))
+    by_place = {(row.twin.name, row.role): row for row in rows}
+    roles = [role for role in ROLES if any(row.role == role for row in rows)]
+    panels = [
+        Rows(quantity, names, {
+            role: [estimate(row) if (row := by_place.get((name, role))) else None for name in names]
+            for role in roles
+        }, scale)
+        for quantity, scale, estimate in (
+            ("invariant, %", 100.0, attrgetter("invariance_rate")),
+            ("TV distance", 1.0, attrgetter("tv_distance")),
+        )
+    ]  # fmt: skip
+    return intervals(panels, COLOUR_OF_ROLE)
 
 
 def _cells(questions: Questions, row: Row) -> list[str]:
