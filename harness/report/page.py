@@ -153,6 +153,7 @@ def _pieces(
         charts=charts,
         examples=contents.examples(runs),
         attributions=contents.attributions(runs),
+        notes=contents.notes(runs),
         sweeps=[panel for run in runs.runs for panel in contents.sweeps(run)],
         licence=library.licence(),
         vega=library.packed(library.vega()),

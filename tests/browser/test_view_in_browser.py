@@ -22,6 +22,7 @@ from harness.core.work import tidy
 from harness.evaluate.run import evaluate as evaluation
 from harness.report.page import write_report
 from harness.report.runs import gather
+from harness.runs.notes import notes
 
 pytestmark = pytest.mark.slow
 
@@ -217,3 +218,31 @@ def test_the_list_follows_a_run_to_its_end_without_a_new_page(page, address, fol
         go_on.set()
         going.join(60)
         shutil.rmtree(folder / "third")
+
+
+def test_a_note_is_written_from_a_runs_page_and_stands_on_it(page, address, folder):
+    page.goto(address)
+    page.get_by_role("link", name="first").click()
+    wait(page)
+    page.locator("#list a[data-n]").nth(1).click()
+    page.get_by_role("link", name="Show them").click()
+    page.wait_for_url("**/run?path=first&scene=*#scene=*")
+    page.get_by_role("link", name="Note on this decision").click()
+    page.wait_for_url("**/notes?path=first&scene=*")
+    scene = page.get_by_label("Decision point").input_value()
+    page.get_by_label("Note", exact=True).fill("brakes too late\nfor what it was told")
+    assert Axe().run(page).response["violations"] == []
+    for size, name in ((WIDE, "view-notes"), (NARROW, "view-notes-narrow")):
+        page.set_viewport_size(size)
+        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+        picture(page, name)
+    page.get_by_role("button", name="Keep note").click()
+    expect(page.locator(".noted")).to_contain_text("brakes too late")
+    assert [note.scene for note in notes(folder / "first")] == [scene]
+    page.get_by_role("link", name="first").click()
+    wait(page)
+    noted = page.locator("#decisions p", has_text="Noted on")
+    expect(noted).to_contain_text(f"{scene}: brakes too late")
+    noted.get_by_role("link").click()
+    page.wait_for_url(f"**#scene={scene}*")
+    (folder / "first/notes.json").unlink()

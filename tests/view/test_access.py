@@ -11,7 +11,8 @@ from harness.report.view.access import cookie
 from harness.report.view.app import app
 
 PAGES = ["/", "/progress", "/style.css", "/run?path=first", "/picture?path=first/sweep-tau&name=sweep.svg",
-         "/compare?path=first&path=second", "/report?path=first", "/nowhere"]  # fmt: skip
+         "/compare?path=first&path=second", "/report?path=first", "/notes?path=first",
+         "/nowhere"]  # fmt: skip
 
 
 @pytest.fixture

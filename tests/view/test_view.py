@@ -23,7 +23,6 @@ from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.report.view import pages
 from harness.report.view.app import View
-from harness.report.view.pages import WAY_BACK
 from harness.runs.folder import read
 
 
@@ -85,7 +84,8 @@ def test_a_click_on_a_head_turns_the_order_around_and_keeps_the_filter(browser: 
 @pytest.mark.slow
 def test_a_run_opens_with_its_report_unless_that_is_older(browser: TestClient, reports: Path) -> None:
     report = reports / "first/report.html"
-    assert browser.get("/run?path=first").text.replace(f"{WAY_BACK}\n", "") == report.read_text()
+    shown = pages.with_way_back(report.read_text(), [("Notes", "/notes?path=first")])
+    assert browser.get("/run?path=first").text == shown
     report.write_text("an old one")
     os.utime(report, (1, 1))
     made = browser.get("/run?path=first").text
@@ -100,8 +100,10 @@ def test_one_decision_opens_with_what_its_page_leaves_out(
     address: str, browser: TestClient, reports: Path
 ) -> None:
     scene = next(iter(read(reports / "first").decisions.scenes))
-    whole = browser.get(f"{address}&scene={scene}").text
-    assert browser.get(address).text == re.sub('<script [^>]*id="opened">.*?</script>\n', "", whole)
+    links = '<p class="way-back">.*?</p>'
+    whole = re.sub(links, "", browser.get(f"{address}&scene={scene}").text)
+    without = re.sub('<script [^>]*id="opened">.*?</script>\n', "", whole)
+    assert re.sub(links, "", browser.get(address).text) == without
     detail = json.loads(packed(whole, "opened"))[scene]
     assert list(detail["cameras"]) == list(detail["world"]["viewers"])
     assert all(detail["prompts"][a["prompt"]] for run in detail["runs"] if run for a in run["answers"])

@@ -6,12 +6,12 @@ then opened must lie in the folder itself (`folder.py`). What a run says it was 
 prompt and its dataset, is read as by `harness report`: shown only if it has the digest that the run noted.
 
 Nobody without the token gets anything (`access.py`), and other sites get nothing: names other than this
-machine's are refused, which ends DNS rebinding, and no page may be framed, embedded or posted to. The list
-runs no script but, while a run goes on, one of its own that asks how far that is. A run's page is as
-untrusted as the run's author, so pages are kept apart from the list and from each other: `sandbox` gives them
-an origin of their own, from which they can read nothing here, and they may load nothing. Their inline scripts
-may run as far as their own policy lets them, and save files if they are clicked. Browsers show no page that
-is both in a sandbox and `same-origin` with its opener, so these are not.
+machine's are refused, which ends DNS rebinding, and no page may be framed, embedded or, but for a note,
+posted to. The list runs no script but, while a run goes on, one of its own that asks how far that is. A run's
+page is as untrusted as the run's author, so pages are kept apart from the list and from each other: `sandbox`
+gives them an origin of their own, from which they can read nothing here, and they may load nothing. Their
+inline scripts may run as far as their own policy lets them, and save files if they are clicked. Browsers show
+no page that is both in a sandbox and `same-origin` with its opener, so these are not.
 """
 
 import asyncio
@@ -21,6 +21,7 @@ from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from threading import Thread
+from urllib.parse import parse_qs, urlencode
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -29,7 +30,7 @@ from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -39,7 +40,9 @@ from harness.report.view import pages
 from harness.report.view.access import Access
 from harness.report.view.folder import PICTURES, own_file, pictures, whole
 from harness.runs.listing import Listed, runs
+from harness.runs.notes import FILE as NOTES
 
+MOST_SENT = 1 << 16  # bytes of a form: every character of a note may take twelve
 HOSTS = ("127.0.0.1", "localhost")
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; style-src 'self'; img-src 'self' data:; "
@@ -69,10 +72,14 @@ def app(folder: Path, token: str) -> ASGIApp:
     routes = {
         "/": view.index, "/progress": view.progress, "/style.css": view.style, "/run": view.run,
         "/picture": view.picture, "/compare": view.compare, "/report": view.report,
+        "/notes": view.notes,
     }  # fmt: skip
     return _Guarded(
         Starlette(
-            routes=[Route(path, page, methods=["GET"]) for path, page in routes.items()],
+            routes=[
+                *(Route(path, page, methods=["GET"]) for path, page in routes.items()),
+                Route("/notes", view.note, methods=["POST"]),  # the one address that writes
+            ],
             middleware=[
                 Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False),
                 Middleware(Access, token=token),
@@ -105,6 +112,7 @@ class View:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._drawing = asyncio.Lock()  # a page holds all rows of its runs
+        self._writing = asyncio.Lock()  # all notes of a run are one file
 
     def index(self, request: Request) -> Response:
         query = request.query_params
@@ -129,13 +137,43 @@ class View:
             return await self._drawn(request, partial(pages.suite, self.folder, run.name))
         if run.kind not in pages.RUNS:
             return await run_in_threadpool(self._study, run)
-        written, drawn = (own_file(self.folder, run.name, name) for name in ("report.html", "run.json"))
+        written, *made_of = (
+            own_file(self.folder, run.name, name) for name in ("report.html", "run.json", NOTES)
+        )
         scene = request.query_params.get("scene")
-        if not (written and drawn and written.stat().st_mtime >= drawn.stat().st_mtime):
+        drawn = [file.stat().st_mtime for file in made_of if file]
+        if not (written and drawn and written.stat().st_mtime >= max(drawn)):
             written = None
+        links = [pages.to_notes(run.name, scene)]
         if written and scene is None:
-            return await run_in_threadpool(_shown, written)
-        return await self._drawn(request, partial(pages.report, self._whole([run]), written, scene))
+            return await run_in_threadpool(_shown, written, links)
+        return await self._drawn(request, partial(pages.report, self._whole([run]), written, scene), links)
+
+    async def notes(self, request: Request) -> Response:
+        """Return the notes on a run, with a form for more."""
+        [run] = await run_in_threadpool(self._picked, request)
+        [path] = self._whole([run])
+        scene = request.query_params.get("scene", "")
+        # With the usual policy of referrers, browsers would not say which site sends the form.
+        page = await run_in_threadpool(pages.notes, path, run.name, scene)
+        return HTMLResponse(page, headers={"Referrer-Policy": "same-origin"})
+
+    async def note(self, request: Request) -> Response:
+        """Write a note on a decision point of a run. `Access` refuses another origin; browsers state one."""
+        if "origin" not in request.headers:
+            raise HTTPException(403, "it is not said which site sends this; send it from a page of this list")
+        sent = b""
+        async for chunk in request.stream():
+            sent += chunk
+            if len(sent) > MOST_SENT:
+                raise HTTPException(413, "this is longer than a note may be; shorten it")
+        form = parse_qs(sent.decode("ascii", "replace"), keep_blank_values=True, errors="replace")
+        name, scene, text = (form.get(key, [""])[0] for key in ("path", "scene", "text"))
+        [run] = await run_in_threadpool(self._runs, [name])
+        [path] = self._whole([run])
+        async with self._writing:
+            await run_in_threadpool(pages.note, path, scene, text)
+        return RedirectResponse(f"/notes?{urlencode({'path': run.name})}", 303)
 
     def picture(self, request: Request) -> Response:
         [run] = self._listed([request.query_params.get("path", "")])
@@ -187,7 +225,10 @@ class View:
         return [by_name[name] for name in names]
 
     def _picked(self, request: Request) -> Sequence[Listed]:
-        listed = self._listed(list(dict.fromkeys(request.query_params.getlist("path"))))
+        return self._runs(list(dict.fromkeys(request.query_params.getlist("path"))))
+
+    def _runs(self, names: Sequence[str]) -> Sequence[Listed]:
+        listed = self._listed(names)
         for run in listed:
             if run.state != "finished" or run.kind not in pages.RUNS:
                 raise UserError(f"{printable(run.name)} is no finished run of a model; pick others")
@@ -222,8 +263,8 @@ class View:
             return _with_way_back(await asyncio.wrap_future(drawn), links)
 
 
-def _shown(page: Path) -> Response:
-    return _with_way_back(pages.whole_text(page))
+def _shown(page: Path, links: Sequence[tuple[str, str]] = ()) -> Response:
+    return _with_way_back(pages.whole_text(page), links)
 
 
 def _with_way_back(page: str, links: Sequence[tuple[str, str]] = ()) -> Response:

@@ -10,6 +10,7 @@ from urllib.parse import urlencode
 
 from markupsafe import Markup
 
+from harness.core.errors import UserError, printable
 from harness.core.files import bytes_of, sha256_bytes, text_of
 from harness.report import suite as suites
 from harness.report.compare import page as comparison
@@ -19,7 +20,9 @@ from harness.report.page import render, with_decision
 from harness.report.runs import gather
 from harness.report.templating import environment, visible
 from harness.report.view.folder import whole
+from harness.runs import notes as run_notes
 from harness.runs.folder import Run
+from harness.runs.folder import read as read_run
 from harness.runs.listing import UNREAD, Listed, runs
 from harness.runs.suite import SuiteRun, contents_of, read
 from harness.runs.unfinished import Extent, extent
@@ -158,6 +161,28 @@ def wrong(reason: str) -> str:
 def style() -> str:
     """Return the report's style, and the list's own."""
     return environment().get_template("style.css").render() + text_of(TEMPLATES / "list.css")
+
+
+def to_notes(run: str, scene: str | None = None) -> tuple[str, str]:
+    """Return a link to the notes on a run, with its text; or to a new note on one decision point of it."""
+    where = {"path": run, **({} if scene is None else {"scene": scene})}
+    return "Notes" if scene is None else "Note on this decision", f"/notes?{urlencode(where)}"
+
+
+def notes(path: Path, name: str, scene: str) -> str:
+    """Return the notes on a run, with a form for one on a scene."""
+    every = run_notes.notes(path)
+    text = next((note.text for note in every if note.scene == scene), "")
+    return _page("notes.html.j2", run=name, notes=every, scene=scene, text=text, longest=run_notes.LONGEST)
+
+
+def note(path: Path, scene: str, text: str) -> None:
+    """Write a note on a decision point of a run. Raises UserError if the run has no such point."""
+    if scene not in read_run(path).decisions.labels("scene"):
+        raise UserError(
+            f"{printable(path.name)} has no decision point {printable(scene)!r}; copy one from its page"
+        )
+    run_notes.write(path, scene, text)
 
 
 def script() -> str:

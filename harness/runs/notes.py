@@ -1,0 +1,58 @@
+"""What people noted on decision points of a run, in its folder: `notes.json`, which `harness view` writes."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+
+from harness.core.errors import UserError, printable
+from harness.core.files import BROKEN, text_of, write_whole
+
+FILE = "notes.json"
+MOST, LONGEST = 1000, 4000  # notes of a run, and characters of one
+
+
+class Note(msgspec.Struct, frozen=True, kw_only=True):
+    """A note, of which a decision point has one at most."""
+
+    scene: str  # id of the decision point
+    text: str
+    date: str  # when it was written, UTC, ISO 8601
+
+
+def notes(run: Path) -> list[Note]:
+    """Return a run's notes, sorted by decision point; none without the file.
+
+    Raises UserError if it is broken.
+    """
+    try:
+        return msgspec.json.decode(text_of(run / FILE, "text"), type=list[Note])
+    except FileNotFoundError:
+        return []
+    except BROKEN as error:
+        raise UserError(
+            f"{printable(run / FILE)} is broken ({printable(error)}); mend it, or delete it"
+        ) from None
+
+
+def write(run: Path, scene: str, text: str) -> None:
+    """Note something on a decision point, in the place of what was noted there; an empty text deletes that.
+
+    Raises UserError if it is too long, or the file is full, broken or cannot be written.
+    """
+    kept = [note for note in notes(run) if note.scene != scene]
+    text = "\n".join(text.split("\r\n")).strip()
+    if len(text) > LONGEST or (text and len(kept) >= MOST):
+        raise UserError(
+            f"a note has {LONGEST} characters at most, and a run {MOST} notes; shorten it, or delete some"
+        )
+    if text:
+        date = datetime.now(UTC).isoformat(timespec="seconds")
+        kept.append(Note(scene=scene, text=text, date=date))
+    kept.sort(key=lambda note: note.scene)
+    try:
+        write_whole(run / FILE, msgspec.json.format(msgspec.json.encode(kept), indent=1) + b"\n")
+    except OSError as error:
+        raise UserError(
+            f"{printable(run / FILE)} cannot be written ({error.strerror}); see whose folder it is"
+        ) from None

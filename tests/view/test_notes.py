@@ -1,0 +1,144 @@
+"""Notes on decision points: they stay with the run, and nobody else writes them."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from starlette.testclient import TestClient
+from viewing import SECRET, TOKEN, said
+
+from harness.report.page import render
+from harness.report.runs import gather
+from harness.report.view.access import cookie
+from harness.runs.folder import read
+from harness.runs.notes import LONGEST, MOST, notes
+
+HERE = {"Origin": "http://127.0.0.1:7654"}
+
+
+def form(scene: str, text: str, path: str = "first") -> dict[str, str]:
+    return {"path": path, "scene": scene, "text": text}
+
+
+@pytest.fixture
+def scene(reports: Path) -> str:
+    return read(reports / "first").decisions.labels("scene")[0]
+
+
+def test_a_note_stays_with_its_run_and_stands_on_its_page(
+    browser: TestClient, reports: Path, scene: str
+) -> None:
+    written = browser.post("/notes", data=form(scene, " it brakes <b>late</b>\r\nhere "), headers=HERE)
+    assert (written.status_code, written.url.path) == (200, "/notes")
+    assert "it brakes &lt;b&gt;late&lt;/b&gt;\nhere</p>" in written.text
+    [note] = notes(reports / "first")
+    assert (note.scene, note.text) == (scene, "it brakes <b>late</b>\nhere")
+    assert f'value="{scene}"' in browser.get(f"/notes?path=first&scene={scene}").text
+    page = render(gather([reports / "first"]))
+    assert f">{scene}</a>: it brakes &lt;b&gt;late&lt;/b&gt;\nhere</p>" in page
+    assert "Noted on" not in render(gather([reports / "second"]))
+    browser.post("/notes", data=form(scene, "once more"), headers=HERE)
+    assert [note.text for note in notes(reports / "first")] == ["once more"]
+    browser.post("/notes", data=form(scene, " "), headers=HERE)
+    assert notes(reports / "first") == []
+
+
+def test_a_page_that_was_written_before_a_note_is_drawn_anew(
+    browser: TestClient, reports: Path, scene: str
+) -> None:
+    (reports / "first/report.html").write_text("<body>written before")
+    before = browser.get("/run?path=first").text
+    assert "written before" in before
+    assert 'href="/notes?path=first"' in before
+    browser.post("/notes", data=form(scene, "new"), headers=HERE)
+    later = (reports / "first/report.html").stat().st_mtime + 1
+    os.utime(reports / "first/notes.json", (later, later))
+    assert f">{scene}</a>: new</p>" in browser.get("/run?path=first").text
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{}, {"Origin": "http://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:7655"},
+     {**HERE, "Sec-Fetch-Site": "cross-site"}],
+)  # fmt: skip
+def test_no_other_site_and_no_page_of_a_run_writes_a_note(
+    headers: dict[str, str], browser: TestClient, reports: Path, scene: str
+) -> None:
+    assert browser.post("/notes", data=form(scene, "evil"), headers=headers).status_code == 403
+    assert not (reports / "first/notes.json").exists()
+
+
+@pytest.mark.parametrize("given", ["", "wrong"])
+def test_without_the_token_no_note_is_written(
+    given: str, browser: TestClient, reports: Path, scene: str
+) -> None:
+    browser.cookies.set(cookie(7654), given)
+    browser.cookies.clear()
+    sent = {**HERE, "Cookie": f"{cookie(7654)}={given}"}
+    for address in ("/notes", f"/notes?token={TOKEN}x"):
+        assert browser.post(address, data=form(scene, "evil"), headers=sent).status_code == 403
+    assert not (reports / "first/notes.json").exists()
+
+
+def test_a_browser_says_which_site_sends_the_form(browser: TestClient) -> None:
+    answer = browser.get("/notes?path=first")
+    assert answer.headers["referrer-policy"] == "same-origin", "without it a browser sends `Origin: null`"
+    assert "form-action 'self'" in answer.headers["content-security-policy"]
+
+
+@pytest.mark.parametrize(
+    ("sent", "line"),
+    [
+        (form("nowhere", "x"), "first has no decision point 'nowhere'; copy one from its page"),
+        (form("", "x"), "first has no decision point ''"),
+        (form("SCENE", "x" * (LONGEST + 1)), f"a note has {LONGEST} characters at most"),
+        (form("SCENE", "x", "../secret"), "no run '../secret' in "),
+        (form("SCENE", "x", "first/sweep-tau"), "first/sweep-tau is no finished run of a model"),
+        ({}, "no run '' in "),
+        (form("SCENE", "\U0001f697" * 10_000), "this is longer than a note may be"),
+    ],
+)
+def test_what_cannot_be_noted_is_one_line(
+    sent: dict[str, str], line: str, browser: TestClient, reports: Path, scene: str
+) -> None:
+    sent = {key: value.replace("SCENE", scene) for key, value in sent.items()}
+    answer = browser.post("/notes", data=sent, headers=HERE)
+    assert answer.status_code in (400, 404, 413)
+    assert said(answer).startswith(line)
+    assert not list(reports.rglob("notes.json"))
+
+
+def test_the_longest_note_of_any_characters_can_be_kept(
+    browser: TestClient, reports: Path, scene: str
+) -> None:
+    text = "\U0001f697" * LONGEST
+    assert browser.post("/notes", data=form(scene, text), headers=HERE).status_code == 200
+    assert notes(reports / "first")[0].text == text
+
+
+def test_a_run_has_so_many_notes_and_no_more(browser: TestClient, reports: Path, scene: str) -> None:
+    full = [{"scene": f"s{n:04d}", "text": "x", "date": ""} for n in range(MOST)]
+    (reports / "first/notes.json").write_text(json.dumps(full))
+    assert said(browser.post("/notes", data=form(scene, "x"), headers=HERE)).startswith("a note has")
+    assert "Noted on" not in render(gather([reports / "first"])), "they are on no decision point of the run"
+
+
+def test_a_link_in_the_place_of_notes_is_neither_read_nor_written_through(
+    browser: TestClient, reports: Path, tmp_path: Path, scene: str
+) -> None:
+    (reports / "first/notes.json").symlink_to(tmp_path / "secret/secret.txt")
+    for answer in (
+        browser.get("/notes?path=first"),
+        browser.post("/notes", data=form(scene, "x"), headers=HERE),
+    ):
+        assert said(answer) == "first has no notes.json of its own; delete it"
+    assert (tmp_path / "secret/secret.txt").read_text() == SECRET
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[1]", '[{"scene": 1}]', "[" * 100_000])
+def test_broken_notes_are_one_line(text: str, browser: TestClient, reports: Path) -> None:
+    (reports / "first/notes.json").write_text(text)
+    answer = browser.get("/notes?path=first")
+    assert answer.status_code == 400
+    assert "notes.json is broken (" in said(answer)
