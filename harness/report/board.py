@@ -115,8 +115,8 @@ def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
     heads = ("entry", "rank", by, "on one scale", f"gain over {BASELINE}", *others, "computed again here")
     layouts = sum(len(run.grid.episodes) for run in suite.runs.values())
     about = (
-        f"{edition.description}. {lead.capitalize()} in %, means over {len(suite.runs)} families of "
-        f"{layouts} layouts × {len(suite.manifest.seeds)} channel seeds, with 95 % intervals over layouts. "
+        f"{edition.description}. {lead.capitalize()} in %, means over {len(suite.runs)} families, "
+        f"{layouts} layouts × {len(suite.manifest.seeds)} channel seeds in all, with 95 % intervals over layouts. "
         f"The edition's digest is {edition.digest}."
     )
     note = (
