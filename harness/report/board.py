@@ -116,8 +116,8 @@ def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
     layouts = sum(len(run.grid.episodes) for run in suite.runs.values())
     about = (
         f"{edition.description}. {lead.capitalize()} in %, means over {len(suite.runs)} families, "
-        f"{layouts} layouts × {len(suite.manifest.seeds)} channel seeds in all, with 95 % intervals over layouts. "
-        f"The edition's digest is {edition.digest}."
+        f"{layouts} layouts × {len(suite.manifest.seeds)} channel seeds in all, with 95 % intervals over "
+        f"layouts. The edition's digest is {edition.digest}."
     )
     note = (
         f"Rank: one more than the number of entries that are clearly better under {by}, whose difference, "
