@@ -55,6 +55,24 @@ class HelperSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     ] = None
 
 
+UntilWidth = Annotated[
+    float | None,
+    option(
+        "Stop as soon as the 95 % interval of success is so narrow, in points, in every condition; it is "
+        "one that holds at every look.",
+        EPISODES,
+    ),
+]
+UntilDecided = Annotated[
+    str | None,
+    option(
+        "Stop as soon as success differs from that of the finished run in this folder in every "
+        "condition, by such an interval.",
+        EPISODES,
+    ),
+]
+
+
 class FrozenSettings(
     Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="frozen"
 ):
@@ -81,22 +99,8 @@ class FrozenSettings(
         option("Draw this many episodes at random from those that --only and --danger leave.", EPISODES),
     ] = None
     sample_seed: Annotated[int, option("Seed of this draw.", EPISODES)] = 0
-    until_width: Annotated[
-        float | None,
-        option(
-            "Stop as soon as the 95 % interval of success is so narrow, in points, in every condition; it is "
-            "one that holds at every look.",
-            EPISODES,
-        ),
-    ] = None
-    until_decided: Annotated[
-        str | None,
-        option(
-            "Stop as soon as success differs from that of the finished run in this folder in every "
-            "condition, by such an interval.",
-            EPISODES,
-        ),
-    ] = None
+    until_width: UntilWidth = None
+    until_decided: UntilDecided = None
 
 
 class DriveSettings(
@@ -126,22 +130,8 @@ class DriveSettings(
         int,
         option("Seed of this draw; with the same seed, eval draws the same episodes of as many.", EPISODES),
     ] = 0
-    until_width: Annotated[
-        float | None,
-        option(
-            "Stop as soon as the 95 % interval of success is so narrow, in points, in every condition; it is "
-            "one that holds at every look.",
-            EPISODES,
-        ),
-    ] = None
-    until_decided: Annotated[
-        str | None,
-        option(
-            "Stop as soon as success differs from that of the finished run in this folder in every "
-            "condition, by such an interval.",
-            EPISODES,
-        ),
-    ] = None
+    until_width: UntilWidth = None
+    until_decided: UntilDecided = None
 
 
 class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
