@@ -45,8 +45,8 @@ def command(
     """
     from harness.report.plan import as_mapping, from_pilots, from_rate
 
-    _check("--detect", detect, 0.1, 99)
-    _check("--power", power, 50, 99)
+    in_range("--detect", detect, 0.1, 99)
+    in_range("--power", power, 50, 99)
     if layouts is not None:
         in_range("--layouts", layouts, 2, MOST)
     if bool(pilots) == (rate is not None):
@@ -57,9 +57,9 @@ def command(
     if correlation is not None:
         if rate is None:
             raise UserError("--correlation goes with --rate; pilots show their own; leave it out")
-        _check("--correlation", correlation, 0, 1)
+        in_range("--correlation", correlation, 0, 1)
     if rate is not None:
-        _check("--rate", rate, 0, 100)
+        in_range("--rate", rate, 0, 100)
         plan = from_rate(rate / 100, correlation or 0.0, detect / 100, power / 100, layouts)
     else:
         if pilots and len(pilots) > 2:
@@ -69,11 +69,6 @@ def command(
         echo_json(as_mapping(plan, detect / 100, power / 100))
         return
     _show(plan, detect, power)
-
-
-def _check(option: str, value: float, least: float, most: float) -> None:
-    if not least <= value <= most:
-        raise UserError(f"{option} {value:g} is out of range; give {least:g} to {most:g}")
 
 
 def _show(plan: "Plan", detect: float, power: float) -> None:

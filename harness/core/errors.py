@@ -60,7 +60,8 @@ def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserE
     return UserError(f"unknown {kind} {printable(name)!r}{suggestion} known: {listed}{hint}")
 
 
-def in_range(option: str, value: int, least: int, most: int) -> None:
+def in_range(option: str, value: float, least: float, most: float) -> None:
     """Raise UserError unless `least` <= `value` <= `most`."""
     if not least <= value <= most:
-        raise UserError(f"{option} {value} is out of range; give {least} to {most}")
+        given = f"{value:g}" if isinstance(value, float) else value
+        raise UserError(f"{option} {given} is out of range; give {least} to {most}")

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.core.arrays import Floats
+from harness.core.figures import amount
 from harness.radio.reception import by_sight
 from harness.report.drawing.colours import COLOURS, FAINT, GREY, INK, MARKERS
 from harness.report.drawing.pictures import styled
@@ -128,8 +129,7 @@ def reception(
         axes.set(
             xlabel="others' curves, %", ylabel="model, %", xlim=(-2, 102), ylim=(-2, 102), aspect="equal"
         )
-        curves_ = f"{len(against)} curve{'s' * (len(against) != 1)}"
-        axes.set_title(f"{curves_}, {mean:.1f} points apart on average", fontsize=8)
+        axes.set_title(f"{amount(len(against), 'curve')}, {mean:.1f} points apart on average", fontsize=8)
     return figure
 
 
