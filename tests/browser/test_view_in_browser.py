@@ -111,13 +111,18 @@ def test_a_report_works_in_its_sandbox(page, address):
     expect(said).to_have_text(re.compile(r"^[1-9]\d* of "))
 
 
-def test_a_decision_opens_with_what_its_page_leaves_out(page, address):
+def open_whole_decision(page, address):
+    """Open the second decision of the first run, with what the run's page leaves out."""
     page.goto(address)
     page.get_by_role("link", name="first").click()
     wait(page)
     page.locator("#list a[data-n]").nth(1).click()
     page.get_by_role("link", name="Show them").click()
     page.wait_for_url("**/run?path=first&scene=*#scene=*")
+
+
+def test_a_decision_opens_with_what_its_page_leaves_out(page, address):
+    open_whole_decision(page, address)
     wait(page)
     assert page.locator(".cameras .frame").count() == 4
     assert page.locator(".answer details").count() > 0
@@ -221,12 +226,7 @@ def test_the_list_follows_a_run_to_its_end_without_a_new_page(page, address, fol
 
 
 def test_a_note_is_written_from_a_runs_page_and_stands_on_it(page, address, folder):
-    page.goto(address)
-    page.get_by_role("link", name="first").click()
-    wait(page)
-    page.locator("#list a[data-n]").nth(1).click()
-    page.get_by_role("link", name="Show them").click()
-    page.wait_for_url("**/run?path=first&scene=*#scene=*")
+    open_whole_decision(page, address)
     page.get_by_role("link", name="Note on this decision").click()
     page.wait_for_url("**/notes?path=first&scene=*")
     scene = page.get_by_label("Decision point").input_value()
