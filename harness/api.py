@@ -214,10 +214,10 @@ def run(
         source = resolve.driven(stated.world)
     spec = resolve.spec(stated, source)
     folder = default_out(spec) if out is None else Path(out)
-    told, kept = hooks.chosen(_several(tracker)), default_file() if cache else None
+    trackers, kept = hooks.chosen(_several(tracker)), default_file() if cache else None
     with costs.budget(max_cost, [spec]) as limit:
         spec = replace(spec, budget=limit)
-        evaluate(spec, folder, cache=kept, quiet=quiet, workers=workers, hooks=told)
+        evaluate(spec, folder, cache=kept, quiet=quiet, workers=workers, hooks=trackers)
     return load(folder)
 
 

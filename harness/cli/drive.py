@@ -88,7 +88,7 @@ def command(
         raise UserError(
             f"--max-cost {max_cost:g}: the processes of a cluster do not add up what they spend; leave it out"
         )
-    silent, told = as_json or quiet, hooks.chosen(tracker or ())
+    silent, trackers = as_json or quiet, hooks.chosen(tracker or ())
     with costs.budget(max_cost, [spec]) as limit:
         spec = replace(spec, budget=limit)
         if part and out:
@@ -103,7 +103,7 @@ def command(
         done, page = evaluate(
             spec, where, cache=None if no_cache else default_file(), quiet=silent, workers=who, full=full,
             then=lambda: videos.extend(write_failures(where, save_video, silent) if save_video else ()),
-            hooks=told,
+            hooks=trackers,
         )  # fmt: skip
     tell(done, as_json, quiet)
     if silent:

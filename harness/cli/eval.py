@@ -109,7 +109,7 @@ def command(
             for each in zip(specs, counted, strict=True):
                 _show_counted(*each)
         return
-    told = hooks.chosen(tracker or ())
+    trackers = hooks.chosen(tracker or ())
     at_servers = any(agent.card.server for spec in specs for agent in spec.agents)
     who = options.workers_of(workers or ("1" if at_servers else "2"))
     if workers is not None:
@@ -117,7 +117,7 @@ def command(
     with costs.budget(max_cost, specs) as limit:
         specs = [replace(spec, budget=limit) for spec in specs]
         silent, cache = as_json or quiet, None if no_cache else default_file()
-        evaluated = partial(evaluate, cache=cache, quiet=silent, workers=who, full=full, hooks=told)
+        evaluated = partial(evaluate, cache=cache, quiet=silent, workers=who, full=full, hooks=trackers)
         if repeat is not None:
             repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
             return

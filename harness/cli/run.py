@@ -76,11 +76,11 @@ def evaluate(
 ) -> "tuple[Evaluated, Path]":  # fmt: skip
     """Evaluate, frozen or in closed loop, with a progress bar; write the run and its page, `full` or not.
 
-    `then` adds files to the run; a run that is stopped there resumes there. `hooks` are told of it.
+    `then` adds files to the run; a run that is stopped there resumes there. `hooks` follow it.
     """
     from harness.cli.report import write
     from harness.evaluate.frozen_world import FrozenSource
-    from harness.evaluate.hooks import telling
+    from harness.evaluate.hooks import following
     from harness.evaluate.run import evaluate as evaluated
 
     name, dataset = printable(spec.ego.card.name, 30), None
@@ -89,15 +89,15 @@ def evaluate(
         progress = bar(f"asking {name}", quiet=quiet, grows=True)
     else:
         progress = bar(f"driving {name}", len(list(spec.source.layout_seeds)), quiet)
-    with telling(hooks, folder, spec.settings()) as told:
+    with following(hooks, folder, spec.settings()) as followers:
         with progress as done:
-            run = evaluated(spec, folder, told.counting(done), cache, done.more, workers, opens)
+            run = evaluated(spec, folder, followers.counting(done), cache, done.more, workers, opens)
         dataset = dataset and walked(dataset, run)
         with work.going_on(folder):
             page = write([folder], quiet=quiet, dataset=dataset, workers=workers if dataset else 1, full=full)
             then()
         work.tidy(folder)
-        told.end(run)
+        followers.end(run)
     return run, page
 
 

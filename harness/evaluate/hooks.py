@@ -1,7 +1,7 @@
-"""What is told of a run while it goes: hooks, of which a user chooses some by name.
+"""Hooks that follow a run while it goes, of which a user chooses some by name.
 
 A package adds one by an entry point in the group `swarmdrive.hooks`. A hook that fails costs a run nothing:
-one line on stderr says so, and it is told no more of that run.
+one line on stderr says so, and it follows that run no further.
 """
 
 import os
@@ -26,7 +26,7 @@ CHOSEN = "SWARMDRIVE_TRACKERS"  # environment variable: names, with commas, wher
 
 @runtime_checkable
 class Hook(Protocol):
-    """What is told of a command's runs, one run after the other; it may raise anything."""
+    """What follows a command's runs, one run after the other; it may raise anything."""
 
     def begin(self, folder: Path, settings: Mapping[str, Any]) -> None:
         """Take note of a run, before the first answer counts.
@@ -65,7 +65,7 @@ def chosen(names: Iterable[str]) -> dict[str, Hook]:
     return {name: HOOKS[name] for name in typed}
 
 
-class Told:
+class Followers:
     """Some hooks during one run. It begins for them with its first answer, or when it ends with none new."""
 
     def __init__(self, hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]) -> None:
@@ -79,7 +79,7 @@ class Told:
             progress(new)
             self._begin()
             self._total += new
-            self._tell("answered", self._total)
+            self._call("answered", self._total)
 
         return count if self._hooks else progress
 
@@ -87,18 +87,18 @@ class Told:
         if done:
             self._begin()
         if self._begun:
-            self._tell("end", done)
+            self._call("end", done)
 
     def _begin(self) -> None:
         if not self._begun:
             self._begun = True
-            self._tell("begin", self._folder, self._settings)
+            self._call("begin", self._folder, self._settings)
 
-    def _tell(self, what: str, *about: Any) -> None:
+    def _call(self, method: str, *arguments: Any) -> None:
         for name, hook in list(self._hooks.items()):
             try:
                 with redirect_stdout(sys.stderr):  # what a command prints may be read by a program
-                    getattr(hook, what)(*about)
+                    getattr(hook, method)(*arguments)
             except Exception as error:  # a stranger's code
                 shown = one_line(error) or type(error).__name__
                 print(
@@ -109,11 +109,11 @@ class Told:
 
 
 @contextmanager
-def telling(hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]) -> Iterator[Told]:
-    """Tell hooks of a run; if it is stopped, that it ended so."""
-    told = Told(hooks, folder, settings)
+def following(hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]) -> Iterator[Followers]:
+    """Have hooks follow a run; if it is stopped, they learn that it ended so."""
+    followers = Followers(hooks, folder, settings)
     try:
-        yield told
+        yield followers
     except BaseException:
-        told.end(None)
+        followers.end(None)
         raise

@@ -55,7 +55,7 @@ def further_rounds(
         said = replace(
             said, intents=replace(intents, helpers=np.where(more.on_time[..., None], newer, intents.helpers))
         )
-        # The last decision's call ends the decision of whoever has heard nothing since.
+        # Who hears nothing new keeps the last decision, and its call counts once.
         repeated_s = np.where(any_of(more.on_time), 0.0, call_s)
         heard = replace(_together(heard, more), exchange_s=more.exchange_s - repeated_s)
     return said, heard
