@@ -22,6 +22,13 @@ HEAD = """\
 Written by `python docs/reference.py` out of the program, which says the same with `--help`. Bad input is one
 line on stderr and exit code 2; all codes are in [a table](answers.md#exit-codes).
 """
+SHARED = """\
+## Shared options
+
+Options with one meaning in several commands. Each command below names those that it has, in brackets with its
+default where defaults differ.
+"""
+HELP = r"(.*?)(?: \[?(?:[Dd]efault: )?((?<=efault: ).*?|(?<=\[)required)[.\]]?)?"  # meaning and default
 
 
 def pages() -> list[Path]:
@@ -56,16 +63,51 @@ def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
         yield from commands(each, f"{path} {name}")
 
 
-def section(path: str, command: Any, example: str) -> str:
-    """A command's purpose, arguments, options with their defaults, and an example."""
+def parameters(command: Any) -> Iterator[tuple[str, str, str]]:
+    """A command's arguments and options but `--help`: what is typed, its meaning, and its default."""
     context = Context(command)
-    usage = " ".join([path, *command.collect_usage_pieces(context)])
-    lines = [f"## {path}", "", command.help, "", "```text", usage, "```", ""]
-    records = [parameter.get_help_record(context) for parameter in command.get_params(context)]
-    rows = [f"| `{name}` | {_cell(text)} |" for name, text in filter(None, records) if name != "--help"]
-    if rows:
-        lines += ["| argument or option | meaning |", "|---|---|", *rows, ""]
+    for parameter in command.get_params(context):
+        name, text = parameter.get_help_record(context) or ("--help", "")
+        if name != "--help":
+            yield name, *re.fullmatch(HELP, " ".join(text.split())).groups("")
+
+
+def shared(found: list[tuple[str, Any]]) -> dict[str, tuple[str, set[str]]]:
+    """Options that several commands have: by what is typed, the meaning that most have, and its defaults."""
+    meanings: dict[str, dict[str, list[str]]] = {}
+    for name, meaning, default in (each for _, command in found for each in parameters(command)):
+        if name.startswith("-"):
+            meanings.setdefault(name, {}).setdefault(meaning, []).append(default)
+    most = {name: max(each.items(), key=lambda item: len(item[1])) for name, each in meanings.items()}
+    return {name: (each, {*has}) for name, (each, has) in sorted(most.items()) if len(has) > 1}
+
+
+def section(path: str, command: Any, example: str, common: dict[str, tuple[str, set[str]]]) -> str:
+    """A command's purpose, its arguments and options with their defaults, and an example."""
+    usage = " ".join([path, *command.collect_usage_pieces(Context(command))])
+    own, named = [], []
+    flags = [name.split()[0] for name in common]
+    for name, meaning, default in parameters(command):
+        usual, defaults = common.get(name, ("", {default}))
+        if meaning != usual:
+            own.append(_item(name, meaning, default))
+            continue
+        flag = name.split()[0]
+        shown = f"`{flag if flags.count(flag) == 1 else name}`"
+        named.append(f"{shown} ({_plain(default)})" if default and len(defaults) > 1 else shown)
+    if named:
+        own.append(f"- [shared](#shared-options): {', '.join(named)}")
+    lines = [f"## {path}", "", command.help, "", "```text", usage, "```", "", *own, ""]
     return "\n".join([*lines, "```console", f"$ {example}", "```", ""])
+
+
+def shared_section(common: dict[str, tuple[str, set[str]]]) -> str:
+    """What options mean that several commands have."""
+    items = (
+        _item(name, meaning, *defaults if len(defaults) == 1 else ("",))
+        for name, (meaning, defaults) in common.items()
+    )
+    return "\n".join([SHARED, *items, ""])
 
 
 def overview(found: list[tuple[str, Any]]) -> str:
@@ -75,7 +117,7 @@ def overview(found: list[tuple[str, Any]]) -> str:
         lines.append(f"| **{panel}** | |")
         for path, command in found:
             if path.split()[1] in names:
-                purpose = _cell(re.split(r"\.\s", command.help)[0].rstrip("."))
+                purpose = _plain(re.split(r"\.\s", command.help)[0].rstrip("."))
                 lines.append(f"| [{path}](#{path.replace(' ', '-')}) | {purpose} |")
     return "\n".join([*lines, ""])
 
@@ -86,11 +128,17 @@ def reference() -> str:
     found = list(commands(get_command(app), "harness"))
     # A command without an example ends this here: the documents have to show each of them.
     examples = {path: next(line for line in lines if f"{line} ".startswith(f"{path} ")) for path, _ in found}
-    sections = (section(path, command, examples[path]) for path, command in found)
-    return "\n".join([HEAD, overview(found), *sections])
+    common = shared(found)
+    sections = (section(path, command, examples[path], common) for path, command in found)
+    return "\n".join([HEAD, overview(found), shared_section(common), *sections])
 
 
-def _cell(text: str) -> str:
+def _item(name: str, meaning: str, default: str) -> str:
+    stated = f" Default: {default}." if default not in ("", "required") else " Required." * bool(default)
+    return f"- `{name}`: {_plain(meaning + stated)}"
+
+
+def _plain(text: str) -> str:
     return re.sub(r"([<>|*\[\]])", r"\\\1", " ".join(text.split()))
 
 
