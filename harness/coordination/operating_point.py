@@ -151,6 +151,8 @@ class OperatingPoint:
             raise wrong("on_demand", True, f"false where {holds}: an agent plans in any case")
         if self.radio.edge == FUSION:
             raise wrong("edge", FUSION, f"none or relay where {holds}: a unit has no plan")
+        if any(attack.in_words for attack in attacks_of(self.guard.attack)):
+            raise wrong("attack", self.guard.attack, f"one on intents where {holds}, which has no words")
         if self.guard.defence:
             allowed = f"left out where {holds}, which is no advice and has no words"
             raise wrong("defence", self.guard.defence, allowed)

@@ -92,6 +92,7 @@ def test_plans_of_agents_are_of_each_pair_and_no_helper_model_is_asked(tmp_path:
         ("6g:consensus=auction", "content is 'intent'; it must be plan where consensus is auction"),
         (PLAN + "auction,on_demand=true", "on_demand is True"),
         (PLAN + "auction,messages=blind", "messages is 'blind'"),
+        (PLAN + "auction,attack=liar+injection", "attack is 'liar.injection'; it must be one on intents"),
     ],
 )
 def test_what_plans_go_without_is_refused_in_one_line(condition: str, says: str) -> None:
