@@ -16,6 +16,7 @@ from harness.core.statistics import mean_of
 from harness.dataset.build import build
 from harness.report.view.access import cookie
 from harness.report.view.app import app
+from harness.report.words import compared
 from harness.runs.leading import BALANCED
 from harness.runs.listing import runs
 from harness.runs.suite import read
@@ -268,6 +269,7 @@ def test_ls_lists_a_suite_above_its_runs_with_its_mean(evaluated: Harness) -> No
     found = {one.name: one for one in runs(Path("reports"))}
     assert list(found) == [DONE.name, f"{DONE.name}/exits", f"{DONE.name}/small"]
     suite, best = found[DONE.name], read(DONE).score(found[DONE.name].condition, BALANCED)
+    assert suite.condition == compared(read(DONE))[0]
     assert (suite.kind, suite.state, suite.model, suite.prompt) == ("suite", "finished", "proxy", "v2 and v4")
     assert (suite.success, suite.low, suite.high) == (best.value, best.low, best.high)
     assert "  suite proxy · v2 and v4 · json" in evaluated("run", "ls")[1]

@@ -41,7 +41,8 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     Reception is the probability that one message arrives, averaged over shadowing.
     """
     from harness.radio.channel import Physical
-    from harness.radio.profiles import CHANNELS, outside
+    from harness.radio.limits import outside
+    from harness.radio.profiles import CHANNELS
     from harness.radio.reception import DISTANCES_M, by_sight
 
     profile_name, channel = channel_of(name)
@@ -98,7 +99,8 @@ def check(
     a tenth as many samples. Each published curve is compared at its own settings.
     """
     from harness.radio.channel import Physical
-    from harness.radio.profiles import CHANNELS, outside
+    from harness.radio.limits import outside
+    from harness.radio.profiles import CHANNELS
     from harness.radio.reception import PACKETS
     from harness.radio.reception import check as checked
 

@@ -25,7 +25,8 @@ VARIANT = 32  # columns of model, prompt and answer mode
 def ls(folder: options.Reports = Path("reports"), as_json: options.Json = False) -> None:
     """List runs and studies, newest first.
 
-    Each has the success of its best condition, balanced over danger and none where that leads.
+    Each has the success of its best condition that no warning of its page is about, balanced over danger and
+    none where that leads.
     """
     from harness.runs.listing import UNREAD, runs
 

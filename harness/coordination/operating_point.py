@@ -16,8 +16,9 @@ from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES, names, reads_plans
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
-from harness.core.config import changed, pairs, settable, value_of
+from harness.core.config import changed, settable, value_of
 from harness.core.errors import UserError, printable, unknown
+from harness.core.pairs import pairs
 from harness.radio import constant
 from harness.radio.channel import Channel, Physical, Unit
 from harness.radio.networks import Network, network

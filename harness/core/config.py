@@ -145,11 +145,6 @@ def settable(record: Any) -> list[str]:
     return [name for name, value in values.items() if isinstance(value, str | bool | int | float)]
 
 
-def pairs(text: str) -> dict[str, str]:
-    """Return the names and values in `density_per_km=200,power_dbm=23`; a missing value is empty."""
-    return {key: value for key, _, value in (pair.partition("=") for pair in text.split(",") if pair)}
-
-
 def value_of(usual: object, text: str) -> object:
     """Convert a text to the type of the `usual` value.
 

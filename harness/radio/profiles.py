@@ -5,7 +5,6 @@ in the group `swarmdrive.channels`.
 """
 
 import os
-from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
@@ -87,23 +86,6 @@ class Profiles(FilesAndPlugins[Channel]):
         plain = {**asdict(self.profile(name)), "parameters": parameters}
         record: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(plain))
         return record
-
-
-def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) -> list[str]:
-    """Return a sentence for each setting outside the limits for which the source validated the model."""
-    return [
-        f"{name} = {_number(settings.get(name)):g} is outside what its model was held against, "
-        f"{low:g} to {high:g}."
-        for name, (low, high) in limits.items()
-        if not low <= _number(settings.get(name)) <= high
-    ]
-
-
-def _number(value: object) -> float:
-    try:
-        return float(value) if isinstance(value, str | int | float) else np.nan
-    except ValueError:
-        return np.nan
 
 
 @read_once

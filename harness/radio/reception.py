@@ -13,10 +13,11 @@ from msgspec import Meta
 
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
-from harness.core.config import changed, pairs
+from harness.core.config import changed
 from harness.core.errors import UserError, printable
 from harness.core.figures import known
 from harness.core.files import text_of
+from harness.core.pairs import pairs
 from harness.core.statistics import Estimate, episode_interval, rate_interval, resampled
 from harness.radio.channel import CLEAR, Channel, Draws, Links, Physical, Site
 from harness.radio.constant import density_coupled_loss

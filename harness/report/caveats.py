@@ -6,12 +6,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from harness.backends.base import BARE
 from harness.backends.registry import reads_prompts
-from harness.core.config import pairs
 from harness.core.errors import printable
 from harness.core.figures import amount
 from harness.evaluate.examine import MOST_SHARE, recall_findings
 from harness.parsing.status import Status
-from harness.radio.profiles import outside
+from harness.runs import doubts
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
 from harness.runs.metrics import ALL
@@ -21,7 +20,6 @@ from harness.world.drivers import BLIND
 from harness.world.parameters import Parameters
 
 FEW = 100  # episodes; with fewer a page warns of wide intervals
-OFF_LAG = 0.5  # least share of decisions that act in another frame of which a page warns
 # By role: whose answers, and what takes their place.
 _FAILED = {
     "ego": ("the ego's", "it drives by the fallback, and success says little about the model"),
@@ -139,7 +137,7 @@ def of_run(run: Run) -> Iterator[str]:
     if retries:
         yield f"The engine had errors: {retries} attempts were repeated."
     for control, heard in _CONTROLS.items():
-        if names := _controls(run.manifest, control):
+        if names := doubts.controls(run.manifest.conditions, control):
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
     yield from unheard(run)
     yield from lost_at_once(run)
@@ -148,7 +146,7 @@ def of_run(run: Run) -> Iterator[str]:
     yield from moved_system(run.manifest)
     yield from beyond_sources(run.manifest)
     yield from on_device(run.manifest)
-    if off := _off_lag(run):
+    if off := doubts.lagging(_off_lag(run)):
         yield (
             f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
             "closed-loop success may differ. harness study fidelity compares the two."
@@ -162,29 +160,21 @@ def of_run(run: Run) -> Iterator[str]:
 
 
 def doubted(*runs: Run) -> set[str]:
-    """Return the conditions that a warning is about: controls, another lag, a radio beyond its source."""
-    names = {c for run in runs for c in _off_lag(run)}
-    for manifest in (run.manifest for run in runs):
-        names.update(*(_controls(manifest, control) for control in _CONTROLS))
-        names |= {name for name, _ in _beyond(manifest)}
-    return names
+    """Return the conditions of these runs that a warning is about."""
+    return {
+        name
+        for run in runs
+        for name in doubts.doubted(run.manifest.conditions, _channels(run.manifest), _off_lag(run))
+    }
 
 
-def _controls(manifest: Manifest, control: str) -> list[str]:
-    return [c["name"] for c in manifest.conditions if c.get("messages") == control]
+def _off_lag(run: Run) -> dict[str, float | None]:
+    scores = {c: run.score(c, doubts.OFF_LAG) for c in run.conditions}
+    return {c: score.value for c, score in scores.items() if score}
 
 
-def _off_lag(run: Run) -> list[str]:
-    scores = {c: run.score(c, "off_lag_rate") for c in run.conditions}
-    return [c for c, score in scores.items() if score and (score.value or 0.0) >= OFF_LAG]
-
-
-def _beyond(manifest: Manifest) -> Iterator[tuple[str, str]]:
-    for condition in manifest.conditions:
-        if record := manifest.channels.get(condition.get("profile") or ""):
-            settings = {**record.parameters, **pairs(condition.get("radio", ""))}
-            for sentence in outside(settings, record.limits):
-                yield condition["name"], sentence
+def _channels(manifest: Manifest) -> dict[str, doubts.Channel]:
+    return {name: (record.parameters, record.limits) for name, record in manifest.channels.items()}
 
 
 def findings_of(manifest: Manifest) -> Iterator[str]:
@@ -269,7 +259,7 @@ def on_device(manifest: Manifest) -> Iterator[str]:
 
 def beyond_sources(manifest: Manifest) -> Iterator[str]:
     """Yield conditions whose radio has settings that its model's source never held against anything."""
-    for name, sentence in _beyond(manifest):
+    for name, sentence in doubts.beyond(manifest.conditions, _channels(manifest)):
         yield f"{printable(name)}: {sentence}"
 
 

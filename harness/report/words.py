@@ -13,7 +13,7 @@ from harness.core.statistics import mean_of
 from harness.report.caveats import doubted
 from harness.runs import metrics
 from harness.runs.folder import Run
-from harness.runs.leading import IN_WORDS, lead_of
+from harness.runs.leading import IN_WORDS, best_of, lead_of
 from harness.runs.metrics import BASELINE, GAINS, LATENCY, METRICS, SUCCESS, entry, of_ends
 from harness.runs.records import Latency, Manifest, Score, Times, role_word
 from harness.runs.success import Success
@@ -71,15 +71,12 @@ def headline(run: Run | SuiteRun) -> str:
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
     """Return the best condition, and the one that it is held against: the one without V2V, or the worst.
 
-    The best is of those that no warning is about, where there is one besides that without V2V. Empty where
-    there is none.
+    Empty where there is none.
     """
     lead = lead_of(run)
     scores = {c: s.value or 0.0 for c in run.conditions if (s := run.score(c, lead)) is not None}
     radios = {c["name"] for c in run.manifest.conditions if c.get("profile") is not None}
-    warned = doubted(*_runs(run))
-    trusted = [c for c in scores if c not in warned]  # in their order, which decides between equal ones
-    best = max(trusted if radios & {*trusted} else scores, key=lambda c: scores[c], default="")
+    best = best_of(scores, radios, doubted(*_runs(run)))
     alone = [c["name"] for c in run.manifest.conditions if c.get("profile") is None and c["name"] in scores]
     base = alone[0] if alone else min(scores, key=lambda c: scores[c], default="")
     return best, "" if base == best else base

@@ -1,9 +1,9 @@
-"""The metric by which runs are read: success balanced over layouts with and without a danger, or plain.
+"""The metric by which runs are read, and the condition: success balanced over danger and none, or plain.
 
 It is balanced where layouts are of both kinds, as a run's rows of `BALANCED` say.
 """
 
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
@@ -29,3 +29,13 @@ def leading(*names: Container[str]) -> str:
 def lead_of(*runs: Scored) -> str:
     """Return the metric by which runs are read together: balanced success where all of them state it."""
     return leading(*({score.metric for score in run.scores if score.value is not None} for run in runs))
+
+
+def best_of(success: Mapping[str, float], radios: Container[str], doubted: Container[str]) -> str:
+    """Return the condition with the most success; the first of several, and empty where there is none.
+
+    A condition in doubt does not count where one with a radio is left.
+    """
+    trusted = [name for name in success if name not in doubted]
+    counted = trusted if any(name in radios for name in trusted) else success
+    return max(counted, key=lambda name: success[name], default="")

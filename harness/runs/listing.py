@@ -4,7 +4,7 @@ import csv
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from io import TextIOWrapper
@@ -15,7 +15,8 @@ from harness.core.errors import UserError, printable
 from harness.core.files import BROKEN, opened, text_of
 from harness.core.formats import CONFIG, SOURCES, SUITE, WORK
 from harness.runs import formats
-from harness.runs.leading import ANY_TIME, BALANCED, SUCCESS, leading
+from harness.runs.doubts import OFF_LAG, doubted
+from harness.runs.leading import ANY_TIME, BALANCED, SUCCESS, best_of, leading
 
 DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
@@ -32,6 +33,7 @@ STUDIES = {
 }
 FAILED = "failed_rate_ego"
 UNREAD = 0.5  # share of failed answers from which a run's headline mentions them
+Rows = Sequence[dict[str, str]]  # of a summary
 _BROKEN = (*BROKEN, AttributeError, csv.Error)  # in what no type was given to
 
 
@@ -52,7 +54,7 @@ class Listed:
     prompt: str | None = None  # the prompt version; those of all families for a suite
     answer: str | None = None  # the answer mode
     tags: tuple[str, ...] = ()  # words by which to find it
-    condition: str | None = None  # the condition with the highest success; the first of several
+    condition: str | None = None  # the best condition that no warning of its page is about
     success: float | None = None  # that, 0 to 1, over episodes; for a suite, the mean over families
     low: float | None = None  # lower end of its 95 % interval; None if the data cannot bound it
     high: float | None = None  # its upper end
@@ -137,7 +139,7 @@ def _finished_entry(path: str, has_summary: bool, written: datetime) -> Listed:
             return listed
         listed = replace(listed, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
         listed = replace(_with_config(listed, config), why="summary.csv")
-        return _with_summary(path, listed) if has_summary else listed
+        return _with_success(listed, rows := _rows(path), [(config, rows)]) if has_summary else listed
     except _BROKEN:
         return listed
 
@@ -156,7 +158,11 @@ def _suite_entry(path: str, root: str, has_summary: bool, written: datetime) -> 
             date=max(entry.date for entry in parts),
             prompt=" and ".join(dict.fromkeys(str(entry.prompt) for entry in parts)),
         )  # fmt: skip
-        return _with_summary(path, listed) if has_summary else listed
+        if not has_summary:
+            return listed
+        folders = [os.path.join(path, name) for name in names]
+        runs = [(_json(folder, "run.json"), _rows(folder)) for folder in folders]
+        return _with_success(listed, _rows(path), runs)
     except _BROKEN:
         return listed
 
@@ -166,26 +172,40 @@ def own_name(name: str) -> bool:
     return os.path.basename(name) == name and not name.startswith(".")
 
 
-def _with_summary(path: str, listed: Listed) -> Listed:
-    """Return an entry as finished, with the best condition of its summary."""
+def _rows(path: str) -> Rows:
+    """Return what a list has of a summary: a folder may hold a thousand of a thousand rows."""
     with opened(os.path.join(path, "summary.csv"), "rows") as data, TextIOWrapper(data, "utf-8-sig") as file:
-        # Parse only the rows needed: a folder may hold a thousand summaries of a thousand rows.
-        markers = [f",{metric}," for metric in (BALANCED, SUCCESS, FAILED)]
+        markers = [f",{metric}," for metric in (BALANCED, SUCCESS, FAILED, OFF_LAG)]
         head, *lines = [
             line for n, line in enumerate(file) if n == 0 or any(metric in line for metric in markers)
         ]
-    table = list(csv.DictReader([head, *lines]))
-    metric = leading({row["metric"] for row in table})
-    kinds = {row["interval"] for row in table if row["metric"] == metric}
+    return list(csv.DictReader([head, *lines]))
+
+
+def _with_success(listed: Listed, rows: Rows, runs: Sequence[tuple[dict[str, Any], Rows]]) -> Listed:
+    """Return an entry as finished, with the best condition of a summary; `runs` are those it is of."""
+    metric = leading({row["metric"] for row in rows})
+    kinds = {row["interval"] for row in rows if row["metric"] == metric}
     kind = ANY_TIME if ANY_TIME in kinds else "episodes"
-    rows = [row for row in table if (row["metric"], row["interval"]) == (metric, kind)]
-    best = max(rows, key=lambda row: _number(row["value"]) or 0.0)
-    value, low, high = (_number(best[key]) for key in ("value", "ci_low", "ci_high"))
-    unread = next((_number(row["value"]) for row in table if row["metric"] == FAILED), None)
+    leads = [row for row in rows if (row["metric"], row["interval"]) == (metric, kind)]
+    radios = {c["name"] for c in runs[0][0]["conditions"] if c.get("profile") is not None}
+    warned = {name for run in runs for name in _doubted(*run)}
+    best = best_of({row["condition"]: _number(row["value"]) or 0.0 for row in leads}, radios, warned)
+    [lead] = [row for row in leads if row["condition"] == best]
+    value, low, high = (_number(lead[key]) for key in ("value", "ci_low", "ci_high"))
+    unread = next((_number(row["value"]) for row in rows if row["metric"] == FAILED), None)
     return replace(
-        listed, state="finished", why=None, condition=best["condition"], success=value, low=low,
+        listed, state="finished", why=None, condition=best, success=value, low=low,
         high=high, unread=unread, metric=metric,
     )  # fmt: skip
+
+
+def _doubted(config: dict[str, Any], rows: Rows) -> set[str]:
+    """Return the conditions that a warning of a run's page is about."""
+    records = config.get("channels", {}).items()
+    channels = {name: (record["parameters"], record.get("limits", {})) for name, record in records}
+    off_lag = {row["condition"]: _number(row["value"]) for row in rows if row["metric"] == OFF_LAG}
+    return doubted(config["conditions"], channels, off_lag)
 
 
 def _with_config(entry: Listed, config: dict[str, Any]) -> Listed:

@@ -14,6 +14,8 @@ from evaluating import live_spec_of, run, spec_of
 from harness import cli
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
+from harness.report.words import compared
+from harness.runs.folder import read
 from harness.runs.listing import runs
 
 Said = tuple[int, str, str]
@@ -62,15 +64,28 @@ def test_it_lists_frozen_live_and_sweep_newest_first(folder: Path) -> None:
     ]  # fmt: skip
 
 
-def test_success_is_that_of_the_best_condition_over_episodes(folder: Path) -> None:
+def test_success_is_that_of_the_condition_in_the_headline_over_episodes(folder: Path) -> None:
     [frozen] = [one for one in runs(folder) if one.name == "frozen"]
     lines = (folder / "frozen/summary.csv").read_text().splitlines()
     rates = [
         line.split(",") for line in lines if ",balanced_success_rate," in line and line.endswith(",episodes")
     ]
-    best = max(rates, key=lambda row: float(row[6]))
+    [best] = [row for row in rates if row[4] == compared(read(folder / "frozen"))[0]]
     assert len(rates) == 3
     assert (frozen.condition, frozen.success, frozen.low, frozen.high) == (best[4], *map(float, best[6:9]))
+
+
+def test_a_condition_that_the_page_warns_of_is_the_best_in_no_list(folder: Path) -> None:
+    summary = folder / "frozen/summary.csv"
+    [best] = [one.condition for one in runs(folder) if one.name == "frozen"]
+    lines = summary.read_text().splitlines(keepends=True)
+    warned = [row.split(",") for row in lines if f",{best},off_lag_rate," in row]
+    assert warned
+    for row in warned:
+        lines[lines.index(",".join(row))] = ",".join([*row[:6], "0.9", *row[7:]])
+    summary.write_text("".join(lines))
+    [frozen] = [one for one in runs(folder) if one.name == "frozen"]
+    assert frozen.condition == compared(read(folder / "frozen"))[0] != best
 
 
 def test_people_read_it_in_eighty_columns(harness: Callable[..., Said], folder: Path) -> None:
