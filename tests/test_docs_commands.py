@@ -61,8 +61,6 @@ CUT = {
     "harness dataset scenario drive": "--episodes 2 --workers 1",  # of 100 and of 500
     "harness dataset scenario audit": "--layouts 24 --workers 1",  # of 300
     "harness dataset scenario audit occluded-intersection": "--layouts 40 --workers 1",  # 24: a tell
-    "harness dataset scenario audit all-way-crossing": "--layouts 40 --workers 1",
-    "harness dataset scenario audit narrow-passage": "--layouts 40 --workers 1",
     "harness model distill": "--layouts 2 --samples 16,16,16,16 --workers 1",  # of 240 and 300 000
     CHECKED: "--dataset ../few",  # 4 episodes of 240
     "harness prompt optimize": "--tune ../few --limit 2",  # 4 layouts of 24, and 2 of 240
@@ -132,7 +130,6 @@ NOT_RUN = {
     "harness eval --model qwen3-4b --engine llama-cpp": "needs weights from a hub",
     "harness eval --model swarm-tiny --latency measured": "a busy machine is refused",
     "harness run export reports/proxy-v2-occluded-intersection-v3 --inspect logs/run.eval": "needs inspect",
-    "harness dataset rank occluded-intersection-v2 --json": "long; docs/datasets.md ranks a small one",
 }
 OTHER_PROGRAMS = {
     "inspect": "serves until it is interrupted",
