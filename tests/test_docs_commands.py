@@ -102,27 +102,13 @@ NOT_RUN = {
     "harness model check smollm2-135m": "needs those weights",
     "harness prompt check v10 --model smollm2-135m": "needs those weights",
     "harness eval --model smollm2-135m --limit 4": "needs those weights",
-    "harness eval --model smollm2-135m --engine llama-cpp --limit 4": "needs those weights",
-    "harness model parity smollm2-135m --prompts 500 --read-outs": "needs those weights, and 12 CPU minutes",
-    "harness model distill occluded-intersection:witnesses=each,radio_share=0.25,limits=2,perception=2"
-    " --base smollm2-135m --lora --prompt v9 --samples 0,20000,0,0 --out models/driver": "needs weights",
-    "harness eval --model models/driver --engine transformers --prompt v9 --answer readout": "needs them",
     "harness model distill occluded-intersection --base smollm2-135m --lora --rate 5e-4 --dtype bfloat16"
     " --prompt v9 --samples 0,12800,0,0 --out models/mine": "needs those weights, and an hour",
-    "harness eval --model swarm-smol --prompt v9 --answer readout --condition single-local --condition 6g"
-    " --control shuffled-messages --limit 100": "needs those weights",
     "harness eval --model smollm2-135m --prompt v9 --answer readout --condition single-local --condition 6g"
-    " --control shuffled-messages --limit 100 --out reports/before": "as above",
+    " --control shuffled-messages --limit 100 --out reports/before": "needs those weights",
     "harness eval --model models/mine --prompt v9 --answer readout --condition single-local --condition 6g"
     " --control shuffled-messages --limit 100 --out reports/after": "as above",
     "harness compare reports/before reports/after": "needs those runs",
-    "harness model distill occluded-intersection --base models/swarm-tiny --prompt v1 --prompt v2"
-    " --samples 0,24000,12000,24000 --out models/again": "takes half an hour; a shorter one is run",
-    "harness model distill blind-merge do-not-pass hard-brake-ahead occluded-intersection parking-exit"
-    " roundabout-entry --base models/swarm-tiny-six-v2 --prompt v4 --samples 0,16000,8000,0"
-    " --objective values --out models/bolder": "as above",
-    "harness eval --model models/bolder --prompt v4 --answer readout --dataset suite:v2v-safety-2"
-    " --condition single-local --condition 6g --control shuffled-messages": "needs that model",
     "harness model check qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b": "needs those weights",
     "harness eval --model my-served --server http://gpu-1:8000/v1 --server http://gpu-2:8000/v1"
