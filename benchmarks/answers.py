@@ -1,6 +1,7 @@
 """What each answer mode scores: decision, read-out, constrained and json of the same models.
 
-    python benchmarks/answers.py [--only TEXT] [--layouts N] [--out reports/answers] [--page docs/answers.md]
+    python benchmarks/answers.py [--only TEXT] [--layouts N] [--out reports/answers]
+                                 [--page benchmarks/measured/answers.md]
 
 It evaluates each of `ASKED` in each of its modes on report layouts, alone and with helpers under `6g`, and
 writes the table of the page between its marks. What is finished is read and not made again; a stopped one
