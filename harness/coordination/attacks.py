@@ -1,7 +1,7 @@
 """Attacks: helpers that lie or fail, so that the channel carries something else than what they intend.
 
-An attack stands between a helper's answer and the channel. `docs/trust.md` maps each to the classes of
-ETSI TS 103 759 and to the names of VeReMi and F2MD.
+An attack stands between a helper's answer and the channel. `benchmarks/measured/trust.md` maps each to the
+classes of ETSI TS 103 759 and to the names of VeReMi and F2MD.
 
 One attack is a name and its settings, `spoof:share=1/3:distance_m=3`. Several at once are joined by `+`; they
 have the same attackers, as far as their shares go. To add an attack, write a class here, or an entry point in

@@ -29,7 +29,7 @@ CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, tim
 
 @dataclass(frozen=True)
 class Trust:
-    """Reputation with memory. All numbers were chosen on layouts of the tuning range (`docs/trust.md`)."""
+    """Reputation with memory. All numbers were chosen on tune layouts (`benchmarks/measured/trust.md`)."""
 
     faith: tuple[float, float] = (2.5, 0.5)  # what counts for and against a helper before its first message
     kept: float = 0.6  # share of what counts for and against a helper that is left at the next step
