@@ -43,7 +43,7 @@ def test_every_number_of_the_paper_is_in_the_ledger(found: pd.DataFrame) -> None
 
 
 def test_the_ledger_is_inside_its_aims(found: pd.DataFrame) -> None:
-    """One row is known to miss (docs/studies.md): at 40 % loss more is heard than in the paper."""
+    """One row is known to miss (benchmarks/measured/studies.md): at 40 % loss more is heard than in the paper."""
     assert set(found[found.verdict == "misses"].id) <= {"B12"}
     ran = found[found.kind != "cited"]
     noise = ran.metric.map({"success": 1.0}).fillna(0.0)
@@ -62,7 +62,7 @@ def test_a_verdict_looks_at_the_interval() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [100, 105, 110])
 def test_on_any_seeds_28_rows_hold_at_the_papers_own_sizes(first: int) -> None:
-    """Sets that the table of docs/studies.md does not have."""
+    """Sets that the table of benchmarks/measured/studies.md does not have."""
     parts = [
         play(Calibrated(p.episodes), p.name, p.settings, range(first, first + 5), lambda done: None)
         for p in panels()
