@@ -1,14 +1,16 @@
-"""Every command and every piece of Python in the documents is run.
+"""Every command and every piece of Python in the documents is run, and prints what its page shows.
 
 A page is a story, from top to bottom in one folder. A command that is neither run nor excused by name fails
-its page.
+its page, and so does a line that is shown and was not printed.
 """
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from difflib import unified_diff
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,14 @@ from harness.evaluate.replay import stills
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = dict(commands(get_command(app), "harness"))
-TYPED = list(dict.fromkeys(shlex.join(shlex.split(line, comments=True)) for line in all_typed()))
+
+
+def command_of(line: str) -> str:
+    """What a line types, without its comment and in one way of quoting."""
+    return shlex.join(shlex.split(line, comments=True))
+
+
+TYPED = list(dict.fromkeys(map(command_of, all_typed())))
 
 # What a reader is taken to have: the model that ships stands for his own.
 READER_HAS = {
@@ -129,15 +138,36 @@ OTHER_PROGRAMS = {
     "pre-commit": "tests/test_hooks.py reads what it would run",
 }
 
+# Pages that show anything have these whole: they are run once, and copied into their folders.
+ONCE = ("harness eval --model proxy", "harness eval --model local-view")
+
+# What is shown below these is not compared. What is shown below any other line is, and the line runs whole.
+UNCHECKED: dict[str, str] = {}
+UNCHECKED_PAGES = {
+    "docs/answers.md", "docs/attribution.md", "docs/benchmark.md", "docs/comparing.md", "docs/devices.md",
+    "docs/prompts.md", "docs/radio.md", "docs/repeats.md", "docs/results.md",
+    "docs/servers.md", "docs/swarms.md", "docs/tutorial-model.md", "docs/twins.md",
+}  # fmt: skip
+
+
+def shell_of(page: Path) -> list[tuple[str, str]]:
+    """The lines that a page has a reader type, each with what it shows below."""
+    return [each for language, block in blocks(page) if language == "console" for each in typed(block)]
+
 
 def lines_of(page: Path) -> list[str]:
     """What a page has a reader type."""
-    shell = [block for language, block in blocks(page) if language != "python"]
-    return [shlex.join(shlex.split(line, comments=True)) for block in shell for line, _ in typed(block)]
+    return [command_of(line) for line, _ in shell_of(page)]
 
 
 def name(page: Path) -> str:
     return str(page.relative_to(ROOT))
+
+
+SHOWN = {  # by page; but the code that `echo $?` shows, which the line before it has to end with
+    name(page): {command_of(line) for line, shown in shell_of(page) if shown.strip() and line != "echo $?"}
+    for page in pages()
+}
 
 
 def parsed(args: list[str]) -> tuple[str, list[str]]:
@@ -149,24 +179,71 @@ def parsed(args: list[str]) -> tuple[str, list[str]]:
     return pytest.fail(f"no such command: harness {shlex.join(args)}")
 
 
+def expression(shown: list[str]) -> str:
+    """What a page shows, as a regular expression: `…` alone is any lines, and in a line any text."""
+    return "".join(
+        r"(?:.*\n)*?" if line == "…" else re.escape(line).replace("…", ".*") + r"\n" for line in shown
+    )
+
+
+def difference(shown: str, printed: str) -> str:
+    """What a page shows against what was printed, if they differ; white space at line ends does not count."""
+    showing, printing = ([line.rstrip() for line in text.rstrip().split("\n")] for text in (shown, printed))
+    if re.fullmatch(expression(showing), "".join(f"{line}\n" for line in printing)):
+        return ""
+    return "\n".join(unified_diff(showing, printing, "shown", "printed", lineterm=""))
+
+
+@pytest.fixture
+def copied(
+    harness: Callable[..., Any], once: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> Callable[[list[str]], str]:
+    """Types a command of `ONCE`: what it writes is copied to this folder, and what it prints is returned."""
+
+    def typed(args: list[str]) -> str:
+        def fill(folder: Path) -> None:
+            folder.mkdir()
+            with monkeypatch.context() as inside:
+                inside.chdir(folder)
+                code, out, _ = harness(*args)
+            assert code == 0, out
+            folder.with_suffix(".txt").write_text(out)
+
+        folder = once("-".join(["page", *args]), fill)
+        shutil.copytree(folder, ".", dirs_exist_ok=True)
+        return folder.with_suffix(".txt").read_text()
+
+    return typed
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in pages() if blocks(page) and page != PAGE], ids=name)
-def test_a_page_can_be_followed(
-    page: Path, harness: Callable[..., Any], small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_page_can_be_followed_and_shows_what_is_printed(
+    page: Path,
+    harness: Callable[..., Any],
+    copied: Callable[[list[str]], str],
+    small_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that four episodes are two shards
     monkeypatch.setattr("harness.report.drawing.video.stills", lambda played: [*stills(played)][::20])
+    monkeypatch.setattr("harness.cli.progress.LINE_S", 3600.0)  # a reader's terminal has a bar instead
+    monkeypatch.setattr(sys, "stderr", sys.stdout)  # a reader sees both in one place
     for file, stands_for in {**READER_HAS, "few": small_path}.items():
         (tmp_path / file).symlink_to(stands_for)
     known: dict[str, Any] = {}
+    wrong: list[str] = []
+    compared = name(page) not in UNCHECKED_PAGES
+    copies = compared and SHOWN[name(page)]
     for language, block in blocks(page):
         if language == "python":
             exec(compile(block, page.name, "exec"), known)
             continue
         lines = typed(block)
-        for (line, _), (then, shown) in zip(lines, [*lines[1:], ("", "")], strict=True):
+        for (line, shown), (then, code_shown) in zip(lines, [*lines[1:], ("", "")], strict=True):
             program, *args = shlex.split(line, comments=True)
-            command = shlex.join([program, *args])
+            command = command_of(line)
             if program == "cd":
                 monkeypatch.chdir(args[0])
             elif program == "export":
@@ -175,23 +252,57 @@ def test_a_page_can_be_followed(
                 path, rest = parsed(args)
                 COMMANDS[path].make_context(path, rest)
             elif program == "harness":
-                path, _ = parsed(args)
-                code, _, err = harness(*args, *CUT.get(command, CUT.get(path, "")).split())
-                if lacks := re.search(r"needs (\S+), which is not installed", err):
+                whole = compared and shown.strip() and command not in UNCHECKED
+                if copies and command in ONCE:
+                    code, out = 0, copied(args)
+                else:
+                    path, _ = parsed(args)
+                    cut = "" if whole else CUT.get(command, CUT.get(path, ""))
+                    code, out, _ = harness(*args, *cut.split())
+                if lacks := re.search(r"needs (\S+), which is not installed", out):
                     pytest.skip(f"followed up to here: {line} needs {lacks[1]}")
                 # A page that shows `echo $?` says how the line before it ends.
-                says = int(shown.split()[0]) if then == "echo $?" else 0
-                assert code == CUT_ENDS.get(command, says), f"{line}\n{err}"
+                says = int(code_shown.split()[0]) if then == "echo $?" else 0
+                assert code == CUT_ENDS.get(command, says), f"{line}\n{out}"
+                if whole and (differs := difference(shown, out)):
+                    wrong.append(f"{line}\n{differs}")
             elif program in ("cp", "echo", "sed"):
                 subprocess.run(line, shell=True, check=True)
             else:
                 assert program in OTHER_PROGRAMS, line
+    if wrong:
+        pytest.fail("\n\n".join([f"{name(page)} shows what is not printed", *wrong]), pytrace=False)
 
 
 def test_what_is_excused_is_still_in_the_documents() -> None:
-    assert {*NOT_RUN, *CUT_ENDS} <= set(TYPED)
+    assert {*NOT_RUN, *CUT_ENDS, *ONCE} <= set(TYPED)
     assert set(OTHER_PROGRAMS) <= {line.split()[0] for line in TYPED}
     assert set(CUT) <= {*COMMANDS, *TYPED}
+    assert set(UNCHECKED) <= set[str]().union(*SHOWN.values())
+
+
+def test_what_is_shown_is_compared_or_excused() -> None:
+    for page, lines in SHOWN.items():
+        compared = {line for line in lines if line.startswith("harness ")} - {*NOT_RUN, *CUT_ENDS}
+        assert page in UNCHECKED_PAGES or lines <= {*compared, *UNCHECKED}, page
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed", "same"),
+    [
+        ("a 68.5\n", "a 68.5  \n\n", True),
+        ("a 68.5\n", "a 68.6\n", False),
+        ("a 68.5\n", "a 68.5\nb\n", False),
+        ("b\n", "a\nb\n", False),
+        ("…\nb\n…\n", "a\nb\n", True),
+        ("a\n…\nc\n", "a\nb\nb\nc\n", True),
+        ("a\n…\nc\n", "a\nb\nd\n", False),
+        ("at … s\n", "at 0.1 (s) s\n", True),
+        ("at … s\n", "at 0.1\ns\n", False),
+    ],
+)
+def test_dots_stand_for_lines_or_text_and_all_else_is_compared(shown: str, printed: str, same: bool) -> None:
+    assert (difference(shown, printed) == "") == same
 
 
 @pytest.mark.parametrize("page", pages(), ids=name)
