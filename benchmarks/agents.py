@@ -1,6 +1,7 @@
 """What a swarm is worth: every vehicle decides, with what they may hear of each other, by scene and model.
 
-    python benchmarks/agents.py [--only TEXT] [--layouts N] [--out reports/agents] [--page PAGE] [OPTIONS]
+    python benchmarks/agents.py [--only TEXT] [--layouts N] [--out reports/agents]
+                                [--page benchmarks/measured/agents.md] [OPTIONS]
 
 Drives each scene that has seats on report layouts: with all of its vehicles as agents, with the ego alone,
 and with the first model also with a share of them, and beside it plans each layout for all agents together.
