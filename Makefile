@@ -27,7 +27,8 @@ real: .venv/dev ## fetch a published model, SmolLM2 with 135 million weights, an
 
 results: .venv/dev ## docs/results.md and its picture: hours on a CPU; RESULTS="--limit 20" asks published models less
 	$(BIN)/harness model pull smollm2-135m
-	$(BIN)/python benchmarks/results.py --page docs/results.md --picture docs/pictures/results.svg $(RESULTS)
+	$(BIN)/python benchmarks/results.py --page docs/results.md --details benchmarks/measured/results.md \
+	  --picture docs/pictures/results.svg $(RESULTS)
 
 quick: .venv/dev ## nine tests of ten in about two minutes: all that are not marked slow
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" --hypothesis-profile quick --cpu-limit 0.5

@@ -1,12 +1,13 @@
 """What models do in the paper's scenario: prompts, answer modes and conditions, with n and intervals.
 
     python benchmarks/results.py [--limit N] [--layouts N] [--device D] [--only TEXT] [--out reports/results]
-                                 [--page docs/results.md] [--picture docs/pictures/results.svg]
+                                 [--page docs/results.md] [--details benchmarks/measured/results.md]
+                                 [--picture docs/pictures/results.svg]
 
-It evaluates each row of `ROWS` on the report layouts of `DATASET`, one run a row, and writes the
-tables of the page between its marks, and the picture. Finished runs are read and not made again; a stopped
-one goes on with the same command. On a CPU, a published model takes seconds an answer: with `--limit` it is
-asked on fewer layouts, and each row says on how many.
+It evaluates each row of `ROWS` on the report layouts of `DATASET`, one run a row, and writes success between
+the marks of the page, what the answers are like between those of the details, and the picture. Finished runs
+are read and not made again; a stopped one goes on with the same command. On a CPU, a published model takes
+seconds an answer: with `--limit` it is asked on fewer layouts, and each row says on how many.
 """
 
 import argparse
@@ -74,6 +75,7 @@ ROWS = (*MODELS, *RULES)
 def main() -> None:
     """Make the runs that are missing, and write the page's tables and its picture."""
     arguments = options(__doc__, "results", picture=True)
+    arguments.add_argument("--details", type=Path, help="page to write to what the answers are like")
     arguments.add_argument("--limit", type=int, help="layouts of each run of a published model")
     arguments.add_argument("--answers", type=Path, help="folder of such runs, whose answers are scored again")
     arguments.add_argument("--device", help="where published models run")
@@ -84,10 +86,11 @@ def main() -> None:
             make(row, given)
     runs = {row: read(path) for row in ROWS if (path := given.out / row.folder).joinpath("run.json").exists()}
     said = {row: list(of_roles(row, run)) for row, run in runs.items() if row in MODELS}
-    tables = "\n\n".join([success(runs), answers(runs, said), sentences(said)])
-    print(tables)
-    if given.page:
-        write_tables(given.page, tables)
+    details = f"{answers(runs, said)}\n\n{sentences(said)}"
+    for page, text in ((given.page, success(runs)), (given.details, details)):
+        print(text)
+        if page:
+            write_tables(page, text)
     if given.picture:
         save(drawn(runs), given.picture, "svg")
 
