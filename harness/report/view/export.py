@@ -23,8 +23,8 @@ from harness.runs.suite import SuiteRun
 
 INDEX, PAGE = "index.html", "report.html"
 HEADS = (
-    "run", "kind", "model", "prompt", "scenes", "condition", "success", f"gain over {BASELINE}", "unsafe",
-    "n", "began",
+    "run", "success", f"gain over {BASELINE}", "unsafe", "n", "condition", "model", "prompt", "scenes",
+    "kind", "began",
 )  # fmt: skip
 NOTE = (
     "Success, with its 95 % interval over episodes, is that of the run's best condition that no warning of "
@@ -109,6 +109,6 @@ def _row(run: Listed, done: Run | SuiteRun) -> tuple[str, ...]:
     lead = lead_of(done)
     n = sum(len(part.grid.episodes) for part in _parts(done).values())
     figures = (words.cell(done.score(best, metric)) for metric in (lead, GAINS[lead], "unsafe_rate"))
-    agents = run.kind, run.model or "–", run.prompt or "–", done.source
+    agents = run.model or "–", run.prompt or "–", done.source, run.kind
     where = linked(run.name, quote(f"{run.name}/{PAGE}"))
-    return where, *agents, f"{best}, {IN_WORDS[lead]}", *figures, str(n), f"{run.date:%Y-%m-%d}"
+    return where, *figures, str(n), f"{best}, {IN_WORDS[lead]}", *agents, f"{run.date:%Y-%m-%d}"
