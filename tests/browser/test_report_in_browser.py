@@ -371,11 +371,14 @@ def test_it_prints_light_and_without_controls(opened, report):
     assert paper(page) == "rgb(255, 255, 255)"
     assert not page.locator("nav").is_visible()
     assert not page.locator("#list form").is_visible()
+    assert page.locator(".sortable th button").first.is_visible(), "the heads of columns are on paper, too"
     printed = page.pdf()
     assert printed.startswith(b"%PDF")
     assert len(printed) > 50_000
     page.set_viewport_size({"width": 718, "height": 1040})  # A4 with margins of 10 mm
     assert page.evaluate("document.documentElement.scrollWidth") <= 718
+    head, line = page.locator("#strips thead th").first, page.locator("#strips tbody th").first
+    assert head.bounding_box()["height"] < 2 * line.bounding_box()["height"], "no head breaks within a word"
 
 
 @pytest.mark.parametrize("where", ["", "#scene"])

@@ -1,0 +1,62 @@
+"""Pages without a script: none is wider than a telephone, and what is wide in them scrolls inside itself."""
+
+import pytest
+
+pytest.importorskip("playwright", reason="needs the dev extra")
+pytest.importorskip("axe_playwright_python", reason="needs the dev extra")
+
+from axe_playwright_python.sync_playwright import Axe
+from evaluating import run as evaluate
+from evaluating import spec_of
+from opening import NARROW, picture
+
+from harness.coordination.operating_point import named_point
+from harness.report.compare.difference import compare
+from harness.report.compare.page import render
+from harness.report.compare.pair import pair
+from harness.report.document import Section, Table, document
+from harness.report.view.export import export
+
+pytestmark = pytest.mark.slow
+
+LONG = "6g:schedule=always,weight_cap=0.5,max_helpers=2"
+DRAWN = "<svg xmlns='http://www.w3.org/2000/svg' width='1056' height='300'></svg>"
+WIDTH_REM = 66
+
+
+@pytest.fixture(scope="module")
+def pages(small, tmp_path_factory):
+    """A page as studies write them, one of a comparison, and an exported list, by name."""
+    folder = tmp_path_factory.mktemp("documents")
+    points = named_point("single-local"), named_point(LONG)
+    runs = [folder / "reports" / name for name in ("proxy", "cruise")]
+    for run in runs:
+        evaluate(spec_of(small, run.name, points=points), run)
+    cells = [f"{value}.0 [{value}.0, 100.0]" for value in range(10)]
+    table = Table("A table of ten columns", [*map(str, range(10))], [cells])
+    data = f"data:image/svg+xml,{DRAWN}"
+    study = Section(f"A study of {LONG}", [LONG], tables=[table], pictures={"figure": (data, WIDTH_REM)})
+    (folder / "study.html").write_text(document([study]))
+    (folder / "compare.html").write_text(render(compare(pair(*runs)), (), 10, lambda run: None))
+    export(folder / "reports", folder / "site", lambda done: None)
+    return {"study": folder / "study.html", "compare": folder / "compare.html",
+            "export": folder / "site/index.html"}  # fmt: skip
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("name", ["study", "compare", "export"])
+def test_a_document_fits_a_telephone_and_is_read_aloud(browser, pages, name, scheme):
+    page = browser.new_page(viewport=NARROW, color_scheme=scheme)
+    page.goto(pages[name].as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
+    assert Axe().run(page).response["violations"] == []
+    picture(page, f"{name}-narrow-{scheme}")
+    page.close()
+
+
+def test_a_wide_figure_is_drawn_so_that_it_can_be_read(browser, pages):
+    page = browser.new_page(viewport=NARROW)
+    page.goto(pages["study"].as_uri())
+    rem = page.evaluate("parseFloat(getComputedStyle(document.documentElement).fontSize)")
+    assert page.locator("figure img").bounding_box()["width"] == pytest.approx(0.6 * WIDTH_REM * rem, abs=1)
+    page.close()
