@@ -43,7 +43,7 @@ def test_every_number_of_the_paper_is_in_the_ledger(found: pd.DataFrame) -> None
 
 
 def test_the_ledger_is_inside_its_aims(found: pd.DataFrame) -> None:
-    """One row is known to miss (benchmarks/measured/studies.md): at 40 % loss more is heard than in the paper."""
+    """One row misses (benchmarks/measured/studies.md): at 40 % loss more is heard than in the paper."""
     assert set(found[found.verdict == "misses"].id) <= {"B12"}
     ran = found[found.kind != "cited"]
     noise = ran.metric.map({"success": 1.0}).fillna(0.0)
