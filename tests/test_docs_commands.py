@@ -44,6 +44,7 @@ CHECKED = "harness prompt check mine --tokenizer ../tokenizer.json --dataset occ
 # line has its own, or its command's.
 SHARD = "--episodes 4 --seeds 0 --workers 1"
 CUT = {
+    **{line: "" for line in TYPED if re.search("--limit 20 --out reports/[ab]$", line)},  # then compared
     "harness drive --model proxy --shard 1/2 --out reports/split/1": SHARD,
     "harness drive --model proxy --shard 2/2 --out reports/split/2": SHARD,
     "harness eval --model ./my-checkpoint": "--limit 1",  # by transformers, which is slow on a CPU
@@ -78,10 +79,7 @@ CUT = {
 
 # Ends otherwise than its page shows, since what it reads was cut.
 CUT_ENDS = {
-    # Two episodes pass the gates that 240 fail.
-    "harness compare reports/a reports/b"
-    " --fail-if '6g:success_rate < -0.01' --fail-if '6g:unsafe_rate > 0.01'": 0,
-    # Of two episodes, each is the only one of its kind.
+    # Each of two episodes is the only one of its kind.
     "harness plan reports/v2 reports/v4 --detect 5": 2,
     # The model that ships has 768 tokens; the page counts those of a Qwen.
     CHECKED: 1,
@@ -141,13 +139,7 @@ OTHER_PROGRAMS = {
 # Pages that show anything have these whole: they are run once, and copied into their folders.
 ONCE = ("harness eval --model proxy", "harness eval --model local-view")
 
-# What is shown below these is not compared. What is shown below any other line is, and the line runs whole.
-UNCHECKED: dict[str, str] = {}
-UNCHECKED_PAGES = {
-    "docs/answers.md", "docs/attribution.md", "docs/benchmark.md", "docs/comparing.md",
-    "docs/prompts.md", "docs/repeats.md", "docs/results.md",
-    "docs/servers.md", "docs/swarms.md", "docs/tutorial-model.md", "docs/twins.md",
-}  # fmt: skip
+UNCHECKED_PAGES = {"docs/tutorial-prompt.md"}
 
 
 def shell_of(page: Path) -> list[tuple[str, str]]:
@@ -252,7 +244,7 @@ def test_a_page_can_be_followed_and_shows_what_is_printed(
                 path, rest = parsed(args)
                 COMMANDS[path].make_context(path, rest)
             elif program == "harness":
-                whole = compared and shown.strip() and command not in UNCHECKED
+                whole = compared and shown.strip()
                 if copies and command in ONCE:
                     code, out = 0, copied(args)
                 else:
@@ -278,13 +270,12 @@ def test_what_is_excused_is_still_in_the_documents() -> None:
     assert {*NOT_RUN, *CUT_ENDS, *ONCE} <= set(TYPED)
     assert set(OTHER_PROGRAMS) <= {line.split()[0] for line in TYPED}
     assert set(CUT) <= {*COMMANDS, *TYPED}
-    assert set(UNCHECKED) <= set[str]().union(*SHOWN.values())
 
 
-def test_what_is_shown_is_compared_or_excused() -> None:
+def test_what_is_shown_is_compared() -> None:
     for page, lines in SHOWN.items():
-        compared = {line for line in lines if line.startswith("harness ")} - {*NOT_RUN, *CUT_ENDS}
-        assert page in UNCHECKED_PAGES or lines <= {*compared, *UNCHECKED}, page
+        assert all(line.startswith("harness ") for line in lines), page
+        assert not lines & {*NOT_RUN, *CUT_ENDS}, page
 
 
 @pytest.mark.parametrize(
