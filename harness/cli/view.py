@@ -16,7 +16,7 @@ def command(
     port: int = typer.Option(7654, help="Port on 127.0.0.1; 0 picks a free one."),
     open_browser: bool = typer.Option(False, "--open", help="Also open the page in the browser."),
     export: Path | None = typer.Option(
-        None, help="Serve nothing; write the list and the runs' pages to this new folder."
+        None, help="Serve nothing; write the list and all pages to this new folder."
     ),
 ) -> None:
     """List, open and compare runs and studies in a browser.

@@ -16,6 +16,7 @@ import httpx
 import pytest
 import uvicorn
 
+from harness.report.document import Section, document
 from harness.report.view.access import cookie
 from harness.report.words import cell
 from harness.runs.folder import read
@@ -115,7 +116,7 @@ def test_an_exported_folder_has_a_list_and_a_page_of_each_run_and_no_path_of_thi
     (reports / "second/report.html").write_text(f"<body>{tmp_path} is not for others")
     code, out, err = harness("view", str(reports), "--export", str(tmp_path / "site"))
     assert (code, out) == (0, f"wrote {tmp_path / 'site/index.html'}\n")
-    assert "left out first/sweep-tau: a sweep; its folder can be published as it is" in err
+    assert "left out first/sweep-tau: a sweep without a page that this version wrote; make it again" in err
     site = {
         str(file.relative_to(tmp_path / "site")): file.read_text()
         for file in (tmp_path / "site").rglob("*.html")
@@ -130,6 +131,22 @@ def test_an_exported_folder_has_a_list_and_a_page_of_each_run_and_no_path_of_thi
     figures = [cell(run.score("6g", metric)) for metric in (lead, GAINS[lead], "unsafe_rate")]
     assert "".join(f"<td>{figure}</td>" for figure in figures) in site["index.html"]
     assert not any(str(tmp_path) in page for page in site.values())
+
+
+def test_an_exported_folder_has_studies_whose_page_can_run_no_script(
+    reports: Path, harness: Callable[..., Said], tmp_path: Path
+) -> None:
+    page = document([Section("A sweep of many points")])
+    (reports / "first/sweep-tau/index.html").write_text(page)
+    spy = reports / "second/sweep-tau"
+    spy.mkdir()
+    (spy / "sweep.json").write_text('{"sources": []}')
+    (spy / "index.html").write_text(page.replace("<meta", "<script></script><meta", 1))
+    code, _, err = harness("view", str(reports), "--export", str(tmp_path / "site"))
+    assert (code, err.count("left out")) == (0, 1)
+    assert "left out second/sweep-tau: a sweep without a page that this version wrote" in err
+    assert "A sweep of many points" in (tmp_path / "site/first/sweep-tau/report.html").read_text()
+    assert '<a href="first/sweep-tau/report.html">' in (tmp_path / "site/index.html").read_text()
 
 
 def test_a_port_in_use_is_one_line(harness: Callable[..., Said]) -> None:

@@ -1,4 +1,4 @@
-"""A folder of pages to publish: the list of finished runs, and the page of each. Nothing serves it."""
+"""A folder of pages to publish: lists of finished runs and of studies, and the page of each."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -13,8 +13,8 @@ from harness.report import suite as suites
 from harness.report.document import Section, Table, document, linked
 from harness.report.page import render
 from harness.report.runs import gather
-from harness.report.view.folder import whole
-from harness.report.view.pages import RUNS, suite_of, with_way_back
+from harness.report.view.folder import own_file, whole
+from harness.report.view.pages import RUNS, suite_of, whole_text, with_way_back
 from harness.runs.folder import Run
 from harness.runs.leading import IN_WORDS, lead_of
 from harness.runs.listing import Listed, runs
@@ -26,6 +26,7 @@ HEADS = (
     "run", "success", f"gain over {BASELINE}", "unsafe", "n", "condition", "model", "prompt", "scenes",
     "kind", "began",
 )  # fmt: skip
+OF_STUDIES = ("study", "kind", "of", "written")
 NOTE = (
     "Success, with its 95 % interval over episodes, is that of the run's best condition that no warning of "
     "its page is about. The gain is paired by episode. Unsafe episodes end in a collision or off the road, "
@@ -35,9 +36,10 @@ NOTE = (
 
 
 def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[str]:
-    """Write the pages of a folder's finished runs and suites to a new folder, to be published as it is.
+    """Write the pages of a folder's finished runs, suites and studies to a new folder, to be published.
 
-    Every page is drawn anew: what else lies in a run's folder is not published, nor are studies.
+    Every page of a run is drawn anew: what else lies in its folder is not published. A study's page is
+    published as it is, if it begins as one that may run no script.
 
     Args:
         folder: what `harness view` lists.
@@ -53,7 +55,7 @@ def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[s
     if os.path.lexists(out):
         raise UserError(f"--export {printable(out)} is there already; give a new folder")
     listed = runs(folder)
-    rows, warnings, left = [], [], []
+    rows, studies, warnings, left = [], [], [], []
     try:
         with making(out) as part:
             for run in listed:
@@ -65,16 +67,23 @@ def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[s
                     at = part / run.name / PAGE
                     home = quote(os.path.relpath(part / INDEX, at.parent))
                     write_whole(at, with_way_back(page, home=home))
+                    if done is None:
+                        link = linked(run.name, quote(f"{run.name}/{PAGE}"))
+                        studies.append((link, run.kind, run.model or "–", f"{run.date:%Y-%m-%d}"))
+                        continue
                     rows.append(_row(run, done))
                     warnings += [f"{run.name}: {text}" for text in caveats.merged(_parts(done), caveats.void)]
-                progress(1)
-            if not rows:
+                finally:
+                    progress(1)
+            if not (rows or studies):
                 why = f" ({left[0]})" if left else ""
                 raise UserError(
                     f"{printable(folder)} has no run that can be shown{why}; make one with `harness eval`"
                 )
-            table = Table("Finished runs, the newest first", HEADS, rows, NOTE, left=True)
-            write_whole(part / INDEX, document([Section("Runs", tables=[table], warnings=warnings)]))
+            of_runs = Table("Finished runs, the newest first", HEADS, rows, NOTE, left=True)
+            of_studies = Table("Studies, the newest first", OF_STUDIES, studies, left=True)
+            tables = [table for table in (of_runs, of_studies) if table.rows]
+            write_whole(part / INDEX, document([Section("Runs", tables=tables, warnings=warnings)]))
     except OSError as error:
         raise UserError(
             f"--export {printable(out)} cannot be written ({error.strerror}); give another folder"
@@ -82,18 +91,28 @@ def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[s
     return left
 
 
-def _page(folder: Path, run: Listed) -> tuple[str, Run | SuiteRun]:
+def _page(folder: Path, run: Listed) -> tuple[str, Run | SuiteRun | None]:
+    """Return a page, and the run or suite that it is of; None for a study."""
     if run.state != "finished":
         raise UserError(f"{run.state} ({printable(run.why)})")
-    if run.kind not in (*RUNS, "suite"):
-        raise UserError(f"a {run.kind}; its folder can be published as it is")
     if not run.name.isprintable():
         raise UserError("its name cannot be sent; rename it")
+    if run.kind not in (*RUNS, "suite"):
+        return _study(folder, run), None
     if run.kind == "suite":
         done = suite_of(folder, run.name)
         return suites.render([(done, suites.lines(done))], partial(_near, done.path)), done
     gathered = gather([whole(folder, run.name)])
     return render(gathered), gathered.runs[0]
+
+
+def _study(folder: Path, run: Listed) -> str:
+    file = own_file(folder, run.name, INDEX)
+    page = whole_text(file) if file else ""
+    # What stands there forbids scripts in all that follows.
+    if not page.startswith(document([Section("")]).partition("<title>")[0]):
+        raise UserError(f"a {run.kind} without a page that this version wrote; make it again")
+    return page
 
 
 def _near(path: Path, run: Run) -> str:
