@@ -19,6 +19,8 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from harness.core.errors import UserError, printable
+
 _EXACT = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False, check_circular=False
 )
@@ -172,6 +174,12 @@ def replacing(path: Path) -> Iterator[Path]:
             os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def refuse_taken(option: str, folder: Path) -> None:
+    """Raise UserError if there is something where an option names a new folder."""
+    if os.path.lexists(folder):
+        raise UserError(f"{option} {printable(folder)} is there already; give a new folder")
 
 
 @contextmanager

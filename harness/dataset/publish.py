@@ -1,6 +1,5 @@
 """Publish datasets in forms that other programs load: Parquet tables, a card and a Croissant file."""
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ import pyarrow.parquet as pq
 
 from harness.core.errors import UserError, printable
 from harness.core.figures import known
-from harness.core.files import making, sha256_file, write_whole
+from harness.core.files import making, refuse_taken, sha256_file, write_whole
 from harness.core.progress import Progress
 from harness.core.statistics import rate_interval
 from harness.dataset.card import CROISSANT, README, Table, croissant, path_of, readme
@@ -46,8 +45,7 @@ def publish(
     Raises UserError if the folder is there, the name will not do, two datasets have one name, or one is
     damaged, and OSError if the folder cannot be written.
     """
-    if os.path.lexists(out):
-        raise UserError(f"--out {printable(out)} is there already; give a new folder")
+    refuse_taken("--out", out)
     manifests = [read_manifest(folder)[0] for folder in folders]
     names = [manifest.name for manifest in manifests]
     if twice := next((name for name in names if names.count(name) > 1), None):
