@@ -119,9 +119,6 @@ class Metered:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
 
-    def identity(self) -> dict[str, Any]:
-        return self._backend.identity()
-
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         if self._limit:
             self._limit.check()
