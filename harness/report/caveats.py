@@ -63,14 +63,15 @@ def looked_at(manifest: Manifest) -> Iterator[str]:
 
 
 def merged(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
-    """Return the caveats of runs, each sentence once; of several with the names of those it is about."""
+    """Return the caveats of runs, each sentence once, with the names of those it is about if not of all."""
     about: dict[str, list[str]] = {}
     for name, run in runs.items():
         for sentence in of(run):
             about.setdefault(sentence, []).append(name)
-    if len(runs) == 1:
-        return list(about)
-    return [f"{', '.join(names)}: {sentence}" for sentence, names in about.items()]
+    return [
+        sentence if len(names) == len(runs) else f"{', '.join(names)}: {sentence}"
+        for sentence, names in about.items()
+    ]
 
 
 def unread(scores: Sequence[Score]) -> Iterator[str]:
