@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from markupsafe import Markup, escape
 
 from harness.core.errors import UserError, printable, unknown
+from harness.core.figures import crossed
 from harness.core.files import bytes_of
 from harness.runs.records import FrozenScenes, Score
 from harness.runs.tables import Tables, tables_of
@@ -81,7 +82,7 @@ class Run(Tables):
             for condition in self.source.conditions
         ]
         sentences = [words.headline(self.source), *caveats.unread(self.source.scores)]
-        n = f"n = {len(self.source.grid.episodes)} episodes × {len(self.source.grid.seeds)} channel seeds"
+        n = f"n = {crossed(len(self.source.grid.episodes), len(self.source.grid.seeds))}"
         return _page(sentences, _frame(pd.DataFrame(rows)), f"{n}; 95 % intervals over episodes; {self.path}")
 
 

@@ -49,7 +49,7 @@ def test_a_run_says_which_and_its_command_selects_them_again(harness: Callable[.
     words = ("--danger", "left", "--sample", "2", "--sample-seed", "7", "--condition", "6g", "--seeds", "3:4")
     code, out, _ = harness("eval", *words, "--out", "a")
     assert code == 0
-    assert "n = 2 episodes × 1 channel seeds; of layout seeds 200000 to 200199 (report);" in out
+    assert "n = 2 episodes × 1 channel seed; of layout seeds 200000 to 200199 (report);" in out
     made = json.loads(Path("a/run.json").read_text())
     assert made["world"]["selection"] == {"danger": "left", "sample": 2, "sample_seed": 7}
     again = shlex.split(made["command"])

@@ -12,7 +12,7 @@ from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.cli.terminal import console, echo_json, table
 from harness.core.errors import UserError, printable
-from harness.core.figures import shown
+from harness.core.figures import amount, shown
 
 if TYPE_CHECKING:
     from harness.core.statistics import Estimate
@@ -67,8 +67,9 @@ def build(
         options.say_shard(part, out, f"{mine} of {episodes} layouts")
         return
     typer.echo(
-        f"wrote {printable(out)} of {printable(scenarios.title(scenario))}: {manifest['episodes']} layouts, "
-        f"{manifest['nodes']} decision points, in {time.monotonic() - begun_s:.0f} s"
+        f"wrote {printable(out)} of {printable(scenarios.title(scenario))}: "
+        f"{amount(manifest['episodes'], 'layout')}, {amount(manifest['nodes'], 'decision point')}, "
+        f"in {time.monotonic() - begun_s:.0f} s"
     )
 
 
@@ -88,7 +89,8 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
         typer.echo("\n".join(problems))
     else:
         typer.echo(
-            f"{manifest.name} is sound: {manifest.episodes} layouts, {manifest.nodes} decision points\n"
+            f"{manifest.name} is sound: {amount(manifest.episodes, 'layout')}, "
+            f"{amount(manifest.nodes, 'decision point')}\n"
             f"manifest sha256 {digest}"
         )
         if lost:

@@ -13,6 +13,7 @@ from harness.cli.run import Column, as_mapping, default_out, evaluate, show
 from harness.cli.terminal import echo_json
 from harness.core import extras
 from harness.core.errors import UserError, in_range, printable
+from harness.core.figures import crossed
 from harness.core.seeds import stated
 from harness.evaluate.settings import OUTPUT, DriveSettings, Settings, changed
 
@@ -145,7 +146,7 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
     world = cast("ClosedLoop", done.manifest.world)
     drawn_from = world.selection.get("of")
     notes = (
-        f"n = {world.episodes} episodes × {len(done.manifest.seeds)} channel seeds; "
+        f"n = {crossed(world.episodes, len(done.manifest.seeds))}; "
         f"{'of ' if drawn_from else ''}{stated(world.first_seed, drawn_from or world.episodes)};\n"
         "95 % intervals over episodes; missed: decisions longer than the decision window;\n"
         "gap: smallest distance to a vehicle; clear: time until the ego had cleared, if\n"

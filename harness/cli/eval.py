@@ -12,6 +12,7 @@ from harness.cli import options, repeats, suite
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show, walked
 from harness.cli.terminal import echo_cost, echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
+from harness.core.figures import crossed
 from harness.core.seeds import stated
 from harness.evaluate.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
 from harness.runs import leading
@@ -138,7 +139,7 @@ def command(
     gain = [of for of in [GAINS[leading.lead_of(done)]] if any(s.metric == of.metric for s in done.scores)]
     beside = {name: references[name] for name in BESIDE if name in references}
     notes = (
-        f"n = {len(dataset.episodes)} episodes × {len(specs[0].seeds)} channel seeds; "
+        f"n = {crossed(len(dataset.episodes), len(specs[0].seeds))}; "
         f"{'of ' if selected else ''}{stated(dataset.manifest.seed, seeds_of)};",
         "95 % intervals over episodes; msgs: per episode" + "; gain: over single-local, paired" * bool(gain),
         *map(meaning, beside),

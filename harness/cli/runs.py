@@ -11,7 +11,7 @@ from harness.cli.progress import bar
 from harness.cli.terminal import WIDTH, echo_json, echo_wrong
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
-from harness.core.figures import DASH, PERCENT
+from harness.core.figures import DASH, PERCENT, amount
 from harness.runs.leading import BALANCED
 
 if TYPE_CHECKING:
@@ -142,7 +142,8 @@ def merge(
             echo_json(manifest)
         elif not quiet:
             typer.echo(
-                f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points"
+                f"wrote {printable(out)}: {amount(manifest['episodes'], 'layout')}, "
+                f"{amount(manifest['nodes'], 'decision point')}"
             )
         return
     from harness.cli.report import write

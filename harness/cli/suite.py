@@ -11,7 +11,7 @@ import typer
 from harness.cli.run import RunGroup, as_mapping, free_folder, origins
 from harness.cli.terminal import console, echo_json, table
 from harness.core.errors import UserError, printable
-from harness.core.figures import shown
+from harness.core.figures import amount, shown
 from harness.core.formats import SUITE, WORK
 
 if TYPE_CHECKING:
@@ -132,9 +132,9 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
         ],
     )  # fmt: skip
     text.print(
-        f"n: episodes, each × {len(done.manifest.seeds)} channel seeds; seeds: what the layout seeds are "
-        "for; 95 % intervals over episodes; gains are paired; the mean gives each family the same weight, "
-        "and its interval is about other episodes of these families, not about other families"
+        f"n: episodes, each × {amount(len(done.manifest.seeds), 'channel seed')}; seeds: what the layout "
+        "seeds are for; 95 % intervals over episodes; gains are paired; the mean gives each family the same "
+        "weight, and its interval is about other episodes of these families, not about other families"
     )
     figures = {(s.condition, s.metric): s for s in done.scores}
     for note in origins(done.manifest, figures, ", as means over families"):

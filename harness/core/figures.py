@@ -75,6 +75,11 @@ def amount(n: int, noun: str) -> str:
     return f"{n} {noun}{'s' * (n != 1)}"
 
 
+def crossed(episodes: int, seeds: int) -> str:
+    """Write what figures are over: `6 episodes × 1 channel seed`."""
+    return f"{amount(episodes, 'episode')} × {amount(seeds, 'channel seed')}"
+
+
 def known(value: float | None) -> float | None:
     """Return the number; None if it is NaN."""
     return None if value is None or math.isnan(value) else value

@@ -12,6 +12,7 @@ from msgspec import Meta, Struct
 from harness.backends.card import Card
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
+from harness.core.figures import amount
 from harness.core.files import digest
 from harness.core.resources import find, names
 from harness.core.seeds import FIRST, LAST_EPISODE, LAST_SEED
@@ -117,7 +118,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if not isinstance(world, FrozenScenes) or self.datasets.get(world.name) != world.sha256:
             yield f"its scenes are {printable(getattr(world, 'name', 'driven'), 40)}, none of its datasets"
         elif world.limit != limit or world.selection:
-            yield f"it has {world.episodes} layouts that were selected, and all count"
+            yield f"it has {amount(world.episodes, 'layout')} that were selected, and all count"
         elif world.name in others:
             yield f"another is of {printable(world.name, 40)}, too"
         if m.helpers:

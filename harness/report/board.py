@@ -8,6 +8,7 @@ from markupsafe import Markup
 
 from harness.backends.registry import reads_prompts
 from harness.core.errors import UserError, printable
+from harness.core.figures import amount
 from harness.core.statistics import Estimate, mean_of
 from harness.evaluate.rescore import Rescored
 from harness.report.document import Section, Table, document, forest, reach
@@ -116,8 +117,8 @@ def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
     layouts = sum(len(run.grid.episodes) for run in suite.runs.values())
     about = (
         f"{edition.description}. {lead.capitalize()} in %, means over {len(suite.runs)} families, "
-        f"{layouts} layouts × {len(suite.manifest.seeds)} channel seeds in all, with 95 % intervals over "
-        f"layouts. The edition's digest is {edition.digest}."
+        f"{amount(layouts, 'layout')} × {amount(len(suite.manifest.seeds), 'channel seed')} in all, with "
+        f"95 % intervals over layouts. The edition's digest is {edition.digest}."
     )
     note = (
         f"Rank: one more than the number of entries that are clearly better under {by}, whose difference, "

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from harness.core.figures import amount
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.seeds import purposes
 from harness.dataset.load import Dataset
@@ -106,8 +107,9 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
         f"{suite.variant} on {suite.name}",
         [words.headline(suite)],
         [
-            f"{suite.description}. {len(suite.runs)} families × {len(suite.manifest.seeds)} channel seeds; "
-            "figures are means over families, with 95 % intervals over episodes."
+            f"{suite.description}. {len(suite.runs)} families × "
+            f"{amount(len(suite.manifest.seeds), 'channel seed')}; figures are means over families, with "
+            "95 % intervals over episodes."
         ],
         [_families(lines, place, lead_of(suite)), _metrics(suite)],
         warnings=caveats.merged(suite.runs, caveats.void),

@@ -18,6 +18,7 @@ from harness.coordination.calibrations import (
 )
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError, printable
+from harness.core.figures import amount
 from harness.core.files import write_whole
 from harness.core.seeds import stated
 from harness.dataset.forest import Forest
@@ -87,7 +88,7 @@ def calibrate(
     seeds = stated(first, last - first + 1)
     found = Calibration(
         level, command,
-        f"{manifest.variant.model} on {manifest.world.name}, {seeds}, {len(forest.seeds)} layouts",
+        f"{manifest.variant.model} on {manifest.world.name}, {seeds}, {amount(len(forest.seeds), 'layout')}",
         first, last, data.scenario.name, tuple(run.actions), question_of(manifest.agent(0)),
         corrections["ego"], corrections.get("helper"),
     )  # fmt: skip

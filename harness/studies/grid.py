@@ -19,7 +19,7 @@ from harness.backends.registry import open_backend
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
-from harness.core.figures import PLAIN, shown
+from harness.core.figures import PLAIN, crossed, shown
 from harness.core.multiplicity import LEVEL
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, resampled_estimate
@@ -310,7 +310,7 @@ def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
     return Study(
         "grid", f"{grid.rows} egos × {grid.columns} helpers on {spec.source.name}", headline(grid),
         [
-            f"Varied: {factors}. n = {len(episodes)} episodes × {len(spec.seeds)} channel seeds "
+            f"Varied: {factors}. n = {crossed(len(episodes), len(spec.seeds))} "
             f"({', '.join(map(str, spec.seeds))}), the same for all combinations, so differences are "
             "paired by episode; 95 % intervals are over episodes. All figures are in cells.csv and "
             "effects.csv; each combination's run is in cells/. The inference time is declared, or "

@@ -19,6 +19,7 @@ from harness.coordination.schedules import INPUTS, Learnt, Network, Stated, Weig
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
+from harness.core.figures import amount
 from harness.core.files import write_whole
 from harness.core.seeds import Purpose, purposes, stated
 from harness.studies.choices import Choices, Choose, choices
@@ -43,7 +44,7 @@ def layouts(stored: ReplayedRun, wanted: Purpose) -> str:
             f"{printable(stored.run.path)}: {stated(first, count)}; give a run on {wanted} layouts, which "
             "`harness dataset build --seed` makes"
         )
-    return f"{stored.name} on {stored.dataset.name}, {stated(first, count)}, {len(seeds)} layouts"
+    return f"{stored.name} on {stored.dataset.name}, {stated(first, count)}, {amount(len(seeds), 'layout')}"
 
 
 def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:

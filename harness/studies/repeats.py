@@ -21,7 +21,7 @@ from harness.coordination.trigger import entropy_nats
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
-from harness.core.figures import Unit, shown
+from harness.core.figures import Unit, amount, shown
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, episode_interval, known_mean, rate_interval, resampled
 from harness.core.versions import versions
@@ -249,8 +249,9 @@ def repeats_study(repeats: Repeats) -> Study:
     return Study(
         "repeats", f"{k} repeats of {first.variant} on {source}", headline(repeats),
         [
-            f"{k} repeats × {len(first.seeds)} channel seeds of {len(repeats.runs[0].grid.episodes)} "
-            f"episodes at temperature {first.temperature:g}. Each repeat is a whole run with its own "
+            f"{k} repeats × {amount(len(first.seeds), 'channel seed')} of "
+            f"{amount(len(repeats.runs[0].grid.episodes), 'episode')} at temperature "
+            f"{first.temperature:g}. Each repeat is a whole run with its own "
             "sampling seed, and with the same episodes and channel seeds, so they differ only in the "
             "random draws of the model's answers. 95 % intervals are over episodes. All figures are in "
             "repeats.csv."

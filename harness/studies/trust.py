@@ -19,7 +19,7 @@ from harness.coordination.rules import EGO_PROMPT, RULES, reads_plans
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
-from harness.core.figures import as_mapping, shown
+from harness.core.figures import as_mapping, crossed, shown
 from harness.core.files import digest
 from harness.core.multiplicity import LEVEL
 from harness.core.progress import Progress
@@ -331,7 +331,7 @@ def trust_study(bench: Bench) -> Study:
     return Study(
         "trust", f"Consensus rules under attack: {bench.name} on {bench.source}", headline(bench),
         [
-            f"n = {n} episodes × {len(bench.seeds)} channel seeds under {bench.condition}. All cells have "
+            f"n = {crossed(n, len(bench.seeds))} under {bench.condition}. All cells have "
             "the same episodes, channel draws and attackers, so differences are paired by episode; 95 % "
             "intervals are over episodes. Price in peace: the difference in "
             f"{bench.counting.words} from linear while nobody attacks, in points. All figures are in "

@@ -161,7 +161,7 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
     scenes = list(dict.fromkeys(answer.scene for answer in answers_of(worse[0])))
     n = len(scenes)
     for part in (
-        "B: ", "proxy · prompt v2 · constrained", "4 episodes × 2 seeds of small", "differ in answer",
+        "B: ", "proxy · prompt v2 · constrained", "4 episodes × 2 channel seeds of small", "differ in answer",
         "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-69.9, +28.1] 1.000",
         "success: 0 gained, 2 lost of 8 episodes × seeds; McNemar's exact test over episodes p = 1.000",
         "lost: 1 late", f"answers: ego strict → failed: {n} of {n}",

@@ -36,7 +36,7 @@ def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(h
     run = tmp_path / "run"
     code, out, err = harness("drive", *draw, *of, "--condition", "6g", "--workers", 2, "--out", run)
     assert (code, err) == (0, "")
-    assert f"n = 2 episodes × 1 channel seeds; of layout seeds {layouts['seed']} to" in out
+    assert f"n = 2 episodes × 1 channel seed; of layout seeds {layouts['seed']} to" in out
     assert (
         harness("eval", "--dataset", small_path, *draw, "--condition", "6g", "--out", tmp_path / "frozen")[0]
         == 0

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from harness.core.errors import printable
-from harness.core.figures import POINTS, shown
+from harness.core.figures import POINTS, amount, crossed, shown
 from harness.core.multiplicity import LEVEL
 from harness.prompts.difference import marked
 from harness.prompts.versions import as_it_was
@@ -155,14 +155,14 @@ def _any_time(pair: Pair) -> Iterator[str]:
 
 def paired(pair: Pair) -> str:
     """Return what is paired, and what only one of the runs has."""
-    text = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {where(pair.a.run)}"
+    text = f"{crossed(len(pair.episodes), len(pair.seeds))} of {where(pair.a.run)}"
     for name, side in (("A", pair.a), ("B", pair.b)):
         conditions = [c for c in side.run.conditions if c not in pair.conditions]
         episodes = len(side.run.grid.episodes) - len(pair.episodes)
         if conditions:
             text += f"; only {name} has {', '.join(conditions)}"
         if episodes:
-            text += f"; {name} has {episodes} more episodes"
+            text += f"; {name} has {amount(episodes, 'more episode')}"
     return text
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from harness.core.errors import UserError, printable
-from harness.core.files import making, write_whole
+from harness.core.files import making, refuse_taken, write_whole
 from harness.report import caveats, words
 from harness.report import suite as suites
 from harness.report.document import Section, Table, document, linked
@@ -52,8 +52,7 @@ def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[s
     Raises:
         UserError: `out` is there already or cannot be written, or no run can be shown.
     """
-    if os.path.lexists(out):
-        raise UserError(f"--export {printable(out)} is there already; give a new folder")
+    refuse_taken("--export", out)
     listed = runs(folder)
     rows, studies, warnings, left = [], [], [], []
     try:
