@@ -203,6 +203,7 @@ def show(
     """
     from harness.report.caveats import causes, caveats, lost_at_once
     from harness.report.constancy import ignores_input, in_a_line
+    from harness.report.words import adjusted_lines
     from harness.runs.folder import read
 
     m = done.manifest
@@ -231,7 +232,7 @@ def show(
             of_each = " and ".join(str(half.n) for half in halves if half)
             text.print(f"balanced: mean of both, of {of_each} episodes\n")
     by_witnesses(figures, names)
-    for note in (*notes, *in_a_line(run), *origins(m, figures)):
+    for note in (*notes, *adjusted_lines(run), *in_a_line(run), *origins(m, figures)):
         text.print(note)
 
 

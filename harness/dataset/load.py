@@ -177,6 +177,11 @@ class Dataset:
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
         return replace(self, trees=trees)
 
+    @property
+    def whole(self) -> "Dataset":
+        """The dataset with all of its episodes."""
+        return replace(self, trees=Trees(range(self.manifest.episodes), self.trees.read))
+
     def reference_success(self) -> dict[str, Floats]:
         """Return the success of each reference in each episode, (E,): 0 or 1, of `uniform` its probability.
 

@@ -9,15 +9,17 @@ import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.covariate import LEAST
 from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.schema import Edge
-from harness.dataset.select import ALL, Selection
+from harness.dataset.select import ALL, NONE, Selection
 from harness.evaluate.draws import channel_draws
 from harness.evaluate.looks import Until
 from harness.evaluate.settings import FrozenSettings
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
+from harness.runs.difficulty import REFERENCES, Layout
 from harness.runs.metrics import World, by_danger
 from harness.runs.records import Episode, FrozenScenes, Looks
 from harness.world.lookouts import radios
@@ -73,6 +75,20 @@ class FrozenSource:
             selection = replace(selection, limit=len(numbers))
         dataset, until = self.dataset.of_episodes(frozenset(numbers)), self.until and self.until.after(looks)
         return FrozenSource(dataset, selection, until)
+
+    def layouts(self, asked: int) -> list[Layout]:
+        """Return how hard each layout is that might have been asked; none unless they are more than `asked`.
+
+        None, too, of so few that nothing can be corrected.
+        """
+        whole = self.dataset.whole
+        pool = replace(self.selection, limit=None, sample=None).of(whole)
+        if not LEAST <= asked < len(pool.episodes):
+            return []
+        success = pool.reference_success()
+        dangers = (tree.danger.sector or NONE for tree in pool.trees)
+        known = (success[name].tolist() for name in REFERENCES)
+        return [Layout(*each) for each in zip(pool.episodes, dangers, *known, strict=True)]
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
         """Yield the first decision point of each of up to `most` episodes, of whatever vehicles."""

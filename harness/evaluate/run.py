@@ -52,6 +52,7 @@ from harness.evaluate.walk import walk
 from harness.runs import folder
 from harness.runs import sources as kept_sources
 from harness.runs.decisions import Decisions
+from harness.runs.difficulty import Layout, adjusted_scores
 from harness.runs.formats import FORMAT
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Looks, Manifest
@@ -247,7 +248,8 @@ def _frozen(
         if not in_workers:
             backend = together(spec.cards, costs.metered(spec.cards, models, place, spec.budget), cache)
         seen, looked = _walked(spec, chunks, place, walk_all)
-        return _gather(out, as_finished(spec, begun, looked), seen, place, made_of)
+        layouts = source.layouts(sum(map(len, seen)))
+        return _gather(out, as_finished(spec, begun, looked), seen, place, made_of, layouts=layouts)
 
 
 def spreadable(spec: Spec, workers: Workers) -> Workers:
@@ -431,12 +433,12 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
 
 def _gather(
     out: Path, begun: RunStart, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes],
-    folders: Sequence[Path] = (),
+    folders: Sequence[Path] = (), layouts: Sequence[Layout] = (),
 ) -> Evaluated:  # fmt: skip
     """Score the chunks in a working folder and write the files of the finished run, with its sources.
 
     `place` is the working folder, `made_of` has the sources by name, `folders` are folders that the run is
-    merged from.
+    merged from, and `layouts` those that its own are a part of.
     """
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     works = [place, *(shard / WORK for shard in folders)]
@@ -462,6 +464,8 @@ def _gather(
         ]  # fmt: skip
         if settings["world"].get("looks"):
             summary = [*summary, *any_time_scores(whole.grid, episodes)]
+        if layouts:
+            summary = [*summary, *adjusted_scores(whole.grid, episodes, layouts)]
         manifest = msgspec.convert({
             "format": FORMAT, "name": out.name, "created": begun.created,
             "command": shlex.join([*begun.command, "--out", str(out)]), "tags": begun.tags, **settings,
@@ -478,7 +482,7 @@ def _gather(
             write_whole(out / FILE, text_of(of_words(begun.command)))
         servers.write(out, works)
         decisions_of_all = folder.decisions_of(parts, settings["actions"])
-        folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
+        folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary, layouts)
     return Evaluated(out, manifest, summary)
 
 

@@ -6,18 +6,21 @@ from typing import Any
 from markupsafe import Markup
 
 from harness.core import multiplicity
+from harness.core.covariate import worth
 from harness.core.errors import printable
 from harness.core.figures import PLAIN, Unit
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import mean_of
+from harness.core.statistics import Estimate, mean_of
 from harness.report.caveats import doubted
 from harness.runs import metrics
 from harness.runs.folder import Run
-from harness.runs.leading import IN_WORDS, best_of, lead_of
-from harness.runs.metrics import BASELINE, GAINS, LATENCY, METRICS, SUCCESS, entry, of_ends
+from harness.runs.leading import ANY_TIME, IN_WORDS, best_of, lead_of
+from harness.runs.metrics import ADJUSTED, BASELINE, GAINS, LATENCY, METRICS, SUCCESS, entry, of_ends, written
 from harness.runs.records import Latency, Manifest, Score, Times, role_word
 from harness.runs.success import Success
 from harness.runs.suite import SuiteRun
+
+WORTH = 1.1  # times as many layouts; a corrected figure that is worth less is not shown beside the plain one
 
 
 def shown(score: Score) -> dict[str, str]:
@@ -86,8 +89,10 @@ def figures(run: Run) -> list[dict[str, str]]:
     """Return the few numbers of a run that are read first, each with what it is and its interval."""
     best, base = compared(run)
     lead = lead_of(run)
+    better, gained = adjusted(run, best, lead) or (None, "")
     wanted = [
         (f"{IN_WORDS[lead]} under {best}", run.score(best, lead)),
+        (f"adjusted for difficulty, {gained}", better),
         *(
             (what, run.score(best, half))
             for what, half in zip(("with a danger", "without a danger"), entry(lead).halves, strict=False)
@@ -98,6 +103,33 @@ def figures(run: Run) -> list[dict[str, str]]:
         ("ego's answers that could not be read", run.score(metrics.ALL, "failed_rate_ego")),
     ]
     return [{"what": what, **shown(score)} for what, score in wanted if score is not None]
+
+
+def as_good_as(plain: Estimate, corrected: Estimate) -> str:
+    """Say how many times as many layouts the plain figure needs; empty if it is about as good."""
+    times = worth(plain, corrected)
+    return f"as good as {times:.1f} times as many layouts" if times >= WORTH else ""
+
+
+def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
+    """Return success corrected by the layouts' difficulty, and what that is as good as; None if no better.
+
+    Nor where an interval of every look leads, which this one is not.
+    """
+    plain, better = run.score(condition, metric), run.score(condition, ADJUSTED[metric])
+    if not plain or not better or plain.interval == ANY_TIME:
+        return None
+    gained = as_good_as(plain.estimate, better.estimate)
+    return (better, gained) if gained else None
+
+
+def adjusted_lines(run: Run) -> Iterator[str]:
+    """Yield it of all conditions in which there is one, plain and balanced, as lines."""
+    for metric, words in IN_WORDS.items():
+        each = {name: figure for name in run.conditions if (figure := adjusted(run, name, metric))}
+        cells = (f"{printable(name)} {written(score)}, {gained}" for name, (score, gained) in each.items())
+        if each:
+            yield f"{words} % adjusted for difficulty: {'; '.join(cells)}"
 
 
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:

@@ -36,6 +36,8 @@ from harness.runs.answers import Answered, Answers
 from harness.runs.attribution import Attribution
 from harness.runs.decisions import DecisionFiles, Decisions, arrow_file
 from harness.runs.devices import Speed
+from harness.runs.difficulty import FILE as DIFFICULTY
+from harness.runs.difficulty import Layout
 from harness.runs.leading import ANY_TIME
 from harness.runs.metrics import Grid, World
 from harness.runs.records import (
@@ -183,6 +185,19 @@ class Run:
         exists = (self.path / attribution.FILE).is_file()
         return self._read(attribution.FILE, attribution.load) if exists else None
 
+    @cached_property
+    def layouts(self) -> tuple[Layout, ...]:
+        """The rows of `difficulty.csv`; none where the run came to all of its dataset's layouts."""
+        exists = self.world == "frozen" and (self.path / DIFFICULTY).is_file()
+        return self._read(DIFFICULTY, self._layouts) if exists else ()
+
+    def _layouts(self, file: Path) -> tuple[Layout, ...]:
+        layouts = _records(file, Layout)
+        dangers = {layout.episode: layout.danger for layout in layouts}
+        if len(dangers) < len(layouts) or any(dangers.get(e.episode) != e.danger for e in self.episodes):
+            raise ValueError("an episode is there twice, or it lacks one of the run's")
+        return layouts
+
     def score(self, condition: str, metric: str) -> Score | None:
         """Return a metric's score in one condition; of several intervals, one that holds at every look.
 
@@ -270,7 +285,7 @@ def read(path: Path) -> Run:
 
 def write(
     out: Path, manifest: Manifest, decisions: Decisions | DecisionFiles, episodes: Sequence[Episode],
-    answers: Iterable[bytes], scores: Sequence[Score],
+    answers: Iterable[bytes], scores: Sequence[Score], layouts: Sequence[Layout] = (),
 ) -> None:  # fmt: skip
     """Write a run's files, the manifest last.
 
@@ -281,6 +296,8 @@ def write(
     decisions.write(out / "decisions.parquet")
     write_whole(out / "episodes.csv", csv_text(Episode, episodes, manifest.variant))
     write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
+    if layouts:
+        write_whole(out / DIFFICULTY, csv_text(Layout, layouts))
     text = msgspec.json.format(_ENCODER.encode(manifest), indent=1)
     write_whole(out / "run.json", text + b"\n")
     pa.default_memory_pool().release_unused()  # a report often follows, which needs memory for its own tables

@@ -39,9 +39,11 @@ World = Literal["frozen", "closed-loop"]
 Better = Literal["higher", "lower", "neither"]
 Answers = Sequence[Answer | AnswerFacts]
 BASELINE = "single-local"  # the condition without V2V
-SUCCESS, BALANCED = leading.SUCCESS, leading.BALANCED
+SUCCESS, BALANCED, IN_WORDS = leading.SUCCESS, leading.BALANCED, leading.IN_WORDS
 LATENCY, GAIN = "latency_proxy_ms", f"success_gain_over_{BASELINE}"
 GAINS = {SUCCESS: GAIN, BALANCED: f"balanced_success_gain_over_{BASELINE}"}  # by what is gained
+# What is corrected by the layouts' difficulty, by what it corrects
+ADJUSTED = {name: f"adjusted_{name}" for name in (*GAINS, *GAINS.values())}
 PERCENTILES = (50, 95, 99)
 ALL = "all"  # the condition of a figure that is the same in all of them
 ROLES: tuple[Role, ...] = get_args(Role)
@@ -83,6 +85,7 @@ class Metric:
     half: bool = False  # whether it is of the episodes with a danger alone, or of those without
     # two metrics of a half of the episodes each, whose mean it is
     halves: tuple[str, ...] = ()
+    corrects: str = ""  # the metric that it corrects by the layouts' difficulty, where two runs are compared
     # whether another has taken its place: tables and comparisons keep it, and pages leave it out
     superseded: bool = False
 
@@ -93,7 +96,8 @@ class Metric:
     @property
     def compared(self) -> bool:
         """Whether two runs are compared in it, as in any that is known of an episode or of all decisions."""
-        return bool(self.decisions or self.episodes or self.percentile or self.pooled or self.halves)
+        ways = self.decisions, self.episodes, self.percentile, self.pooled, self.halves, self.corrects
+        return any(ways)
 
 
 class Metrics(Plugins[Metric]):
@@ -393,6 +397,11 @@ BUILT_IN = (
            "higher", "rate", 1.0),
     Metric(GAINS[BALANCED], "balanced success rate less that of the condition without V2V, in the same "
            "episodes", POINTS, "higher", "rate", 1.0),
+    *(Metric(ADJUSTED[name], f"{IN_WORDS[name]}, corrected by what references that ask no model do in these "
+             "layouts and in others of the dataset", PERCENT, "higher", "rate", 1.0, corrects=name,
+             world="frozen", optional=True) for name in GAINS),
+    *(Metric(ADJUSTED[gain], f"{IN_WORDS[name]} less that of the condition without V2V, corrected likewise",
+             POINTS, "higher", "rate", 1.0) for name, gain in GAINS.items()),
     *_of_answers(),
     Metric("agreement_rate", "share of episodes that end alike, frozen and in closed loop", PERCENT,
            "higher", "rate", 1.0),

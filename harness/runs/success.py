@@ -45,9 +45,14 @@ class Success:
         """The same episodes, read by plain success."""
         return Success(np.zeros_like(self.dangerous))
 
+    @property
+    def ways(self) -> "tuple[Success, ...]":
+        """Plain success, and balanced success where that leads."""
+        return (self.plain, self) if self.metric == BALANCED else (self,)
+
     def mean(self, success: Floats) -> float:
         """Return the mean of success, (S, E)."""
-        return float(np.mean([known_mean(known_mean(success[:, part], 0), 0) for part in self._parts]))
+        return float(np.mean([known_mean(known_mean(success[:, part], 0), 0) for part in self.parts]))
 
     def estimate(self, success: Floats) -> Estimate:
         """Return the same with its interval over episodes."""
@@ -59,11 +64,11 @@ class Success:
 
     def any_time(self, success: Floats) -> Estimate:
         """Return mean success, (S, E), with an interval over episodes that holds at every look."""
-        return any_time([known_mean(success, 0)[part] for part in self._parts])
+        return any_time([known_mean(success, 0)[part] for part in self.parts])
 
     def any_time_difference(self, a: Floats, b: Floats) -> Estimate:
         """Return success a - b, both (S, E), paired by episode, with an interval that holds at every look."""
-        return any_time([known_mean(a - b, 0)[part] for part in self._parts], -1.0)
+        return any_time([known_mean(a - b, 0)[part] for part in self.parts], -1.0)
 
     def p_value(self, a: Floats, b: Floats) -> float | None:
         """Return the p-value of no such difference; None without an interval."""
@@ -71,30 +76,30 @@ class Success:
 
     def spread(self, a: Floats, b: Floats, counts: Ints) -> Spread:
         """Return how much success b - a, both (S, E), varies where episodes count so often, (..., E)."""
-        differences, parts = known_mean(b - a, 0), self._parts
+        differences, parts = known_mean(b - a, 0), self.parts
         variances = [variance(differences[part], counts[..., part]) for part in parts]
         return Spread(np.array([part.mean() for part in parts]), np.stack(variances, axis=-1))
 
     def resampled(self, draws: np.random.Generator, times: int) -> Ints:
         """Return how often each episode counts, as in `statistics.resampled`, (1 + times, E), by halves."""
         counts = np.empty((1 + times, len(self.dangerous)), dtype=np.int64)
-        for part in self._parts:
+        for part in self.parts:
             counts[:, part] = resampled(draws, int(part.sum()), times)
         return counts
 
     def weights(self, counts: Ints) -> Floats:
         """Return the weight of each episode in the mean where they count so often, (..., E)."""
-        shares = sum(part / (len(self._parts) * part.sum()) for part in self._parts)
+        shares = sum(part / (len(self.parts) * part.sum()) for part in self.parts)
         return np.asarray(counts * shares)
 
     @property
-    def _parts(self) -> list[Bools]:
+    def parts(self) -> list[Bools]:
         """Which episodes are averaged first, (E,) each; the mean is of these means."""
         halves = [self.dangerous, ~self.dangerous]
         return halves if self.metric == BALANCED else [np.ones_like(self.dangerous)]
 
     def _mean(self, estimate: Callable[[Bools], Estimate]) -> Estimate:
-        parts = self._parts
+        parts = self.parts
         return mean_of([*map(estimate, parts)]) if len(parts) > 1 else estimate(parts[0])
 
 
@@ -107,13 +112,12 @@ def by_condition(grid: Grid, episodes: Sequence[Episode]) -> tuple[Success, dict
 def any_time_scores(grid: Grid, episodes: Sequence[Episode]) -> Iterator[Score]:
     """Yield the scores of success, and of gains in it, whose intervals hold at every look."""
     success, values = by_condition(grid, episodes)
-    for counting in dict.fromkeys((success.plain.metric, success.metric)):
-        by = success if counting == success.metric else success.plain
+    for by in success.ways:
         for name, of_condition in values.items():
-            yield Score.of(name, counting, by.any_time(of_condition), ANY_TIME)
+            yield Score.of(name, by.metric, by.any_time(of_condition), ANY_TIME)
             if BASELINE in values and name != BASELINE:
                 gain = by.any_time_difference(of_condition, values[BASELINE])
-                yield Score.of(name, GAINS[counting], gain, ANY_TIME)
+                yield Score.of(name, GAINS[by.metric], gain, ANY_TIME)
 
 
 def alike(successes: Sequence[Success]) -> list[Success]:

@@ -13,8 +13,10 @@ from harness.core.statistics import LEVEL, Estimate, known_mean
 from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import Pair, Side
 from harness.runs import percentiles, reliability
-from harness.runs.metrics import METRICS, SUCCESS, difference, entry, halved, known_in
+from harness.runs.leading import lead_of
+from harness.runs.metrics import ADJUSTED, METRICS, SUCCESS, difference, entry, halved, known_in
 from harness.runs.sources import prompt_of
+from harness.runs.success import Success
 
 LOST_BY = ("B", "A", None)  # in the order of the list: what B gave away comes first, then what A did
 
@@ -179,6 +181,7 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
             p = p_of_bootstrap(change.value, change.low, change.high)
             differences.append(Difference(metric.name, first, second, change, p))
     a, b = (pair.values(side, SUCCESS, condition) for side in (pair.a, pair.b))
+    differences += _adjusted(pair, condition, a.T, b.T)
     decisions, flipped = _decision_flips(pair, condition)
     return InCondition(
         condition=condition,
@@ -211,6 +214,24 @@ def _difference(pair: Pair, metric: str, condition: str) -> Difference:
         return halved(metric, change_of)
 
     return Difference(metric, before, after, change(LEVEL), p_value(change))
+
+
+def _adjusted(pair: Pair, condition: str, a: Floats, b: Floats) -> Iterator[Difference]:
+    """Yield the differences of success, (S, E) each, corrected by the layouts' difficulty."""
+    pool = pair.pool
+    if pool is None:
+        return
+    ends = [pair.a.ends[condition, pair.seeds[0], episode] for episode in pair.episodes]
+    success = Success.of(ends, lead_of(pair.a.run, pair.b.run))
+    for by in success.ways:
+
+        def change(level: float, by: Success = by) -> Estimate:
+            return pool.difference(by, b, a, level) or by.difference(b, a, level)
+
+        if corrected := pool.difference(by, b, a):
+            before, after = (pool.estimate(by, side) or by.estimate(side) for side in (a, b))
+            name = ADJUSTED[by.metric]
+            yield Difference(name, before.value, after.value, corrected, p_value(change))
 
 
 def _flips(pair: Pair, condition: str, which: Bools) -> Iterator[Flip]:

@@ -14,6 +14,7 @@ from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.core.places import nameless
 from harness.report.words import facts
+from harness.runs.difficulty import Pool
 from harness.runs.folder import Run, read
 from harness.runs.metrics import by_episode, metrics_of
 from harness.runs.percentiles import Decided
@@ -65,6 +66,17 @@ class Pair:
         seeds, episodes = map(grid.seeds.index, self.seeds), map(grid.episodes.index, self.episodes)
         of_condition = side.values[metric][grid.conditions.index(condition)]
         return np.asarray(of_condition[np.ix_(list(seeds), list(episodes))].T)
+
+    @cached_property
+    def pool(self) -> Pool | None:
+        """The layouts that both might have come to, and how hard they are; None where there are no more."""
+        runs = self.a.run, self.b.run
+        own = [{each.episode for each in run.layouts} or {*run.grid.episodes} for run in runs]
+        known = {
+            each.episode: each for run in runs for each in run.layouts if each.episode in own[0] & own[1]
+        }
+        more = len(known) > len(self.episodes)
+        return Pool.of([*known.values()], self.episodes) if more else None
 
     def judged(self, side: Side, condition: str) -> Judged:
         """Return the decisions in `episodes` whose optimal actions are known, by their place there."""

@@ -57,6 +57,7 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole
         if more:
             yield f"{more} more metrics: --all"
         yield words.success(c, pair)
+        yield from words.adjusted(c)
         yield from (f"  {way}: {episodes}" for way, episodes in words.both_ways(c, pair, most))
         yield words.decisions(c, pair)
         yield from (f"  {how}: {scenes}" for how, scenes in words.given_away(c, pair, most))
@@ -95,6 +96,7 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int, who
     lines += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(comparison)}", ""]
     for c in comparison.conditions:
         lines += [f"#### {code(c.condition)}", "", *_table(c, whole), "", words.success(c, pair), ""]
+        lines += [f"- {line}" for line in words.adjusted(c)]
         lines += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
         lines += ["", words.decisions(c, pair), ""]
         lines += [f"- {how}: {code(scenes)}" for how, scenes in words.given_away(c, pair, most)]

@@ -13,9 +13,9 @@ from harness.report.caveats import looked_at, no_prompt, void
 from harness.report.compare.difference import LOST_BY, Comparison, DecisionFlip, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
-from harness.report.words import p_value, pace
+from harness.report.words import as_good_as, p_value, pace
 from harness.runs.leading import IN_WORDS, SUCCESS, lead_of, leading
-from harness.runs.metrics import entry
+from harness.runs.metrics import ADJUSTED, entry
 from harness.runs.records import role_word
 from harness.runs.success import Success
 
@@ -183,6 +183,15 @@ def success(c: InCondition, pair: Pair) -> str:
         return f"{text}; McNemar's exact test over episodes p {p_value(c.test.p_value)}"
     ends = " to ".join(f"{100 * (end or 0.0):+z.1f}" for end in (c.test.low, c.test.high))
     return f"{text}; 95 % interval over episodes {ends} points{'' if gained or lost else OTHERS}"
+
+
+def adjusted(c: InCondition) -> Iterator[str]:
+    """Yield how success changed once corrected by the layouts' difficulty, where that is better."""
+    changes = {d.metric: d.change for d in c.differences}
+    for metric, name in IN_WORDS.items():
+        better = changes.get(ADJUSTED[metric])
+        if better and (gained := as_good_as(changes[metric], better)):
+            yield f"{name} adjusted for difficulty: B - A {shown(better, POINTS, '+')} points, {gained}"
 
 
 def many(comparison: Comparison) -> str:

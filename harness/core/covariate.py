@@ -1,0 +1,70 @@
+"""Correct a mean over some layouts by what is known of more layouts, before anybody was asked there.
+
+The values are regressed on what is known, and their mean is moved by how far its mean in all layouts is from
+that in those with a value: a control variate (Glynn and Szechtman 2002), or the regression estimator of
+two-phase sampling (Cochran 1977, section 12.6). Its variance has three parts: of what the regression leaves,
+of its slopes, and of the layouts that are known, which are a sample, too.
+
+The interval is that of the plain mean, moved as the mean is. Its ends are as much nearer as the standard
+error is smaller, times a quotient of Student's t: what the plain interval does near 0 and 1 stays. It is at
+least as wide as Student's, since the plain one may be narrower elsewhere. `benchmarks/difficulty.py` measures
+how often it holds the truth.
+"""
+
+import math
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.core.statistics import LEVEL, ROUNDING, Estimate
+
+LEAST = 30  # layouts with a value: of fewer, intervals hold the truth too seldom
+COLLINEAR = 1e-6  # what is known varies less in a direction that counts as none, as a standard deviation
+
+
+def corrected(
+    plain: Estimate, values: Floats, known: Floats, pool: Floats, least: float, level: float = LEVEL
+) -> Estimate | None:
+    """Return the mean of values (E,) from `least` to 1, corrected.
+
+    Args:
+        plain: their mean as it is, with its interval.
+        values: of the layouts that have one, which are a random part of all.
+        known: what is known of these, (E, K).
+        pool: the same of all layouts, these included, (N, K).
+        least: the least that a value can be.
+        level: of the plain interval.
+
+    None if there are fewer than `LEAST` values or no further layouts, or if either the values or all that is
+    known of them are alike.
+    """
+    from harness.core.special import stdtrit
+
+    n, deviations = len(values), values - values.mean()
+    squares, centred = float(deviations @ deviations), known - known.mean(axis=0)
+    left_axes, lengths, axes = np.linalg.svd(centred, full_matrices=False)
+    apart = lengths > COLLINEAR * math.sqrt(n)
+    if n < LEAST or len(pool) <= n or squares < ROUNDING or not apart.any():
+        return None
+    axes = axes[apart] / lengths[apart, None]  # in which what is known is uncorrelated, of length 1
+    along = deviations @ left_axes[:, apart]
+    ahead, freedom = axes @ (pool - known.mean(axis=0)).T, n - 1 - int(apart.sum())
+    left = max(squares - float(along @ along), 0.0) / freedom
+    error = left * (1 / n + float(np.sum(ahead.mean(axis=1) ** 2)))
+    error += float((along @ ahead).var(ddof=1)) / len(pool)
+    t, plain_t = stdtrit(np.array([freedom, n - 1]), 0.5 + level / 2).tolist()
+    nearer = t / plain_t * math.sqrt(error / (squares / (n - 1) / n))
+    nearer = max(nearer, 2 * t * math.sqrt(error) / (plain.high - plain.low))
+    value = min(max(plain.value + float(along @ ahead.mean(axis=1)), least), 1.0)
+    low, high = (value + nearer * (end - plain.value) for end in (plain.low, plain.high))
+    return Estimate(value, max(low, least), min(high, 1.0), plain.n, plain.n_excluded)
+
+
+def worth(plain: Estimate, better: Estimate) -> float:
+    """Return how many times as many layouts the plain mean needs for an interval as narrow.
+
+    It is that of the end which is farther from the bounds, where intervals are cut; 1 where none is known.
+    """
+    below = plain.value - plain.low, better.value - better.low
+    above = plain.high - plain.value, better.high - better.value
+    return min(((wide / narrow) ** 2 for wide, narrow in (below, above) if narrow > 0), default=1.0)

@@ -1,0 +1,103 @@
+"""Correct success for the layouts' difficulty, which their trees know before any model is asked.
+
+What two drivers and even actions do in all layouts of a dataset says how hard those are in which a model was
+asked. `harness/core/covariate.py` has the rule.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from msgspec import Struct
+
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.covariate import corrected
+from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of
+from harness.runs import metrics
+from harness.runs.metrics import ADJUSTED, BASELINE, GAINS, SUCCESS, Grid, over_episodes
+from harness.runs.records import Episode, Score
+from harness.runs.success import Success, by_condition
+
+FILE = "difficulty.csv"
+REFERENCES = ("local-view", "cruise", "uniform")  # that ask no model
+
+
+class Layout(Struct, frozen=True):
+    """How well the references do in a layout: a line of `difficulty.csv`."""
+
+    episode: int  # the episode's number
+    danger: str  # where the hidden danger comes from; `none` without one
+    local_view: float  # 1 if the driver `local-view` succeeds, else 0
+    cruise: float  # the same of the driver `cruise`
+    uniform: float  # with what probability it succeeds if all actions are equally likely
+
+    def __post_init__(self) -> None:
+        if not all(0 <= success <= 1 for success in (self.local_view, self.cruise, self.uniform)):
+            raise ValueError(f"episode {self.episode}: a success that is not from 0 to 1")
+
+
+@dataclass(frozen=True)
+class Pool:
+    """The layouts that those of a run, or of two, are a random part of."""
+
+    known: Floats  # how well the references do in each, (N, K)
+    dangerous: Bools  # whether each has a danger, (N,)
+    answered: Ints  # the places of the run's own, (E,)
+
+    @classmethod
+    def of(cls, layouts: Sequence[Layout], episodes: Iterable[int]) -> "Pool":
+        """Return that of some episodes, which are among the layouts."""
+        places = {layout.episode: place for place, layout in enumerate(layouts)}
+        return cls(
+            np.array([(each.local_view, each.cruise, each.uniform) for each in layouts]),
+            np.array([each.danger != "none" for each in layouts]),
+            np.array([places[episode] for episode in episodes]),
+        )
+
+    def difference(self, success: Success, a: Floats, b: Floats, level: float = LEVEL) -> Estimate | None:
+        """Return success a - b, both (S, E), paired by episode and corrected; None if it cannot be."""
+
+        def plain(part: Bools) -> Estimate:
+            return metrics.difference(SUCCESS, a[:, part].T, b[:, part].T, level)
+
+        return self._corrected(success, plain, known_mean(a - b, 0), -1.0, level)
+
+    def estimate(self, success: Success, values: Floats) -> Estimate | None:
+        """Return mean success, (S, E), corrected; None if it cannot be."""
+
+        def plain(part: Bools) -> Estimate:
+            return over_episodes(SUCCESS, values[:, part])
+
+        return self._corrected(success, plain, known_mean(values, 0), 0.0, LEVEL)
+
+    def _corrected(
+        self, success: Success, plain: Callable[[Bools], Estimate], values: Floats, least: float, level: float
+    ) -> Estimate | None:
+        """Correct each half of its own where success is balanced; one that cannot be stays as it is."""
+        parts, known = success.parts, self.known[self.answered]
+        pools = [self.known]
+        if len(parts) > 1:
+            pools = [self.known[self.dangerous], self.known[~self.dangerous]]
+        estimates = [plain(part) for part in parts]
+        better = [
+            corrected(estimate, values[part], known[part], pool, least, level)
+            for estimate, part, pool in zip(estimates, parts, pools, strict=True)
+        ]
+        if not any(better):
+            return None
+        chosen = [new or old for new, old in zip(better, estimates, strict=True)]
+        return mean_of(chosen) if len(chosen) > 1 else chosen[0]
+
+
+def adjusted_scores(grid: Grid, episodes: Sequence[Episode], layouts: Sequence[Layout]) -> Iterator[Score]:
+    """Yield the scores of success, and of gains in it, corrected; the episodes are in the grid's order."""
+    success, values = by_condition(grid, episodes)
+    pool = Pool.of(layouts, grid.episodes)
+    for by in success.ways:
+        for name, of_condition in values.items():
+            figures = {by.metric: pool.estimate(by, of_condition)}
+            if BASELINE in values and name != BASELINE:
+                figures[GAINS[by.metric]] = pool.difference(by, of_condition, values[BASELINE])
+            for metric, estimate in figures.items():
+                if estimate:
+                    yield Score.of(name, ADJUSTED[metric], estimate, "episodes")
