@@ -1,40 +1,89 @@
 """How many answers fewer are enough where each layout's difficulty is taken off its success.
 
 A tree knows, before any model is asked, what the drivers `local-view` and `cruise` and a draw of even
-actions achieve in its layout. Success is regressed on these three over the layouts that were answered, and
-the mean is corrected by how far theirs are from those of a pool of layouts that were not (a control
-variate: Glynn and Szechtman 2002). *Ratio*: how many times as many answers the plain mean needs for the
-same variance, with a pool without end, and its 95 % interval over layouts; a dash where nothing is left to
-vary. *Coverage*: how often Student's interval of a study of few answered layouts, drawn from those of the
-run, and a pool holds the run's mean, *plain* without the correction. *Width*: that of its interval, of the
-plain one's.
+actions achieve in its layout. `harness/core/covariate.py` corrects success by how far theirs in the answered
+layouts are from those of a pool of layouts. *Ratio*: how many times as many answers the plain figure needs
+for an interval as narrow, if the pool has no end, and its 95 % interval over layouts; a dash where nothing is
+left to vary. *Strata*: the same where layouts are counted by kind instead: whether each driver succeeds, and
+whether even actions do so more often than in the median layout. *Width*: of the corrected interval of the
+most answered layouts, as a share of the plain one's. *Coverage*: how often the interval of a study of so many
+answered layouts, drawn from those of the run, and a pool of five times as many holds the run's figure, in
+percent; beside it the plain interval's.
 
-    python benchmarks/difficulty.py [--models proxy constant swarm-tiny] [--layouts 120]
+    python benchmarks/difficulty.py [--models proxy swarm-tiny] [--layouts 120] [--answered 20 30 60]
 """
 
 import argparse
 import json
 import tempfile
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pages
-from scipy.stats import t as student
 
-from harness.core.arrays import Floats
-from harness.core.figures import Unit
-from harness.core.figures import known as number
-from harness.core.statistics import known_mean
+from harness.core import covariate
+from harness.core.arrays import Floats, Ints
+from harness.core.figures import Unit, as_mapping, known, shown
+from harness.core.statistics import Estimate, resampled, resampled_estimate
 from harness.dataset.load import find, load
+from harness.runs.difficulty import REFERENCES, Pool
 from harness.runs.folder import read
-from harness.runs.success import by_condition
+from harness.runs.leading import IN_WORDS
+from harness.runs.success import Success, by_condition
 
-SMALLEST = "--models constant --layouts 12 --studies 2"
+SMALLEST = "--models constant --layouts 12 --studies 2 --answered 12"
 DATASET = "occluded-intersection-v2"
-ANSWERED, POOL = 60, 4  # layouts of a study, and how many times as many more are in its pool
+POOL = 5  # times as many layouts as are answered
+ENDLESS = 1000  # times as many: as good as a pool without end
+LEAST = covariate.LEAST
+MOST = 100  # a greater ratio says that the references explain all
 RESAMPLES = 300
 RATIO = Unit(decimals=2)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Success of a run, or its gain over another."""
+
+    name: str
+    success: Success  # how it counts
+    values: Floats  # success, (S, E)
+    base: Floats | None  # that over which it is a gain
+    known: Floats  # what trees know of the layouts, (E, K)
+
+    def estimates(self, some: Ints, pool: Ints) -> tuple[Estimate, Estimate | None]:
+        """Return it in some layouts, plain and corrected by those of a pool, of which they are the first."""
+        of, values = Success(self.success.dangerous[some]), self.values[:, some]
+        all_of = Pool(self.known[pool], self.success.dangerous[pool], np.arange(len(some)))
+        if self.base is None:
+            return of.estimate(values), all_of.estimate(of, values)
+        base = self.base[:, some]
+        return of.difference(values, base), all_of.difference(of, values, base)
+
+    @property
+    def by_kind(self) -> "Figure":
+        """The same, knowing of each layout only which of eight kinds it is of."""
+        easy = self.known[:, 2] > np.median(self.known[:, 2])
+        of_drivers = self.known[:, :2] == 1
+        return replace(self, known=np.eye(8)[of_drivers @ [4, 2] + easy])
+
+    def ratio(self, some: Ints) -> float:
+        """Return how many times as many answers it needs plain; NaN where nothing is left to vary."""
+        plain, better = self.estimates(some, np.tile(some, ENDLESS))
+        ratio = covariate.worth(plain, better) if better else 1.0
+        return ratio if ratio < MOST else np.nan
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How often intervals of so many answered layouts held the truth."""
+
+    answered: int
+    corrected: float
+    plain: float
+    width: float | None  # of the corrected interval, as a share of the plain one's: the median
 
 
 @dataclass(frozen=True)
@@ -42,99 +91,71 @@ class Cell:
     """What was measured of one figure."""
 
     figure: str
-    n: int  # layouts
-    ratio: float
-    low: float
-    high: float
-    coverage: float
-    plain_coverage: float
-    width: float  # of the corrected interval, as a share of the plain one's
+    ratio: Mapping[str, float | int | None]  # with its interval; n: layouts
+    strata: float | None
+    coverage: list[Coverage]
 
 
-def difficulty(layouts: int) -> Floats:
-    """What trees know of layouts, (E, 3)."""
-    forest = load(find(DATASET), layouts).forest
-    drivers = [forest.driver_success(name).astype(float) for name in ("local-view", "cruise")]
-    return np.column_stack([*drivers, forest.uniform_success()])
+def measure(figure: Figure, answered: int, studies: int, rng: np.random.Generator) -> Coverage:
+    """Make so many studies; those of fewer layouts than the harness corrects are corrected, too."""
+    covariate.LEAST = min(LEAST, answered)
+    layouts = len(figure.known)
+    truth = figure.estimates(np.arange(layouts), np.arange(layouts))[0].value
+    held, widths = np.zeros(2), []
+    for _ in range(studies):
+        pool = rng.integers(layouts, size=POOL * answered)
+        plain, better = figure.estimates(pool[:answered], pool)
+        better = better or plain
+        held += [e.low - 1e-9 <= truth <= e.high + 1e-9 for e in (better, plain)]
+        widths.append((better.high - better.low) / (plain.high - plain.low))
+    corrected, plain_held = (held / studies).tolist()
+    return Coverage(answered, corrected, plain_held, known(float(np.median(widths))))
 
 
-def fit(values: Floats, known: Floats) -> tuple[Floats, float]:
-    """Slopes of values (E,) on what is known, (E, 3), and the variance of what is left."""
-    centred = known - known.mean(axis=0)
-    slopes, _, rank, _ = np.linalg.lstsq(centred, values - values.mean(), rcond=None)
-    left = values - values.mean() - centred @ slopes
-    return slopes, float(left @ left) / max(len(values) - 1 - int(rank), 1)
-
-
-def ratio(values: Floats, known: Floats) -> float:
-    """The variance of values over that of what is left of them; NaN where nothing is left."""
-    left = fit(values, known)[1]
-    return float(values.var(ddof=1)) / left if left > 1e-12 else np.nan
-
-
-def study(rng: np.random.Generator, values: Floats, known: Floats) -> tuple[bool, bool, float]:
-    """Whether the corrected interval and the plain one hold the mean, and the share of their widths."""
-    answered = rng.integers(len(values), size=ANSWERED)
-    pool = np.concatenate([answered, rng.integers(len(values), size=POOL * ANSWERED)])
-    y, x, every = values[answered], known[answered], known[pool]
-    slopes, left = fit(y, x)
-    corrected = y.mean() + (every.mean(axis=0) - x.mean(axis=0)) @ slopes
-    error = np.sqrt(left / ANSWERED + (every @ slopes).var(ddof=1) / len(every))
-    half = student.ppf(0.975, ANSWERED - 4) * error
-    plain = student.ppf(0.975, ANSWERED - 1) * np.sqrt(y.var(ddof=1) / ANSWERED)
-    truth = values.mean()
-    return abs(corrected - truth) <= half, abs(y.mean() - truth) <= plain, half / plain if plain else np.nan
-
-
-def figures(model: str, layouts: int, folder: Path) -> dict[str, Floats]:
-    """Success by layout, (E,), of each condition, and each gain over alone."""
-    run = folder / model
+def figures(model: str, layouts: int, folder: Path) -> Iterator[Figure]:
+    """Run a model; yield success of each condition and its gain over alone, plain and balanced."""
     pages.harness(
         "eval", "--model", model, "--dataset", DATASET, "--limit", str(layouts), "--quiet",
-        "--condition", "single-local", "--condition", "6g", "--out", str(run),
+        "--condition", "single-local", "--condition", "6g", "--out", str(folder / model),
     )  # fmt: skip
-    done = read(run)
-    values = {name: known_mean(each, 0) for name, each in by_condition(done.grid, done.episodes)[1].items()}
-    return {
-        f"{model}, alone": values["single-local"], f"{model}, 6g": values["6g"],
-        f"{model}, gain": values["6g"] - values["single-local"],
-    }  # fmt: skip
+    done = read(folder / model)
+    references = load(find(DATASET), layouts).reference_success()
+    in_trees = np.column_stack([references[name] for name in REFERENCES])
+    balanced, values = by_condition(done.grid, done.episodes)
+    alone, helped = values["single-local"], values["6g"]
+    for how in (balanced.plain, balanced):
+        for name, of, base in (("alone", alone, None), ("6g", helped, None), ("gain", helped, alone)):
+            yield Figure(f"{model}, {IN_WORDS[how.metric]}, {name}", how, of, base, in_trees)
 
 
 def main() -> None:
     """Print a table and one line of JSON."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    arguments.add_argument("--models", nargs="+", default=["proxy", "constant", "swarm-tiny"])
+    arguments.add_argument("--models", nargs="+", default=["proxy", "swarm-tiny"])
     arguments.add_argument("--layouts", type=int, default=120)
+    arguments.add_argument("--answered", nargs="+", type=int, default=[20, 30, 60])
     arguments.add_argument("--studies", type=int, default=1000)
     given = arguments.parse_args()
-    known, cells = difficulty(given.layouts), list[Cell]()
-    print(f"{DATASET}, {given.layouts} layouts; studies of {ANSWERED}, a pool of {POOL} times as many more")
-    print(f"{'':<24}{'ratio':>22}{'coverage':>10}{'plain':>8}{'width':>8}")
+    cells = list[Cell]()
+    print(f"{DATASET}, {given.layouts} layouts; {given.studies} studies, a pool {POOL} times as large")
+    heads = "".join(f"{f'of {answered}':>8}{'plain':>7}" for answered in given.answered)
+    print(f"{'':<36}{'ratio':>20}{'strata':>8}{'width':>7}{heads}")
     with tempfile.TemporaryDirectory() as folder:
         for model in given.models:
-            for figure, values in figures(model, given.layouts, Path(folder)).items():
-                if values.std() == 0:
-                    print(f"{figure:<24}{'alike in all layouts':>22}")
-                    continue
-                rng = np.random.default_rng(list(figure.encode()))
-                drawn = (rng.integers(len(values), size=len(values)) for _ in range(RESAMPLES))
-                ratios = [ratio(values[some], known[some]) for some in drawn]
-                low, high = np.percentile(ratios, (2.5, 97.5))
-                studies = [study(rng, values, known) for _ in range(given.studies)]
-                held, plain, width = zip(*studies, strict=True)
-                cell = Cell(
-                    figure, len(values), ratio(values, known), float(low), float(high), float(np.mean(held)),
-                    float(np.mean(plain)), float(np.nanmean(width)),
-                )  # fmt: skip
-                cells.append(cell)
-                print(
-                    f"{figure:<24}{RATIO.interval(cell.ratio, cell.low, cell.high):>22}"
-                    f"{100 * cell.coverage:>9.1f} {100 * cell.plain_coverage:>7.1f} {cell.width:>7.2f}",
-                    flush=True,
-                )
-    rows = [{k: number(v) if isinstance(v, float) else v for k, v in asdict(c).items()} for c in cells]
-    print(json.dumps({"layouts": given.layouts, "studies": given.studies, "cells": rows}))
+            for figure in figures(model, given.layouts, Path(folder)):
+                rng = np.random.default_rng(list(figure.name.encode()))
+                covariate.LEAST = LEAST
+                drawn = resampled(rng, given.layouts, RESAMPLES)
+                ratios = np.array([figure.ratio(np.repeat(np.arange(given.layouts), n)) for n in drawn])
+                ratio = resampled_estimate(ratios, given.layouts)
+                strata = figure.by_kind.ratio(np.arange(given.layouts))
+                coverage = [measure(figure, n, given.studies, rng) for n in given.answered]
+                cells.append(Cell(figure.name, as_mapping(ratio), known(strata), coverage))
+                held = "".join(f"{100 * c.corrected:>8.1f}{100 * c.plain:>7.1f}" for c in coverage)
+                ratios_shown = f"{shown(ratio, RATIO):>20}{RATIO.number(strata):>8}"
+                width = RATIO.number(coverage[-1].width)
+                print(f"{figure.name:<36}{ratios_shown}{width:>7}{held}", flush=True)
+    print(json.dumps({"studies": given.studies, "cells": [asdict(cell) for cell in cells]}))
 
 
 if __name__ == "__main__":
