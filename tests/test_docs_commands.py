@@ -32,6 +32,9 @@ def command_of(line: str) -> str:
 
 TYPED = list(dict.fromkeys(map(command_of, all_typed())))
 
+# Tables with the commands that made them, which take hours.
+MEASURED = sorted((ROOT / "benchmarks/measured").rglob("*.md"))
+
 # What a reader is taken to have: the model that ships stands for his own.
 READER_HAS = {
     "my-checkpoint": ROOT / "models/swarm-tiny",
@@ -291,7 +294,16 @@ def test_dots_stand_for_lines_or_text_and_all_else_is_compared(shown: str, print
     assert (difference(shown, printed) == "") == same
 
 
-@pytest.mark.parametrize("page", pages(), ids=name)
+@pytest.mark.parametrize("page", MEASURED, ids=name)
+def test_commands_that_measured_something_are_still_there(page: Path) -> None:
+    for line in lines_of(page):
+        program, *args = shlex.split(line)
+        if program == "harness":
+            path, rest = parsed(args)
+            COMMANDS[path].make_context(path, rest)
+
+
+@pytest.mark.parametrize("page", [*pages(), *MEASURED], ids=name)
 def test_commands_named_in_a_sentence_exist_with_their_options(page: Path) -> None:
     prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     for mention in re.findall(r"`harness\s+([a-z][^`]*)`", prose):
