@@ -20,10 +20,13 @@ from harness.core.covariate import LEAST, corrected, worth
 from harness.core.errors import UserError
 from harness.core.statistics import Estimate, rate_interval
 from harness.dataset.load import find, load
+from harness.dataset.select import Selection
+from harness.evaluate import frozen_world
+from harness.evaluate.frozen_world import FrozenSource
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
-from harness.report.words import adjusted_lines
+from harness.report.words import adjusted_lines, figures
 from harness.runs.difficulty import FILE, Pool, adjusted_scores
 from harness.runs.folder import read
 from harness.runs.metrics import ADJUSTED, BALANCED, GAIN, SUCCESS, Grid
@@ -110,12 +113,13 @@ def test_where_nothing_can_be_corrected_there_is_none() -> None:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """`proxy` and a faulty one in the first layouts of a dataset, and `proxy` in all."""
+    """Runs of the first layouts of a dataset, and `proxy` in all."""
     out, path = tmp_path_factory.mktemp("difficulty"), find("occluded-intersection-v2")
     made = {}
     for name, model, limit in (
         ("some", "proxy", ASKED),
         ("faulty", "proxy-faulty", ASKED),
+        ("cruise", "cruise", ASKED),
         ("all", "proxy", None),
     ):
         spec = spec_of(
@@ -170,6 +174,34 @@ def test_two_runs_are_compared_corrected_and_gated(runs: dict[str, Path], harnes
     alike = compare(pair(runs["some"], runs["all"]))
     with pytest.raises(UserError, match="adjusted_success_rate"):
         judge(gate("adjusted_success_rate < 0"), alike)
+
+
+@pytest.mark.slow
+def test_a_difference_of_references_is_that_of_all_layouts_and_is_said(
+    runs: dict[str, Path], harness: Typed
+) -> None:
+    """Alone the proxy is `local-view`, so that both successes follow from what trees know."""
+    layouts = read(runs["some"]).layouts
+    in_all = 100 * np.mean([each.cruise - each.local_view for each in layouts])
+    for option, start in (("--all", ""), ("--markdown", "- ")):
+        _, out, _ = harness("compare", runs["some"], runs["cruise"], option)
+        assert f"\n{start}success adjusted for difficulty: B - A {in_all:+.1f} [" in out
+        assert "times as many layouts" in " ".join(out.split())
+    harness("compare", runs["some"], runs["cruise"], "--html", "page.html")
+    assert f"Success adjusted for difficulty: B - A {in_all:+.1f} [" in Path("page.html").read_text()
+    tiles = {figure["what"].partition(",")[0] for figure in figures(read(runs["cruise"]))}
+    assert "adjusted for difficulty" in tiles
+
+
+@pytest.mark.slow
+def test_of_many_layouts_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those asked are among them, wherever they are drawn from."""
+    monkeypatch.setattr(frozen_world, "MOST_KNOWN", 2)
+    selection = Selection(sample=ASKED)
+    source = FrozenSource(selection.of(load(find("occluded-intersection-v2"))), selection)
+    known = {layout.episode for layout in source.layouts(ASKED)}
+    assert known == {*range(2 * ASKED), *source.dataset.episodes}
+    assert not source.layouts(LEAST - 1)
 
 
 @pytest.mark.slow

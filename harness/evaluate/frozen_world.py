@@ -27,6 +27,8 @@ from harness.world.outcome import rating
 from harness.world.parameters import ROUNDING_FRAMES
 from harness.world.scenario import Scenario
 
+MOST_KNOWN = 20  # layouts for each that is asked: more would cost time, and hardly make an interval narrower
+
 
 @dataclass(frozen=True)
 class FrozenSource:
@@ -77,14 +79,15 @@ class FrozenSource:
         return FrozenSource(dataset, selection, until)
 
     def layouts(self, asked: int) -> list[Layout]:
-        """Return how hard each layout is that might have been asked; none unless they are more than `asked`.
+        """Return how hard the layouts are that might have been asked; the source's first so many were.
 
-        None, too, of so few that nothing can be corrected.
+        There are none if no others might have been, or so few were that nothing can be corrected.
         """
-        whole = self.dataset.whole
+        own, whole = self.dataset.episodes[:asked], self.dataset.whole
         pool = replace(self.selection, limit=None, sample=None).of(whole)
         if not LEAST <= asked < len(pool.episodes):
             return []
+        pool = pool.of_episodes(frozenset((*own, *pool.episodes[: MOST_KNOWN * asked])))
         success = pool.reference_success()
         dangers = (tree.danger.sector or NONE for tree in pool.trees)
         known = (success[name].tolist() for name in REFERENCES)
