@@ -11,6 +11,7 @@ import pytest
 from evaluating import run, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
+from run_on_disk import made_up
 from scipy.stats import t as student
 
 from harness.coordination.operating_point import POINTS
@@ -26,6 +27,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
+from harness.report.view.folder import whole
 from harness.report.words import adjusted_lines, figures
 from harness.runs.difficulty import FILE, Pool, adjusted_scores
 from harness.runs.folder import read
@@ -132,8 +134,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.mark.slow
 def test_a_run_of_some_layouts_states_its_success_corrected_for_all(runs: dict[str, Path]) -> None:
     """Alone the proxy is `local-view`, so that this is its success in all layouts, to the last digit."""
-    some, whole = read(runs["some"]), read(runs["all"])
-    in_all = whole.score("single-local", SUCCESS)
+    some, full = read(runs["some"]), read(runs["all"])
+    in_all = full.score("single-local", SUCCESS)
     assert some.score("single-local", SUCCESS).value != in_all.value
     assert some.score("single-local", ADJUSTED[SUCCESS]).value == pytest.approx(in_all.value)
     gain = some.score("6g", ADJUSTED[GAIN])
@@ -142,17 +144,17 @@ def test_a_run_of_some_layouts_states_its_success_corrected_for_all(runs: dict[s
     assert (gain.n, gain.interval) == (ASKED, "episodes")
     assert some.score("6g", ADJUSTED[BALANCED]) is not None
     assert any("success % adjusted for difficulty: single-local" in line for line in adjusted_lines(some))
-    assert whole.layouts == ()
-    assert not [*adjusted_lines(whole)]
-    assert not [score for score in whole.scores if score.metric in ADJUSTED.values()]
+    assert full.layouts == ()
+    assert not [*adjusted_lines(full)]
+    assert not [score for score in full.scores if score.metric in ADJUSTED.values()]
 
 
 @pytest.mark.slow
 def test_the_first_layouts_of_a_run_are_a_run_of_the_first_layouts(runs: dict[str, Path]) -> None:
-    some, whole = read(runs["some"]), read(runs["all"])
-    first = [e for e in whole.episodes if e.episode < ASKED]
+    some, full = read(runs["some"]), read(runs["all"])
+    first = [e for e in full.episodes if e.episode < ASKED]
     assert first == list(some.episodes)
-    grid = Grid(whole.conditions, whole.grid.seeds, whole.grid.episodes[:ASKED])
+    grid = Grid(full.conditions, full.grid.seeds, full.grid.episodes[:ASKED])
     stated = [score for score in some.scores if score.metric in ADJUSTED.values()]
     assert [*adjusted_scores(grid, first, some.layouts)] == stated
 
@@ -191,6 +193,15 @@ def test_a_difference_of_references_is_that_of_all_layouts_and_is_said(
     assert f"Success adjusted for difficulty: B - A {in_all:+.1f} [" in Path("page.html").read_text()
     tiles = {figure["what"].partition(",")[0] for figure in figures(read(runs["cruise"]))}
     assert "adjusted for difficulty" in tiles
+
+
+def test_a_view_follows_no_link_out_of_its_folder(tmp_path: Path) -> None:
+    made_up(tmp_path / "reports/run")
+    assert whole(tmp_path / "reports", "run")
+    (tmp_path / "secret.csv").write_text("episode\n")
+    (tmp_path / "reports/run" / FILE).symlink_to(tmp_path / "secret.csv")
+    with pytest.raises(UserError, match=f"run has no {FILE} of its own; delete it"):
+        whole(tmp_path / "reports", "run")
 
 
 @pytest.mark.slow

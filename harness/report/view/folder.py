@@ -5,11 +5,13 @@ import stat
 from pathlib import Path
 
 from harness.core.errors import UserError, printable
+from harness.runs.difficulty import FILE as DIFFICULTY
 from harness.runs.notes import FILE as NOTES
 
 PICTURES = {".svg": "image/svg+xml", ".png": "image/png"}
 # What a page of a run is made from.
 READ = ("run.json", "summary.csv", "decisions.parquet", "answers.jsonl", "episodes.csv")
+MAYBE = (NOTES, DIFFICULTY)  # what it may have besides
 
 
 def own_file(root: Path, run: str, name: str) -> Path | None:
@@ -33,8 +35,9 @@ def whole(root: Path, run: str) -> Path:
     for name in READ:
         if own_file(root, run, name) is None:
             raise UserError(f"{printable(run)} has no {name} of its own; make the run again")
-    if os.path.lexists(root / run / NOTES) and own_file(root, run, NOTES) is None:
-        raise UserError(f"{printable(run)} has no {NOTES} of its own; delete it")
+    for name in MAYBE:
+        if os.path.lexists(root / run / name) and own_file(root, run, name) is None:
+            raise UserError(f"{printable(run)} has no {name} of its own; delete it")
     return root / run
 
 
