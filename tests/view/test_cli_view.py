@@ -1,6 +1,7 @@
 """`harness view` as typed."""
 
 import re
+import shutil
 import signal
 import socket
 import stat
@@ -131,6 +132,19 @@ def test_an_exported_folder_has_a_list_and_a_page_of_each_run_and_no_path_of_thi
     figures = [cell(run.score("6g", metric)) for metric in (lead, GAINS[lead], "unsafe_rate")]
     assert "".join(f"<td>{figure}</td>" for figure in figures) in site["index.html"]
     assert not any(str(tmp_path) in page for page in site.values())
+
+
+def test_a_run_that_has_the_name_of_a_page_is_left_out_and_all_others_are_exported(
+    reports: Path, harness: Callable[..., Said], tmp_path: Path
+) -> None:
+    (reports / "second").rename(reports / "index.html")
+    (reports / "first/report.html").unlink()
+    shutil.copytree(reports / "index.html", reports / "first/report.html")
+    code, _, err = harness("view", str(reports), "--export", str(tmp_path / "site"))
+    assert code == 0
+    for name in ("index.html", "first/report.html"):
+        assert f"left out {name}: a page would have its name; rename it" in err
+    assert (tmp_path / "site/first/report.html").is_file()
 
 
 def test_an_exported_folder_has_studies_whose_page_can_run_no_script(

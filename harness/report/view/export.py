@@ -96,6 +96,8 @@ def _page(folder: Path, run: Listed) -> tuple[str, Run | SuiteRun | None]:
         raise UserError(f"{run.state} ({printable(run.why)})")
     if not run.name.isprintable():
         raise UserError("its name cannot be sent; rename it")
+    if not {INDEX, PAGE}.isdisjoint(Path(run.name).parts):
+        raise UserError("a page would have its name; rename it")
     if run.kind not in (*RUNS, "suite"):
         return _study(folder, run), None
     if run.kind == "suite":
