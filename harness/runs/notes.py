@@ -1,5 +1,6 @@
 """What people noted on decision points of a run, in its folder: `notes.json`, which `harness view` writes."""
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -35,12 +36,30 @@ def notes(run: Path) -> list[Note]:
         ) from None
 
 
-def write(run: Path, scene: str, text: str) -> None:
+def date_of(notes: Sequence[Note], scene: str) -> str:
+    """Return when the note on a decision point was written; empty without one."""
+    return next((note.date for note in notes if note.scene == scene), "")
+
+
+def write(run: Path, scene: str, text: str, before: str) -> None:
     """Note something on a decision point, in the place of what was noted there; an empty text deletes that.
 
-    Raises UserError if it is too long, or the file is full, broken or cannot be written.
+    Args:
+        run: its folder.
+        scene: id of the decision point.
+        text: the note.
+        before: the date of the note whose place it takes; empty if there is none.
+
+    Raises UserError if another note is there, it is too long, or the file is full, broken or cannot be
+    written.
     """
-    kept = [note for note in notes(run) if note.scene != scene]
+    every = notes(run)
+    if date_of(every, scene) != before:
+        raise UserError(
+            f"{printable(scene)} has another note than this form began with; go back, copy your text, and "
+            "open the notes again"
+        )
+    kept = [note for note in every if note.scene != scene]
     text = "\n".join(text.split("\r\n")).strip()
     if len(text) > LONGEST or (text and len(kept) >= MOST):
         raise UserError(

@@ -17,8 +17,8 @@ from harness.runs.notes import LONGEST, MOST, notes
 HERE = {"Origin": "http://127.0.0.1:7654"}
 
 
-def form(scene: str, text: str, path: str = "first") -> dict[str, str]:
-    return {"path": path, "scene": scene, "text": text}
+def form(scene: str, text: str, path: str = "first", before: str = "") -> dict[str, str]:
+    return {"path": path, "scene": scene, "text": text, "before": before}
 
 
 @pytest.fixture
@@ -38,10 +38,23 @@ def test_a_note_stays_with_its_run_and_stands_on_its_page(
     page = render(gather([reports / "first"]))
     assert f">{scene}</a>: it brakes &lt;b&gt;late&lt;/b&gt;\nhere</p>" in page
     assert "Noted on" not in render(gather([reports / "second"]))
-    browser.post("/notes", data=form(scene, "once more"), headers=HERE)
-    assert [note.text for note in notes(reports / "first")] == ["once more"]
-    browser.post("/notes", data=form(scene, " "), headers=HERE)
+    assert f'name="before" value="{note.date}"' in browser.get(f"/notes?path=first&scene={scene}").text
+    browser.post("/notes", data=form(scene, "once more", before=note.date), headers=HERE)
+    [note] = notes(reports / "first")
+    assert note.text == "once more"
+    browser.post("/notes", data=form(scene, " ", before=note.date), headers=HERE)
     assert notes(reports / "first") == []
+
+
+@pytest.mark.parametrize("began_with", ["", "2026-01-01T00:00:00+00:00"])
+@pytest.mark.parametrize("text", ["of another tab", ""])
+def test_a_note_that_its_form_did_not_show_is_not_lost(
+    text: str, began_with: str, browser: TestClient, reports: Path, scene: str
+) -> None:
+    browser.post("/notes", data=form(scene, "first"), headers=HERE)
+    answer = browser.post("/notes", data=form(scene, text, before=began_with), headers=HERE)
+    assert said(answer).startswith(f"{scene} has another note than this form began with")
+    assert [note.text for note in notes(reports / "first")] == ["first"]
 
 
 def test_a_page_that_was_written_before_a_note_is_drawn_anew(

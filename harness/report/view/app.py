@@ -168,11 +168,12 @@ class View:
             if len(sent) > MOST_SENT:
                 raise HTTPException(413, "this is longer than a note may be; shorten it")
         form = parse_qs(sent.decode("ascii", "replace"), keep_blank_values=True, errors="replace")
-        name, scene, text = (form.get(key, [""])[0] for key in ("path", "scene", "text"))
+        keys = ("path", "scene", "text", "before")
+        name, *note = (form.get(key, [""])[0] for key in keys)
         [run] = await run_in_threadpool(self._runs, [name])
         [path] = self._whole([run])
         async with self._writing:
-            await run_in_threadpool(pages.note, path, scene, text)
+            await run_in_threadpool(pages.note, path, *note)
         return RedirectResponse(f"/notes?{urlencode({'path': run.name})}", 303)
 
     def picture(self, request: Request) -> Response:

@@ -173,16 +173,23 @@ def notes(path: Path, name: str, scene: str) -> str:
     """Return the notes on a run, with a form for one on a scene."""
     every = run_notes.notes(path)
     text = next((note.text for note in every if note.scene == scene), "")
-    return _page("notes.html.j2", run=name, notes=every, scene=scene, text=text, longest=run_notes.LONGEST)
+    before = run_notes.date_of(every, scene)
+    return _page(
+        "notes.html.j2", run=name, notes=every, scene=scene, text=text, before=before,
+        longest=run_notes.LONGEST,
+    )  # fmt: skip
 
 
-def note(path: Path, scene: str, text: str) -> None:
-    """Write a note on a decision point of a run. Raises UserError if the run has no such point."""
+def note(path: Path, scene: str, text: str, before: str) -> None:
+    """Write a note on a decision point of a run, in the place of the one that was written at `before`.
+
+    Raises UserError if the run has no such point, or that another note.
+    """
     if scene not in read_run(path).decisions.labels("scene"):
         raise UserError(
             f"{printable(path.name)} has no decision point {printable(scene)!r}; copy one from its page"
         )
-    run_notes.write(path, scene, text)
+    run_notes.write(path, scene, text, before)
 
 
 def script() -> str:
