@@ -76,11 +76,15 @@ def runs(folder: Path) -> list[Listed]:
 
 
 def _entries(path: str, root: str, depth: int) -> Iterator[Listed]:
-    entry = _entry(path, root)
+    try:
+        entry = _entry(path, root)
+        names = sorted(os.listdir(path)) if os.access(path, os.R_OK | os.X_OK) else []
+    except FileNotFoundError:  # somebody deletes it at this moment
+        return
     if entry:
         yield replace(entry, name=os.path.relpath(path, root))
     if depth < DEPTH:
-        for name in sorted(os.listdir(path)) if os.access(path, os.R_OK | os.X_OK) else ():
+        for name in names:
             subfolder = os.path.join(path, name)
             if (
                 not name.startswith(".")

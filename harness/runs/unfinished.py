@@ -32,12 +32,18 @@ def extent(run: Path) -> Extent:
     are not written are counted, too.
     """
     work = run / WORK
-    names = sorted(os.listdir(work)) if _own(work) else []
+    names = _names(work)
     parts = [name for name in names if name.startswith("episodes-")]
     done = sum(_episodes(work / name) for name in parts if _own(work / name))
     kept = [name for name in names if name.endswith(".jsonl") and name.startswith(("answers", "episodes-"))]
     due, early = _due(work)
     return Extent(_locked(work / LOCK), done, due, early, sum(_lines(work / name) for name in kept))
+
+
+def _names(folder: Path) -> list[str]:
+    with suppress(OSError):  # it may be gone by now
+        return sorted(os.listdir(folder)) if _own(folder) else []
+    return []
 
 
 def _own(folder: Path) -> bool:

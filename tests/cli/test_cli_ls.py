@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from evaluating import live_spec_of, run, spec_of
@@ -15,6 +16,7 @@ from harness import cli
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
 from harness.report.words import compared
+from harness.runs import listing
 from harness.runs.folder import read
 from harness.runs.listing import runs
 
@@ -202,6 +204,22 @@ def test_what_is_no_run_is_not_listed(folder: Path) -> None:
     os.mkfifo(folder / "notes/summary.csv")
     (folder / "README.md").write_text("notes")
     assert len(runs(folder)) == 3
+
+
+@pytest.mark.parametrize(("module", "call"), [(listing, "_entry"), (os, "listdir")])
+def test_a_folder_that_is_deleted_while_it_is_read_is_not_listed(
+    module: ModuleType, call: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = getattr(module, call)
+
+    def deleting(path: str, *args: str) -> object:
+        if path == str(folder / "live"):
+            shutil.rmtree(path)
+        return real(path, *args)
+
+    with monkeypatch.context() as now:
+        now.setattr(module, call, deleting)
+        assert {each.name for each in runs(folder)} == {"frozen", "frozen/sweep-tau"}
 
 
 def test_no_folder_is_one_line_and_an_empty_one_says_so(harness: Callable[..., Said], tmp_path: Path) -> None:
