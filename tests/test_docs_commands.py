@@ -324,6 +324,8 @@ def test_the_reference_is_the_program_and_other_pages_type_its_examples() -> Non
 def test_console_is_the_one_form_of_a_shell_block() -> None:
     for page in pages():
         assert not re.search(r"^```(sh|bash|shell|shell-session)", page.read_text(), re.MULTILINE), page
+        outside = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+        assert not re.search(r"^ {4,}(\$ )?harness ", outside, re.MULTILINE), page
 
 
 @pytest.mark.slow
