@@ -240,6 +240,18 @@ def test_a_strangers_difficulty_is_one_line(
     assert harness("compare", copy, copy)[0] == 0
 
 
+@pytest.mark.slow
+def test_runs_that_differ_in_how_hard_a_layout_is_are_compared_as_they_are(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    assert pair(runs["some"], runs["faulty"]).pool is not None
+    copy = Path(shutil.copytree(runs["some"], tmp_path / "copy"))
+    text = (copy / FILE).read_text()
+    (copy / FILE).write_text(text.replace("0.0,0.0,0.09", "1.0,0.0,0.09", 1))
+    assert pair(copy, runs["faulty"]).pool is None
+    assert pair(runs["faulty"], copy).pool is None
+
+
 def test_half_of_what_balanced_success_is_may_stay_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where few layouts have no danger, only the others are corrected."""
     values, known = drawn(7, 60, 120)

@@ -196,7 +196,7 @@ def _with_success(listed: Listed, rows: Rows, runs: Sequence[tuple[dict[str, Any
     warned = {name for run in runs for name in _doubted(*run)}
     best = best_of({row["condition"]: _number(row["value"]) or 0.0 for row in leads}, radios, warned)
     [lead] = [row for row in leads if row["condition"] == best]
-    value, low, high = (_number(lead[key]) for key in ("value", "ci_low", "ci_high"))
+    value, low, high = (_share(lead[key]) for key in ("value", "ci_low", "ci_high"))
     unread = next((_number(row["value"]) for row in rows if row["metric"] == FAILED), None)
     return replace(
         listed, state="finished", why=None, condition=best, success=value, low=low,
@@ -228,6 +228,13 @@ def _json(*parts: str) -> Any:
 
 def _date(text: str) -> datetime:
     return datetime.fromisoformat(text).astimezone(UTC)
+
+
+def _share(text: str) -> float | None:
+    share = _number(text)
+    if share is not None and not 0 <= share <= 1:
+        raise ValueError(f"{share} is no share")
+    return share
 
 
 def _number(text: str) -> float | None:

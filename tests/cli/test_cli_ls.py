@@ -149,6 +149,8 @@ def test_an_unfinished_run_says_that_the_same_command_goes_on(
         ("summary.csv", None),
         ("summary.csv", ""),
         ("summary.csv", "condition,metric,value,ci_low,ci_high,interval\n6g,success_rate,x,,,episodes\n"),
+        ("summary.csv", "condition,metric,value,ci_low,ci_high,interval\n6g,success_rate,-5,,,episodes\n"),
+        ("summary.csv", "condition,metric,value,ci_low,ci_high,interval\n6g,success_rate,.9,.8,2,episodes\n"),
         ("summary.csv", "\udcff"),
     ],
 )

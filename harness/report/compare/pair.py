@@ -75,6 +75,8 @@ class Pair:
         known = {
             each.episode: each for run in runs for each in run.layouts if each.episode in own[0] & own[1]
         }
+        if any(known.get(each.episode, each) != each for run in runs for each in run.layouts):
+            return None  # of one dataset both say the same, unless somebody changed a file
         more = len(known) > len(self.episodes)
         return Pool.of([*known.values()], self.episodes) if more else None
 
