@@ -172,6 +172,12 @@ def parsed(args: list[str]) -> tuple[str, list[str]]:
     return pytest.fail(f"no such command: harness {shlex.join(args)}")
 
 
+def hold_against_options(args: list[str]) -> None:
+    """Fail if the program has no such command or options."""
+    path, rest = parsed(args)
+    COMMANDS[path].make_context(path, rest)
+
+
 def expression(shown: list[str]) -> str:
     """What a page shows, as a regular expression: `…` alone is any lines, and in a line any text."""
     return "".join(
@@ -240,8 +246,7 @@ def test_a_page_can_be_followed_and_shows_what_is_printed(
             elif program == "export":
                 monkeypatch.setenv(*args[0].split("=", 1))
             elif command in NOT_RUN:
-                path, rest = parsed(args)
-                COMMANDS[path].make_context(path, rest)
+                hold_against_options(args)
             elif program == "harness":
                 if SHOWN[name(page)] and command in ONCE:
                     code, out = 0, copied(args)
@@ -299,8 +304,7 @@ def test_commands_that_measured_something_are_still_there(page: Path) -> None:
     for line in lines_of(page):
         program, *args = shlex.split(line)
         if program == "harness":
-            path, rest = parsed(args)
-            COMMANDS[path].make_context(path, rest)
+            hold_against_options(args)
 
 
 @pytest.mark.parametrize("page", [*pages(), *MEASURED], ids=name)

@@ -12,7 +12,7 @@ from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.cli.terminal import console, echo_json, table
 from harness.core.errors import UserError, printable
-from harness.core.figures import amount, shown
+from harness.core.figures import dataset_size, shown
 
 if TYPE_CHECKING:
     from harness.core.statistics import Estimate
@@ -68,7 +68,7 @@ def build(
         return
     typer.echo(
         f"wrote {printable(out)} of {printable(scenarios.title(scenario))}: "
-        f"{amount(manifest['episodes'], 'layout')}, {amount(manifest['nodes'], 'decision point')}, "
+        f"{dataset_size(manifest['episodes'], manifest['nodes'])}, "
         f"in {time.monotonic() - begun_s:.0f} s"
     )
 
@@ -89,8 +89,7 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
         typer.echo("\n".join(problems))
     else:
         typer.echo(
-            f"{manifest.name} is sound: {amount(manifest.episodes, 'layout')}, "
-            f"{amount(manifest.nodes, 'decision point')}\n"
+            f"{manifest.name} is sound: {dataset_size(manifest.episodes, manifest.nodes)}\n"
             f"manifest sha256 {digest}"
         )
         if lost:

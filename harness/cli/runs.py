@@ -11,7 +11,7 @@ from harness.cli.progress import bar
 from harness.cli.terminal import WIDTH, echo_json, echo_wrong
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
-from harness.core.figures import DASH, PERCENT, amount
+from harness.core.figures import DASH, PERCENT, dataset_size
 from harness.runs.leading import BALANCED
 
 if TYPE_CHECKING:
@@ -141,10 +141,7 @@ def merge(
         if as_json:
             echo_json(manifest)
         elif not quiet:
-            typer.echo(
-                f"wrote {printable(out)}: {amount(manifest['episodes'], 'layout')}, "
-                f"{amount(manifest['nodes'], 'decision point')}"
-            )
+            typer.echo(f"wrote {printable(out)}: {dataset_size(manifest['episodes'], manifest['nodes'])}")
         return
     from harness.cli.report import write
     from harness.evaluate.run import merge

@@ -80,6 +80,11 @@ def crossed(episodes: int, seeds: int) -> str:
     return f"{amount(episodes, 'episode')} × {amount(seeds, 'channel seed')}"
 
 
+def dataset_size(layouts: int, points: int) -> str:
+    """Write what a dataset holds: `2 layouts, 40 decision points`."""
+    return f"{amount(layouts, 'layout')}, {amount(points, 'decision point')}"
+
+
 def known(value: float | None) -> float | None:
     """Return the number; None if it is NaN."""
     return None if value is None or math.isnan(value) else value

@@ -83,9 +83,11 @@ class FrozenSource:
 
         There are none if no others might have been, or so few were that nothing can be corrected.
         """
-        own, whole = self.dataset.episodes[:asked], self.dataset.whole
-        pool = replace(self.selection, limit=None, sample=None).of(whole)
-        if not LEAST <= asked < len(pool.episodes):
+        if asked < LEAST:
+            return []
+        own, pool = self.dataset.episodes[:asked], self.dataset.whole
+        pool = replace(self.selection, limit=None, sample=None).of(pool)
+        if len(pool.episodes) <= asked:
             return []
         pool = pool.of_episodes(frozenset((*own, *pool.episodes[: MOST_KNOWN * asked])))
         success = pool.reference_success()

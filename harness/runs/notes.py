@@ -36,9 +36,9 @@ def notes(run: Path) -> list[Note]:
         ) from None
 
 
-def date_of(notes: Sequence[Note], scene: str) -> str:
-    """Return when the note on a decision point was written; empty without one."""
-    return next((note.date for note in notes if note.scene == scene), "")
+def note_on(notes: Sequence[Note], scene: str) -> Note:
+    """Return the note on a decision point; an empty one if it has none."""
+    return next((note for note in notes if note.scene == scene), Note(scene=scene, text="", date=""))
 
 
 def write(run: Path, scene: str, text: str, before: str) -> None:
@@ -54,7 +54,7 @@ def write(run: Path, scene: str, text: str, before: str) -> None:
     written.
     """
     every = notes(run)
-    if date_of(every, scene) != before:
+    if note_on(every, scene).date != before:
         raise UserError(
             f"{printable(scene)} has another note than this form began with; go back, copy your text, and "
             "open the notes again"

@@ -70,15 +70,12 @@ class Pair:
     @cached_property
     def pool(self) -> Pool | None:
         """The layouts that both might have come to, and how hard they are; None where there are no more."""
-        runs = self.a.run, self.b.run
-        own = [{each.episode for each in run.layouts} or {*run.grid.episodes} for run in runs]
-        known = {
-            each.episode: each for run in runs for each in run.layouts if each.episode in own[0] & own[1]
-        }
-        if any(known.get(each.episode, each) != each for run in runs for each in run.layouts):
+        a, b = ({layout.episode: layout for layout in side.run.layouts} for side in (self.a, self.b))
+        if any(b.get(episode, layout) != layout for episode, layout in a.items()):
             return None  # of one dataset both say the same, unless somebody changed a file
-        more = len(known) > len(self.episodes)
-        return Pool.of([*known.values()], self.episodes) if more else None
+        both = {*(a or self.a.run.grid.episodes)} & {*(b or self.b.run.grid.episodes)}
+        known = [layout for episode, layout in {**a, **b}.items() if episode in both]
+        return Pool.of(known, self.episodes) if len(known) > len(self.episodes) else None
 
     def judged(self, side: Side, condition: str) -> Judged:
         """Return the decisions in `episodes` whose optimal actions are known, by their place there."""

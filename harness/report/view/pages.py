@@ -172,12 +172,8 @@ def to_notes(run: str, scene: str | None = None) -> tuple[str, str]:
 def notes(path: Path, name: str, scene: str) -> str:
     """Return the notes on a run, with a form for one on a scene."""
     every = run_notes.notes(path)
-    text = next((note.text for note in every if note.scene == scene), "")
-    before = run_notes.date_of(every, scene)
-    return _page(
-        "notes.html.j2", run=name, notes=every, scene=scene, text=text, before=before,
-        longest=run_notes.LONGEST,
-    )  # fmt: skip
+    here = run_notes.note_on(every, scene)
+    return _page("notes.html.j2", run=name, notes=every, here=here, longest=run_notes.LONGEST)
 
 
 def note(path: Path, scene: str, text: str, before: str) -> None:
