@@ -14,7 +14,7 @@ SEES := $(BIN)/python -c "import llama_cpp.mtmd_cpp" 2>/dev/null || $(LLAMA_CPP)
 REAL_PROMPT ?= v10
 REAL_LIMIT ?= 5
 
-.PHONY: eval real results quick test check light browser docs bench clean
+.PHONY: eval real results quick test exhaustive check light browser docs bench clean
 
 eval: .venv/base ## a rule at once; then build llama.cpp, and evaluate the default language model with a report
 	$(BIN)/harness eval --model proxy
@@ -30,11 +30,17 @@ results: .venv/dev ## docs/results.md and its picture: hours on a CPU; RESULTS="
 	$(BIN)/python benchmarks/results.py --page docs/results.md --details benchmarks/measured/results.md \
 	  --picture docs/pictures/results.svg $(RESULTS)
 
-quick: .venv/dev ## nine tests of ten in about two minutes: all that are not marked slow
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" --hypothesis-profile quick --cpu-limit 0.5
+# Two workers; a test over its tier's limit of CPU seconds fails: CONTRIBUTING.md, "A cheap test".
+PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
-test: check browser ## every check and every test
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+quick: .venv/dev ## nine tests of ten in a minute: all that are neither slow nor exhaustive
+	$(PYTEST) -m "not slow and not exhaustive" --hypothesis-profile quick --cpu-limit 0.5
+
+test: check browser ## every check, and every test that is not exhaustive
+	$(PYTEST) -m "not exhaustive" --cpu-limit 4
+
+exhaustive: .venv/dev browser ## the tests that `make test` leaves out; SHARE=K runs the K-th tenth of them
+	$(PYTEST) -m exhaustive --cpu-limit 4 $(if $(SHARE),--share $(SHARE))
 
 light: .venv-light/test ## the tests without torch, llama.cpp and a browser, or ONLY some: what needs one is skipped
 	.venv-light/bin/python -m pytest -n 2 --dist worksteal $(ONLY)

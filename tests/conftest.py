@@ -7,6 +7,7 @@ import re
 import resource
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Generator
 from functools import cache
 from pathlib import Path
@@ -18,6 +19,7 @@ from _pytest.runner import runtestprotocol
 from evaluating import run, spec_of
 from former import SCENARIO
 from hypothesis import settings
+from shares import SHARES, share_of
 
 from harness import cli
 from harness.dataset.build import build
@@ -51,17 +53,38 @@ gc.disable()
 text = cache(Path.read_text)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    what = "fail a test that takes more CPU seconds, with the fixtures that it alone has; name dear files"
+    parser.addoption("--cpu-limit", type=float, metavar="S", help=what)
+    share = f"of the exhaustive tests, the K-th of {SHARES} shares"
+    parser.addoption("--share", type=int, metavar="K", help=share)
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave out files whose tests are all slow, with the engines that they import, where none is run."""
-    left_out = config.getoption("markexpr") == "not slow" and collection_path.suffix == ".py"
-    return True if left_out and "\npytestmark = pytest.mark.slow" in text(collection_path) else None
+    """Leave out files of which no test is run, with the packages that they import."""
+    if collection_path.suffix != ".py" or not collection_path.name.startswith("test_"):
+        return None
+    chosen, source = config.getoption("markexpr"), text(collection_path)
+    whole = re.search(r"^pytestmark = \[?pytest\.mark\.(\w+)", source, re.MULTILINE)
+    tier = whole[1] if whole else ""
+    if chosen == "exhaustive":
+        left_out = "pytest.mark.exhaustive" not in source
+    else:
+        left_out = tier in ("slow", "exhaustive") and f"not {tier}" in chosen
+    return True if left_out else None
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Sort files: of engines first, for one worker alone to import them; then those with slow tests.
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Choose a share; then sort files: of engines first, for one worker to import them; then with slow tests.
 
     The last tests are short then, and no worker waits long for another.
     """
+    share = config.getoption("share")
+    if share is not None:
+        exhaustive = [item for item in items if item.get_closest_marker("exhaustive")]
+        left_out = {item for item in exhaustive if share_of(item.nodeid) != share % SHARES}
+        config.hook.pytest_deselected(items=list(left_out))
+        items[:] = [item for item in items if item not in left_out]
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     needs = re.compile(r'importorskip\("(torch|llama)|tiny_')
     engines = {item.path for item in items if needs.search(text(item.path))}
@@ -75,19 +98,14 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    what = "fail a test that is not `slow` and takes more CPU seconds, with the fixtures that it alone has"
-    parser.addoption("--cpu-limit", type=float, metavar="S", help=what)
-
-
 ALONE_S = 0.01  # what `slowness` works on takes on a core of a server of 2023 that does nothing else
 SHARED = SimpleNamespace(cpu_s=0.0)  # what fixtures took which several tests have
 
 
 def cpu_s() -> float:
-    """CPU seconds of this process and of those that it started and that ended, without shared fixtures."""
+    """CPU seconds of this process and of those that it started and that ended."""
     ended = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.process_time() + ended.ru_utime + ended.ru_stime - SHARED.cpu_s
+    return time.process_time() + ended.ru_utime + ended.ru_stime
 
 
 def slowness() -> float:
@@ -103,37 +121,59 @@ def slowness() -> float:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Generator[None, Any, Any]:
-    start = cpu_s()
+    start, shared_s = cpu_s(), SHARED.cpu_s
     try:
         return (yield)
     finally:
         if fixturedef.scope != "function":
-            SHARED.cpu_s += cpu_s() - start
+            # With those that it asked for, which are in it.
+            SHARED.cpu_s = shared_s + cpu_s() - start
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
     """Fail who takes too long twice: the first may import packages and fill caches for all that follow."""
     limit = item.config.getoption("cpu_limit")
-    if not limit or item.get_closest_marker("slow"):
+    if not limit:
         return None
 
     def run() -> tuple[list[pytest.TestReport], float]:
-        start = cpu_s()
+        start, shared_s = cpu_s(), SHARED.cpu_s
         reports = runtestprotocol(item, nextitem=nextitem, log=False)
-        return reports, cpu_s() - start
+        took = cpu_s() - start
+        reports[0].__dict__["cpu_s"] = took  # which a worker tells the process that prints
+        return reports, took - (SHARED.cpu_s - shared_s)
 
     where = {"nodeid": item.nodeid, "location": item.location}
     item.ihook.pytest_runtest_logstart(**where)
     reports, took = run()
-    if took > limit and all(report.passed for report in reports):
+    unlimited = item.get_closest_marker("exhaustive")
+    if not unlimited and took > limit and all(report.passed for report in reports):
         again = run()[1]
         if again > limit and again > limit * slowness():
+            tier = "exhaustive" if item.get_closest_marker("slow") else "slow"
             reports[1].outcome = "failed"
-            reports[1].longrepr = f"{again:.2f} CPU s, allowed {limit}: make it smaller, or mark it slow"
+            reports[
+                1
+            ].longrepr = (
+                f"{again:.2f} CPU s, allowed {limit}: make it cheaper (CONTRIBUTING.md), or mark it {tier}"
+            )
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)
     item.ihook.pytest_runtest_logfinish(**where)
     return True
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Say where the time went: the ten dearest files."""
+    if not config.getoption("cpu_limit"):
+        return
+    files = Counter[str]()
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if hasattr(report, "cpu_s"):
+                files[report.nodeid.split("::")[0]] += report.cpu_s
+    dearest = ", ".join(f"{file} {spent_s:.0f}" for file, spent_s in files.most_common(10))
+    terminalreporter.write_line(f"CPU s of tests: {files.total():.0f}; the ten dearest files: {dearest}")
 
 
 @pytest.fixture(scope="session")
