@@ -39,11 +39,13 @@ quick: .venv/dev ## nine tests of ten in a minute: all that are neither slow nor
 test: check browser ## every check, and every test that is not exhaustive
 	$(PYTEST) -m "not exhaustive" --cpu-limit 4
 
-exhaustive: .venv/dev browser ## the tests that `make test` leaves out; SHARE=K runs the K-th tenth of them
+# The last share has the tests where no engine is installed, too.
+exhaustive: .venv/dev browser ## the tests that `make test` leaves out; SHARE=K runs the K-th tenth of them, from 0 to 9
 	$(PYTEST) -m exhaustive --cpu-limit 4 $(if $(SHARE),--share $(SHARE))
+	$(if $(filter-out 9,$(SHARE)),,$(MAKE) --no-print-directory light)
 
 light: .venv-light/test ## the tests without torch, llama.cpp and a browser, or ONLY some: what needs one is skipped
-	.venv-light/bin/python -m pytest -n 2 --dist worksteal $(ONLY)
+	.venv-light/bin/python -m pytest -n 2 --dist worksteal -m "not exhaustive" $(ONLY)
 
 browser: ## Debian's chromium for the tests that open pages, which are skipped where there is none
 	@command -v chromium >/dev/null || (apt-get update --quiet=2 && apt-get install --quiet=2 --yes \
