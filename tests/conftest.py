@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -128,6 +129,19 @@ def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Generator[None, 
         if fixturedef.scope != "function":
             # With those that it asked for, which are in it.
             SHARED.cpu_s = shared_s + cpu_s() - start
+
+
+@pytest.fixture(scope="session")
+def shared_work() -> Callable[[], AbstractContextManager[None]]:
+    """What is done within it is several tests' work, and not that of the one at which it is done."""
+
+    @contextmanager
+    def counted() -> Generator[None, None, None]:
+        start = cpu_s()
+        yield
+        SHARED.cpu_s += cpu_s() - start
+
+    return counted
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
