@@ -237,6 +237,12 @@ def two_path(once: Once) -> Path:
 
 
 @pytest.fixture(scope="session")
+def two_run(once: Once, two_path: Path) -> Path:
+    """Folder of a run of the proxy on the two episodes, which are not of the scenes of `small`."""
+    return once("two-run", lambda out: run(spec_of(load(two_path)), out))
+
+
+@pytest.fixture(scope="session")
 def proxy_run(once: Once, small: Dataset) -> Path:
     """Folder of a run of the proxy on every episode of `small`."""
     return once("proxy-run", lambda out: run(spec_of(small), out))

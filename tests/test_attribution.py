@@ -352,7 +352,7 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
     harness: Callable[..., Said], small: Dataset, tmp_path: Path
 ) -> None:
     control = SIXG.changed(name="6g:messages=blind", messages="blind")
-    run(spec_of(small, points=(control, SIXG)), tmp_path / "run")
+    run(spec_of(small, limit=2, points=(control, SIXG), seeds=(0,)), tmp_path / "run")
     code, out, _ = harness("study", "attribute", "run", "--sample", "10")
     assert code == 0
     assert max(map(len, out.splitlines())) <= 80

@@ -38,6 +38,7 @@ from harness.studies.repeats import (
 )
 from harness.studies.study import write_study
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
 Said = tuple[int, str, str]
 # Episode 0 crashes in the first repeat; the others go on and decide otherwise at its second step.
 OUTCOMES: dict[str, dict[str, float | str]] = {
@@ -256,16 +257,9 @@ def test_the_command_prints_tables_and_json(
     harness: Callable[..., Said], small_path: Path, wanderer: Wanderer
 ) -> None:
     args = (
-        "eval",
-        "--dataset",
-        small_path,
-        "--model",
-        "swarm-tiny",
-        "--temperature",
-        "0.7",
-        "--repeats",
-        "2",
-    )
+        "eval", "--dataset", small_path, "--limit", "2", "--model", "swarm-tiny",
+        "--temperature", "0.7", "--repeats", "2",
+    )  # fmt: skip
     code, out, err = harness(*args, "--seeds", "0:2", "--out", "shown")
     assert code == 0, err
     assert max(map(len, out.splitlines())) <= 80

@@ -422,7 +422,7 @@ def test_the_schedule_that_ships_says_what_it_was_learnt_and_tuned_on():
 def test_joules_of_choices_are_those_of_the_runs_decisions(small: Dataset, tmp_path: Path):
     """Read-outs of the model that ships, at the pace of another on a Jetson."""
     spec = spec_of(
-        small, "swarm-tiny", answer="readout", points=(SIXG,),
+        small, "swarm-tiny", answer="readout", limit=2, points=(SIXG,), seeds=(0,),
         device_profile=devices.load("agx-orin"), device_model="qwen3-4b",
     )  # fmt: skip
     done = run(spec, tmp_path / "run")

@@ -83,6 +83,7 @@ def test_every_axis_gives_its_panels(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("svg_alone")
 def test_axes_that_are_crossed_give_every_combination_what_it_has_alone(
     source: ReplayedRun, tmp_path: Path
 ) -> None:
@@ -219,6 +220,7 @@ def test_a_setting_that_one_value_frees_is_drawn(source: ReplayedRun) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("svg_alone")
 def test_another_sweep_is_not_overwritten_and_the_same_one_is_made_again(
     source: ReplayedRun, tmp_path: Path
 ) -> None:
