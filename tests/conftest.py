@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -130,6 +131,19 @@ def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Generator[None, 
             SHARED.cpu_s = shared_s + cpu_s() - start
 
 
+@pytest.fixture(scope="session")
+def shared_work() -> Callable[[], AbstractContextManager[None]]:
+    """What is done within it is several tests' work, and not that of the one at which it is done."""
+
+    @contextmanager
+    def counted() -> Generator[None, None, None]:
+        start = cpu_s()
+        yield
+        SHARED.cpu_s += cpu_s() - start
+
+    return counted
+
+
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
     """Fail who takes too long twice: the first may import packages and fill caches for all that follow."""
     limit = item.config.getoption("cpu_limit")
@@ -220,6 +234,12 @@ def small(small_path: Path) -> Dataset:
 def two_path(once: Once) -> Path:
     """Folder of a real dataset of two episodes."""
     return once("two", lambda out: build(SCENARIO, out, 2, 5, 1, lambda done: None))
+
+
+@pytest.fixture(scope="session")
+def two_run(once: Once, two_path: Path) -> Path:
+    """Folder of a run of the proxy on the two episodes, which are not of the scenes of `small`."""
+    return once("two-run", lambda out: run(spec_of(load(two_path)), out))
 
 
 @pytest.fixture(scope="session")

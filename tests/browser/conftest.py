@@ -1,24 +1,61 @@
 """A real browser, Debian's chromium, and pages opened in it from disk without a network."""
 
 import shutil
+from pathlib import Path
 
 import pytest
 from opening import FLAGS, WIDE, wait
 
+HERE = Path(__file__).parent
+CHROMIUM = shutil.which("chromium")
+RUNNING = pytest.StashKey["Running"]()
 
-# A module's and no longer: while Playwright runs, so does its event loop, and other tests have their own.
-@pytest.fixture(scope="module")
-def browser():
+
+class Running:
+    """One browser for all tests of this folder that follow each other, which count it together."""
+
+    def __init__(self, counted):
+        self.counted, self.engine, self.browser = counted, None, None
+
+    def started(self):
+        if self.browser is None:
+            from playwright.sync_api import sync_playwright
+
+            self.engine = sync_playwright().start()
+            self.browser = self.engine.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        return self.browser
+
+    def end(self):
+        if self.browser is not None:
+            with self.counted():
+                self.browser.close()
+                self.engine.stop()
+            self.browser = None
+
+
+@pytest.fixture(scope="session")
+def running(shared_work, request):
+    made = Running(shared_work)
+    request.config.stash[RUNNING] = made
+    yield made
+    made.end()
+
+
+# While Playwright runs, so does its event loop, and tests of other folders have their own.
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item, nextitem):
+    if nextitem is None or HERE not in nextitem.path.parents:
+        made = item.config.stash.get(RUNNING, None)
+        if made is not None:
+            made.end()
+
+
+@pytest.fixture
+def browser(running):
     pytest.importorskip("playwright", reason="needs the dev extra")
-    from playwright.sync_api import sync_playwright
-
-    chromium = shutil.which("chromium")
-    if chromium is None:
+    if CHROMIUM is None:
         pytest.skip("no chromium here; `make test` installs it from Debian's packages")
-    with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield started
-        started.close()
+    return running.started()
 
 
 @pytest.fixture

@@ -50,6 +50,11 @@ OTHERS = (
 SPOKEN = (*(way.format(deed) for way in WAYS_IN for deed in DEEDS), *OTHERS)
 # No file of a run can hold a lone surrogate: in an answer it is replaced before it is written.
 PAYLOADS = tuple(text.encode("utf-8", "replace").decode() for text in SPOKEN)
+# Each way with another deed than the one before it, and all that is written otherwise.
+OF_EACH_KIND = (
+    *(way * len(DEEDS) + way % len(DEEDS) for way in range(len(WAYS_IN))),
+    *range(len(SPOKEN) - len(OTHERS), len(SPOKEN)),
+)
 VERDICTS = ("strict", "recovered", "failed")
 
 

@@ -18,7 +18,7 @@ from harness.prompts import versions
 from harness.report.page import render
 from harness.report.runs import gather
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.exhaustive
 
 
 def test_one_clicks_from_vehicle_to_vehicle_of_a_step(tmp_path, opened):

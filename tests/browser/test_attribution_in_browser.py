@@ -16,7 +16,7 @@ from harness.runs import folder
 from harness.studies.attribution import attribute, write
 from harness.studies.replayed_run import ReplayedRun
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.exhaustive
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,6 @@ from harness.report.compare.pair import pair
 from harness.report.document import Section, Table, document
 from harness.report.view.export import export
 
-pytestmark = pytest.mark.slow
-
 LONG = "6g:schedule=always,weight_cap=0.5,max_helpers=2"
 DRAWN = "<svg xmlns='http://www.w3.org/2000/svg' width='1056' height='300'></svg>"
 WIDTH_REM = 66
@@ -31,7 +29,7 @@ def pages(small, tmp_path_factory):
     points = named_point("single-local"), named_point(LONG)
     runs = [folder / "reports" / name for name in ("proxy", "cruise")]
     for run in runs:
-        evaluate(spec_of(small, run.name, points=points), run)
+        evaluate(spec_of(small, run.name, points=points, seeds=(0,)), run)
     cells = [f"{value}.0 [{value}.0, 100.0]" for value in range(10)]
     table = Table("A table of ten columns", [*map(str, range(10))], [cells])
     data = f"data:image/svg+xml,{DRAWN}"
@@ -43,8 +41,20 @@ def pages(small, tmp_path_factory):
             "export": folder / "site/index.html"}  # fmt: skip
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("name", ["study", "compare", "export"])
+WIDELY = pytest.mark.exhaustive
+
+
+@pytest.mark.parametrize(
+    ("name", "scheme"),
+    [
+        pytest.param("study", "light", marks=pytest.mark.slow),
+        pytest.param("study", "dark", marks=WIDELY),
+        pytest.param("compare", "light", marks=WIDELY),
+        pytest.param("compare", "dark", marks=pytest.mark.slow),
+        pytest.param("export", "light", marks=WIDELY),
+        pytest.param("export", "dark", marks=WIDELY),
+    ],
+)
 def test_a_document_fits_a_telephone_and_is_read_aloud(browser, pages, name, scheme):
     page = browser.new_page(viewport=NARROW, color_scheme=scheme)
     page.goto(pages[name].as_uri())
@@ -54,6 +64,7 @@ def test_a_document_fits_a_telephone_and_is_read_aloud(browser, pages, name, sch
     page.close()
 
 
+@pytest.mark.exhaustive
 def test_a_wide_figure_is_drawn_so_that_it_can_be_read(browser, pages):
     page = browser.new_page(viewport=NARROW)
     page.goto(pages["study"].as_uri())

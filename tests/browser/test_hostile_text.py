@@ -1,7 +1,8 @@
 """Hostile text in every place that a model, a prompt, a file or its name can write to: nothing of it runs.
 
 Each payload stands alone in every field: one report is of as many runs as there are payloads, another of one
-run under as many conditions; in answers they come in turn.
+run under as many conditions; in answers they come in turn. A third is of a run for each way into markup, with
+another deed each, and of all that is written otherwise.
 """
 
 import csv
@@ -11,14 +12,12 @@ import pytest
 from evaluating import course
 from opening import wait
 from reading import Page, details, packed
-from sample_hostile import PAYLOADS, hostile, prompt_of
+from sample_hostile import OF_EACH_KIND, PAYLOADS, hostile, prompt_of
 
 from harness.core import places
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.report.templating import visible
-
-pytestmark = pytest.mark.slow
 
 WRITTEN = """
   html head meta title style body nav a button noscript main section h1 h2 h3 p strong code span small br
@@ -60,11 +59,20 @@ def test_there_are_a_hundred_payloads_and_each_is_another():
     assert len(set(PAYLOADS)) == len(PAYLOADS) >= 100
 
 
-@pytest.fixture(scope="module", params=["many runs", "many conditions"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param("one of each kind", marks=pytest.mark.slow),
+        pytest.param("many runs", marks=pytest.mark.exhaustive),
+        pytest.param("many conditions", marks=pytest.mark.exhaustive),
+    ],
+)
 def attacked(request, small, tmp_path_factory):
     """The report and its text."""
     base = tmp_path_factory.mktemp("hostile")
-    if request.param == "many runs":
+    if request.param == "one of each kind":
+        folders = [hostile(base / str(n), small, n) for n in OF_EACH_KIND]
+    elif request.param == "many runs":
         folders = [hostile(base / str(n), small, n) for n in range(len(PAYLOADS))]
     else:
         folders = [hostile(base / "0", small, 0, PAYLOADS)]

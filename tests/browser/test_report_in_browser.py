@@ -12,14 +12,16 @@ pytest.importorskip("playwright", reason="needs the dev extra")
 pytest.importorskip("axe_playwright_python", reason="needs the dev extra")
 
 from axe_playwright_python.sync_playwright import Axe
+from evaluating import run as evaluate
+from evaluating import spec_of
 from opening import NARROW, WIDE, picture, wait
 from playwright.sync_api import expect
 from reading import packed
 
 from harness import cli
+from harness.report.page import write_report
+from harness.report.runs import gather
 from harness.runs.folder import read
-
-pytestmark = pytest.mark.slow
 
 SIZE = """async (shown) => {
   const image = new Image();
@@ -28,6 +30,7 @@ SIZE = """async (shown) => {
   return [image.width, image.height];
 }"""
 RUNS = (("proxy", "v1"), ("proxy", "v2"), ("proxy-faulty", "v2"), ("local-view", "v2"))
+ONE = "proxy-v2"
 
 
 def typed(*words):
@@ -38,22 +41,18 @@ def typed(*words):
     assert not ended.value.code
 
 
-@pytest.fixture(scope="session")
-def report(small_path, tmp_path_factory):
-    """Two models, two prompts and two more, under three conditions."""
+@pytest.fixture(scope="module")
+def report(small, tmp_path_factory):
+    """Two models, two prompts and two more, under three conditions; of one the page alone, too."""
     base = tmp_path_factory.mktemp("browser")
-    folders = []
     for model, prompt in RUNS:
-        folders.append(base / f"{model}-{prompt}")
-        typed(
-            "eval", "--model", model, "--prompt", prompt, "--dataset", small_path, "--out", folders[-1],
-            "--seeds", "0:2", "--latency", "paper", "--quiet",
-        )  # fmt: skip
-    typed("report", *folders, "--full", "--out", base / "report.html")
-    return base / "report.html"
+        evaluate(spec_of(small, model, prompt, latency="paper"), base / f"{model}-{prompt}")
+    write_report(gather([base / ONE]), base / ONE / "report.html")
+    folders = [base / f"{model}-{prompt}" for model, prompt in RUNS]
+    return write_report(gather(folders), base / "report.html", full=True)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def index(report):
     return json.loads(packed(report.read_text(), "index"))
 
@@ -66,6 +65,7 @@ def choose(page, name, value):
     page.locator(f"#list select[name={name}]").select_option(value)
 
 
+@pytest.mark.slow
 def test_it_opens_from_disk_with_every_chart_drawn(opened, report):
     page = opened(report)
     assert "SwarmDrive Harness" in page.title()
@@ -77,8 +77,9 @@ def test_it_opens_from_disk_with_every_chart_drawn(opened, report):
     picture(page, "report-1440")
 
 
+@pytest.mark.exhaustive
 def test_what_is_read_first_stands_on_the_first_screen(opened, report):
-    one = report.parent / "proxy-v2" / "report.html"
+    one = report.parent / ONE / "report.html"
     page = opened(one, size={"width": 1440, "height": 900})
     for what in (".caveat", ".headline", ".key div:last-child", "#chart-success-latency svg"):
         box = page.locator(what).first.bounding_box()
@@ -89,6 +90,7 @@ def test_what_is_read_first_stands_on_the_first_screen(opened, report):
     picture(page, "report-first")
 
 
+@pytest.mark.exhaustive
 def test_the_answer_that_lost_an_episode_is_two_clicks_away(opened, report, index):
     page = opened(report)
     page.get_by_role("link", name="Episodes", exact=True).click()
@@ -102,6 +104,7 @@ def test_the_answer_that_lost_an_episode_is_two_clicks_away(opened, report, inde
     expect(page.locator("#decision .verdict.bad").filter(has_text=where["condition"])).to_contain_text(said)
 
 
+@pytest.mark.exhaustive
 def test_episodes_are_sorted_by_what_they_cost(opened, report, index):
     page = opened(report)
     run, S = index["runs"][0], len(index["runs"][0]["seeds"])
@@ -123,6 +126,7 @@ def test_episodes_are_sorted_by_what_they_cost(opened, report, index):
         assert by or costs[0] > 0
 
 
+@pytest.mark.exhaustive
 def test_the_picture_follows_the_conflict_and_shades_what_is_hidden(opened, report, index):
     page = opened(report, f"#scene={index['scenes'][1][0]}", {"width": 1440, "height": 900})
     side = float(page.locator("svg.scene").get_attribute("viewBox").split()[2])
@@ -136,6 +140,7 @@ def test_the_picture_follows_the_conflict_and_shades_what_is_hidden(opened, repo
     expect(page.locator("svg.scene")).to_have_attribute("viewBox", "-80 -80 160 160")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("size", "beside"), [(WIDE, 4), (NARROW, 1)])
 def test_the_cameras_pictures_have_boxes_that_can_be_switched_off(opened, report, index, size, beside):
     page = opened(report, f"#scene={index['scenes'][1][0]}", size)
@@ -160,6 +165,7 @@ def test_the_cameras_pictures_have_boxes_that_can_be_switched_off(opened, report
     assert not page.locator(".cameras label").is_visible()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_on_a_phone_nothing_is_wider_than_the_phone(opened, report, index, scheme):
     page = opened(report, size=NARROW, scheme=scheme)
@@ -173,8 +179,9 @@ def test_on_a_phone_nothing_is_wider_than_the_phone(opened, report, index, schem
     picture(page, f"decision-390-{scheme}")
 
 
+@pytest.mark.exhaustive
 def test_what_a_rules_page_leaves_out_is_said_in_one_line(opened, report, index):
-    page = opened(report.parent / "proxy-v2/report.html", f"#scene={index['scenes'][1][0]}")
+    page = opened(report.parent / ONE / "report.html", f"#scene={index['scenes'][1][0]}")
     assert page.get_by_text("Not in this page").inner_text() == (
         "Not in this page: the camera pictures; the prompts, which the model does not read. harness view "
         "shows them; harness report RUN --full writes a page that has them."
@@ -184,6 +191,7 @@ def test_what_a_rules_page_leaves_out_is_said_in_one_line(opened, report, index)
     picture(page, "decision-left-out")
 
 
+@pytest.mark.slow
 def test_filters_leave_the_decisions_that_have_what_is_asked(opened, report, index):
     page = opened(report)
     run = index["runs"][0]
@@ -215,6 +223,7 @@ def test_filters_leave_the_decisions_that_have_what_is_asked(opened, report, ind
     assert count(again) == count(page)
 
 
+@pytest.mark.exhaustive
 def test_runs_that_disagree_are_found(opened, report, index):
     page = opened(report)
     choose(page, "differ", "runs")
@@ -232,6 +241,7 @@ def test_runs_that_disagree_are_found(opened, report, index):
     assert 0 < count(page) == disagree
 
 
+@pytest.mark.exhaustive
 def test_answers_of_runs_stand_side_by_side_and_are_found_where_they_differ(opened, report, index):
     page = opened(report, "#decisions=&differ=answers")
     first, *others = index["runs"]
@@ -255,6 +265,7 @@ def test_answers_of_runs_stand_side_by_side_and_are_found_where_they_differ(open
         assert own.locator("small").inner_text().startswith(" ".join(answer.raw.split())[:40])
 
 
+@pytest.mark.exhaustive
 def test_a_text_is_searched_in_names_at_once_and_in_answers_on_enter(opened, report, index):
     page = opened(report)
     search = page.locator("input[name=q]")
@@ -269,6 +280,7 @@ def test_a_text_is_searched_in_names_at_once_and_in_answers_on_enter(opened, rep
     assert 0 < found < len(index["scenes"])
 
 
+@pytest.mark.slow
 def test_a_decision_opens_by_its_link_and_keys_lead_on(opened, report, index):
     scene = index["scenes"][1][0]
     page = opened(report, f"#scene={scene}&run=1&condition=v2x&viewer=v2")
@@ -287,6 +299,7 @@ def test_a_decision_opens_by_its_link_and_keys_lead_on(opened, report, index):
     page.wait_for_selector("#decision", state="visible")
 
 
+@pytest.mark.exhaustive
 def test_a_decision_opens_from_the_list_by_keyboard_alone(opened, report, index):
     page = opened(report, "#decisions")
     link = page.locator("#list a[data-n]").first
@@ -297,11 +310,13 @@ def test_a_decision_opens_from_the_list_by_keyboard_alone(opened, report, index)
     assert index["scenes"][0][0] in page.locator("#decision h1").inner_text()
 
 
+@pytest.mark.exhaustive
 def test_a_link_to_no_decision_says_so(opened, report):
     page = opened(report, "#scene=99999-9")
     assert "has no decision 99999-9" in page.locator("#decision").inner_text()
 
 
+@pytest.mark.exhaustive
 def test_what_was_read_in_a_recovered_answer_is_marked(opened, report, index):
     odd = index["statuses"].index("recovered")
     n = next(n for n, mask in enumerate(index["runs"][2]["statuses"]) if mask >> odd & 1)
@@ -310,6 +325,7 @@ def test_what_was_read_in_a_recovered_answer_is_marked(opened, report, index):
     assert page.locator("mark").first.inner_text().lstrip().startswith("{")
 
 
+@pytest.mark.exhaustive
 def test_the_matrix_is_sorted_by_a_click_on_a_head(opened, report):
     page = opened(report, "#matrix")
     table = page.locator("#matrix table.sortable")
@@ -326,6 +342,7 @@ def test_the_matrix_is_sorted_by_a_click_on_a_head(opened, report):
     assert table.locator("th[aria-sort=ascending]").inner_text() == "success"
 
 
+@pytest.mark.exhaustive
 def test_a_table_is_copied_as_csv(opened, report):
     page = opened(report, "#matrix")
     page.evaluate("navigator.clipboard.writeText = async (text) => { window.copied = text; }")
@@ -337,6 +354,7 @@ def test_a_table_is_copied_as_csv(opened, report):
     assert page.evaluate("window.copied").startswith('"run","condition","reply","count"')
 
 
+@pytest.mark.exhaustive
 def test_figures_are_saved_as_svg_and_png(opened, report, index):
     page = opened(report)
     for kind, begins in (("SVG", b"<svg"), ("PNG", b"\x89PNG")):
@@ -355,6 +373,7 @@ def paper(page):
     return page.evaluate("getComputedStyle(document.body).backgroundColor")
 
 
+@pytest.mark.exhaustive
 def test_dark_is_the_systems_choice_or_ones_own(opened, report):
     light, dark = opened(report), opened(report, scheme="dark")
     assert paper(light) == "rgb(255, 255, 255)" != paper(dark)
@@ -365,6 +384,7 @@ def test_dark_is_the_systems_choice_or_ones_own(opened, report):
     assert paper(light) == "rgb(255, 255, 255)"
 
 
+@pytest.mark.exhaustive
 def test_it_prints_light_and_without_controls(opened, report):
     page = opened(report, scheme="dark")
     page.emulate_media(media="print", color_scheme="dark")
@@ -382,6 +402,7 @@ def test_it_prints_light_and_without_controls(opened, report):
         assert heads["height"] < 60, "no head breaks within a word"
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("where", ["", "#scene"])
 def test_it_can_be_read_by_who_does_not_see_it(opened, report, index, where):
     page = opened(report, where and f"#scene={index['scenes'][0][0]}")
@@ -389,6 +410,7 @@ def test_it_can_be_read_by_who_does_not_see_it(opened, report, index, where):
     assert [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in found] == []
 
 
+@pytest.mark.exhaustive
 def test_one_episode_under_one_condition_has_a_page_without_intervals(opened, small_path, tmp_path):
     run = tmp_path / "one"
     typed(

@@ -24,8 +24,6 @@ from harness.report.page import write_report
 from harness.report.runs import gather
 from harness.runs.notes import notes
 
-pytestmark = pytest.mark.slow
-
 SPY = """<title>not told</title><script>
 fetch("/").then(() => { document.title = "read" }, () => { document.title = "refused at " + self.origin })
 </script>"""
@@ -65,6 +63,7 @@ def page(browser):
     assert heard == []
 
 
+@pytest.mark.exhaustive
 def test_two_runs_are_picked_and_compared_by_keyboard_alone(page, address):
     page.goto(address)
     page.get_by_label("Pick first").focus()
@@ -82,6 +81,7 @@ def test_two_runs_are_picked_and_compared_by_keyboard_alone(page, address):
     assert page.locator("tbody th").all_inner_texts() == ["second second"]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_list_fits_a_telephone_and_is_read_aloud(page, address, scheme):
     page.set_viewport_size(NARROW)
@@ -95,6 +95,7 @@ def test_the_list_fits_a_telephone_and_is_read_aloud(page, address, scheme):
     picture(page, f"view-{scheme}")
 
 
+@pytest.mark.slow
 def test_a_report_works_in_its_sandbox(page, address):
     page.goto(address)
     page.get_by_role("link", name="first").click()
@@ -121,6 +122,7 @@ def open_whole_decision(page, address):
     page.wait_for_url("**/run?path=first&scene=*#scene=*")
 
 
+@pytest.mark.exhaustive
 def test_a_decision_opens_with_what_its_page_leaves_out(page, address):
     open_whole_decision(page, address)
     wait(page)
@@ -131,6 +133,7 @@ def test_a_decision_opens_with_what_its_page_leaves_out(page, address):
     expect(page.get_by_role("link", name="Show them")).to_be_visible()
 
 
+@pytest.mark.exhaustive
 def test_links_lead_out_of_a_sandbox_and_the_token_stays_out_of_addresses(page, address):
     """A page in a sandbox is another site to its own server."""
     page.goto(address)
@@ -156,6 +159,7 @@ def test_links_lead_out_of_a_sandbox_and_the_token_stays_out_of_addresses(page, 
     assert page.locator("h1").inner_text() == "B compared with A"
 
 
+@pytest.mark.exhaustive
 def test_the_token_is_needed_and_a_file_may_lead_to_it(browser, address, tmp_path):
     context = browser.new_context()
     page = context.new_page()
@@ -169,6 +173,7 @@ def test_the_token_is_needed_and_a_file_may_lead_to_it(browser, address, tmp_pat
     context.close()
 
 
+@pytest.mark.exhaustive
 def test_a_page_that_spies_reads_nothing_else(browser, address):
     page = browser.new_page()
     page.goto(address)
@@ -178,6 +183,7 @@ def test_a_page_that_spies_reads_nothing_else(browser, address):
     page.close()
 
 
+@pytest.mark.exhaustive
 def test_the_list_follows_a_run_to_its_end_without_a_new_page(page, address, folder, small):
     """A real run that waits in the middle, in the folder that the real command serves."""
     seen, go_on = Event(), Event()
@@ -225,6 +231,7 @@ def test_the_list_follows_a_run_to_its_end_without_a_new_page(page, address, fol
         shutil.rmtree(folder / "third")
 
 
+@pytest.mark.exhaustive
 def test_a_note_is_written_from_a_runs_page_and_stands_on_it(page, address, folder):
     open_whole_decision(page, address)
     page.get_by_role("link", name="Note on this decision").click()

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from html import unescape
 from html.parser import HTMLParser
@@ -14,7 +15,9 @@ from changing import ends
 from run_on_disk import Row, answers_of, change, configure
 
 from harness.core.statistics import Estimate
-from harness.report.compare.difference import Difference
+from harness.report.compare.difference import Comparison, Difference, compare
+from harness.report.compare.gate import gate, judge
+from harness.report.compare.pair import pair
 from harness.report.compare.text import code
 from harness.report.compare.words import line
 
@@ -23,41 +26,57 @@ Harness = Callable[..., Said]
 
 
 @pytest.fixture
-def worse(runs: tuple[Path, Path]) -> tuple[Path, Path]:
-    """Under 6g one success of four is lost in every seed; alone nothing changes."""
-    ends(runs[0], "6g", [["", "", "", ""]] * 2)
-    ends(runs[1], "6g", [["", "late", "", ""]] * 2)
-    return runs
+def worse(worse_once: tuple[Path, Path], tmp_path: Path) -> tuple[Path, Path]:
+    """The two of which one is worse, each to be changed by a test."""
+    one, other = (Path(shutil.copytree(run, tmp_path / run.name)) for run in worse_once)
+    return one, other
+
+
+@pytest.fixture(scope="module")
+def compared(worse_once: tuple[Path, Path]) -> Comparison:
+    return compare(pair(*worse_once))
+
+
+@pytest.mark.parametrize(
+    ("text", "failed"),
+    [
+        ("success_rate < -0.25", []),  # it is -0.25, and its interval ends at -0.70 and at +0.28
+        ("success_rate <= -0.25", ["6g"]),
+        ("success_rate < -0.01", ["6g"]),
+        ("success_rate<-0.01", ["6g"]),
+        ("6g:success_rate < -0.01", ["6g"]),
+        ("single-local:success_rate < -0.01", []),
+        ("success_rate <= 0", ["single-local", "6g"]),
+        ("late_rate > 0.2", ["6g"]),
+        ("late_rate >= 0.3", []),
+        ("success_rate.high < 0", []),
+        ("success_rate.high < 0.3", ["6g"]),
+        ("6g:success_rate.low < -0.6", ["6g"]),
+        ("success_rate.low < -0.7", []),
+        # Alike in all episodes: 0 stands for its ends.
+        ("latency_proxy_ms.high >= 0", ["single-local", "6g"]),
+        ("latency_proxy_ms > 5", []),
+        ("late_rate > 0", ["6g"]),
+        ("unsafe_rate > 0", []),
+    ],
+)
+def test_a_gate_fails_where_it_says(text: str, failed: list[str], compared: Comparison) -> None:
+    assert [condition for condition, _ in judge(gate(text), compared).failed] == failed
 
 
 @pytest.mark.parametrize(
     ("gates", "failed"),
     [
-        (["success_rate < -0.25"], []),  # it is -0.25, and its interval ends at -0.70 and at +0.28
-        (["success_rate <= -0.25"], ["6g"]),
-        (["success_rate < -0.01"], ["6g"]),
-        (["success_rate<-0.01"], ["6g"]),
-        (["6g:success_rate < -0.01"], ["6g"]),
-        (["single-local:success_rate < -0.01"], []),
+        (["success_rate < -0.25"], []),
         (["success_rate <= 0"], ["single-local", "6g"]),
-        (["late_rate > 0.2"], ["6g"]),
-        (["late_rate >= 0.3"], []),
-        (["success_rate.high < 0"], []),
-        (["success_rate.high < 0.3"], ["6g"]),
-        (["6g:success_rate.low < -0.6"], ["6g"]),
-        (["success_rate.low < -0.7"], []),
-        (
-            ["latency_proxy_ms.high >= 0"],
-            ["single-local", "6g"],
-        ),  # alike in all episodes: 0 stands for its ends
         (["latency_proxy_ms > 5", "late_rate > 0", "unsafe_rate > 0"], ["6g"]),
     ],
 )
 def test_gates_decide_the_exit_code(
-    gates: list[str], failed: list[str], worse: tuple[Path, Path], harness: Harness
+    gates: list[str], failed: list[str], worse_once: tuple[Path, Path], harness: Harness
 ) -> None:
     options = [part for gate in gates for part in ("--fail-if", gate)]
-    code, out, err = harness("compare", *worse, *options, "--json")
+    code, out, err = harness("compare", *worse_once, *options, "--json")
     told = json.loads(out, parse_constant=pytest.fail)
     assert (code, err) == (1 if failed else 0, "")
     assert told["passed"] is not bool(failed)
@@ -68,9 +87,9 @@ def test_gates_decide_the_exit_code(
 @pytest.mark.parametrize(("gate", "code"), [("success_rate < -0.25", 0), ("success_rate <= -0.25", 1)])
 @pytest.mark.parametrize("form", [(), ("--markdown",)])
 def test_every_form_ends_with_the_exit_code_of_its_gates(
-    form: tuple[str, ...], gate: str, code: int, worse: tuple[Path, Path], harness: Harness
+    form: tuple[str, ...], gate: str, code: int, worse_once: tuple[Path, Path], harness: Harness
 ) -> None:
-    assert harness("compare", *worse, *form, "--fail-if", gate)[0] == code
+    assert harness("compare", *worse_once, *form, "--fail-if", gate)[0] == code
 
 
 def test_rounding_decides_no_gate(runs: tuple[Path, Path], harness: Harness) -> None:
@@ -171,6 +190,7 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
         assert part in said, part
 
 
+@pytest.mark.slow
 def test_six_metrics_come_first_and_all_print_the_rest(worse: tuple[Path, Path], harness: Harness) -> None:
     """The primary metrics, then what changed most clearly: entropy, and bits, alike in every episode."""
 
@@ -229,6 +249,7 @@ def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harne
     assert (told["seeds"], told["episodes"], told["passed"]) == ([0, 1], 4, True)
 
 
+@pytest.mark.slow
 def test_no_p_is_printed_as_zero_and_json_keeps_the_number(runs: tuple[Path, Path], harness: Harness) -> None:
     """B takes 50 ms more in even episodes and 50.01 in odd ones: certain, also among some thirty."""
 
@@ -285,16 +306,16 @@ def test_a_flip_leads_to_the_decisions_of_both_runs_that_lost_it(
         assert "condition=6g&seed=0" in where
 
 
-def test_gates_are_test_cases_of_junit(worse: tuple[Path, Path], harness: Harness) -> None:
+def test_gates_are_test_cases_of_junit(worse_once: tuple[Path, Path], harness: Harness) -> None:
     gates = ("--fail-if", "6g:success_rate < -0.01", "--fail-if", "unsafe_rate > 0.5")
-    assert harness("compare", *worse, *gates, "--junit", "gates.xml")[0] == 1
+    assert harness("compare", *worse_once, *gates, "--junit", "gates.xml")[0] == 1
     suite = ElementTree.parse("gates.xml").getroot()
     assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
     failed, passed = suite.findall("testcase")
     assert (failed.get("name"), passed.get("name")) == ("6g:success_rate < -0.01", "unsafe_rate > 0.5")
     assert "in 6g (-0.25)" in failed.find("failure").get("message", "")
     assert passed.find("failure") is None
-    code, _, err = harness("compare", *worse, "--junit", "gates.xml")
+    code, _, err = harness("compare", *worse_once, "--junit", "gates.xml")
     assert (code, err) == (2, "harness: --junit writes gates; give one or more with --fail-if\n")
 
 
@@ -348,9 +369,7 @@ def hostile(worse: tuple[Path, Path]) -> tuple[Path, Path]:
     return worse
 
 
-def test_nothing_a_run_says_becomes_markup(
-    hostile: tuple[Path, Path], runs: tuple[Path, Path], harness: Harness
-) -> None:
+def test_nothing_a_run_says_becomes_markup(hostile: tuple[Path, Path], harness: Harness) -> None:
     gate = ("--fail-if", "6g:success_rate < 0")
     code, out, _ = harness("compare", *hostile, *gate, "--html", "page.html")
     assert code == 1

@@ -11,13 +11,11 @@ import pytest
 from changing import SEEDS, ends
 from evaluating import live_spec_of, spec_of
 from evaluating import run as evaluate
-from former import SCENARIO
 from run_on_disk import Row, answers_of, change, configure, made_up, rows_of
 
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.core.multiplicity import SuccessTest, holm
-from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
@@ -328,15 +326,13 @@ def test_live_runs_are_compared_with_live_runs(
 
 @pytest.mark.slow
 def test_what_cannot_be_compared_is_refused(
-    runs: tuple[Path, Path], small: Dataset, tmp_path: Path, harness: Callable[..., Said]
+    runs: tuple[Path, Path], small: Dataset, two_run: Path, tmp_path: Path, harness: Callable[..., Said]
 ) -> None:
-    build(SCENARIO, tmp_path / "data", 1, 7, 1, lambda done: None)
     points = (POINTS["6g"],)
-    other = evaluate(spec_of(load(tmp_path / "data"), points=points, seeds=SEEDS), tmp_path / "other").out
     luck = evaluate(spec_of(small, points=points, seeds=(0, 2)), tmp_path / "luck").out
     v2x = evaluate(spec_of(small, points=(POINTS["v2x"],), seeds=SEEDS), tmp_path / "v2x").out
     for run, said in (
-        (other, "not of the same scenes (small "),
+        (two_run, "not of the same scenes (small "),
         (luck, "have different seeds ([0, 1] and [0, 2])"),
         (v2x, "have no condition in common (single-local, 6g and v2x)"),
         (tmp_path / "nowhere", "is no finished run: it has no run.json"),

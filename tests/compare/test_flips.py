@@ -97,6 +97,7 @@ def test_answers_are_listed_by_what_their_decisions_gave_away(
     assert turned.requests[2] == f"{other}/v1"
 
 
+@pytest.mark.slow
 def test_the_text_that_changed_stands_beside_the_flips(
     flipped: tuple[tuple[Path, Path], list[str]], harness: Harness
 ) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from run_on_disk import made_up
 
@@ -98,6 +98,7 @@ EPISODES = st.integers(1, 8).flatmap(
 
 
 @pytest.mark.slow
+@settings(max_examples=30)  # each writes a run
 @given(EPISODES, st.integers(4, 50))
 def test_as_many_as_asked_for_each_once_in_the_runs_order_and_always_the_same(episodes, n):
     with TemporaryDirectory() as folder:

@@ -136,13 +136,21 @@ def test_a_page_of_runs_of_other_lengths_says_so(run, tmp_path, small_path, monk
     page = render(runs)
     assert "on 2 shared" in page
     assert escape(matrix.uneven(runs)) in page
-    with monkeypatch.context() as patch:  # in parts of a few scenes, of which the shorter run has none
-        one, two = by_workers(runs, tmp_path, patch)
+    # In parts of a few scenes, of which the shorter run has none.
+    one, two = by_workers(runs, tmp_path, monkeypatch)
     assert one == two
     told = details(page)
     assert [details(one), details(two)] == [told, told]
     assert [d["runs"][1] is None for d in told.values()].count(True) > 4
-    one, two = by_workers(gather(paths[::-1]), tmp_path, monkeypatch)
+
+
+@pytest.mark.exhaustive
+def test_workers_write_a_page_whose_first_run_is_the_shorter_one(tmp_path, small_path, monkeypatch):
+    shorter, longer = (
+        evaluate(spec_of(load(small_path, limit), seeds=(0, 1, 2)), tmp_path / f"{limit}").out
+        for limit in (2, 4)
+    )
+    one, two = by_workers(gather([shorter, longer]), tmp_path, monkeypatch)
     assert one == two
 
 

@@ -40,6 +40,7 @@ def test_what_any_action_at_all_clears_is_exact(small: Dataset) -> None:
     assert 0 < fmean(expected) < 1
 
 
+@pytest.mark.slow
 def test_the_model_uniform_comes_to_what_the_trees_say(small: Dataset, tmp_path: Path) -> None:
     """Over many seeds, of which each has draws of its own."""
     of = run(spec_of(small, "uniform", points=(ALONE,), seeds=tuple(range(300))), tmp_path / "run").out
@@ -49,6 +50,7 @@ def test_the_model_uniform_comes_to_what_the_trees_say(small: Dataset, tmp_path:
         assert share == pytest.approx(expected, abs=0.09)  # three standard deviations of a half
 
 
+@pytest.mark.slow
 def test_the_model_constant_is_the_row_frozen_and_driven(small: Dataset, tmp_path: Path) -> None:
     how: dict[str, Any] = {"points": (ALONE,), "seeds": (0,)}
     live = live_spec_of("constant", len(small.episodes), small.manifest.seed, **how)

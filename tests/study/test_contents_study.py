@@ -19,6 +19,7 @@ from harness.runs.metrics import BALANCED, SUCCESS, difference, over_episodes
 from harness.studies.contents import NOTHING, Outcome, holding, witnesses
 from harness.studies.replayed_run import ReplayedRun
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
 Said = tuple[int, str, str]
 VARIED = ("--condition", "6g", "--over", "loss", "--grid", "0,1")
 

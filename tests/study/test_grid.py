@@ -25,6 +25,8 @@ from harness.runs.success import Success
 from harness.studies.grid import Cell, Grid, front, grid_study, headline, run_cells
 from harness.studies.study import write_study
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
+
 
 def agent(model: str = "proxy", prompt: str = "v2") -> Agent:
     return Agent(cards.resolve(model), versions.load(prompt))

@@ -16,6 +16,7 @@ from harness.backends.servers import Server as Place
 from harness.core.errors import UserError
 from harness.core.resources import folder
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
 Said = tuple[int, str, str]
 GOOD = '{"action_distribution":{"SLOWER":0.70,"IDLE":0.20,"FASTER":0.10},"confidence":0.9,"evidence":"v2"}'
 CARD = """engine = "openai"
@@ -139,7 +140,10 @@ def test_another_identity_is_refused_before_a_question(run: Server, harness: Cal
         STUDY,
         ("study", "sweep", "run", "--over", "consensus", "--grid", "ego-prompt", "--out", "swept"),
         ("study", "trust", "run", "--attacks", "jump", "--rules", "linear", "--out", "trusted"),
-        ("study", "schedule", "compare", "run", "--schedule", "entropy", "--out", "scheduled"),
+        pytest.param(
+            ("study", "schedule", "compare", "run", "--schedule", "entropy", "--out", "scheduled"),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=lambda study: study[0],
 )

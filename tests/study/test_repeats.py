@@ -38,6 +38,7 @@ from harness.studies.repeats import (
 )
 from harness.studies.study import write_study
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
 Said = tuple[int, str, str]
 # Episode 0 crashes in the first repeat; the others go on and decide otherwise at its second step.
 OUTCOMES: dict[str, dict[str, float | str]] = {
@@ -126,12 +127,12 @@ def test_variance_lies_between_episodes_or_within() -> None:
 
 @pytest.mark.slow
 def test_the_share_between_episodes_is_found_again() -> None:
-    """Of 4000 episodes whose variance is 3 parts of 4 between them."""
+    """Of 1000 episodes whose variance is 3 parts of 4 between them."""
     rng = np.random.default_rng(5)
-    values = rng.normal(size=(4000, 1)) * 3**0.5 + rng.normal(size=(4000, 4))
+    values = rng.normal(size=(1000, 1)) * 3**0.5 + rng.normal(size=(1000, 4))
     share = between_share(values)
     assert share.low < 0.75 < share.high
-    assert share.high - share.low < 0.04
+    assert share.high - share.low < 0.08
 
 
 def test_repeats_played_by_hand(small: Dataset, tmp_path: Path, wanderer: Wanderer) -> None:
@@ -229,6 +230,7 @@ def test_the_cache_keeps_repeats_apart(small: Dataset, tmp_path: Path, wanderer:
 # -- the command --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_folder_has_a_page_and_all_figures(small: Dataset, tmp_path: Path, wanderer: Wanderer) -> None:
     of = repeated(hot(course(small, 2, OUTCOMES)), tmp_path / "repeats")
     assert "<a href=" not in write_study(repeats_study(of), of.path).read_text()
@@ -255,16 +257,9 @@ def test_the_command_prints_tables_and_json(
     harness: Callable[..., Said], small_path: Path, wanderer: Wanderer
 ) -> None:
     args = (
-        "eval",
-        "--dataset",
-        small_path,
-        "--model",
-        "swarm-tiny",
-        "--temperature",
-        "0.7",
-        "--repeats",
-        "2",
-    )
+        "eval", "--dataset", small_path, "--limit", "2", "--model", "swarm-tiny",
+        "--temperature", "0.7", "--repeats", "2",
+    )  # fmt: skip
     code, out, err = harness(*args, "--seeds", "0:2", "--out", "shown")
     assert code == 0, err
     assert max(map(len, out.splitlines())) <= 80

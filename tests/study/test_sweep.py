@@ -17,7 +17,7 @@ from harness.evaluate.lifecycle import Evaluated
 from harness.studies import replayed_run
 from harness.studies.axes import AXES, Setting, axis_of, grid
 from harness.studies.replayed_run import ReplayedRun
-from harness.studies.study import write_study
+from harness.studies.study import Study, write_study
 from harness.studies.sweep import run_sweep, settings
 
 
@@ -31,12 +31,14 @@ def source(done: Evaluated) -> ReplayedRun:
     return ReplayedRun(done.out)
 
 
-def swept(source: ReplayedRun, out: Path, name: str, text: str | None = None) -> pd.DataFrame:
+def study_of(source: ReplayedRun, out: Path, name: str, text: str | None = None) -> Study:
     axis = AXES[name]
     points = settings([source], [axis], [grid(axis, text)], ["6g"])
-    study = run_sweep([source], {name: points}, source.seeds, out, lambda n: None)
-    write_study(study, out)
-    return study.data["conditions"]
+    return run_sweep([source], {name: points}, source.seeds, out, lambda n: None)
+
+
+def swept(source: ReplayedRun, out: Path, name: str, text: str | None = None) -> pd.DataFrame:
+    return study_of(source, out, name, text).data["conditions"]
 
 
 def value(summary: pd.DataFrame, at: Any, metric: str) -> float:
@@ -64,11 +66,16 @@ def test_without_others_or_trigger_a_vehicle_is_alone(
 
 
 @pytest.mark.slow
-def test_every_axis_gives_its_panels(source: ReplayedRun, tmp_path: Path) -> None:
-    panels = {name: settings([source], [axis], [None], ["6g"]) for name, axis in AXES.items()}
+@pytest.mark.parametrize(
+    "swept_axes", [("tau", "consensus"), pytest.param(tuple(AXES), marks=pytest.mark.exhaustive)]
+)
+def test_every_axis_gives_its_panels(
+    source: ReplayedRun, swept_axes: tuple[str, ...], tmp_path: Path
+) -> None:
+    panels = {name: settings([source], [AXES[name]], [None], ["6g"]) for name in swept_axes}
     study = run_sweep([source], panels, source.seeds, tmp_path, lambda n: None)
     write_study(study, tmp_path)
-    assert set(study.data["conditions"].panel) == set(AXES)
+    assert set(study.data["conditions"].panel) == set(swept_axes)
     names = {f"{table}.{kind}" for table in ("conditions", "episodes") for kind in ("csv", "jsonl")}
     names |= {"index.html", *(f"sweep.{kind}" for kind in ("json", "svg", "pdf", "png"))}
     assert {p.name for p in tmp_path.iterdir()} == names
@@ -76,6 +83,7 @@ def test_every_axis_gives_its_panels(source: ReplayedRun, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("svg_alone")
 def test_axes_that_are_crossed_give_every_combination_what_it_has_alone(
     source: ReplayedRun, tmp_path: Path
 ) -> None:
@@ -104,15 +112,24 @@ TOGETHER = (
 )  # fmt: skip
 
 
+OF_EACH_KIND = (
+    "6g", "6g:loss=0.4", "6g:loss=0.4", "v2x", "6g:on_demand=true,helper_rounds=true", "6g:messages=blind",
+    "6g:consensus=trust", "6g:attack=liar+spoof:share=1/3", "single-local",
+)  # fmt: skip
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "texts", [OF_EACH_KIND, pytest.param(TOGETHER, marks=pytest.mark.exhaustive)], ids=["some", "all"]
+)
 @pytest.mark.parametrize("asks", [True, False])
 def test_points_that_are_walked_together_are_each_as_alone(
-    small: Dataset, asks: bool, tmp_path: Path
+    small: Dataset, asks: bool, texts: tuple[str, ...], tmp_path: Path
 ) -> None:
     """The run came to few decision points: at others its model is asked, or walks are left out."""
     ask = "used" if asks else "all"
     few = run(spec_of(small, points=(POINTS["single-local"],), ask=ask), tmp_path / "few").out
-    names = [name for name in TOGETHER if asks or "blind" not in name]
+    names = [name for name in texts if asks or "blind" not in name]
     points = [Setting(name, named_point(name), vehicles) for vehicles in (4, 2) for name in names]
     source = ReplayedRun(few, asks=asks)
     together = list(source.walked(points, (0, 1, 5)))
@@ -203,12 +220,13 @@ def test_a_setting_that_one_value_frees_is_drawn(source: ReplayedRun) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("svg_alone")
 def test_another_sweep_is_not_overwritten_and_the_same_one_is_made_again(
     source: ReplayedRun, tmp_path: Path
 ) -> None:
-    swept(source, tmp_path, "tau", "0.7")
+    write_study(study_of(source, tmp_path, "tau", "0.7"), tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    swept(source, tmp_path, "tau", "0.7")
+    write_study(study_of(source, tmp_path, "tau", "0.7"), tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     axis = AXES["tau"]
     for text, condition, seeds, other in (

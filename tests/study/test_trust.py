@@ -31,6 +31,7 @@ from harness.studies.trust import (
     trust_study,
 )
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
 ATTACKED = named_point("6g:attack=liar:share=1/3+spoof:share=1/3")
 RULES, ATTACKS, THIRD = ("linear", "trust", "linear:weight_cap=0.3"), ("liar+spoof", "stale"), 1 / 3
 
@@ -83,6 +84,7 @@ def test_a_loss_is_paired_with_the_same_rule_in_peace(bench: Bench) -> None:
     assert bench.price("linear").value == 0
 
 
+@pytest.mark.slow
 def test_finished_cells_are_kept_and_a_torn_one_is_played_again(
     done: Evaluated, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -207,6 +209,7 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
         assert "give either RUN, the folder of a finished run, or --model, with its --prompt" in err
 
 
+@pytest.mark.slow
 def test_objects_are_attacked_by_the_usual_attacks_on_objects(done: Evaluated, tmp_path: Path) -> None:
     stored = ReplayedRun(done.out)
     bench = run_bench(stored, "6g:content=objects", (), (), (1.0,), (0,), tmp_path, Watched())

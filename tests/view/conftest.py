@@ -1,18 +1,15 @@
-import shutil
 from pathlib import Path
 
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
 from starlette.testclient import TestClient
-from viewing import SECRET, TOKEN, configure
+from viewing import laid_out, visitor
 
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
 from harness.report.page import write_report
 from harness.report.runs import gather
-from harness.report.view.access import cookie
-from harness.report.view.app import app
 
 
 @pytest.fixture(scope="session")
@@ -32,19 +29,21 @@ def made(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def reports(made: Path, tmp_path: Path) -> Path:
-    folder = shutil.copytree(made, tmp_path / "reports")
-    for name, day in (("first", 1), ("second", 2)):
-        configure(folder / name, created=f"2026-01-0{day}T12:00:00+00:00")
-    (tmp_path / "secret").mkdir()
-    for file in ("run.json", "report.html", "index.html", "sweep.svg", "secret.txt"):
-        (tmp_path / "secret" / file).write_text(SECRET)
-    return folder
+    return laid_out(made, tmp_path)
 
 
 @pytest.fixture
 def browser(reports: Path) -> TestClient:
-    """Who has opened the address that `harness view` printed."""
-    return TestClient(
-        app(reports, TOKEN), base_url="http://127.0.0.1:7654", raise_server_exceptions=False,
-        cookies={cookie(7654): TOKEN},
-    )  # fmt: skip
+    return visitor(reports)
+
+
+@pytest.fixture(scope="session")
+def kept_reports(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As `reports`, for tests that change nothing of it."""
+    return laid_out(made, tmp_path_factory.mktemp("kept"))
+
+
+@pytest.fixture(scope="session")
+def reader(kept_reports: Path) -> TestClient:
+    """As `browser`, of who changes nothing."""
+    return visitor(kept_reports)

@@ -16,9 +16,9 @@ PAGES = ["/", "/progress", "/style.css", "/run?path=first", "/picture?path=first
 
 
 @pytest.fixture
-def stranger(reports: Path) -> TestClient:
+def stranger(kept_reports: Path) -> TestClient:
     """Another user of the machine, without the token."""
-    return TestClient(app(reports, TOKEN), base_url="http://127.0.0.1:7654")
+    return TestClient(app(kept_reports, TOKEN), base_url="http://127.0.0.1:7654")
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -59,10 +59,10 @@ def test_the_printed_address_gives_a_cookie_and_leaves_the_token_out(stranger: T
     ],
 )
 def test_other_sites_get_nothing_although_the_browser_has_the_cookie(
-    page: str, headers: dict[str, str], browser: TestClient
+    page: str, headers: dict[str, str], reader: TestClient
 ) -> None:
     for asked in (page, f"{page}{'&' if '?' in page else '?'}token={TOKEN}"):
-        answer = browser.get(asked, headers=headers, follow_redirects=False)
+        answer = reader.get(asked, headers=headers, follow_redirects=False)
         assert answer.status_code == 403
         assert said(answer) == "another site asked for this page; open it from the list of runs"
 
@@ -76,8 +76,8 @@ def test_other_sites_get_nothing_although_the_browser_has_the_cookie(
         {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"},
     ],
 )
-def test_its_own_pages_and_links_are_answered(headers: dict[str, str], browser: TestClient) -> None:
-    assert browser.get("/", headers=headers).status_code == 200
+def test_its_own_pages_and_links_are_answered(headers: dict[str, str], reader: TestClient) -> None:
+    assert reader.get("/", headers=headers).status_code == 200
 
 
 def test_two_viewers_on_two_ports_keep_their_cookies_apart(reports: Path, tmp_path: Path) -> None:

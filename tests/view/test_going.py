@@ -10,7 +10,7 @@ import pytest
 from evaluating import live_spec_of, spec_of
 from markupsafe import escape
 from starlette.testclient import TestClient
-from viewing import SECRET
+from viewing import SECRET, visitor
 
 from harness.coordination.operating_point import POINTS
 from harness.core.files import alone
@@ -27,41 +27,49 @@ BEGUN = (
 Look = tuple[Extent, str, dict[str, Any]]
 
 
-@pytest.fixture
-def looks(browser: TestClient, reports: Path, small: Dataset, monkeypatch: pytest.MonkeyPatch) -> list[Look]:
-    """What can be seen of a real run at each of its answers: its extent, the list, and what changes in it."""
-    monkeypatch.setattr(evaluation, "TREES_AT_ONCE", 2)
+@pytest.fixture(scope="module")
+def seen(made: Path, small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> list[Look]:
+    """What is seen of a real run at each answer and after it: its extent, the list, and what changes in it."""
+    reports = Path(shutil.copytree(made, tmp_path_factory.mktemp("going") / "reports"))
+    browser = visitor(reports)
     spec = spec_of(small, points=(POINTS["single-local"], POINTS["6g"]), tags=("slow",), batch_size=1)
-    seen = []
+    looks = []
 
     def look(done: int) -> None:
-        seen.append((extent(reports / "now"), browser.get("/").text, browser.get("/progress").json()))
+        looks.append((extent(reports / "now"), browser.get("/").text, browser.get("/progress").json()))
 
-    evaluation.evaluate(spec, reports / "now", look)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluation, "TREES_AT_ONCE", 2)
+        evaluation.evaluate(spec, reports / "now", look)
     tidy(reports / "now")
-    return seen
+    look(0)
+    return looks
 
 
-def test_the_list_says_how_far_a_run_is_while_it_goes_on(looks: list[Look], browser: TestClient) -> None:
+@pytest.mark.slow
+def test_the_list_says_how_far_a_run_is_while_it_goes_on(seen: list[Look]) -> None:
+    *looks, (_, _, now) = seen
     extents = [each for each, _, _ in looks]
     assert all(each.going and each.due == 4 for each in extents)
     assert {each.done for each in extents} >= {0, 2}
     assert [each.done for each in extents] == sorted(each.done for each in extents)
     assert max(each.answers for each in extents) > 1, "answers are counted before their episodes end"
-    for each, page, now in looks:
-        text = now["unfinished"]["now"]
+    for each, page, then in looks:
+        text = then["unfinished"]["now"]
         assert text.startswith(f"going on now: {each.done} of 4 episodes")
         assert f'unfinished</strong> <small data-run="now">{text}</small>' in page
-        assert now["going"]
-    now = browser.get("/progress").json()
+        assert then["going"]
     assert (now["going"], now["unfinished"]) == (False, {})
     assert now["listed"] != looks[-1][2]["listed"] == looks[0][2]["listed"], "it changes once a run ends"
 
 
+@pytest.mark.slow
 def test_the_list_runs_its_own_script_and_only_while_a_run_goes_on(
-    looks: list[Look], browser: TestClient, reports: Path
+    seen: list[Look], browser: TestClient, reports: Path
 ) -> None:
+    *looks, (_, last, _) = seen
     assert all(page.count("<script") == 1 for _, page, _ in looks)
+    assert "<script" not in last
     after = browser.get("/")
     assert "<script" not in after.text
     assert "script-src" not in after.headers["content-security-policy"]
@@ -112,6 +120,7 @@ def test_a_run_that_may_stop_early_has_that_many_at_most(reports: Path) -> None:
     assert extent(reports / "begun") == Extent(going=False, done=0, due=40, early=True, answers=0)
 
 
+@pytest.mark.slow
 def test_episodes_that_are_driven_are_counted_as_they_end(
     reports: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,16 +11,11 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from evaluating import run as evaluate
-from evaluating import spec_of
-from former import SCENARIO
 from reading import packed
 from starlette.requests import Request
 from starlette.testclient import TestClient
 from viewing import configure, names, said
 
-from harness.dataset.build import build
-from harness.dataset.load import load
 from harness.report.view import pages
 from harness.report.view.app import View
 from harness.runs.folder import read
@@ -202,7 +197,7 @@ def test_a_report_is_of_what_is_picked(browser: TestClient) -> None:
     ],
 )
 def test_what_cannot_be_shown_is_one_readable_line(
-    address: str, line: str, browser: TestClient, reports: Path, tmp_path: Path
+    address: str, line: str, browser: TestClient, reports: Path, request: pytest.FixtureRequest
 ) -> None:
     manifest = json.loads((reports / "second/run.json").read_text())
     (reports / "killed/.work").mkdir(parents=True)
@@ -213,8 +208,7 @@ def test_what_cannot_be_shown_is_one_readable_line(
     (reports / "cut/decisions.parquet").unlink()
     (reports / "garbled/decisions.parquet").write_text("{")
     if "other" in address:
-        build(SCENARIO, tmp_path / "data", 1, 7, 1, lambda done: None)
-        evaluate(spec_of(load(tmp_path / "data")), reports / "other")
+        shutil.copytree(request.getfixturevalue("two_run"), reports / "other")
     answer = browser.get(address)
     assert answer.status_code == 400
     assert line in said(answer)

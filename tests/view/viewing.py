@@ -3,11 +3,16 @@
 import json
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from html import unescape
 from pathlib import Path
 
 from httpx import Response
+from starlette.testclient import TestClient
+
+from harness.report.view.access import cookie
+from harness.report.view.app import app
 
 TOKEN = "a-token-of-these-tests"
 SECRET = "what lies outside, or is hidden"
@@ -19,6 +24,25 @@ def configure(run: Path, **values: object) -> None:
     then = file.stat().st_mtime
     file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
     os.utime(file, (then, then))
+
+
+def visitor(reports: Path) -> TestClient:
+    """Who has opened the address that `harness view` printed."""
+    return TestClient(
+        app(reports, TOKEN), base_url="http://127.0.0.1:7654", raise_server_exceptions=False,
+        cookies={cookie(7654): TOKEN},
+    )  # fmt: skip
+
+
+def laid_out(made: Path, base: Path) -> Path:
+    """A copy of the runs, one a day after the other, and secrets beside it."""
+    folder = Path(shutil.copytree(made, base / "reports"))
+    for name, day in (("first", 1), ("second", 2)):
+        configure(folder / name, created=f"2026-01-0{day}T12:00:00+00:00")
+    (base / "secret").mkdir()
+    for file in ("run.json", "report.html", "index.html", "sweep.svg", "secret.txt"):
+        (base / "secret" / file).write_text(SECRET)
+    return folder
 
 
 def names(page: str) -> Iterator[str]:
