@@ -17,13 +17,12 @@ pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("highway_env", reason="needs the sim extra")
 
 from former import SCENARIO
-from teaching import drawn_once
+from teaching import SEED, drawn_by
 
 from harness.backends import cards
 from harness.backends.base import Request
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
-from harness.core.seeds import FIRST
 from harness.prompts import readout
 from harness.prompts import versions as prompts
 from harness.training.answers import cells, sights
@@ -41,11 +40,11 @@ from harness.training.model import (
 )
 from harness.training.questions import Question, alone
 from harness.training.student import Student
-from harness.training.train import STAGES, Plan
+from harness.training.train import Plan
 from harness.world.perception.camera import Sight
 
 VERSIONS = (prompts.load("v7"), prompts.load("v8"))
-PLAN = Plan(dict.fromkeys(STAGES, 16), batch=8)
+PLAN = Plan({"excerpts": 4, "alone": 4, "messages": 8, "answers": 6}, batch=2)
 LAYOUTS = 2
 
 
@@ -57,23 +56,22 @@ CAMERA = {"sensors": ("camera", "lidar"), "indicator": "off"}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _drawn_once() -> Iterator[None]:
+def _drawn_once(once: Any) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.training.lessons.decision_points", drawn_once)
+        patch.setattr("harness.training.lessons.decision_points", drawn_by(once))
         yield
 
 
 @pytest.fixture(scope="module")
 def lessons(tmp_path_factory: pytest.TempPathFactory) -> Lessons:
     place = tmp_path_factory.mktemp("lessons")
-    return draw(SCENARIO, VERSIONS, LAYOUTS, FIRST["train"], place, 1, silent)
+    return draw(SCENARIO, VERSIONS, LAYOUTS, SEED, place, 1, silent)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("distilled") / "seer"
-    distill(Curriculum({SCENARIO: VERSIONS}, LAYOUTS, FIRST["train"]), PLAN, out, silent, silent, "cpu")
-    return out
+def folder(once: Any) -> Path:
+    taught = Curriculum({SCENARIO: VERSIONS}, LAYOUTS, SEED)
+    return once("seer", lambda out: distill(taught, PLAN, out, silent, silent, "cpu"))
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +117,7 @@ def test_whom_the_cameras_show_is_listed_nearest_first():
 
 
 def test_the_first_stage_asks_whom_the_picture_shows(lessons: Lessons, tmp_path: Path):
-    student = Student([lessons], PLAN, tmp_path, "cpu")
+    student = Student([replace(lessons, scenes=lessons.scenes[::3])], PLAN, tmp_path, "cpu")
     learnt = student.lessons[0].scenes
     listed = [sights(scene.graphs[v]) for scene in learnt for v in scene.viewers]
     samples = student.samples("excerpts")
