@@ -117,6 +117,8 @@ def test_a_batch_answers_as_each_alone(model: Any, answer: str) -> None:
         question(model, 0, 1, answer), question(model, 1, 2, answer, "Another scene, longer"),
         question(model, 2, 1, answer, "The same picture"), question(model, 3, 3, answer),
     ]  # fmt: skip
+    if answer == "json":
+        asked = [replace(request, max_tokens=12) for request in asked]
     together = [c.text for c in model.complete(asked)]
     alone = [model.complete([request])[0].text for request in asked]
     again = [model.complete([request])[0].text for request in reversed(asked)]

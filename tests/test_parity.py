@@ -25,7 +25,7 @@ from harness.evaluate.asking import requests
 from harness.training.gguf_export import export
 from harness.training.parity import PASSES, Finding, compare
 
-PROMPTS = 4
+PROMPTS = 3
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +139,9 @@ def test_another_architecture_is_compared_but_for_its_export(
     for answer in ("json", "readout"):
         spec = spec_of(small, str(llama), answer=answer)
         raw = replace(spec, ego=replace(spec.ego, card=here, letters="raw"))
-        of[answer] = [replace(request, max_tokens=8) for request in list(requests(raw, scenes_of(small)))[:2]]
+        whole = list(requests(raw, scenes_of(small)))[:2]
+        # The system text alone is long in a vocabulary of bytes, and says nothing of an architecture.
+        of[answer] = [replace(request, max_tokens=8, messages=request.messages[1:]) for request in whole]
     passes: list[int] = []
     found = compare(here, there, of["json"], of["readout"], passes.append)
     assert sum(passes) == PASSES

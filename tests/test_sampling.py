@@ -181,7 +181,10 @@ def test_a_server_is_sent_temperature_and_seed() -> None:
 
 @pytest.mark.slow
 def test_a_run_is_drawn_by_its_sampling_seed(small: Dataset, tiny: Path, tmp_path: Path) -> None:
-    spec = spec_of(small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, limit=2)
+    alone = (POINTS["single-local"],)
+    spec = spec_of(
+        small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, limit=2, points=alone
+    )
     one, again = (run(replace(spec, batch_size=n), tmp_path / str(n)) for n in (8, 3))
     assert same_decisions(one.out, again.out)
     other = run(replace(spec, sampling_seed=2), tmp_path / "other")

@@ -25,7 +25,7 @@ from harness.training.train import Sample, hidden_states
 from harness.world.perception.camera import Sight
 
 MODEL, FOLDER = "swarm-tiny-vl", Path(__file__).parents[1] / "models" / "swarm-tiny-vl"
-SCENES = 12
+SCENES = 5
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_its_picture_tokens_see(shipped: Dataset) -> None:
 
 @pytest.mark.slow
 def test_both_engines_answer_its_image_prompts_alike(shipped: Dataset) -> None:
-    questions = asked(shipped, "own")[:12]
+    questions = asked(shipped, "own")[:6]
     one, other = (intents(engine, questions) for engine in ("transformers", "llama-cpp"))
     assert one == pytest.approx(other, abs=0.02)
 
