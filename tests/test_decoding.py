@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -87,7 +88,6 @@ def best(backend: LanguageModel, ids: Sequence[int], texts: Sequence[str]) -> st
 # -- json ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> None:
     from transformers import GenerationConfig
 
@@ -109,7 +109,6 @@ def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> Non
     assert len(lengths) > 2, "answers of one length would not show that rows leave their batch"
 
 
-@pytest.mark.slow
 def test_what_is_guessed_saves_forwards_and_changes_no_answer(small: Dataset) -> None:
     """On the model that ships, whose texts have a shape that can be guessed."""
     opened = open_backend(resolve("swarm-tiny", "transformers"), batch_size=BATCH, device="cpu")
@@ -376,7 +375,6 @@ def company_changes_nothing(backend: LanguageModel, requests: list[Request]) -> 
     same([backend.complete([request])[0] for request in requests], together)
 
 
-@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(st.lists(REQUESTS, max_size=7))
 def test_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:

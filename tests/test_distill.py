@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -65,7 +66,6 @@ def few(once: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
         ]
 
 
-@pytest.mark.slow
 def test_of_each_level_as_many_are_learnt_from_as_a_whole_tree_has():
     forest = load(folder("datasets") / "occluded-intersection-v2", 10).forest
     chosen = forest.drivers[lessons.TEACHER]
@@ -140,7 +140,6 @@ def test_the_teacher_wants_what_turned_out_safe_and_least_late() -> None:
     assert danger.tolist() == [1.0, 0.0, 0.0]
 
 
-@pytest.mark.slow
 def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(few: list[Lessons]) -> None:
     """Played again in the simulator, action by action, from the start."""
     for each in few:
@@ -271,7 +270,6 @@ def test_an_orthogonal_factor_has_singular_values_near_one() -> None:
 # -- a run ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_it_writes_a_model_that_every_engine_can_take(student: Path) -> None:
     names = {p.name for p in student.iterdir()}
     assert names >= {"config.json", "model.safetensors", "tokenizer.json", "student-f16.gguf", "README.md"}
@@ -282,13 +280,11 @@ def test_it_writes_a_model_that_every_engine_can_take(student: Path) -> None:
     assert "imitate one planner in the scenarios below" in (student / "README.md").read_text()
 
 
-@pytest.mark.slow
 def test_its_loss_falls(student: Path) -> None:
     for stage, curve in json.loads((student / "training.json").read_text())["curves"].items():
         assert curve[-1][1] < curve[0][1], stage
 
 
-@pytest.mark.slow
 def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, asked: list[Question]) -> None:
     from transformers import AutoTokenizer
 
@@ -303,7 +299,6 @@ def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, as
     assert len(tokenizer("307")["input_ids"]) == 3, "every digit stands alone"
 
 
-@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_model(
     student: Path, drawn_before: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -323,7 +318,6 @@ def test_a_killed_run_goes_on_to_the_same_model(
         assert (out / name).read_bytes() == (student / name).read_bytes()
 
 
-@pytest.mark.slow
 def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
     student: Path, drawn_before: None, tmp_path: Path
 ) -> None:
@@ -348,7 +342,6 @@ def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
         )
 
 
-@pytest.mark.slow
 def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_path: Path) -> None:
     plan = replace(PLAN, samples={**PLAN.samples, "alone": 8, "messages": 1})
     with pytest.raises(UserError, match=r"--samples: 1 sequences of the stage messages take too few scenes"):
@@ -405,7 +398,6 @@ def test_it_learns_from_every_level_of_a_tree(few: list[Lessons]) -> None:
             assert all(steps.count(step) <= PER_LEVEL for step in steps)
 
 
-@pytest.mark.slow
 def test_a_layout_teaches_the_same_wherever_it_is_drawn(few: list[Lessons]) -> None:
     again = msgspec.json.encode(few_points(PASSING, CURRICULUM.seed + 1, 1))
     assert msgspec.json.decode(again, type=list[lessons.Point]) == [

@@ -13,6 +13,7 @@ from msgspec import structs
 
 from harness.world.scene_graph import Node
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("highway_env", reason="needs the sim extra")
 
@@ -144,7 +145,6 @@ def test_each_token_of_a_picture_says_how_far_the_nearest_vehicle_in_its_square_
     assert somebody > 20
 
 
-@pytest.mark.slow
 def test_an_engine_reads_what_the_model_learnt_from(
     folder: Path, lessons: Lessons, asked: list[Question], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -210,7 +210,6 @@ def test_a_picture_is_answered_as_the_base_answers_the_same_scene_graph_in_words
     assert all(s.target is q.label for q, s in zip(texts, student.reading(texts), strict=True))
 
 
-@pytest.mark.slow
 def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
     model = new_model(read_tokenizer(folder, sees=True), 0, sees=True)
     with pytest.raises(
@@ -219,7 +218,6 @@ def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
         take_over(model, folder)
 
 
-@pytest.mark.slow
 def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
     model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
     for answer in ("json", "constrained", "readout"):
@@ -228,7 +226,6 @@ def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
             assert completion.prompt_tokens > VISION.tokens
 
 
-@pytest.mark.slow
 def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Question]):
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     requests = [request(q) for q in asked[:6]]
@@ -242,7 +239,6 @@ def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Q
         assert p == pytest.approx(q, abs=0.02)
 
 
-@pytest.mark.slow
 def test_the_picture_is_what_two_prompts_that_say_the_same_differ_in(folder: Path, asked: list[Question]):
     model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
     one, other = asked[0], next(q for q in asked if q.image and q.image.sha256 != asked[0].image.sha256)

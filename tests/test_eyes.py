@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 
 import tiny_vl
@@ -110,7 +111,6 @@ def test_a_picture_has_the_tokens_that_the_card_says(model: Any) -> None:
     assert said.prompt_tokens == len(tokens)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["json", "constrained", "readout"])
 def test_a_batch_answers_as_each_alone(model: Any, answer: str) -> None:
     asked = [

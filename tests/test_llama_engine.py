@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
@@ -107,7 +108,6 @@ TOKENS = st.lists(st.integers(0, VOCABULARY - 1), max_size=5)
 # -- what goes in -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("prompt", ["v1", "v2"])
 def test_every_prompt_of_an_episode_is_the_same_text_and_the_same_tokens(
     engine: LlamaEngine, theirs: Any, small: Dataset, prompt: str
@@ -169,7 +169,6 @@ def test_argmax_is_of_all_tokens_or_of_those_listed_and_the_lowest_id_wins_a_tie
     session.close()
 
 
-@pytest.mark.slow
 @settings(max_examples=25)
 @given(st.data())
 def test_whatever_way_sequences_go_it_is_as_if_each_were_read_from_scratch(
@@ -257,7 +256,6 @@ def in_mode(request: Request, answer: Any) -> Request:
     return replace(request, answer=answer, messages=messages, max_tokens=64)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["json", "constrained", "readout"])
 def test_in_every_mode_it_answers_as_transformers_does(
     backend: LlamaBackend, theirs: Any, answer: str
@@ -363,7 +361,6 @@ def test_an_option_that_cannot_be_names_what_can(tiny: Path, options: Any, messa
         open_gguf(tiny / "F32.gguf", **options)
 
 
-@pytest.mark.slow
 def test_what_cannot_be_is_said_in_the_child_as_well(tiny: Path) -> None:
     with pytest.raises(UserError, match=r"device 'cuda:7'; llama.cpp as it is built here has: cpu"):
         open_gguf(tiny / "F32.gguf", device="cuda:7")
@@ -443,7 +440,6 @@ def test_a_file_of_ones_own_is_known_by_its_content_and_by_what_reads_it(
     }  # fmt: skip
 
 
-@pytest.mark.slow
 def test_nothing_is_said_on_stderr(tiny: Path, capfd: pytest.CaptureFixture[str]) -> None:
     opened = open_gguf(tiny / "F32.gguf")
     assert opened.complete([ask(0)])[0].error is None

@@ -10,6 +10,7 @@ import former
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -218,7 +219,6 @@ def test_a_card_without_its_adapter_lacks_weights() -> None:
 # -- a training -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
     names = {path.name for path in taught.iterdir()}
     assert names == {
@@ -239,7 +239,6 @@ def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
     assert (card.adapter, card.letters, card.weights) == (str(taught), "raw", "swarm-tiny")
 
 
-@pytest.mark.slow
 def test_a_killed_teaching_goes_on_to_the_same_adapter(
     taught: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -307,7 +306,6 @@ def test_layouts_with_a_danger_weigh_as_much_as_those_without() -> None:
     assert share(plain.weights) != pytest.approx(0.5, abs=0.01)
 
 
-@pytest.mark.slow
 def test_the_value_rises_where_it_is_what_is_learnt(tmp_path: Path) -> None:
     samples = {"excerpts": 0, "alone": 16, "messages": 8, "answers": 0}
     plan = replace(PLAN, samples=samples, objective="values")
@@ -322,7 +320,6 @@ def test_a_training_that_was_begun_before_there_were_objectives_goes_on() -> Non
     assert replace(PLAN, objective="values").settings()["objective"] == "values"
 
 
-@pytest.mark.slow
 def test_all_weights_of_a_base_can_learn(tmp_path: Path) -> None:
     plan = replace(
         PLAN, samples={**PLAN.samples, "alone": 16, "answers": 0}, adapt=Adapt(None, 1e-3, "bfloat16")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -102,7 +103,6 @@ def any_way_ends_where_one_forward_does(
         assert session.argmax([None] * len(sequences)) == expected.argmax(-1).tolist()
 
 
-@pytest.mark.slow
 @few
 @given(shared_beginnings, own_ends, st.data())
 def test_any_way_of_going_forward_ends_where_one_forward_does(
@@ -178,7 +178,6 @@ def what_is_right_of_a_guess_stays(model: Any, data: st.DataObject) -> None:
             np.testing.assert_allclose(session.log_probs(EVERY), naive(model, sequences), atol=1e-4)
 
 
-@pytest.mark.slow
 @few
 @given(st.data())
 def test_of_a_guess_stays_what_the_model_would_have_written(model: Any, data: st.DataObject) -> None:
@@ -191,7 +190,6 @@ def test_of_many_guesses_stays_what_the_model_would_have_written(model: Any, dat
     what_is_right_of_a_guess_stays(model, data)
 
 
-@pytest.mark.slow
 @few
 @given(st.lists(st.lists(tokens, min_size=1, max_size=12), min_size=1, max_size=3), st.data())
 def test_each_way_to_go_on_ends_where_one_forward_does(
@@ -339,7 +337,6 @@ calls = st.lists(
 )  # fmt: skip
 
 
-@pytest.mark.slow
 @few
 @given(calls, st.data())
 def test_what_was_read_before_changes_no_answer(
