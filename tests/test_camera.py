@@ -33,27 +33,37 @@ from harness.world.state import VehicleState, WorldState
 DATASETS = sorted(path.parent.name for path in Path(folder("datasets")).glob("*/manifest.json"))
 WIDTH, HEIGHT = SIZE_PX
 FOCAL_PX = focal_px(WIDTH)
-SCENES = 12  # of each dataset, four viewers each
+FEW, MANY = 2, 12  # decision points of a dataset, four viewers each
+# The latest dataset of each scenario stands for those before it: only layouts and numbers are others there.
+LATEST = sorted({name.rpartition("-v")[0]: name for name in DATASETS}.values())
 ROAD = scenarios.get("hard-brake-ahead")
 
 
-@pytest.fixture(params=DATASETS)
-def dataset(request: pytest.FixtureRequest) -> Dataset:
-    """The layouts of each dataset that ships."""
-    return load(folder("datasets") / request.param)
+SOME = [pytest.param((name, FEW), marks=pytest.mark.slow, id=name) for name in LATEST]
+EVERY = [
+    pytest.param((name, MANY), marks=pytest.mark.exhaustive, id=f"{name}-{MANY}-moments") for name in DATASETS
+]
 
 
-def moments(dataset: Dataset) -> list[tuple[WorldState, str]]:
+@pytest.fixture(scope="module", params=[*SOME, *EVERY])
+def played(request: pytest.FixtureRequest) -> tuple[Dataset, list[tuple[WorldState, str]]]:
+    """A dataset that ships, and moments of it."""
+    name, scenes = request.param
+    dataset = load(folder("datasets") / name)
+    return dataset, moments(dataset, scenes)
+
+
+def moments(dataset: Dataset, scenes: int) -> list[tuple[WorldState, str]]:
     """Some decision points, those that only errors lead to among them, and their viewers."""
-    drawn = np.random.default_rng(0).choice(len(dataset.forest.ids), SCENES, replace=False)
-    scenes = dataset.scenes([dataset.forest.ids[n] for n in sorted(drawn)])
-    return [(scene.state, viewer) for scene in scenes for viewer in scene.viewers]
+    drawn = np.random.default_rng(0).choice(len(dataset.forest.ids), scenes, replace=False)
+    chosen = dataset.scenes([dataset.forest.ids[n] for n in sorted(drawn)])
+    return [(scene.state, viewer) for scene in chosen for viewer in scene.viewers]
 
 
-@pytest.mark.slow
-def test_a_hidden_vehicle_changes_no_pixel(dataset: Dataset):
+def test_a_hidden_vehicle_changes_no_pixel(played: tuple[Dataset, list[tuple[WorldState, str]]]):
     hidden = 0
-    for state, viewer in moments(dataset):
+    dataset, shown = played
+    for state, viewer in shown:
         eye = state.vehicle(viewer)
         reported = {d.id for d in detect(state, eye, dataset.scenario.parameters)} | {viewer}
         without = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
@@ -64,10 +74,12 @@ def test_a_hidden_vehicle_changes_no_pixel(dataset: Dataset):
     assert hidden
 
 
-@pytest.mark.slow
-def test_a_vehicle_in_sight_and_in_the_field_owns_pixels(dataset: Dataset):
+def test_a_vehicle_in_sight_and_in_the_field_owns_pixels(
+    played: tuple[Dataset, list[tuple[WorldState, str]]],
+):
     owners = 0
-    for state, viewer in moments(dataset):
+    dataset, shown = played
+    for state, viewer in shown:
         eye = state.vehicle(viewer)
         seen, view = frame(dataset.scenario, state, viewer).boxes(), sweep(state, eye)
         off = np.abs((view.bearing_rad - eye.heading_rad + np.pi / 2) % np.pi - np.pi / 2)
@@ -79,7 +91,7 @@ def test_a_vehicle_in_sight_and_in_the_field_owns_pixels(dataset: Dataset):
 
 
 def test_a_frame_is_the_same_every_time_and_another_for_another_viewer():
-    state, viewer = moments(load(folder("datasets") / DATASETS[0]))[0]
+    state, viewer = moments(load(folder("datasets") / DATASETS[0]), 1)[0]
     of = scenarios.get(state.scenario)
     pixels = frame(of, state, viewer).pixels
     assert pixels.shape == (HEIGHT, WIDTH, 3)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -37,6 +38,7 @@ from harness.prompts import readout
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 LANES = ("LANE_LEFT", "IDLE", "LANE_RIGHT")
 MODES: tuple[AnswerMode, ...] = ("json", "constrained", "readout")
+BATCH = 8
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +88,6 @@ def best(backend: LanguageModel, ids: Sequence[int], texts: Sequence[str]) -> st
 # -- json ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> None:
     from transformers import GenerationConfig
 
@@ -108,22 +109,21 @@ def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> Non
     assert len(lengths) > 2, "answers of one length would not show that rows leave their batch"
 
 
-@pytest.mark.slow
 def test_what_is_guessed_saves_forwards_and_changes_no_answer(small: Dataset) -> None:
     """On the model that ships, whose texts have a shape that can be guessed."""
-    opened = open_backend(resolve("swarm-tiny", "transformers"), batch_size=16, device="cpu")
+    opened = open_backend(resolve("swarm-tiny", "transformers"), batch_size=BATCH, device="cpu")
     assert isinstance(opened, LanguageModel)
-    asked = list(requests(spec_of(small, "swarm-tiny"), scenes_of(small)))[:16]
+    asked = list(requests(spec_of(small, "swarm-tiny"), scenes_of(small)))[:BATCH]
     asked += [replace(request, max_tokens=9) for request in asked[:3]]
     alone = [opened.complete([request])[0] for request in asked]
     forwards: list[object] = []
     hook = engine_of(opened).model.register_forward_pre_hook(lambda *_: forwards.append(None))
-    together = opened.complete(asked[:16])
+    together = opened.complete(asked[:BATCH])
     hook.remove()
-    together += opened.complete(asked[16:])
+    together += opened.complete(asked[BATCH:])
     untimed = [replace(c, batch_size=1, **UNTIMED) for c in (*together, *alone)]
     assert untimed[: len(asked)] == untimed[len(asked) :]
-    assert len({c.text for c in alone}) > 8
+    assert len({c.text for c in alone}) > BATCH / 2
     assert len(forwards) < 0.8 * max(c.completion_tokens or 0 for c in alone)
 
 
@@ -370,12 +370,22 @@ REQUESTS = st.builds(
 )
 
 
-@pytest.mark.slow
-@settings(max_examples=25, deadline=None)
-@given(st.lists(REQUESTS, max_size=7))
-def test_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:
+def company_changes_nothing(backend: LanguageModel, requests: list[Request]) -> None:
     together = backend.complete(requests)
     same([backend.complete([request])[0] for request in requests], together)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.lists(REQUESTS, max_size=7))
+def test_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:
+    company_changes_nothing(backend, requests)
+
+
+@pytest.mark.exhaustive
+@settings(max_examples=60, deadline=None)
+@given(st.lists(REQUESTS, max_size=7))
+def test_much_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:
+    company_changes_nothing(backend, requests)
 
 
 @settings(max_examples=15, deadline=None)

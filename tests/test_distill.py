@@ -4,19 +4,21 @@ import json
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import former
 import msgspec
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from teaching import drawn_once
+from teaching import PER_LEVEL, SEED, drawn_by, few_points
 from typer.testing import CliRunner
 
 from harness.backends import cards
@@ -39,10 +41,10 @@ from harness.training.train import STAGES, Plan, Sample, _batches
 from harness.world.reference import drive, finish
 from harness.world.world import World
 
-PLAN = Plan({"excerpts": 128, "alone": 128, "messages": 128, "answers": 96}, batch=8)
+PLAN = Plan({"excerpts": 16, "alone": 16, "messages": 16, "answers": 16}, batch=4)
 CROSSING, PASSING = former.SCENARIO, former.scenes("do-not-pass")
 LEARNT = {CROSSING: (prompts.load("v1"), prompts.load("v2")), PASSING: (prompts.load("v4"),)}
-CURRICULUM = Curriculum(LEARNT, layouts=2, seed=100_000)
+CURRICULUM = Curriculum(LEARNT, layouts=2, seed=SEED)
 
 
 class Killed(Exception):
@@ -54,17 +56,16 @@ def silent(*_: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def few(tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
+def few(once: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
     place = tmp_path_factory.mktemp("lessons")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lessons, "decision_points", drawn_once)
+        patch.setattr(lessons, "decision_points", drawn_by(once))
         return [
             draw(scenario, versions, CURRICULUM.layouts, CURRICULUM.seed, place / scenario.name, 1, silent)
             for scenario, versions in LEARNT.items()
         ]
 
 
-@pytest.mark.slow
 def test_of_each_level_as_many_are_learnt_from_as_a_whole_tree_has():
     forest = load(folder("datasets") / "occluded-intersection-v2", 10).forest
     chosen = forest.drivers[lessons.TEACHER]
@@ -112,18 +113,19 @@ def asked(few: list[Lessons]) -> list[Question]:
 
 
 @pytest.fixture
-def drawn_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lessons, "decision_points", drawn_once)
+def drawn_before(once: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lessons, "decision_points", drawn_by(once))
 
 
 @pytest.fixture(scope="module")
-def student(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("distilled") / "student"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lessons, "decision_points", drawn_once)
-        patch.setattr("harness.training.train.LOG_STEPS", 4)
-        distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
-    return out
+def student(once: Any) -> Path:
+    def fill(out: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(lessons, "decision_points", drawn_by(once))
+            patch.setattr("harness.training.train.LOG_STEPS", 2)
+            distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
+
+    return once("student", fill)
 
 
 # -- the teacher ------------------------------------------------------------------------------------
@@ -138,7 +140,6 @@ def test_the_teacher_wants_what_turned_out_safe_and_least_late() -> None:
     assert danger.tolist() == [1.0, 0.0, 0.0]
 
 
-@pytest.mark.slow
 def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(few: list[Lessons]) -> None:
     """Played again in the simulator, action by action, from the start."""
     for each in few:
@@ -269,7 +270,6 @@ def test_an_orthogonal_factor_has_singular_values_near_one() -> None:
 # -- a run ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_it_writes_a_model_that_every_engine_can_take(student: Path) -> None:
     names = {p.name for p in student.iterdir()}
     assert names >= {"config.json", "model.safetensors", "tokenizer.json", "student-f16.gguf", "README.md"}
@@ -280,13 +280,11 @@ def test_it_writes_a_model_that_every_engine_can_take(student: Path) -> None:
     assert "imitate one planner in the scenarios below" in (student / "README.md").read_text()
 
 
-@pytest.mark.slow
 def test_its_loss_falls(student: Path) -> None:
     for stage, curve in json.loads((student / "training.json").read_text())["curves"].items():
         assert curve[-1][1] < curve[0][1], stage
 
 
-@pytest.mark.slow
 def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, asked: list[Question]) -> None:
     from transformers import AutoTokenizer
 
@@ -301,14 +299,13 @@ def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, as
     assert len(tokenizer("307")["input_ids"]) == 3, "every digit stands alone"
 
 
-@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_model(
     student: Path, drawn_before: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("harness.training.train.KEEP_S", 0.0)
-    monkeypatch.setattr("harness.training.train.LOG_STEPS", 4)
+    monkeypatch.setattr("harness.training.train.LOG_STEPS", 2)
     out = tmp_path / "student"
-    for kill in (("alone", 96), ("answers", 64)):
+    for kill in (("alone", 8), ("answers", 8)):
 
         def progress(stage: str, seen: int, loss: float, kill: tuple[str, int] = kill) -> None:
             if (stage, seen) == kill:
@@ -321,7 +318,6 @@ def test_a_killed_run_goes_on_to_the_same_model(
         assert (out / name).read_bytes() == (student / name).read_bytes()
 
 
-@pytest.mark.slow
 def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
     student: Path, drawn_before: None, tmp_path: Path
 ) -> None:
@@ -346,7 +342,6 @@ def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
         )
 
 
-@pytest.mark.slow
 def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_path: Path) -> None:
     plan = replace(PLAN, samples={**PLAN.samples, "alone": 8, "messages": 1})
     with pytest.raises(UserError, match=r"--samples: 1 sequences of the stage messages take too few scenes"):
@@ -400,12 +395,11 @@ def test_it_learns_from_every_level_of_a_tree(few: list[Lessons]) -> None:
             steps = [s.record.step for s in each.scenes if s.record.episode == number]
             assert set(steps) == set(range(min(steps), max(steps) + 1))
             assert max(steps) > 1
-            assert all(steps.count(step) <= lessons.PER_LEVEL for step in steps)
+            assert all(steps.count(step) <= PER_LEVEL for step in steps)
 
 
-@pytest.mark.slow
 def test_a_layout_teaches_the_same_wherever_it_is_drawn(few: list[Lessons]) -> None:
-    again = msgspec.json.encode(lessons.decision_points(PASSING, CURRICULUM.seed + 1, 1))
+    again = msgspec.json.encode(few_points(PASSING, CURRICULUM.seed + 1, 1))
     assert msgspec.json.decode(again, type=list[lessons.Point]) == [
         lessons.Point(scene.record, few[1].labels[scene.id].tolist())
         for scene in few[1].scenes if scene.record.episode == 1

@@ -13,17 +13,17 @@ from msgspec import structs
 
 from harness.world.scene_graph import Node
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("highway_env", reason="needs the sim extra")
 
 from former import SCENARIO
-from teaching import drawn_once
+from teaching import SEED, drawn_by
 
 from harness.backends import cards
 from harness.backends.base import Request
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
-from harness.core.seeds import FIRST
 from harness.prompts import readout
 from harness.prompts import versions as prompts
 from harness.training.answers import cells, sights
@@ -41,11 +41,11 @@ from harness.training.model import (
 )
 from harness.training.questions import Question, alone
 from harness.training.student import Student
-from harness.training.train import STAGES, Plan
+from harness.training.train import Plan
 from harness.world.perception.camera import Sight
 
 VERSIONS = (prompts.load("v7"), prompts.load("v8"))
-PLAN = Plan(dict.fromkeys(STAGES, 16), batch=8)
+PLAN = Plan({"excerpts": 4, "alone": 4, "messages": 8, "answers": 6}, batch=2)
 LAYOUTS = 2
 
 
@@ -57,23 +57,22 @@ CAMERA = {"sensors": ("camera", "lidar"), "indicator": "off"}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _drawn_once() -> Iterator[None]:
+def _drawn_once(once: Any) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.training.lessons.decision_points", drawn_once)
+        patch.setattr("harness.training.lessons.decision_points", drawn_by(once))
         yield
 
 
 @pytest.fixture(scope="module")
 def lessons(tmp_path_factory: pytest.TempPathFactory) -> Lessons:
     place = tmp_path_factory.mktemp("lessons")
-    return draw(SCENARIO, VERSIONS, LAYOUTS, FIRST["train"], place, 1, silent)
+    return draw(SCENARIO, VERSIONS, LAYOUTS, SEED, place, 1, silent)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("distilled") / "seer"
-    distill(Curriculum({SCENARIO: VERSIONS}, LAYOUTS, FIRST["train"]), PLAN, out, silent, silent, "cpu")
-    return out
+def folder(once: Any) -> Path:
+    taught = Curriculum({SCENARIO: VERSIONS}, LAYOUTS, SEED)
+    return once("seer", lambda out: distill(taught, PLAN, out, silent, silent, "cpu"))
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +118,7 @@ def test_whom_the_cameras_show_is_listed_nearest_first():
 
 
 def test_the_first_stage_asks_whom_the_picture_shows(lessons: Lessons, tmp_path: Path):
-    student = Student([lessons], PLAN, tmp_path, "cpu")
+    student = Student([replace(lessons, scenes=lessons.scenes[::3])], PLAN, tmp_path, "cpu")
     learnt = student.lessons[0].scenes
     listed = [sights(scene.graphs[v]) for scene in learnt for v in scene.viewers]
     samples = student.samples("excerpts")
@@ -146,7 +145,6 @@ def test_each_token_of_a_picture_says_how_far_the_nearest_vehicle_in_its_square_
     assert somebody > 20
 
 
-@pytest.mark.slow
 def test_an_engine_reads_what_the_model_learnt_from(
     folder: Path, lessons: Lessons, asked: list[Question], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -212,7 +210,6 @@ def test_a_picture_is_answered_as_the_base_answers_the_same_scene_graph_in_words
     assert all(s.target is q.label for q, s in zip(texts, student.reading(texts), strict=True))
 
 
-@pytest.mark.slow
 def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
     model = new_model(read_tokenizer(folder, sees=True), 0, sees=True)
     with pytest.raises(
@@ -221,7 +218,6 @@ def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
         take_over(model, folder)
 
 
-@pytest.mark.slow
 def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
     model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
     for answer in ("json", "constrained", "readout"):
@@ -230,7 +226,6 @@ def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
             assert completion.prompt_tokens > VISION.tokens
 
 
-@pytest.mark.slow
 def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Question]):
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     requests = [request(q) for q in asked[:6]]
@@ -244,7 +239,6 @@ def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Q
         assert p == pytest.approx(q, abs=0.02)
 
 
-@pytest.mark.slow
 def test_the_picture_is_what_two_prompts_that_say_the_same_differ_in(folder: Path, asked: list[Question]):
     model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
     one, other = asked[0], next(q for q in asked if q.image and q.image.sha256 != asked[0].image.sha256)

@@ -276,9 +276,23 @@ def project(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path("prompts/mine")
 
 
-@pytest.mark.slow
-def test_the_command_draws_them_from_train_layouts(project: Path, harness: Harness) -> None:
+@pytest.fixture(
+    params=[
+        pytest.param("few", marks=pytest.mark.slow),
+        pytest.param("as many as are drawn", marks=pytest.mark.exhaustive),
+    ]
+)
+def _points(request: pytest.FixtureRequest, once: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The decision points of a layout from which examples are taken: few are drawn once."""
     pytest.importorskip("highway_env", reason="needs the sim extra")
+    from teaching import drawn_by
+
+    if request.param == "few":
+        monkeypatch.setattr("harness.training.prompt_examples.decision_points", drawn_by(once))
+
+
+@pytest.mark.usefixtures("_points")
+def test_the_command_draws_them_from_train_layouts(project: Path, harness: Harness) -> None:
     drawing = ("prompt", "examples", "mine", "--scenario", scenarios.DEFAULT)
     code, out, _ = harness(*drawing)
     mine = prompts.load("mine")
@@ -320,6 +334,7 @@ def test_what_cannot_be_drawn_is_one_line(
     assert not (project / EXAMPLES).exists()
 
 
+@pytest.mark.slow
 def test_check_counts_them_and_show_shows_them(project: Path, harness: Harness, small_path: Path) -> None:
     tokenizer = folder("models") / "swarm-tiny"
 

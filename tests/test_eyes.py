@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 
 import tiny_vl
@@ -110,13 +111,14 @@ def test_a_picture_has_the_tokens_that_the_card_says(model: Any) -> None:
     assert said.prompt_tokens == len(tokens)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["json", "constrained", "readout"])
 def test_a_batch_answers_as_each_alone(model: Any, answer: str) -> None:
     asked = [
         question(model, 0, 1, answer), question(model, 1, 2, answer, "Another scene, longer"),
         question(model, 2, 1, answer, "The same picture"), question(model, 3, 3, answer),
     ]  # fmt: skip
+    if answer == "json":
+        asked = [replace(request, max_tokens=12) for request in asked]
     together = [c.text for c in model.complete(asked)]
     alone = [model.complete([request])[0].text for request in asked]
     again = [model.complete([request])[0].text for request in reversed(asked)]

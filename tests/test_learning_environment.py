@@ -165,14 +165,14 @@ def test_driving_is_the_walk_through_the_tree(make: Make, small: Dataset) -> Non
 
 @pytest.mark.slow
 def test_trees_are_built_once_and_say_what_was_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = package.environment("hard-brake-ahead", layouts=1, quiet=True)
+    env = package.environment("parking-exit", layouts=1, quiet=True)
     monkeypatch.setattr("harness.learning.layouts.build", None)
-    again = package.environment("hard-brake-ahead", layouts=1, quiet=True)
+    again = package.environment("parking-exit", layouts=1, quiet=True)
     assert np.array_equal(env.values.table, again.values.table)
     learnt = json.loads(json.dumps(env.learnt()))
     first = {"layouts": 1, "first_seed": FIRST["train"], "purpose": "train", "then": "best"}
     assert first.items() <= learnt.items()
-    assert set(learnt["scenarios"]) == {"hard-brake-ahead"}
+    assert set(learnt["scenarios"]) == {"parking-exit"}
     assert learnt["prompts"] == {env.ask.prompt.version: env.ask.prompt.sha256}
 
 

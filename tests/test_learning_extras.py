@@ -8,10 +8,11 @@ import pytest
 
 import harness as package
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
+pytestmark = pytest.mark.filterwarnings("default")
 STATED = '{{"action_distribution":{{"SLOWER":{},"IDLE":{},"FASTER":{}}}}}'
 
 
+@pytest.mark.exhaustive  # the rewards themselves: `test_learning_environment.py`
 def test_grpo_takes_steps_on_exact_rewards(small_path: Path, tmp_path: Path) -> None:
     trl = pytest.importorskip("trl", reason="needs the trl extra")
     datasets = pytest.importorskip("datasets", reason="needs the trl extra")
@@ -63,6 +64,7 @@ def trace_of(task: Any, text: str) -> Any:
     return vf.Trace(task=about, agent=AgentInfo(config=vf.AgentConfig()), nodes=[said])
 
 
+@pytest.mark.slow
 def test_verifiers_scores_a_trace_as_the_trees_do(taskset: Any, small_path: Path) -> None:
     env = package.environment(dataset=small_path, viewer="any")
     tasks, rows = [*taskset], env.rows(per_level=2)
@@ -83,6 +85,7 @@ def test_verifiers_scores_a_trace_as_the_trees_do(taskset: Any, small_path: Path
             assert trace.metrics["readable"] == readable
 
 
+@pytest.mark.slow
 def test_verifiers_makes_an_environment_of_it_and_report_seeds_are_one_line(taskset: Any) -> None:
     from verifiers.v1.utils.loaders import load_environment, load_taskset, resolve_env_config
 

@@ -37,6 +37,7 @@ def test_what_is_no_layout_is_one_line(seed: Any, said: str) -> None:
         driven.reset(options={"layout_seed": seed})
 
 
+@pytest.mark.slow
 def test_report_layouts_are_refused_whatever_their_manifest_calls_them(tmp_path: Path) -> None:
     folder = tmp_path / "renamed"
     shutil.copytree(find("occluded-intersection-v2"), folder)

@@ -93,8 +93,8 @@ def by_hand(backend: Any, request: Request) -> list[float]:
 def test_an_engine_averages_what_it_says_of_each_order_alone_or_in_a_batch(engine: str) -> None:
     pytest.importorskip({"llama-cpp": "llama_cpp", "transformers": "torch"}[engine])
     near = {"llama-cpp": 5e-4, "transformers": 2e-5}[engine]  # F16 keys and values, float32 weights
-    asked = [*questions.requests(agent(engine))[:5], questions.requests(agent(engine), "helper")[0]]
-    batches = open_backend(agent(engine).card, batch_size=4)
+    asked = [*questions.requests(agent(engine))[:2], questions.requests(agent(engine), "helper")[0]]
+    batches = open_backend(agent(engine).card, batch_size=2)
     single = open_backend(agent(engine).card, batch_size=1)
     together, alone = batches.complete(asked), single.complete(asked)
     for one, other in zip(together, alone, strict=True):
@@ -113,12 +113,13 @@ def test_an_engine_averages_what_it_says_of_each_order_alone_or_in_a_batch(engin
         assert shares(one.text) == pytest.approx(shares(other.text), abs=near)
 
 
+@pytest.mark.slow
 def test_both_engines_average_alike() -> None:
     pytest.importorskip("llama_cpp")
     pytest.importorskip("torch")
     answers: list[list[Completion]] = []
     for engine in ("llama-cpp", "transformers"):
-        backend = open_backend(agent(engine).card, batch_size=4)
-        answers.append(backend.complete(questions.requests(agent(engine))[:4]))
+        backend = open_backend(agent(engine).card, batch_size=2)
+        answers.append(backend.complete(questions.requests(agent(engine))[:2]))
     for one, other in zip(*answers, strict=True):
         assert shares(one.text) == pytest.approx(shares(other.text), abs=0.005)

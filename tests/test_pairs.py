@@ -246,7 +246,7 @@ def test_a_model_learns_from_the_pairs(run: Path, harness: Harness, tmp_path: Pa
     assert sum(loss_of(line).item() for line in lines) < sum(before)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive  # what the file holds, and that a model learns from it, are shown above
 @pytest.mark.filterwarnings("default")
 def test_trl_trains_on_the_file_as_it_is(run: Path, harness: Harness, tmp_path: Path) -> None:
     trl = pytest.importorskip("trl", reason="needs the trl extra")
@@ -270,7 +270,7 @@ def test_trl_trains_on_the_file_as_it_is(run: Path, harness: Harness, tmp_path: 
     assert trainer.train().global_step == 2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("default")
 def test_trl_prefers_by_the_file_as_it_is(run: Path, harness: Harness, tmp_path: Path) -> None:
     trl = pytest.importorskip("trl", reason="needs the trl extra")

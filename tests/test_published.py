@@ -10,6 +10,7 @@ import former
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -17,7 +18,7 @@ import tiny_llama
 import torch
 from msgspec import structs
 from safetensors.torch import save_file
-from teaching import drawn_once
+from teaching import SEED, drawn_by
 from typer.testing import CliRunner
 
 from harness.backends import adapters, cards
@@ -40,11 +41,11 @@ from harness.world.world import World
 
 BASE = cards.resolve("swarm-tiny", "transformers")
 PLAN = Plan(
-    {"excerpts": 0, "alone": 96, "messages": 0, "answers": 32}, batch=8, adapt=Adapt(rank=4, rate=2e-2)
+    {"excerpts": 0, "alone": 12, "messages": 0, "answers": 6}, batch=2, adapt=Adapt(rank=4, rate=2e-2)
 )
 CROSSING, PASSING = former.SCENARIO, former.scenes("do-not-pass")
 LEARNT = dict.fromkeys((CROSSING, PASSING), (prompts.load("v9"),))  # three actions, and five
-CURRICULUM = Curriculum(LEARNT, layouts=2, seed=100_000, base=BASE)
+CURRICULUM = Curriculum(LEARNT, layouts=2, seed=SEED, base=BASE)
 
 
 class Killed(Exception):
@@ -56,20 +57,23 @@ def silent(*_: object) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(lessons, "decision_points", drawn_once)
-    monkeypatch.setattr("harness.training.train.LOG_STEPS", 4)
+def _quick(once: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(lessons, "decision_points", drawn_by(once))
+    monkeypatch.setattr("harness.training.train.LOG_STEPS", 2)
+    monkeypatch.setattr("harness.training.student.WATCHED", 8)
     monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path / "cache"))
 
 
 @pytest.fixture(scope="module")
-def taught(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("taught") / "pupil"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lessons, "decision_points", drawn_once)
-        patch.setattr("harness.training.train.LOG_STEPS", 4)
-        distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
-    return out
+def taught(once: Any) -> Path:
+    def fill(out: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(lessons, "decision_points", drawn_by(once))
+            patch.setattr("harness.training.train.LOG_STEPS", 2)
+            patch.setattr("harness.training.student.WATCHED", 8)
+            distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
+
+    return once("pupil", fill)
 
 
 def asked(n: int) -> Request:
@@ -215,7 +219,6 @@ def test_a_card_without_its_adapter_lacks_weights() -> None:
 # -- a training -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
     names = {path.name for path in taught.iterdir()}
     assert names == {
@@ -231,18 +234,17 @@ def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
         assert sum(held_out["likeliest"].values()) == pytest.approx(1.0)
     text = (taught / "README.md").read_text()
     assert "A LoRA adapter of rank 4 for `swarm-tiny`" in text
-    assert "train seeds 100000 to 100001" in text
+    assert "train seeds 100001 to 100002" in text
     card = cards.resolve(str(taught))
     assert (card.adapter, card.letters, card.weights) == (str(taught), "raw", "swarm-tiny")
 
 
-@pytest.mark.slow
 def test_a_killed_teaching_goes_on_to_the_same_adapter(
     taught: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("harness.training.train.KEEP_S", 0.0)
     out = tmp_path / "pupil"
-    for kill in (("alone", 64), ("answers", 32)):
+    for kill in (("alone", 8), ("answers", 4)):
 
         def progress(stage: str, seen: int, *_: float, kill: tuple[str, int] = kill) -> None:
             if (stage, seen) == kill:
@@ -276,10 +278,10 @@ def test_a_decisions_gradient_is_the_exact_policy_gradient() -> None:
 def test_a_value_is_what_the_episode_comes_to_when_the_decision_is_played() -> None:
     """Played in the simulator from the start of a layout, action by action."""
     scenario = PASSING
-    [first] = [p for p in drawn_once(scenario, 100_001, 1) if p.record.step == 0]
-    reference, safe = drive(scenario, "full-view", 100_001), []
+    [first] = [p for p in lessons.decision_points(scenario, SEED, 1) if p.record.step == 0]
+    reference, safe = drive(scenario, "full-view", SEED), []
     for action in scenario.actions:
-        world = World.start(scenario, 100_001)
+        world = World.start(scenario, SEED)
         world.act(action)
         [outcome] = finish([world], [lessons.TEACHER])
         safe.append(outcome.judged(reference, world.layout.danger, scenario.parameters).success)
@@ -289,7 +291,7 @@ def test_a_value_is_what_the_episode_comes_to_when_the_decision_is_played() -> N
 
 
 def test_layouts_with_a_danger_weigh_as_much_as_those_without() -> None:
-    records = [p.record for n in range(2) for p in drawn_once(CROSSING, 100_000 + n, n)]
+    records = [p.record for n in range(2) for p in lessons.decision_points(CROSSING, SEED + n, n)]
     scenes = tuple(
         Scene(structs.replace(r, danger=Danger(*((None, None) if r.step > 2 else ("left", "v5")))))
         for r in records
@@ -304,13 +306,12 @@ def test_layouts_with_a_danger_weigh_as_much_as_those_without() -> None:
     assert share(plain.weights) != pytest.approx(0.5, abs=0.01)
 
 
-@pytest.mark.slow
 def test_the_value_rises_where_it_is_what_is_learnt(tmp_path: Path) -> None:
-    samples = {"excerpts": 0, "alone": 64, "messages": 32, "answers": 0}
+    samples = {"excerpts": 0, "alone": 16, "messages": 8, "answers": 0}
     plan = replace(PLAN, samples=samples, objective="values")
     facts = distill(CURRICULUM, plan, tmp_path / "pupil", silent, silent, "cpu")
     assert facts["curves"]["messages"][-1][3] > facts["curves"]["alone"][0][3]
-    assert len(facts["curves"]["messages"]) == 1
+    assert len(facts["curves"]["messages"]) == 2
     assert "- Objective: `values`, the probability of actions" in (tmp_path / "pupil/README.md").read_text()
 
 
@@ -319,7 +320,6 @@ def test_a_training_that_was_begun_before_there_were_objectives_goes_on() -> Non
     assert replace(PLAN, objective="values").settings()["objective"] == "values"
 
 
-@pytest.mark.slow
 def test_all_weights_of_a_base_can_learn(tmp_path: Path) -> None:
     plan = replace(
         PLAN, samples={**PLAN.samples, "alone": 16, "answers": 0}, adapt=Adapt(None, 1e-3, "bfloat16")

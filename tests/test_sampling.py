@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +81,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny", context_tokens=2048)
 
 
-@pytest.fixture(scope="module", params=["transformers", "llama-cpp"])
+@pytest.fixture(scope="module", params=["transformers", pytest.param("llama-cpp", marks=pytest.mark.slow)])
 def card(request: pytest.FixtureRequest, tiny: Path) -> Card:
     if request.param == "transformers":
         return resolve(str(tiny))
@@ -99,9 +100,11 @@ def ask(i: int, answer: AnswerMode = "json", **options: Any) -> Request:
     )  # fmt: skip
 
 
+opened = cache(open_backend)  # a process of llama.cpp takes longer to start than to answer
+
+
 def said(card: Card, requests: Sequence[Request], batch_size: int = 4) -> list[str]:
-    opened = open_backend(card, batch_size=batch_size, device="cpu")
-    completions = opened.complete(requests)
+    completions = opened(card, batch_size=batch_size, device="cpu").complete(requests)
     assert not any(c.error for c in completions)
     return [c.text for c in completions]
 
@@ -140,21 +143,21 @@ def test_tokens_come_as_often_as_the_model_says(tiny: Path) -> None:
     from harness.backends.language_model import LanguageModel
     from harness.backends.transformers.engine import TransformersEngine
 
-    opened = open_backend(resolve(str(tiny)), batch_size=64, device="cpu")
-    assert isinstance(opened, LanguageModel)
-    assert isinstance(opened.engine, TransformersEngine)
-    ids = opened.chat.encode(opened.chat.render(ask(2).messages, thinking=False))
+    hot = open_backend(resolve(str(tiny)), batch_size=64, device="cpu")
+    assert isinstance(hot, LanguageModel)
+    assert isinstance(hot.engine, TransformersEngine)
+    ids = hot.chat.encode(hot.chat.render(ask(2).messages, thinking=False))
     with torch.inference_mode():
-        row = opened.engine.model(torch.tensor([ids])).logits[0, -1].double() / 1.5
+        row = hot.engine.model(torch.tensor([ids])).logits[0, -1].double() / 1.5
     p = row.softmax(-1).numpy()
     n = 600
     texts = [
-        c.text for c in opened.complete([ask(2, max_tokens=1, temperature=1.5, sample=s) for s in range(n)])
+        c.text for c in hot.complete([ask(2, max_tokens=1, temperature=1.5, sample=s) for s in range(n)])
     ]
     for token in np.argsort(p)[::-1][:4].tolist():
-        text = "" if token in opened.engine.stops else opened.chat.decode([token])
+        text = "" if token in hot.engine.stops else hot.chat.decode([token])
         expected = (
-            sum(float(p[t]) for t in range(len(p)) if opened.chat.decode([t]) == text) if text else p[token]
+            sum(float(p[t]) for t in range(len(p)) if hot.chat.decode([t]) == text) if text else p[token]
         )
         assert abs(texts.count(text) / n - expected) < 4 * (expected * (1 - expected) / n) ** 0.5
 
@@ -181,7 +184,10 @@ def test_a_server_is_sent_temperature_and_seed() -> None:
 
 @pytest.mark.slow
 def test_a_run_is_drawn_by_its_sampling_seed(small: Dataset, tiny: Path, tmp_path: Path) -> None:
-    spec = spec_of(small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, limit=2)
+    alone = (POINTS["single-local"],)
+    spec = spec_of(
+        small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, limit=2, points=alone
+    )
     one, again = (run(replace(spec, batch_size=n), tmp_path / str(n)) for n in (8, 3))
     assert same_decisions(one.out, again.out)
     other = run(replace(spec, sampling_seed=2), tmp_path / "other")
@@ -221,9 +227,11 @@ def test_a_replay_asks_on_as_the_run_was_asked(
         '[latency]\nsource = "paper"\nbasis = "none"\n'
     )
     alone, both = (POINTS["single-local"],), (POINTS["single-local"], POINTS["6g"])
-    spec = spec_of(small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, points=both)
+    spec = spec_of(
+        small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, limit=1, points=both
+    )
     stored = run(replace(spec, points=alone), tmp_path / "stored")
-    replayed = spec_of(small, f"replay:{stored.out}", answer="constrained", points=both)
+    replayed = spec_of(small, f"replay:{stored.out}", answer="constrained", limit=1, points=both)
     again, whole = run(replayed, tmp_path / "again"), run(spec, tmp_path / "whole")
     assert same_decisions(again.out, whole.out)
     assert len(read(again.out).answers) > len(read(stored.out).answers)

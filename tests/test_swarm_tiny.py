@@ -18,6 +18,7 @@ from harness.evaluate.lifecycle import Evaluated
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
 
 EPISODES = 48
+# That its answers stay what they are, `conformance/test_answer_versions.py` says of a few of them.
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +31,14 @@ def done(shipped: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluate
     return run(spec_of(shipped, "swarm-tiny", seeds=(0, 1, 2, 3, 4)), tmp_path_factory.mktemp("r") / "run")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_its_answers_are_valid_as_they_come(done: Evaluated) -> None:
     said = [answer.verdict for answer in answers_of(done.out)]
     assert len(said) > 1000
     assert said.count("strict") >= 0.98 * len(said)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset) -> None:
     """Hidden: the ego does not see the danger, and a sector of its view is occluded."""
     said = [d for d in decisions(done.out, "single-local") if d.seed == 0]  # nothing of it depends on luck
@@ -51,7 +52,7 @@ def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset
     assert np.mean(hidden) > POINTS["6g"].ask.tau_nats, "so that it asks for help"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_its_helpers_messages_help(done: Evaluated) -> None:
     alone, helped = (figure(done, c, "success_rate").value for c in ("single-local", "6g"))
     assert helped - alone >= 0.08

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -69,8 +70,9 @@ def said(completions: list[Completion]) -> list[tuple[object, ...]]:
 # -- answers ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("batch_size", [1, 3, 8])
+@pytest.mark.parametrize(
+    "batch_size", [3, *(pytest.param(size, marks=pytest.mark.exhaustive) for size in (1, 8))]
+)
 def test_a_batch_says_what_each_request_alone_would_in_the_order_asked(tiny: Path, batch_size: int) -> None:
     one = open_tiny(tiny, batch_size=1)
     alone = [one.complete([request])[0] for request in REQUESTS]
@@ -80,7 +82,6 @@ def test_a_batch_says_what_each_request_alone_would_in_the_order_asked(tiny: Pat
     assert len({c.text for c in alone}) > 5, "answers that are all alike would show no order"
 
 
-@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.builds(ask, st.integers(0, 15), max_tokens=st.integers(1, 12)), max_size=6))
 def test_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from harness.backends.engine import common_beginning
@@ -27,6 +28,7 @@ SHAPE: dict[str, Any] = {
 }  # fmt: skip
 EVERY = list(range(64))
 tokens = st.integers(0, 63)
+few = settings(max_examples=20)
 
 
 def full_attention() -> Any:
@@ -79,13 +81,11 @@ def widths(model: Any) -> Iterator[list[tuple[int, int]]]:
 # -- a session ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@given(
-    st.lists(tokens, max_size=20),
-    st.lists(st.lists(tokens, min_size=1, max_size=12), min_size=1, max_size=4),
-    st.data(),
-)
-def test_any_way_of_going_forward_ends_where_one_forward_does(
+shared_beginnings = st.lists(tokens, max_size=20)
+own_ends = st.lists(st.lists(tokens, min_size=1, max_size=12), min_size=1, max_size=4)
+
+
+def any_way_ends_where_one_forward_does(
     model: Any, shared: list[int], ends: list[list[int]], data: st.DataObject
 ) -> None:
     sequences = [[*shared, *end] for end in ends]
@@ -101,6 +101,22 @@ def test_any_way_of_going_forward_ends_where_one_forward_does(
         expected = naive(model, sequences)
         np.testing.assert_allclose(session.log_probs(EVERY), expected, atol=1e-4)
         assert session.argmax([None] * len(sequences)) == expected.argmax(-1).tolist()
+
+
+@few
+@given(shared_beginnings, own_ends, st.data())
+def test_any_way_of_going_forward_ends_where_one_forward_does(
+    model: Any, shared: list[int], ends: list[list[int]], data: st.DataObject
+) -> None:
+    any_way_ends_where_one_forward_does(model, shared, ends, data)
+
+
+@pytest.mark.exhaustive
+@given(shared_beginnings, own_ends, st.data())
+def test_of_many_ways_to_go_forward_each_ends_where_one_forward_does(
+    model: Any, shared: list[int], ends: list[list[int]], data: st.DataObject
+) -> None:
+    any_way_ends_where_one_forward_does(model, shared, ends, data)
 
 
 def test_an_empty_chunk_leaves_a_sequence_to_the_last_bit(model: Any) -> None:
@@ -133,9 +149,7 @@ def test_log_probabilities_are_of_the_whole_vocabulary(model: Any) -> None:
         assert whole.dtype == np.float64
 
 
-@pytest.mark.slow
-@given(st.data())
-def test_of_a_guess_stays_what_the_model_would_have_written(model: Any, data: st.DataObject) -> None:
+def what_is_right_of_a_guess_stays(model: Any, data: st.DataObject) -> None:
     """Sequences go forward by right, wrong and empty guesses, and end where one forward of each does."""
     sequences = data.draw(st.lists(st.lists(tokens, min_size=1, max_size=9), min_size=1, max_size=4))
     reader = Reader(model)
@@ -164,7 +178,19 @@ def test_of_a_guess_stays_what_the_model_would_have_written(model: Any, data: st
             np.testing.assert_allclose(session.log_probs(EVERY), naive(model, sequences), atol=1e-4)
 
 
-@pytest.mark.slow
+@few
+@given(st.data())
+def test_of_a_guess_stays_what_the_model_would_have_written(model: Any, data: st.DataObject) -> None:
+    what_is_right_of_a_guess_stays(model, data)
+
+
+@pytest.mark.exhaustive
+@given(st.data())
+def test_of_many_guesses_stays_what_the_model_would_have_written(model: Any, data: st.DataObject) -> None:
+    what_is_right_of_a_guess_stays(model, data)
+
+
+@few
 @given(st.lists(st.lists(tokens, min_size=1, max_size=12), min_size=1, max_size=3), st.data())
 def test_each_way_to_go_on_ends_where_one_forward_does(
     model: Any, sequences: list[list[int]], data: st.DataObject
@@ -305,9 +331,14 @@ def test_a_prompt_that_is_another_ones_beginning_still_has_a_token_of_its_own(qw
                 np.testing.assert_allclose(session.log_probs(EVERY), naive(qwen, sequences), atol=1e-4)
 
 
-@pytest.mark.slow
-@given(st.lists(st.lists(st.sampled_from([SYSTEM, SYSTEM[::-1], SYSTEM[:20]]), min_size=1, max_size=3),
-                min_size=1, max_size=5), st.data())  # fmt: skip
+calls = st.lists(
+    st.lists(st.sampled_from([SYSTEM, SYSTEM[::-1], SYSTEM[:20]]), min_size=1, max_size=3),
+    min_size=1, max_size=5,
+)  # fmt: skip
+
+
+@few
+@given(calls, st.data())
 def test_what_was_read_before_changes_no_answer(
     qwen: Any, heads: list[list[list[int]]], data: st.DataObject
 ) -> None:
