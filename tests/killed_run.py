@@ -1,7 +1,8 @@
 """Evaluations that are really killed: `python killed_run.py DATASET FOLDER`, a run in each subfolder.
 
 `at-<n>` dies by SIGKILL just before the n-th call that changes the disk, for every n that there is;
-`after-<ms>-<i>` is killed by its parent, whatever it is doing then.
+`after-<ms>-<i>` is killed by its parent, whatever it is doing then. Tests import `killed_at`, too, for a kill
+of each kind.
 """
 
 import itertools
@@ -11,7 +12,9 @@ import signal
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from evaluating import run, spec_of
 
@@ -31,30 +34,56 @@ def spec_to_kill(dataset: Dataset) -> Spec:
     return spec_of(dataset, limit=2, points=(POINTS["single-local"], *map(named_point, CONTENTS)))
 
 
-def die_before(n: int) -> None:
-    """Let this process kill itself in place of its n-th change of the disk."""
+PLACES = {
+    "before anything": ("mkdir", ".work"),
+    "before it keeps its settings": ("replace", "/.work/config.json"),
+    "between two parts": ("unlink", "/.work/episodes-000000-000000.jsonl"),
+    "while a part is written": ("replace", "/episodes.csv"),
+    "before a table": ("replace", "/run/decisions.parquet"),
+    "before the last file": ("replace", "/run/run.json"),
+    "while the work is cleared away": ("unlink", "lock"),
+}  # by what it is killed before: the change of the disk, and how its path ends
+Dies = Callable[[str, str], bool]  # whether to die before a change, by its name and path
+
+
+def nth(n: int) -> Dies:
     count = itertools.count(1)
+    return lambda name, path: next(count) == n
+
+
+def at(name: str, end: str) -> Dies:
+    return lambda change, path: change == name and path.endswith(end)
+
+
+def die_before(dies: Dies) -> None:
+    """Let this process kill itself in place of a change of the disk."""
     for name in CHANGES:
-        setattr(os, name, _dying(getattr(os, name), count, n))
+        setattr(os, name, _dying(name, getattr(os, name), dies))
 
 
-def _dying(change, count, n):
-    def call(*args, **options):
-        if next(count) == n:
+def _dying(name: str, change: Callable[..., Any], dies: Dies) -> Callable[..., Any]:
+    def call(*args: Any, **options: Any) -> Any:
+        if dies(name, _path(name, args)):
             os.kill(os.getpid(), signal.SIGKILL)
         return change(*args, **options)
 
     return call
 
 
-def forked(spec: Spec, out: Path, before: int = 0) -> int:
+def _path(name: str, args: tuple[Any, ...]) -> str:
+    if name == "fsync":
+        return os.readlink(f"/proc/self/fd/{args[0]}")
+    return os.fspath(args[1] if name == "replace" else args[0])
+
+
+def forked(spec: Spec, out: Path, dies: Dies | None = None) -> int:
     """Process id of a child that evaluates."""
     child = os.fork()
     if child == 0:
         status = 1  # whatever happens, a child must not go on as its parent
         try:
-            if before:
-                die_before(before)
+            if dies:
+                die_before(dies)
             run(spec, out)
             status = 0
         except BaseException:
@@ -64,15 +93,22 @@ def forked(spec: Spec, out: Path, before: int = 0) -> int:
     return child
 
 
+def killed_at(spec: Spec, out: Path, dies: Dies) -> None:
+    """Evaluate in a child that kills itself."""
+    _, status = os.waitpid(forked(spec, out, dies), 0)
+    assert os.WIFSIGNALED(status), f"the run that was to die ended with status {status}"
+    assert os.WTERMSIG(status) == signal.SIGKILL
+
+
 def main(dataset: Path, folder: Path) -> None:
-    spec = spec_to_kill(load(dataset))
+    spec = spec_to_kill(load(dataset, limit=2))
     run(spec, folder / "whole")
     evaluation.TREES_AT_ONCE, evaluation.WALKS_AT_ONCE = TREES_AT_ONCE, WALKS_AT_ONCE
     began = time.monotonic()
     run(spec, folder / "again")
     took_s = time.monotonic() - began
     for n in itertools.count(1):
-        _, status = os.waitpid(forked(spec, folder / f"at-{n}", before=n), 0)
+        _, status = os.waitpid(forked(spec, folder / f"at-{n}", nth(n)), 0)
         if not os.WIFSIGNALED(status):
             break
     if status:

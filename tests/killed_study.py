@@ -1,7 +1,7 @@
-"""Studies that are really killed: `python killed_study.py DATASET FOLDER [NAME...]`.
+"""Studies that are really killed.
 
-Each command of `COMMANDS` is typed in `whole/NAME` by nobody disturbed, and in `resumed/NAME` it dies by
-SIGKILL in the middle of its writes to the disk, counted, and is typed again.
+Each command of `COMMANDS` is typed once by nobody disturbed; and once it dies by SIGKILL in the middle of its
+writes to the disk, counted, and is typed again.
 """
 
 import os
@@ -9,11 +9,13 @@ import shutil
 import signal
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import pytest
 from evaluating import Scripted, sure
 from former import DRIVE
 
@@ -115,38 +117,45 @@ def typed(words: Sequence[str], here: Path, last: int | None = None) -> int:
     with os.fdopen(read) as counted:
         count = int(counted.read() or 0)
     if status and not (last and os.WIFSIGNALED(status)):
-        sys.exit(f"{' '.join(words)} ended with status {status}")
+        pytest.fail(f"{' '.join(words)} ended with status {status}")
     return count
 
 
-def main(dataset: Path, folder: Path, names: Sequence[str]) -> None:
-    os.environ["SWARMDRIVE_CACHE"] = os.fspath(folder / "cache")
+def base(dataset: Path, folder: Path) -> None:
+    """A dataset and a run of it, which studies read."""
+    shutil.copytree(dataset, folder / "data")
+    with stands_still():
+        typed(("eval", "--dataset", "data", "--seeds", "0:1", *POINTS, "--out", RUN), folder)
+
+
+def study_of(name: str, base: Path, folder: Path) -> None:
+    """Type a study's command twice, each in a copy of `base`: in `folder`/whole, and killed in /resumed."""
+    here, command = folder / "here", COMMANDS[name]
+    with stands_still():
+        for kind in ("whole", "resumed"):
+            shutil.copytree(base, here)  # at the same place, since manifests name it
+            if DRIVEN in command:
+                driven = (*DRIVE, "--episodes", "4", "--first-seed", "100", "--seeds", "0:1", *POINTS)
+                typed((*driven, "--out", DRIVEN), here)
+            if kind == "whole":
+                count = typed(command, here)
+            else:
+                typed(command, here, max(1, count // 2))
+                typed(command, here)
+            here.rename(folder / kind)
+
+
+@contextmanager
+def stands_still() -> Iterator[None]:
+    """What runs state about themselves is the same each time, and they are made in many small parts."""
     backend = repeats.open_backend  # type: ignore[attr-defined]
 
     def opens(card: Card, **options: Any) -> Any:
         return Wanderer() if card.name == "swarm-tiny" else backend(card, **options)
 
-    for module, name, instead in (
-        (evaluation, "EPISODES_AT_ONCE", 1), (lifecycle, "datetime", Then), (repeats, "open_backend", opens),
-        (study, "FORMATS", ("svg",)),  # the pictures of a study take longer than all else
-    ):  # fmt: skip
-        setattr(module, name, instead)
-    base, here = folder / "base", folder / "here"
-    shutil.copytree(dataset, base / "data")
-    typed(("eval", "--dataset", "data", "--seeds", "0:1", *POINTS, "--out", RUN), base)
-    typed(
-        (*DRIVE, "--episodes", "4", "--first-seed", "100", "--seeds", "0:1", *POINTS, "--out", DRIVEN), base
-    )
-    for name in names or COMMANDS:
-        for kind in ("whole", "resumed"):
-            shutil.copytree(base, here)  # at the same place, since manifests name it
-            if kind == "whole":
-                count = typed(COMMANDS[name], here)
-            else:
-                typed(COMMANDS[name], here, max(1, count // 2))
-                typed(COMMANDS[name], here)
-            os.renames(here, folder / kind / name)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve(), sys.argv[3:])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluation, "EPISODES_AT_ONCE", 1)
+        patch.setattr(lifecycle, "datetime", Then)
+        patch.setattr(repeats, "open_backend", opens)
+        patch.setattr(study, "FORMATS", ("svg",))  # the pictures of a study take longer than all else
+        yield

@@ -15,6 +15,7 @@ from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.dataset import load
 from harness.dataset.select import Selection
+from harness.evaluate import run
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.live_world import LiveSource
@@ -57,7 +58,7 @@ def n_answers(folder: Path) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("source", [frozen(), LiveSource(1_000_000, 4)], ids=["frozen", "closed loop"])
+@pytest.mark.parametrize("source", [frozen(4), LiveSource(1_000_000, 2)], ids=["frozen", "closed loop"])
 def test_decisions_are_those_of_asking_all(source: Source, tmp_path: Path) -> None:
     names = POINTS if source.kind == "closed-loop" else (*POINTS, "v2x:messages=shuffled")
     for ask in ("all", "used"):
@@ -73,8 +74,9 @@ def test_nobody_asks_so_no_helper_answers(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_workers_change_no_byte(tmp_path: Path) -> None:
-    source = LiveSource(1_000_000, 18)
+def test_workers_change_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "EPISODES_AT_ONCE", 2)
+    source = LiveSource(1_000_000, 4)
     for workers in (1, 2):
         evaluate(spec(source, "used", ("v2x",)), tmp_path / str(workers), lambda done: None, workers=workers)
     names = [*TABLES, "answers.jsonl"]
@@ -106,7 +108,7 @@ def test_a_stopped_run_asks_the_same_in_the_same_batches(tmp_path: Path) -> None
 
         return opens
 
-    wanted = spec(frozen(30), "used", ("v2x:max_helpers=1", "6g"))
+    wanted = spec(frozen(12), "used", ("v2x:max_helpers=1", "6g"))
     evaluate(wanted, tmp_path / "whole", lambda done: None, opens=opening("whole", -1))
     with pytest.raises(Stops):
         evaluate(wanted, tmp_path / "stopped", lambda done: None, opens=opening("stopped", 3))
@@ -129,7 +131,7 @@ STUDIED = [Setting(name, named_point(name), 4) for name in ("v2x", "v2x:tau_nats
 @pytest.mark.slow
 def test_a_study_of_a_run_that_asked_few_is_that_of_one_that_asked_all(tmp_path: Path) -> None:
     for ask in ("all", "used"):
-        evaluate(spec(frozen(4), ask, ("single-local",)), tmp_path / ask, lambda done: None)
+        evaluate(spec(frozen(2), ask, ("single-local",)), tmp_path / ask, lambda done: None)
     shutil.copytree(tmp_path / "used", tmp_path / "alone")
     watched = {"all": Watched(), "used": Watched()}
     by_run = [

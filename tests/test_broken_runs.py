@@ -1,6 +1,7 @@
 """A run that is broken, or of another version, is one line that names the file and what to do."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from functools import reduce
@@ -13,6 +14,7 @@ import pytest
 from run_on_disk import change, configure, made_up, rows_of
 
 import harness
+from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.report.compare import text
 from harness.report.compare.difference import compare
@@ -29,8 +31,9 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
-    return made_up(tmp_path / "run")
+def run(once: Callable[[str, Callable[[Path], object]], Path], tmp_path: Path) -> Path:
+    made = once("to-break", lambda folder: made_up(folder / "run"))
+    return Path(shutil.copytree(made / "run", tmp_path / "run"))
 
 
 def refused(run: Path, file: str) -> str:
@@ -167,7 +170,29 @@ def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from places(inner, (*at, key))
 
 
-@pytest.mark.slow
+def wrong_values(stated: Any, at: tuple[Any, ...]) -> Iterator[Any]:
+    """A JSON value with what stands at a place gone, and with each wrong value there."""
+    for wrong in ("gone", *WRONG):
+        changed = deepcopy(stated)
+        table = reduce(lambda table, key: table[key], at[:-1], changed)
+        if wrong == "gone":
+            del table[at[-1]]
+        else:
+            table[at[-1]] = wrong
+        yield changed
+
+
+def said_of(run: Path, stated: Any, compares: bool = True) -> tuple[bool, str]:
+    """Whether a run that states this is read, and the comparison with itself or the error."""
+    (run / "run.json").write_text(json.dumps(stated))
+    try:
+        folder.read(run)
+        return True, text.terminal(compare(pair(run, run)), [], 5) if compares else ""
+    except UserError as error:
+        return False, str(error)
+
+
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("closed_loop", [False, True])
 def test_whatever_the_manifest_says_the_run_is_read_or_refused_in_a_line(
     closed_loop: bool, tmp_path: Path
@@ -177,22 +202,32 @@ def test_whatever_the_manifest_says_the_run_is_read_or_refused_in_a_line(
     stated = json.loads((run / "run.json").read_text())
     compared = 0
     for at in places(stated):
-        for wrong in ("gone", *WRONG):
-            changed = deepcopy(stated)
-            table = reduce(lambda table, key: table[key], at[:-1], changed)
-            if wrong == "gone":
-                del table[at[-1]]
-            else:
-                table[at[-1]] = wrong
-            (run / "run.json").write_text(json.dumps(changed))
-            try:
-                said = text.terminal(compare(pair(run, run)), [], 5)
-            except UserError as error:
-                said = str(error)
-            else:
-                compared += 1
+        for changed in wrong_values(stated, at):
+            is_read, said = said_of(run, changed)
             assert said.replace("\n", "").isprintable()
+            compared += is_read
     assert compared > 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closed_loop", [False, True])
+def test_whatever_the_manifest_says_the_run_is_refused_in_a_line_or_the_first_that_is_read_compared(
+    closed_loop: bool, tmp_path: Path
+) -> None:
+    """Of a run with one condition; where it was driven, at what is said of its world."""
+    run = made_up(tmp_path / "run", closed_loop=closed_loop, points=(POINTS["6g"],), episodes=1, steps=1)
+    stated = json.loads((run / "run.json").read_text())
+    compared = 0
+    for at in places(stated):
+        if closed_loop and at[0] != "world":
+            continue
+        fresh = True
+        for changed in wrong_values(stated, at):
+            is_read, said = said_of(run, changed, compares=fresh)
+            assert said.replace("\n", "").isprintable()
+            compared += is_read and fresh
+            fresh = fresh and not is_read
+    assert compared > (2 if closed_loop else 40)
 
 
 @pytest.mark.parametrize("episodes", [0, 1, 3, 5, 10**9])

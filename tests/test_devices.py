@@ -11,14 +11,14 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from evaluating import Scripted, course, run, same_decisions, says, spec_of, sure
+from evaluating import Scripted, course, live_spec_of, run, same_decisions, says, spec_of, sure
 from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.backends.base import Completion, Request
 from harness.coordination.coordinate import coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import CLOUD, OperatingPoint, named_point
+from harness.coordination.operating_point import CLOUD, POINTS, OperatingPoint, named_point
 from harness.core.errors import Unanswered, UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset
@@ -264,7 +264,35 @@ def test_a_read_out_writes_one_token(small: Dataset, tmp_path: Path) -> None:
     assert not told.decisions["deadline_missed"].any()
 
 
+class Wordy(Scripted):
+    """Says how many tokens it read and wrote, by the question."""
+
+    def _say(self, request: Request) -> Completion:
+        done = super()._say(request)
+        return replace(done, prompt_tokens=100 + len(request.id), completion_tokens=9 + ord(request.id[-1]))
+
+
 @pytest.mark.slow
+def test_workers_count_a_models_tokens_as_one_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker is forked with the model that answers here."""
+    monkeypatch.setattr(evaluation, "opened", lambda *_: Wordy({}))
+    monkeypatch.setattr(evaluation, "EPISODES_AT_ONCE", 1)
+    spec = live_spec_of(
+        "swarm-tiny", points=(POINTS["6g"],), seeds=(0,), batch_size=4,
+        device_profile=devices.load("agx-orin"), device_model="qwen3-0.6b",
+    )  # fmt: skip
+    one, other = (tmp_path / workers for workers in "12")
+    for out in (one, other):
+        evaluation.evaluate(spec, out, lambda done: None, workers=int(out.name))
+    for name in ("decisions.parquet", "episodes.csv", "summary.csv"):
+        assert (one / name).read_bytes() == (other / name).read_bytes()
+    told = folder.read(one)
+    assert not np.isnan(told.decisions["inference_j"]).any()
+
+
+@pytest.mark.exhaustive
 def test_workers_change_no_row(tmp_path: Path) -> None:
     """Each in a process of its own, as a user types it: a fork has none of an open engine's threads."""
     here = "from harness import cli; from harness.evaluate import run; run.EPISODES_AT_ONCE = 1; cli.main()"

@@ -115,18 +115,18 @@ def test_where_nothing_can_be_corrected_there_is_none() -> None:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Runs of the first layouts of a dataset, and `proxy` in all."""
+    """Runs of the first layouts of a dataset, and `proxy` alone in all."""
     out, path = tmp_path_factory.mktemp("difficulty"), find("occluded-intersection-v2")
     made = {}
     for name, model, limit in (
         ("some", "proxy", ASKED),
         ("faulty", "proxy-faulty", ASKED),
         ("cruise", "cruise", ASKED),
+        ("more", "proxy", ASKED + 10),
         ("all", "proxy", None),
     ):
-        spec = spec_of(
-            load(path, limit), model, limit=limit, points=(POINTS["single-local"], POINTS["6g"]), seeds=(0,)
-        )
+        points = (POINTS["single-local"],) if name == "all" else (POINTS["single-local"], POINTS["6g"])
+        spec = spec_of(load(path, limit), model, limit=limit, points=points, seeds=(0,))
         run(spec, made.setdefault(name, out / name))
     return made
 
@@ -151,7 +151,7 @@ def test_a_run_of_some_layouts_states_its_success_corrected_for_all(runs: dict[s
 
 @pytest.mark.slow
 def test_the_first_layouts_of_a_run_are_a_run_of_the_first_layouts(runs: dict[str, Path]) -> None:
-    some, full = read(runs["some"]), read(runs["all"])
+    some, full = read(runs["some"]), read(runs["more"])
     first = [e for e in full.episodes if e.episode < ASKED]
     assert first == list(some.episodes)
     grid = Grid(full.conditions, full.grid.seeds, full.grid.episodes[:ASKED])

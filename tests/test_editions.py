@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import tempfile
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -69,10 +70,14 @@ def made(project: Harness, once: Once, tmp_path: Path) -> Path:
         )
         assert (code, err) == (0, "")
 
-    folder = once("entry", run)
-    copytree(folder, tmp_path / "entry")
-    code, _, err = project("benchmark", "pack", "entry", "--edition", "mine-1", "--made-by", "A. N. Author")
-    assert (code, err) == (0, "")
+    copytree(once("entry", run), tmp_path / "entry")
+
+    def pack(out: Path) -> None:
+        by = ("--edition", "mine-1", "--made-by", "A. N. Author")
+        code, _, err = project("benchmark", "pack", "entry", *by, "--out", out)
+        assert (code, err) == (0, "")
+
+    copyfile(once("entry.zip", pack), tmp_path / "entry.zip")
     return tmp_path / "entry.zip"
 
 
@@ -231,16 +236,20 @@ HOSTILE: dict[str, tuple[Change, str]] = {
 
 @pytest.mark.parametrize("what", HOSTILE)
 def test_a_hostile_file_is_refused_in_one_line_and_leaves_nothing(
-    project: Harness, made: Path, tmp_path: Path, what: str
+    project: Harness, made: Path, tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """What is unpacked lies deep in the test's folder, so that what leaves its own folder is seen."""
     change, message = HOSTILE[what]
     changed(made, change)
-    before = {path for path in tmp_path.parent.rglob("*") if "__pycache__" not in path.parts}
+    deep = tmp_path / "a/b"
+    deep.mkdir(parents=True)
+    monkeypatch.setattr(tempfile, "tempdir", str(deep))
+    before = {path for path in tmp_path.rglob("*") if "__pycache__" not in path.parts}
     code, out, err = project("benchmark", "verify", made)
     assert (code, out) == (2, ""), err
     assert (err[:9], err.count("\n")) == ("harness: ", 1)
     assert message in err
-    assert {path for path in tmp_path.parent.rglob("*") if "__pycache__" not in path.parts} == before
+    assert {path for path in tmp_path.rglob("*") if "__pycache__" not in path.parts} == before
     assert not Path("/tmp/escaped").exists()
 
 

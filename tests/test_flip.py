@@ -37,7 +37,8 @@ LETTERS = pytest.mark.parametrize("letters", ["raw", "cyclic"])
 def spec_with(small: Dataset, letters: Letters = "raw", flip: bool = True) -> Spec:
     card = cards.resolve("swarm-tiny", "transformers")
     points = (POINTS["single-local"], POINTS["6g"])
-    spec = spec_of(small, prompt="v4", limit=1, points=points, seeds=(0,), ask="all")
+    one = small.of_episodes([0])
+    spec = spec_of(one, prompt="v4", limit=1, points=points, seeds=(0,), ask="all")
     return with_ego(spec, card=card, answer="readout", letters=letters, flip=flip)
 
 

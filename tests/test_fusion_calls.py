@@ -191,9 +191,15 @@ CONDITIONS = (POINTS["single-local"], POINTS["6g"], FUSION)
 
 
 @pytest.fixture(scope="module")
-def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
+def two(small: Dataset) -> Dataset:
+    """Layouts of which the model makes some other calls in each; a question takes it 30 ms."""
+    return small.of_episodes([0, 1])
+
+
+@pytest.fixture(scope="module")
+def done(two: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
-    spec = spec_of(small, LANGUAGE_MODEL, points=CONDITIONS, latency="paper")
+    spec = spec_of(two, LANGUAGE_MODEL, points=CONDITIONS, latency="paper")
     return run(spec, tmp_path_factory.mktemp("fusion") / "run")
 
 
@@ -217,7 +223,7 @@ def test_it_pays_a_second_inference_where_it_heard_somebody(done: Evaluated) -> 
     assert figure(done, "6g", "fusion_ms").value == 0
 
 
-def test_the_policy_is_what_it_answered_and_the_record_has_it(done: Evaluated, small: Dataset) -> None:
+def test_the_policy_is_what_it_answered_and_the_record_has_it(done: Evaluated, two: Dataset) -> None:
     answers = {answer.id: answer for answer in answers_of(done.out)}
     again = 0
     for d in decisions(done.out, FUSION.name):
@@ -231,8 +237,8 @@ def test_the_policy_is_what_it_answered_and_the_record_has_it(done: Evaluated, s
         if said.heard:
             senders = [answers[f"{said.scene}/{viewer}"] for viewer in said.heard]
             told = [{"sender": a.viewer, "intent": list(a.intent), **a.message} for a in senders]
-            graph = small.scene(said.scene).graphs["v1"]
-            assert said.prompt_sha256 == digest(prompt("v2").render(graph, small.actions, told))
+            graph = two.scene(said.scene).graphs["v1"]
+            assert said.prompt_sha256 == digest(prompt("v2").render(graph, two.actions, told))
 
 
 def test_a_scenes_answers_are_the_egos_the_helpers_and_the_fusion_calls(done: Evaluated) -> None:
@@ -242,8 +248,8 @@ def test_a_scenes_answers_are_the_egos_the_helpers_and_the_fusion_calls(done: Ev
     assert [role for _, role in order].count("merge") > 5
 
 
-def test_a_replay_scores_the_same_in_other_batches(done: Evaluated, small: Dataset, tmp_path: Path) -> None:
-    spec = spec_of(small, f"replay:{done.out}", points=CONDITIONS, latency="paper", batch_size=3)
+def test_a_replay_scores_the_same_in_other_batches(done: Evaluated, two: Dataset, tmp_path: Path) -> None:
+    spec = spec_of(two, f"replay:{done.out}", points=CONDITIONS, latency="paper", batch_size=3)
     replayed = run(spec, tmp_path / "replay")
     assert same_scores(replayed, done)
     assert same_decisions(replayed.out, done.out)
@@ -275,9 +281,9 @@ def killed(spec: Spec, out: Path, how: str, after: int) -> None:
 
 @pytest.mark.parametrize("how", ["announced", "made"])
 def test_killed_among_the_fusion_calls_it_goes_on(
-    how: str, done: Evaluated, small: Dataset, tmp_path: Path
+    how: str, done: Evaluated, two: Dataset, tmp_path: Path
 ) -> None:
-    spec = spec_of(small, LANGUAGE_MODEL, points=CONDITIONS, latency="paper")
+    spec = spec_of(two, LANGUAGE_MODEL, points=CONDITIONS, latency="paper")
     killed(spec, tmp_path / "run", how, after=1)
     run(spec, tmp_path / "run")
     assert same_decisions(tmp_path / "run", done.out)

@@ -19,6 +19,7 @@ from evaluating import Scripted, run, says, scenes_of, spec_of, with_ego
 from run_on_disk import answers_of
 
 from harness.backends.base import Completion, Request
+from harness.backends.card import Card
 from harness.backends.card import Latency as CardLatency
 from harness.backends.cards import resolve
 from harness.coordination.operating_point import POINTS, named_point
@@ -301,37 +302,88 @@ def engine() -> str:
     return pytest.skip("needs the llama-cpp or the transformers extra")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
+COMMANDS = pytest.mark.parametrize(
     "command", [("eval", "--limit", "1"), ("drive", "--episodes", "1", "--workers", "1")]
 )
+
+
+@pytest.mark.exhaustive
+@COMMANDS
 def test_a_measured_run_repeated_from_its_manifest_on_a_busy_machine_has_the_same_rows(
     command: Sequence[str], engine: str, harness: Callable[..., Any], small_path: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """Measured while idle; then twice under load: as it was asked, and each answer alone and timed."""
     monkeypatch.setattr(timing, "load_a_core", lambda: 0.0)
+    is_measured((*command, "--engine", engine), "0:2", harness, small_path, tmp_path)
+    with busy_machine():
+        has_the_same_rows(harness, tmp_path)
+
+
+class Slowing(Scripted):
+    """Decides by the question. It takes longer at each, and times those that it was asked alone."""
+
+    def __init__(self, before: int, batch_size: int) -> None:
+        super().__init__({})
+        self._before, self._batch_size = before, batch_size
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        company = min(self._batch_size, len(requests))
+        seconds = (self._before + len(self.asked)) / 1000 + 0.01 if company == 1 else None
+        return [replace(c, seconds=seconds, batch_size=company) for c in super().complete(requests)]
+
+    def _say(self, request: Request) -> Completion:
+        share = sum(map(ord, request.id)) % 5 / 10
+        text = says((0.5 - share / 2, 0.5 - share / 2, share), request.role)
+        return Completion(request.id, text, None, None, "stop", None, 1)
+
+
+@pytest.mark.slow
+@COMMANDS
+def test_a_measured_run_repeated_from_its_manifest_by_a_slower_model_has_the_same_rows(
+    command: Sequence[str], harness: Callable[..., Any], small_path: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """As it was asked, and each answer alone and timed."""
+    opened: list[Slowing] = []
+
+    def opens(card: Card, device: Any, dtype: Any, batch_size: int) -> Slowing:
+        opened.append(Slowing(sum(len(each.asked) for each in opened), batch_size))
+        return opened[-1]
+
+    for name in ("open_backend", "opened"):
+        monkeypatch.setattr(evaluation, name, opens)
+    monkeypatch.setattr(timing, "load_a_core", lambda: 0.0)
+    is_measured(command, "0:2", harness, small_path, tmp_path)
+    has_the_same_rows(harness, tmp_path)
+
+
+def is_measured(
+    command: Sequence[str], seeds: str, harness: Callable[..., Any], small_path: Path, tmp_path: Path
+) -> None:
     data = ("--dataset", small_path) if command[0] == "eval" else ("--first-seed", "100")
     points = ("--condition", "single-local", "--condition", "6g", "--condition", "6g:consensus=ego-prompt")
     code, _, err = harness(
-        *command, *data, *points, "--model", LANGUAGE_MODEL, "--engine", engine, "--seeds", "0:2",
-        "--latency", "measured", "--no-cache", "--out", tmp_path / "run",
+        *command, *data, *points, "--model", LANGUAGE_MODEL, "--seeds", seeds, "--latency", "measured",
+        "--no-cache", "--out", tmp_path / "run",
     )  # fmt: skip
     assert code == 0, err
+    latency = json.loads((tmp_path / "run/run.json").read_text())["latency"]
+    trials = 5 if command[0] == "eval" else 1
+    assert (latency["source"], latency["sample"]["ego"]["n"]) == ("measured", trials)
+
+
+def has_the_same_rows(harness: Callable[..., Any], tmp_path: Path) -> None:
+    """Whether the command in the manifest makes the same run, in batches and one by one."""
     first = json.loads((tmp_path / "run/run.json").read_text())
     latency = first["latency"]
-    assert (latency["source"], latency["sample"]["ego"]["n"]) == (
-        "measured",
-        5 if command[0] == "eval" else 1,
-    )
     program, *words = shlex.split(first["command"])
     stated = f"ego={latency['ego_s']},helper={latency['helper_s']},fusion={latency['fusion_s']}"
     assert words[words.index("--latency") + 1] == stated
-    with busy_machine():
-        for name, other in (("again", ()), ("alone", ("--batch-size", "1"))):
-            again = [*words, "--no-cache", *other, "--out", str(tmp_path / name)]
-            assert (program, harness(*again)[0]) == ("harness", 0)
-            assert same_rows(tmp_path / name, tmp_path / "run")
+    for name, other in (("again", ()), ("alone", ("--batch-size", "1"))):
+        again = [*words, "--no-cache", *other, "--out", str(tmp_path / name)]
+        assert (program, harness(*again)[0]) == ("harness", 0)
+        assert same_rows(tmp_path / name, tmp_path / "run")
     times_of = json.loads((tmp_path / "alone/run.json").read_text())["answer_times"]
     said = answers_of(tmp_path / "alone")
     assert {role: t["n"] for role, t in times_of.items()} == Counter(a.role for a in said)

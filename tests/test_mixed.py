@@ -10,6 +10,7 @@ from evaluating import live_spec_of, run, same_decisions, spec_of
 from run_on_disk import answers_of
 
 from harness.backends import cards
+from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
@@ -131,12 +132,16 @@ def test_times_of_several_helper_models_are_declared_in_turn(small: Dataset) -> 
 
 
 @pytest.mark.slow
-def test_a_mix_drives_as_well(tmp_path: Path) -> None:
+def test_a_mix_drives_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that both workers have some
+
     def driven(workers: int) -> Path:
         from harness.core.work import tidy
         from harness.evaluate.run import evaluate
 
-        spec = live_spec_of(helpers=(helper("proxy-faulty"),))
+        spec = live_spec_of(
+            helpers=(helper("proxy-faulty"),), points=(POINTS["6g"],), seeds=(0,), batch_size=4
+        )
         out = evaluate(spec, tmp_path / str(workers), lambda done: None, workers=workers).out
         tidy(out)
         return out

@@ -26,7 +26,7 @@ from typer.main import get_command  # noqa: E402
 from harness.cli import app  # noqa: E402
 from harness.core import ray_tasks  # noqa: E402
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.exhaustive
 Typed = Callable[..., tuple[int, str, str]]
 DRIVE = ("drive", "--model", "cruise", "--episodes", "33", "--seeds", "0", "--quiet")
 NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}

@@ -9,6 +9,7 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import fields
+from itertools import product
 from pathlib import Path
 
 import msgspec
@@ -60,10 +61,20 @@ READERS = {
 }
 
 
+# A run of each kind, and one of each commit; a page of the others is in `make exhaustive`.
+REPORTED = ("356ad2b/drive", "356ad2b/proxy", "8cccefb/mixed", "0103f23/attack")
+
+
 @pytest.mark.parametrize(
-    "command", [pytest.param("report", marks=pytest.mark.slow), "csv", "jsonl", "junit", "compare"]
+    ("run", "command"),
+    [
+        *((run, command) for run in RUNS for command in READERS if command != "report"),
+        *(
+            pytest.param(run, "report", marks=pytest.mark.slow if run in REPORTED else pytest.mark.exhaustive)
+            for run in RUNS
+        ),
+    ],
 )
-@pytest.mark.parametrize("run", RUNS)
 def test_commands_read_every_run(run: str, command: str, harness: Typed) -> None:
     code, _, error = harness(*READERS[command].format(run=HERE / run).split())
     assert (code, error) == (0, "")
@@ -85,9 +96,23 @@ SAME = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("command", STUDIES)
-@pytest.mark.parametrize("run", STUDIED)
+# All of the oldest run, which lacks the most; of a mix and of an attacked run what walks anew.
+USUAL = {
+    *(("356ad2b/proxy", command) for command in STUDIES),
+    ("8cccefb/mixed", "sweep"),
+    ("8cccefb/mixed", "replay"),
+    ("0103f23/attack", "trust"),
+    ("0103f23/attack", "replay"),
+}
+
+
+@pytest.mark.parametrize(
+    ("run", "command"),
+    [
+        pytest.param(*each, marks=pytest.mark.slow if each in USUAL else pytest.mark.exhaustive)
+        for each in product(STUDIED, STUDIES)
+    ],
+)
 def test_studies_read_frozen_runs(
     run: str, command: str, kept: Callable[[str], Path], harness: Typed
 ) -> None:
@@ -143,7 +168,7 @@ def test_driven_runs_are_held_against_frozen_ones(commit: str, harness: Typed) -
     assert (code, error) == (0, "")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_driven_run_is_drawn(harness: Typed) -> None:
     code, _, error = harness("run", "video", HERE / "356ad2b/drive", "0", "--out", "episode.gif")
     assert code == 0, error
@@ -166,8 +191,10 @@ def test_what_a_run_cannot_have_is_one_line(commit: str, harness: Typed) -> None
 BEGUN = "drive --model local-view --episodes 40 --seeds 0 --workers 1 --condition single-local --quiet"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("commit", ["8cccefb", "0103f23"])
+@pytest.mark.parametrize(
+    "commit",
+    [pytest.param("8cccefb", marks=pytest.mark.exhaustive), pytest.param("0103f23", marks=pytest.mark.slow)],
+)
 def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: Typed) -> None:
     """The part that it had is taken as it is. Its bare name has come to mean other scenes."""
     begun = kept(f"{commit}/begun")

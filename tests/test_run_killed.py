@@ -4,13 +4,13 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 from evaluating import FILES, run, same_files, spec_of, walked, with_ego
-from killed_run import TREES_AT_ONCE, WALKS_AT_ONCE, spec_to_kill
+from killed_run import PLACES, TREES_AT_ONCE, WALKS_AT_ONCE, at, killed_at, spec_to_kill
 from run_on_disk import answers_of
 
 from harness.backends import cards
@@ -19,12 +19,13 @@ from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.core.files import alone
 from harness.core.formats import CONFIG
-from harness.dataset.load import Dataset
+from harness.dataset.load import Dataset, load
 from harness.evaluate.kept_answers import MORE_FOLLOWS, read_kept
 from harness.evaluate.latency import PAPER
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 
+Once = Callable[[str, Callable[[Path], object]], Path]
 RESULT = {*FILES, "run.json", "run.toml", "sources"}
 
 
@@ -36,35 +37,80 @@ def killed(small_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
-def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(
-    killed: Path, small: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A layout is a part of a run, and a seed a walk."""
     monkeypatch.setattr("harness.evaluate.run.TREES_AT_ONCE", TREES_AT_ONCE)
     monkeypatch.setattr("harness.evaluate.run.WALKS_AT_ONCE", WALKS_AT_ONCE)
+
+
+@pytest.fixture(scope="module")
+def to_kill(small_path: Path) -> Spec:
+    return spec_to_kill(load(small_path, limit=2))
+
+
+@pytest.fixture(scope="module")
+def whole(to_kill: Spec, once: Once) -> Path:
+    """The run in one part that nobody kills."""
+    return once("whole-of-killed", lambda out: run(to_kill, out))
+
+
+@pytest.mark.exhaustive
+def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(
+    killed: Path, to_kill: Spec, in_parts: None
+) -> None:
     outs = sorted(killed.glob("at-*"), key=lambda p: int(p.name[3:]))
     assert len(outs) > 20
     begun = [out for out in outs if not (out / "run.json").exists()]
     assert 10 < len(begun) < len(outs), "kills before the end, and while the work is cleared away"
-    _all_become_whole(outs, killed, small)
+    for out in outs:
+        _becomes_whole(out, killed / "whole", to_kill)
+
+
+@pytest.mark.exhaustive
+def test_killed_at_any_time_and_resumed_it_is_the_same_run(
+    killed: Path, to_kill: Spec, in_parts: None
+) -> None:
+    for out in sorted(killed.glob("after-*")):
+        _becomes_whole(out, killed / "whole", to_kill)
 
 
 @pytest.mark.slow
-def test_killed_at_any_time_and_resumed_it_is_the_same_run(
-    killed: Path, small: Dataset, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("place", PLACES)
+def test_killed_at_one_place_of_each_kind_and_resumed_it_is_the_same_run(
+    place: str, whole: Path, to_kill: Spec, in_parts: None, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("harness.evaluate.run.TREES_AT_ONCE", TREES_AT_ONCE)
-    monkeypatch.setattr("harness.evaluate.run.WALKS_AT_ONCE", WALKS_AT_ONCE)
-    _all_become_whole(sorted(killed.glob("after-*")), killed, small)
+    out = tmp_path / "run"
+    killed_at(to_kill, out, at(*PLACES[place]))
+    done = {path.name for path in out.glob(".work/episodes-*") if path.is_dir()}
+    assert len(done) == {
+        "before anything": 0,
+        "before it keeps its settings": 0,
+        "while a part is written": 0,
+        "between two parts": 1,
+    }.get(place, 2)
+    assert (out / "run.json").exists() == (place == "while the work is cleared away")
+    _becomes_whole(out, whole, to_kill)
 
 
-def _all_become_whole(outs: list[Path], killed: Path, small: Dataset) -> None:
-    spec = spec_to_kill(small)
-    for out in outs:
-        if not (out / "run.json").exists() or (out / ".work").exists():
-            assert run(spec, out).manifest.seeds == (0, 1)
-        assert same_files(out, killed / "whole"), out.name
-        assert {p.name for p in out.iterdir()} == RESULT, out.name
+@pytest.mark.slow
+def test_killed_between_two_walks_of_a_part_it_is_the_same_run(
+    whole: Path, to_kill: Spec, in_parts: None, tmp_path: Path
+) -> None:
+    """As the second walk keeps its first answers, which the first did not need."""
+    out = tmp_path / "run"
+    killed_at(to_kill, out, at("fsync", "answers-2.jsonl"))
+    asked = (out / ".work/answers.jsonl").read_bytes()
+    assert 0 < len(asked) < len((whole / "answers.jsonl").read_bytes())
+    assert list(out.glob(".work/episodes-*")) == []
+    _becomes_whole(out, whole, to_kill)
+
+
+def _becomes_whole(out: Path, whole: Path, spec: Spec) -> None:
+    if not (out / "run.json").exists() or (out / ".work").exists():
+        assert run(spec, out).manifest.seeds == (0, 1)
+    assert same_files(out, whole), out.name
+    assert {p.name for p in out.iterdir()} == RESULT, out.name
 
 
 def unfinished(spec: Spec, out: Path, kept: bytes) -> Path:
@@ -227,7 +273,7 @@ def test_a_run_is_written_by_one_process_at_a_time(answers: bytes, small: Datase
 def test_a_read_out_over_cyclic_orders_goes_on_where_it_was_killed(small: Dataset, tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
     card = cards.resolve("swarm-tiny", "transformers")
-    spec = with_ego(spec_of(small, limit=2), card=card, answer="readout", letters="cyclic")
+    spec = with_ego(spec_of(small.of_episodes([0])), card=card, answer="readout", letters="cyclic")
     kept = tmp_path / "answers.jsonl"
     walked(spec, open_backend(spec.ego.card, device="cpu"), PAPER, kept)
     lines = kept.read_bytes().splitlines(keepends=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from misbehaving import Asked, completion, serving
 
@@ -255,9 +255,23 @@ json_values = st.recursive(
 )
 
 
+STATED = given(st.dictionaries(st.text(), json_values), st.sampled_from([*SERVERS]))
+
+
 @pytest.mark.slow
-@given(st.dictionaries(st.text(), json_values), st.sampled_from([*SERVERS]))
+@settings(max_examples=25)
+@STATED
 def test_whatever_is_stated_is_a_short_identity(facts: dict[str, Any], kind: Kind) -> None:
+    is_short(facts, kind)
+
+
+@pytest.mark.exhaustive
+@STATED
+def test_whatever_is_stated_of_more_is_a_short_identity(facts: dict[str, Any], kind: Kind) -> None:
+    is_short(facts, kind)
+
+
+def is_short(facts: dict[str, Any], kind: Kind) -> None:
     import asyncio
 
     from harness.backends.openai.http import Reply

@@ -374,7 +374,7 @@ def test_which_servers_answer_is_no_part_of_the_models_identity() -> None:
 def served_spec(small: Dataset, *urls: str) -> Spec:
     """An evaluation of a card that names another server, at these."""
     mine = replace(card("http://127.0.0.1:9/v1"), server=Where("http://127.0.0.1:9/v1", retries=2))
-    return replace(with_ego(spec_of(small), card=mine), servers=urls, batch_size=4)
+    return replace(with_ego(spec_of(small, seeds=(0,)), card=mine), servers=urls, batch_size=4)
 
 
 def evaluated(spec: Spec, out: Path, cache: Path | None = None, workers: int = 1) -> Path:
@@ -427,8 +427,10 @@ def parted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_module, "TREES_AT_ONCE", 1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cached", [False, True])
+@pytest.mark.parametrize(
+    "cached",
+    [pytest.param(False, marks=pytest.mark.exhaustive), pytest.param(True, marks=pytest.mark.slow)],
+)
 def test_workers_ask_what_one_process_asks(
     parted: None, small: Dataset, tmp_path: Path, cached: bool
 ) -> None:

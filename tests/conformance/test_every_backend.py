@@ -1,7 +1,7 @@
 """What holds for every backend that can run here: the contract of `harness.backends.base.Backend`."""
 
 import json
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +19,8 @@ from harness.core.files import digest
 from harness.dataset.load import load
 from harness.evaluate.asking import requests
 from harness.training.gguf_export import export
+
+Once = Callable[[str, Callable[[Path], object]], Path]
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,17 @@ ENGINES = [
 ]
 
 
+def tiny_weights(folder: Path) -> None:
+    """A checkpoint, which takes seconds of imports, and its GGUF file."""
+    import tiny_qwen3
+
+    tiny_qwen3.build(folder / "tiny", context_tokens=2048)
+    export(folder / "tiny", folder / "tiny.gguf", "F32")
+
+
 @pytest.fixture(scope="module", params=ENGINES, ids="-".join)
 def case(
-    request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, small_path: Path, once: Once, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Case]:
     folder = tmp_path_factory.mktemp("conformance")
     model, answer = request.param
@@ -54,11 +64,9 @@ def case(
     if model in WITH_WEIGHTS:
         if find_spec("torch") is None or find_spec("transformers") is None:
             pytest.skip("needs the transformers extra")
-        import tiny_qwen3
-
-        tiny_qwen3.build(folder / "tiny", context_tokens=2048)
+        tiny = once("every-backend", tiny_weights)
     if model == "transformers":
-        model = str(folder / "tiny")
+        model = str(tiny / "tiny")
     if model == "sparrow":
         pytest.importorskip("sparrow_decider", reason="needs the sparrow extra")
         model = "sparrow-general"
@@ -75,8 +83,7 @@ def case(
     if model == "llama-cpp":
         if find_spec("llama_cpp") is None:
             pytest.skip("needs the llama-cpp extra")
-        export(folder / "tiny", folder / "tiny.gguf", "F32")
-        model = str(folder / "tiny.gguf")
+        model = str(tiny / "tiny.gguf")
     spec = spec_of(data, model, answer=answer)
     asked = list(requests(spec, data.scenes(data.forest.ids[:1])))  # where every walk begins
     if answer == "json":  # the others take what they take

@@ -3,15 +3,12 @@
 import csv
 import json
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pandas as pd
 import pytest
 from driving import spec
 from evaluating import FILES
-from killed_drive import EPISODES, EPISODES_AT_ONCE
+from killed_run import PLACES, at, killed_at
 
 from harness.backends.driver import DriverBackend
 from harness.core.errors import UserError
@@ -20,8 +17,6 @@ from harness.evaluate import live_world
 from harness.evaluate.live_world import LiveWorld
 from harness.evaluate.run import evaluate
 from harness.runs.formats import FORMAT
-
-HERE = Path(__file__).parent
 
 
 def folder_of(of, out, workers=1, done=None):
@@ -72,35 +67,54 @@ def test_a_summary_agrees_with_its_episodes(whole):
     ]
 
 
+@pytest.fixture(scope="module")
+def four(tmp_path_factory):
+    return folder_of(spec(episodes=4), tmp_path_factory.mktemp("four") / "run")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("workers", "batch_size"), [(2, 8), (1, 1), (1, 100), (2, 3)])
-def test_workers_and_batches_change_no_byte(whole, tmp_path, monkeypatch, workers, batch_size):
-    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 4)  # so that both workers have some
-    found = folder_of(spec(episodes=10, batch_size=batch_size), tmp_path / "run", workers)
-    assert found == {name: (whole / name).read_bytes() for name in FILES}
+def test_workers_and_batches_change_no_byte(four, tmp_path, monkeypatch, workers, batch_size):
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 2)  # so that both workers have some
+    assert folder_of(spec(episodes=4, batch_size=batch_size), tmp_path / "run", workers) == four
 
 
-@pytest.mark.slow
-def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp_path, monkeypatch):
-    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", EPISODES_AT_ONCE)
-    cruise = spec("cruise", seeds=(0,), episodes=EPISODES)
-    expected = folder_of(cruise, tmp_path / "whole")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(HERE.parent)])}
-    # Before the settings are kept, in chunks, before a table, tidying up.
-    places = ("6", "20", "38", "75", "100")
-    command = [sys.executable, str(HERE / "killed_drive.py"), str(tmp_path), *places]
-    subprocess.run(command, env=environment, check=True)
-    resumed = 0
-    for n in places:
-        out = tmp_path / f"at-{n}"
-        if (out / ".work" / "config.json").is_file() and not (out / "run.json").is_file():
-            with pytest.raises(UserError, match=r"begun with --seeds .*, and not with --seeds"):
-                evaluate(spec("cruise", seeds=(1,), episodes=EPISODES), out, lambda done: None)
-            resumed += 1
-        if not (out / "run.json").exists() or (out / ".work").exists():
-            assert folder_of(cruise, out) == expected
-        assert {p.name for p in out.iterdir()} == {*FILES, "run.json", "run.toml", "sources"}
-    assert resumed == 3
+@pytest.fixture(scope="module")
+def whole_of_killed(tmp_path_factory):
+    return folder_of(cruise(), tmp_path_factory.mktemp("whole-of-killed") / "run")
+
+
+def cruise(seed=0):
+    return spec("cruise", seeds=(seed,), episodes=3, batch_size=4)
+
+
+NOT_BEGUN = ("before anything", "before it keeps its settings", "while the work is cleared away")
+# Those where a closed loop does something of its own; at the others it is as a frozen run.
+ITS_OWN = ("before it keeps its settings", "between two parts", "while a part is written")
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        pytest.param(place, marks=pytest.mark.slow if place in ITS_OWN else pytest.mark.exhaustive)
+        for place in PLACES
+    ],
+)
+def test_killed_at_one_place_of_each_kind_and_resumed_it_is_the_same_run(
+    whole_of_killed, tmp_path, monkeypatch, place
+):
+    """Of a run in three parts. A frozen run is killed everywhere: tests/test_run_killed.py."""
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)
+    change, end = PLACES[place]
+    out = tmp_path / "run"
+    killed_at(cruise(), out, at(change, end))
+    begun = (out / ".work" / "config.json").is_file() and not (out / "run.json").is_file()
+    assert begun == (place not in NOT_BEGUN)
+    if begun:
+        with pytest.raises(UserError, match=r"begun with --seeds .*, and not with --seeds"):
+            evaluate(cruise(seed=1), out, lambda done: None)
+    assert folder_of(cruise(), out) == whole_of_killed
+    assert {p.name for p in out.iterdir()} == {*FILES, "run.json", "run.toml", "sources"}
 
 
 @pytest.mark.slow
@@ -114,7 +128,20 @@ def test_a_chunk_that_kills_its_worker_is_named_and_the_same_command_goes_on(har
             super().__init__(scenario, first_seed, numbers, *others)
 
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 2)
-    line = ("drive", "--model", "cruise", "--episodes", "5", "--seeds", "0", "--quiet", "--out", "run")
+    alone = ("--condition", "single-local")
+    line = (
+        "drive",
+        "--model",
+        "cruise",
+        "--episodes",
+        "5",
+        "--seeds",
+        "0",
+        *alone,
+        "--quiet",
+        "--out",
+        "run",
+    )
     with monkeypatch.context() as patched:
         patched.setattr(live_world, "LiveWorld", Deadly)
         code, out, said = harness(*line)
