@@ -21,10 +21,12 @@ PATIENCE_S = 20.0  # CPU of this thread; the slowest takes some 2 s
 PLAIN = ImmutableSandboxedEnvironment()
 
 
-@pytest.fixture
-def narrow(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A tenth of the steps, little memory, and an end. With all steps: benchmarks/campaigns/templates.py."""
-    monkeypatch.setattr("harness.core.templates.MOST_STEPS", MOST_STEPS // 10)
+@pytest.fixture(
+    params=[pytest.param(10, marks=pytest.mark.exhaustive, id="tenth"), pytest.param(50, id="fiftieth")]
+)
+def narrow(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Few of the steps, little memory, and an end. With all steps: benchmarks/campaigns/templates.py."""
+    monkeypatch.setattr("harness.core.templates.MOST_STEPS", MOST_STEPS // request.param)
     limits = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + GROWTH_BYTES, limits[1]))

@@ -94,7 +94,9 @@ def test_a_console_that_lacks_a_character_gets_another(env: dict[str, str], tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("closed", [(0,), (1,), (2,), (0, 1, 2)])
+@pytest.mark.parametrize(
+    "closed", [(0, 1, 2), *(pytest.param((number,), marks=pytest.mark.exhaustive) for number in range(3))]
+)
 def test_a_run_without_streams_is_whole(closed: tuple[int, ...], tmp_path: Path) -> None:
     def close() -> None:
         for number in closed:
@@ -175,7 +177,9 @@ def test_a_date_of_the_environment_that_is_none(date: str, monkeypatch: pytest.M
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("date", ["garbage", "99999999999999999999"])
+@pytest.mark.parametrize(
+    "date", ["garbage", pytest.param("99999999999999999999", marks=pytest.mark.exhaustive)]
+)
 def test_a_run_under_a_date_that_is_none(date: str, tmp_path: Path) -> None:
     """Some packages read it while they are imported."""
     done = ended(
