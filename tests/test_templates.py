@@ -19,9 +19,10 @@ from harness.prompts.template import Template
 GROWTH_BYTES = 1 << 30
 PATIENCE_S = 20.0  # CPU of this thread; the slowest takes some 2 s
 PLAIN = ImmutableSandboxedEnvironment()
-DEAR = ("deep filters", "deep loops", "many copies")  # which take long to compile
+# These take long to compile; others are as deep, or as long.
+DEAR = {"deep filters": "exhaustive", "deep loops": "slow", "many copies": "exhaustive"}
 HOSTILE = [
-    pytest.param(text, id=name, marks=pytest.mark.slow if name in DEAR else ())
+    pytest.param(text, id=name, marks=getattr(pytest.mark, DEAR[name]) if name in DEAR else ())
     for name, text in (TEMPLATES | PADDING).items()
 ]
 
