@@ -17,9 +17,10 @@ import table  # noqa: E402
 
 SCRIPTS = table.scripts()
 # What the documents have somebody type is theirs; each line of what a benchmark prints last is one of JSON.
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
+pytestmark = pytest.mark.filterwarnings("default")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 def test_a_benchmark_runs_at_its_smallest(
     script: Path,

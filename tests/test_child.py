@@ -18,6 +18,7 @@ from harness.backends.llama_cpp.backend import LOADS, Child
 from harness.core.errors import UserError
 
 TESTS = Path(__file__).parent
+pytestmark = pytest.mark.slow
 
 
 def ask(said: str, name: str = "r") -> Request:
@@ -57,7 +58,6 @@ def test_answers_come_from_another_process_with_its_seconds_and_identity(tmp_pat
     child.close()
 
 
-@pytest.mark.slow
 def test_who_kills_the_engine_time_after_time_is_an_error_and_the_others_are_answered(tmp_path: Path) -> None:
     child = mortal(tmp_path)
     first, killer, last = child.complete([ask("first", "a"), ask("die", "b"), ask("last", "c")])
@@ -71,7 +71,6 @@ def test_who_kills_the_engine_time_after_time_is_an_error_and_the_others_are_ans
     child.close()
 
 
-@pytest.mark.slow
 def test_a_death_by_company_costs_nobody_an_answer(tmp_path: Path) -> None:
     child = mortal(tmp_path)
     answers = child.complete([ask("hello"), ask("die in company")])
@@ -79,7 +78,6 @@ def test_a_death_by_company_costs_nobody_an_answer(tmp_path: Path) -> None:
     child.close()
 
 
-@pytest.mark.slow
 def test_an_exit_is_a_death_too(tmp_path: Path) -> None:
     child = mortal(tmp_path)
     assert [c.error for c in child.complete([ask("exit")])] == ["engine died: exit code 3"]
@@ -96,7 +94,6 @@ def test_an_engine_killed_while_idle_is_started_again(tmp_path: Path) -> None:
     child.close()
 
 
-@pytest.mark.slow
 def test_an_engine_that_somebody_stops_is_ended_and_its_question_asked_of_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -125,7 +122,6 @@ def test_an_engine_that_is_stopped_for_a_moment_goes_on(
     child.close()
 
 
-@pytest.mark.slow
 def test_deaths_while_loading_are_tried_again_and_then_said(tmp_path: Path) -> None:
     child = mortal(tmp_path, deaths=LOADS - 1)
     assert born(tmp_path) == LOADS
@@ -189,9 +185,10 @@ def interruptible() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("interruptible")
-@pytest.mark.parametrize("blow", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "blow", [signal.SIGINT, signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.exhaustive)]
+)
 def test_whatever_ends_the_run_ends_the_engine(tmp_path: Path, blow: signal.Signals) -> None:
     """Ctrl-C goes to all processes of a terminal: the engine's hears nothing, and says nothing."""
     script = tmp_path / "run.py"

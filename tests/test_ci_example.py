@@ -44,7 +44,6 @@ file.write_text(json.dumps(comments))
 """
 
 pytestmark = [
-    pytest.mark.slow,
     pytest.mark.skipif(find_spec("llama_cpp") is None, reason="needs the extra llama-cpp"),
     pytest.mark.skipif(which("jq") is None, reason="needs jq, which stands in for the one in gh"),
 ]
@@ -98,6 +97,7 @@ def github_of(base: str) -> dict[str, str]:
     return {f"{pull}.base.sha": base, f"{pull}.number": "7", "github.token": "none"}
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("breaks", [False, True])
 def test_the_workflow_guards_a_prompt(breaks: bool, repo: Path, tmp_path: Path) -> None:
     base = git(repo, "rev-parse", "HEAD")
@@ -126,6 +126,7 @@ def test_the_workflow_guards_a_prompt(breaks: bool, repo: Path, tmp_path: Path) 
     assert (repo / "comparison.html").is_file()
 
 
+@pytest.mark.slow
 def test_a_prompt_that_is_new_is_compared_with_nothing_and_that_is_said(repo: Path, tmp_path: Path) -> None:
     git(repo, "rm", "-r", "--quiet", "prompts/mine")
     git(repo, "commit", "--quiet", "--message", "before it was there")

@@ -1,7 +1,8 @@
 """Every command and every piece of Python in the documents is run, and prints what its page shows.
 
 A page is a story, from top to bottom in one folder. A command that is neither run nor excused by name fails
-its page, and so does a line that is shown and was not printed.
+its page, and so does a line that is shown and was not printed. Most pages are followed by `make exhaustive`
+alone: what they type, the tests of those commands prove, and each line of them is held against the program.
 """
 
 import re
@@ -20,6 +21,9 @@ from typer.main import get_command
 
 from harness.cli import app
 from harness.evaluate.replay import stills
+
+Harness = Callable[..., tuple[int, str, str]]
+Copied = Callable[[str], str]
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = dict(commands(get_command(app), "harness"))
@@ -139,8 +143,25 @@ OTHER_PROGRAMS = {
     "pre-commit": "tests/test_hooks.py reads what it would run",
 }
 
-# Pages that show anything have these whole: they are run once, and copied into their folders.
-ONCE = ("harness eval --model proxy", "harness eval --model local-view")
+# Pages that show anything have these whole: they are run once, after what they need, and copied into their
+# folders.
+PROXY, LOCAL_VIEW = "harness eval --model proxy", "harness eval --model local-view"
+EVALUATED, OTHER = (f"reports/{model}-v2-occluded-intersection-v3" for model in ("proxy", "local-view"))
+ONCE = {
+    PROXY: (),
+    LOCAL_VIEW: (),
+    f"harness compare {OTHER} {EVALUATED}": (LOCAL_VIEW, PROXY),
+    f"harness study sweep {EVALUATED} --over loss --grid 0,0.2,0.4": (PROXY,),
+}
+
+# Pages that `make test` follows, each with how the lines begin that it leaves out.
+FOLLOWED = {
+    "docs/answers.md": (),
+    "docs/comparing.md": ("harness eval", "harness compare", "harness run history", "harness plan reports/"),
+    "docs/first-evaluation.md": (),
+    "docs/radio.md": ("harness eval", "harness radio check"),
+    "docs/tutorial-prompt.md": ("harness eval", "harness compare", "harness report"),
+}  # fmt: skip
 
 
 def shell_of(page: Path) -> list[tuple[str, str]]:
@@ -194,85 +215,150 @@ def difference(shown: str, printed: str) -> str:
 
 
 @pytest.fixture
-def copied(
-    harness: Callable[..., Any], once: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> Callable[[list[str]], str]:
+def reader(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> Harness:
+    """The command as a reader types it, who sees stdout and stderr in one place."""
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that four episodes are two shards
+    monkeypatch.setattr("harness.report.drawing.video.stills", lambda played: [*stills(played)][::20])
+    monkeypatch.setattr("harness.cli.progress.LINE_S", 3600.0)  # a reader's terminal has a bar instead
+    monkeypatch.setattr(sys, "stderr", sys.stdout)
+    return harness
+
+
+@pytest.fixture
+def copied(reader: Harness, once: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> Copied:
     """Types a command of `ONCE`: what it writes is copied to this folder, and what it prints is returned."""
 
-    def typed(args: list[str]) -> str:
+    def made(command: str) -> Path:
         def fill(folder: Path) -> None:
             folder.mkdir()
+            for need in ONCE[command]:
+                shutil.copytree(made(need), folder, dirs_exist_ok=True)
             with monkeypatch.context() as inside:
                 inside.chdir(folder)
-                code, out, _ = harness(*args)
+                code, out, _ = reader(*shlex.split(command)[1:])
             assert code == 0, out
             folder.with_suffix(".txt").write_text(out)
 
-        folder = once("-".join(["page", *args]), fill)
+        return once(f"page-{re.sub('[^a-z0-9]+', '-', command)}", fill)
+
+    def typed(command: str) -> str:
+        folder = made(command)
         shutil.copytree(folder, ".", dirs_exist_ok=True)
         return folder.with_suffix(".txt").read_text()
 
     return typed
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in pages() if blocks(page) and page != PAGE], ids=name)
-def test_a_page_can_be_followed_and_shows_what_is_printed(
-    page: Path,
-    harness: Callable[..., Any],
-    copied: Callable[[list[str]], str],
-    small_path: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that four episodes are two shards
-    monkeypatch.setattr("harness.report.drawing.video.stills", lambda played: [*stills(played)][::20])
-    monkeypatch.setattr("harness.cli.progress.LINE_S", 3600.0)  # a reader's terminal has a bar instead
-    monkeypatch.setattr(sys, "stderr", sys.stdout)  # a reader sees both in one place
-    for file, stands_for in {**READER_HAS, "few": small_path}.items():
-        (tmp_path / file).symlink_to(stands_for)
-    known: dict[str, Any] = {}
-    wrong: list[str] = []
-    for language, block in blocks(page):
-        if language == "python":
-            exec(compile(block, page.name, "exec"), known)
-            continue
-        lines = typed(block)
-        for (line, shown), (then, code_shown) in zip(lines, [*lines[1:], ("", "")], strict=True):
-            program, *args = shlex.split(line, comments=True)
-            command = command_of(line)
-            if program == "cd":
-                monkeypatch.chdir(args[0])
-            elif program == "export":
-                monkeypatch.setenv(*args[0].split("=", 1))
-            elif command in NOT_RUN:
-                hold_against_options(args)
-            elif program == "harness":
-                if SHOWN[name(page)] and command in ONCE:
-                    code, out = 0, copied(args)
-                else:
-                    path, _ = parsed(args)
-                    cut = "" if shown.strip() else CUT.get(command, CUT.get(path, ""))
-                    code, out, _ = harness(*args, *cut.split())
-                if lacks := re.search(r"needs (\S+), which is not installed", out):
-                    pytest.skip(f"followed up to here: {line} needs {lacks[1]}")
+class Followed:
+    """A page as a reader follows it, who types what it has him type, in one folder."""
+
+    def __init__(self, page: Path, reader: Harness, copied: Copied, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.page, self.reader, self.copied, self.monkeypatch = page, reader, copied, monkeypatch
+        self.wrong: list[str] = []
+
+    def all_but(self, left_out: tuple[str, ...], few: Path) -> None:
+        """Follow it, but for the lines that begin so."""
+        for file, stands_for in {**READER_HAS, "few": few}.items():
+            Path(file).symlink_to(stands_for)
+        known: dict[str, Any] = {}
+        for language, block in blocks(self.page):
+            if language == "python":
+                exec(compile(block, self.page.name, "exec"), known)
+                continue
+            lines = typed(block)
+            for (line, shown), (then, code_shown) in zip(lines, [*lines[1:], ("", "")], strict=True):
                 # A page that shows `echo $?` says how the line before it ends.
                 says = int(code_shown.split()[0]) if then == "echo $?" else 0
-                assert code == CUT_ENDS.get(command, says), f"{line}\n{out}"
-                if shown.strip() and (differs := difference(shown, out)):
-                    wrong.append(f"{line}\n{differs}")
-            elif program in ("cp", "echo", "sed"):
-                subprocess.run(line, shell=True, check=True)
+                if not line.startswith(left_out):
+                    self.line(line, shown, says)
+
+    def line(self, line: str, shown: str, says: int) -> None:
+        program, *args = shlex.split(line, comments=True)
+        command = command_of(line)
+        if program == "cd":
+            self.monkeypatch.chdir(args[0])
+        elif program == "export":
+            self.monkeypatch.setenv(*args[0].split("=", 1))
+        elif command in NOT_RUN:
+            hold_against_options(args)
+        elif program == "harness":
+            if SHOWN[name(self.page)] and command in ONCE:
+                code, out = 0, self.copied(command)
             else:
-                assert program in OTHER_PROGRAMS, line
-    if wrong:
-        pytest.fail("\n\n".join([f"{name(page)} shows what is not printed", *wrong]), pytrace=False)
+                path, _ = parsed(args)
+                cut = "" if shown.strip() else CUT.get(command, CUT.get(path, ""))
+                code, out, _ = self.reader(*args, *cut.split())
+            if lacks := re.search(r"needs (\S+), which is not installed", out):
+                pytest.skip(f"followed up to here: {line} needs {lacks[1]}")
+            assert code == CUT_ENDS.get(command, says), f"{line}\n{out}"
+            self.compare(line, shown, out)
+        elif program in ("cp", "echo", "sed"):
+            subprocess.run(line, shell=True, check=True)
+        else:
+            assert program in OTHER_PROGRAMS, line
+
+    def compare(self, line: str, shown: str, out: str) -> None:
+        """Note what is shown and was not printed."""
+        if shown.strip() and (differs := difference(shown, out)):
+            self.wrong.append(f"{line}\n{differs}")
+
+    def end(self) -> None:
+        if self.wrong:
+            told = [f"{name(self.page)} shows what is not printed", *self.wrong]
+            pytest.fail("\n\n".join(told), pytrace=False)
+
+
+FOLLOWABLE = [page for page in pages() if blocks(page) and page != PAGE]
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("page", FOLLOWABLE, ids=name)
+def test_a_page_can_be_followed_and_shows_what_is_printed(
+    page: Path, reader: Harness, copied: Copied, small_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    followed = Followed(page, reader, copied, monkeypatch)
+    followed.all_but((), small_path)
+    followed.end()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in FOLLOWABLE if name(page) in FOLLOWED], ids=name)
+def test_a_cheap_page_can_be_followed_and_shows_what_is_printed(
+    page: Path, reader: Harness, copied: Copied, small_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    followed = Followed(page, reader, copied, monkeypatch)
+    followed.all_but(FOLLOWED[name(page)], small_path)
+    followed.end()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "docs/tutorial-radio.md"], ids=name)
+def test_what_several_pages_show_is_printed(
+    page: Path, reader: Harness, copied: Copied, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The runs of the first evaluation, which these pages show as well, and a sweep of it."""
+    followed = Followed(page, reader, copied, monkeypatch)
+    shared = [(line, shown) for line, shown in shell_of(page) if command_of(line) in ONCE]
+    assert [bool(shown.strip()) for _, shown in shared].count(True) >= 2
+    for line, shown in shared:
+        followed.compare(line, shown, copied(command_of(line)))
+    followed.end()
+
+
+def test_every_line_of_every_page_is_one_that_the_program_takes() -> None:
+    for line in TYPED:
+        program, *args = shlex.split(line)
+        if program == "harness":
+            hold_against_options(args)
+        else:
+            assert program in (*OTHER_PROGRAMS, "cd", "cp", "echo", "export", "sed"), line
 
 
 def test_what_is_excused_is_still_in_the_documents() -> None:
     assert {*NOT_RUN, *CUT_ENDS, *ONCE} <= set(TYPED)
     assert set(OTHER_PROGRAMS) <= {line.split()[0] for line in TYPED}
     assert set(CUT) <= {*COMMANDS, *TYPED}
+    assert set(FOLLOWED) <= set(map(name, FOLLOWABLE))
 
 
 def test_what_is_shown_is_compared() -> None:
@@ -332,7 +418,7 @@ def test_console_is_the_one_form_of_a_shell_block() -> None:
         assert not re.search(r"^ {4,}(\$ )?harness ", outside, re.MULTILINE), page
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_site_has_no_broken_link_and_asks_no_other_host(tmp_path: Path) -> None:
     pytest.importorskip("sphinx", reason="needs the docs extra")
     pytest.importorskip("myst_parser", reason="needs the docs extra")

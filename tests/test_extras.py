@@ -52,7 +52,7 @@ def test_each_optional_package_is_in_its_extra_and_in_no_base() -> None:
             assert any(re.match(rf"{package}\b", line) for line in project["optional-dependencies"][extra])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_frozen_evaluation_and_what_is_done_with_it_need_no_extra(tmp_path: Path) -> None:
     lines = (
         "eval --model proxy --limit 2 --quiet --out a",
@@ -73,25 +73,29 @@ def test_a_frozen_evaluation_and_what_is_done_with_it_need_no_extra(tmp_path: Pa
     assert (tmp_path / "a/report.html").is_file()
 
 
+NEEDS = {
+    "drive --model proxy --episodes 1": ("highway-env", "sim"),
+    "dataset scenario drive occluded-intersection": ("highway-env", "sim"),
+    "dataset build occluded-intersection --episodes 1 --out built": ("highway-env", "sim"),
+    "dataset show occluded-intersection-v2 00000-0 --out scene.svg": ("matplotlib", "report"),
+    "study paper --out paper": ("matplotlib", "report"),
+    "eval --model swarm-tiny": ("llama-cpp-python", "llama-cpp"),
+    "model distill do-not-pass --out student": ("torch", "transformers"),
+}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("line", "package", "extra"),
-    [
-        ("drive --model proxy --episodes 1", "highway-env", "sim"),
-        ("dataset scenario drive occluded-intersection", "highway-env", "sim"),
-        ("dataset build occluded-intersection --episodes 1 --out built", "highway-env", "sim"),
-        ("dataset show occluded-intersection-v2 00000-0 --out scene.svg", "matplotlib", "report"),
-        ("study paper --out paper", "matplotlib", "report"),
-        ("eval --model swarm-tiny", "llama-cpp-python", "llama-cpp"),
-        ("model distill do-not-pass --out student", "torch", "transformers"),
-    ],
-)
-def test_what_needs_an_extra_says_in_one_line_which(
-    tmp_path: Path, line: str, package: str, extra: str
-) -> None:
-    said = bare(tmp_path, line)
-    assert said.endswith(
-        f" needs {package}, which is not installed; run `pip install 'swarmdrive-harness[{extra}]'`\nexit 2\n"
-    )
-    assert said.count("\n") == 2
+def test_what_needs_an_extra_says_in_one_line_which(tmp_path: Path) -> None:
+    said = bare(tmp_path, *NEEDS).splitlines()
+    for line, needs, ended in zip(NEEDS, said[::2], said[1::2], strict=True):
+        package, extra = NEEDS[line]
+        install = f"pip install 'swarmdrive-harness[{extra}]'"
+        assert needs.endswith(f" needs {package}, which is not installed; run `{install}`"), line
+        assert ended == "exit 2", line
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_frozen_evaluation_needs_no_extra(tmp_path: Path) -> None:
+    assert bare(tmp_path, "eval --model proxy --limit 1 --seeds 0 --quiet --out a") == "exit 0\n"
+    assert (tmp_path / "a/report.html").is_file()

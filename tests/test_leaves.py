@@ -9,8 +9,9 @@ import pytest
 CAMPAIGN = Path(__file__).parents[1] / "benchmarks/campaigns/leaves.py"
 PROJECT = ("network", "device", "card", "prompt", "suite", "curves")  # what is read in milliseconds
 
+pytestmark = pytest.mark.exhaustive
 
-@pytest.mark.slow
+
 def test_a_changed_leaf_of_a_project_is_one_line(tmp_path: Path) -> None:
     kinds = [word for kind in PROJECT for word in ("--kind", kind)]
     command = [sys.executable, str(CAMPAIGN), "--count", "100", "--seed", "7", *kinds]

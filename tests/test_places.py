@@ -100,7 +100,7 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     assert places == ["reports/one/report.html", None, "report.html"], "pages of one project are linked"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_page_of_studies_names_a_folder(typed: Callable[..., str]) -> None:
     here = Path.cwd()
     run = here / "reports/one"

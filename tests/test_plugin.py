@@ -1,12 +1,15 @@
 """The seams from outside: `tests/plugin`, installed beside the harness, adds one of each kind of plug-in.
 
-Commands run as typed, in a process of their own that has the package; this one only reads what they wrote.
+Commands run as typed, in processes of their own: one that has the package, for most of them, and one that
+has not. This one only reads what they wrote and said.
 """
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -30,7 +33,43 @@ FROZEN = ("single-local", "6g", SMOOTHED, "fog", FOG_SMOOTHED, CLOSE, MUMBLED, N
 DRIVEN = (SMOOTHED, FOG_SMOOTHED)
 ACTIONS, PLACES = ("SLOWER", "IDLE", "FASTER"), (1, 2, 3)
 
+MISTAKES = {
+    ("--condition", "fogg"): "unknown operating point 'fogg'; did you mean 'fog'? known: 6g, ",
+    ("--condition", "fog:loss=0"): "loss is 0.0; it must be left out: channel profile fog has no such",
+    ("--condition", "6g:consensus=smooth"): "unknown consensus 'smooth'; did you mean 'smoothing'?",
+}
+NAMES = {
+    ("--condition", "fog"): "unknown operating point 'fog'; known: 6g, ",
+    ("--model", "mine"): "unknown engine in model card",
+}
+# Types commands one after the other, and writes down how each ended and what it said.
+TYPES = """
+import contextlib, io, json, sys
+from harness import cli
+told = []
+for words in json.load(sys.stdin):
+    sys.argv = ["harness", *words]
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            cli.main()
+        except SystemExit as ended:
+            told.append((ended.code or 0, out.getvalue(), err.getvalue()))
+json.dump(told, sys.stdout)
+"""
+
 pytestmark = pytest.mark.slow
+
+
+class Said(NamedTuple):
+    """How a command ended, and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+
+Words = tuple[str, ...]
 
 
 @pytest.fixture(scope="module")
@@ -45,29 +84,56 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def frozen(project: Path, small_path: Path) -> Tables:
-    conditions = [f"--condition={name}" for name in FROZEN]
-    told = ("--tracker", "notebook", "--out", "frozen")
-    typed(project, "eval", "--model", "mine", "--dataset", small_path, *conditions, *told)
+def with_package(project: Path, small_path: Path) -> dict[Words, Said]:
+    """What is typed where the package is installed: two runs, a sweep, a report and mistakes."""
+    evaluated = ("eval", "--model", "mine", "--dataset", str(small_path))
+    driven = ("drive", "--model", "mine", "--episodes", "2", "--seeds", "0:2", "--out", "driven")
+    over = ("--over", "consensus", "--grid", "linear,smoothing", "--condition", "6g", "--condition", "fog")
+    lines = [
+        (*evaluated, *conditions(FROZEN), "--tracker", "notebook", "--out", "frozen"),
+        (*driven, *conditions(DRIVEN)),
+        ("study", "sweep", "frozen", *over, "--quiet"),
+        ("report", "driven", "--out", "driven.html"),
+    ]
+    wrong = [("eval", "--model", "mine", *words) for words in MISTAKES]
+    told = typed(project, [*lines, *wrong], package=True)
+    assert [told[line].code for line in lines] == [0] * len(lines), told
+    return told
+
+
+@pytest.fixture(scope="module")
+def without_package(project: Path, with_package: dict[Words, Said]) -> dict[Words, Said]:
+    """What is typed there once the package is gone: a report, and its names."""
+    report = ("report", "frozen", "--out", "frozen.html")
+    return typed(project, [report, *(("eval", *words) for words in NAMES)], package=False)
+
+
+@pytest.fixture(scope="module")
+def frozen(project: Path, with_package: dict[Words, Said]) -> Tables:
     return harness.load(project / "frozen")
 
 
 @pytest.fixture(scope="module")
-def driven(project: Path) -> Tables:
-    conditions = [f"--condition={name}" for name in DRIVEN]
-    drive = ("drive", "--model", "mine", *conditions, "--episodes", "2", "--seeds", "0:2")
-    typed(project, *drive, "--out", "driven")
+def driven(project: Path, with_package: dict[Words, Said]) -> Tables:
     return harness.load(project / "driven")
 
 
-def typed(project: Path, *words: str | Path, package: bool = True, code: int = 0) -> str:
-    """What a command says: on stdout, or on stderr where it ends otherwise than with 0."""
+def conditions(names: Words) -> list[str]:
+    return [f"--condition={name}" for name in names]
+
+
+def typed(project: Path, lines: list[Words], *, package: bool) -> dict[Words, Said]:
+    """What commands say that are typed one after the other, in one process."""
     site = [str(project.parent / "site")] if package else []
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([*site, str(Path(__file__).parents[1])])}
-    command = [sys.executable, "-m", "harness", *map(str, words)]
-    done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == code, done.stderr
-    return done.stderr if code else done.stdout
+    command = [sys.executable, "-c", TYPES]
+    done = subprocess.run(
+        command, cwd=project, env=environment, input=json.dumps(lines), capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    told = [Said(*each) for each in json.loads(done.stdout)]
+    return dict(zip(lines, told, strict=True))
 
 
 def decided(run: Tables, condition: str) -> pd.DataFrame:
@@ -210,8 +276,6 @@ def test_the_metric_is_in_the_summary(frozen: Tables):
 
 
 def test_a_sweep_plays_the_rule_on_what_is_stored(project: Path, frozen: Tables):
-    over = ("--over", "consensus", "--grid", "linear,smoothing", "--condition", "6g", "--condition", "fog")
-    typed(project, "study", "sweep", "frozen", *over, "--quiet")
     table = pd.read_csv(project / "frozen" / "sweep-consensus" / "conditions.csv")
     swept = table.set_index(["condition", "value", "metric", "interval"])["mean"].sort_index()
     own = frozen.summary.set_index(["condition", "metric", "interval"]).value.sort_index()
@@ -223,38 +287,27 @@ def test_a_sweep_plays_the_rule_on_what_is_stored(project: Path, frozen: Tables)
     assert success["linear"] != success["smoothing"]
 
 
-@pytest.mark.parametrize(("kind", "package"), [("frozen", True), ("driven", True), ("frozen", False)])
 def test_a_report_of_a_run_needs_no_package(
-    project: Path, kind: str, package: bool, request: pytest.FixtureRequest
+    project: Path, with_package: dict[Words, Said], without_package: dict[Words, Said]
 ):
-    request.getfixturevalue(kind)
-    typed(project, "report", kind, "--out", "page.html", package=package)
-    page = (project / "page.html").read_text()
-    assert all(name in page for name in ("mine", "cautious", SMOOTHED, "fog"))
+    told = with_package | without_package
+    for kind in ("driven", "frozen"):
+        assert told["report", kind, "--out", f"{kind}.html"].code == 0
+        page = (project / f"{kind}.html").read_text()
+        assert all(name in page for name in ("mine", "cautious", SMOOTHED, "fog"))
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--condition", "fogg"), "unknown operating point 'fogg'; did you mean 'fog'? known: 6g, "),
-        (("--condition", "fog:loss=0"), "loss is 0.0; it must be left out: channel profile fog has no such"),
-        (("--condition", "6g:consensus=smooth"), "unknown consensus 'smooth'; did you mean 'smoothing'?"),
-    ],
-)
-def test_a_mistake_is_one_line_that_knows_the_package(project: Path, words: tuple[str, str], said: str):
-    message = typed(project, "eval", "--model", "mine", *words, code=2)
-    assert said in message
+@pytest.mark.parametrize("words", MISTAKES)
+def test_a_mistake_is_one_line_that_knows_the_package(words: Words, with_package: dict[Words, Said]):
+    code, _, message = with_package["eval", "--model", "mine", *words]
+    assert code == 2
+    assert MISTAKES[words] in message
     assert message.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--condition", "fog"), "unknown operating point 'fog'; known: 6g, "),
-        (("--model", "mine"), "unknown engine in model card"),
-    ],
-)
-def test_without_the_package_its_names_mean_nothing(project: Path, words: tuple[str, str], said: str):
-    message = typed(project, "eval", *words, package=False, code=2)
-    assert said in message
+@pytest.mark.parametrize("words", NAMES)
+def test_without_the_package_its_names_mean_nothing(words: Words, without_package: dict[Words, Said]):
+    code, _, message = without_package["eval", *words]
+    assert code == 2
+    assert NAMES[words] in message
     assert message.count("\n") == 1

@@ -50,7 +50,7 @@ def test_a_checkpoint_is_fetched_once_without_what_nobody_loads(tmp_path: Path) 
     assert fetched.read_bytes() == CHECKPOINT["model.safetensors"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_with_the_hub_gone_what_was_fetched_is_found(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
     pytest.importorskip("transformers", reason="needs the transformers extra")
@@ -73,7 +73,7 @@ def test_of_a_repository_of_gguf_files_the_cards_one_is_fetched_and_held_to_its_
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_projector_is_fetched_with_the_file_that_it_belongs_to(tmp_path: Path) -> None:
     (tmp_path / "models").mkdir()
     (tmp_path / "swarmdrive.toml").touch()

@@ -19,6 +19,12 @@ from harness.prompts.template import Template
 GROWTH_BYTES = 1 << 30
 PATIENCE_S = 20.0  # CPU of this thread; the slowest takes some 2 s
 PLAIN = ImmutableSandboxedEnvironment()
+# These take long to compile; others are as deep, or as long.
+DEAR = {"deep filters": "exhaustive", "deep loops": "slow", "many copies": "exhaustive"}
+HOSTILE = [
+    pytest.param(text, id=name, marks=getattr(pytest.mark, DEAR[name]) if name in DEAR else ())
+    for name, text in (TEMPLATES | PADDING).items()
+]
 
 
 @pytest.fixture
@@ -35,7 +41,7 @@ def narrow(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("narrow")
-@pytest.mark.parametrize("text", [*TEMPLATES.values(), *PADDING.values()], ids=[*TEMPLATES, *PADDING])
+@pytest.mark.parametrize("text", HOSTILE)
 def test_no_prompt_template_runs_for_ever_or_fills_memory(text: str) -> None:
     with pytest.raises(Exception, match=r".") as refused:
         Template(f"{{% block user %}}{text}{{% endblock %}}").render({"actions": ("A",)}, ("user",))
@@ -43,7 +49,7 @@ def test_no_prompt_template_runs_for_ever_or_fills_memory(text: str) -> None:
 
 
 @pytest.mark.usefixtures("narrow")
-@pytest.mark.parametrize("text", [*TEMPLATES.values(), *PADDING.values()], ids=[*TEMPLATES, *PADDING])
+@pytest.mark.parametrize("text", HOSTILE)
 def test_no_chat_template_runs_for_ever_or_fills_memory(text: str) -> None:
     with pytest.raises(UserError, match=r"^model 'sly': its chat template ") as refused:
         ChatTemplate("sly", text).render([{"role": "user", "content": "x"}])

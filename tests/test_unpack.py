@@ -25,6 +25,7 @@ from harness.core.errors import UserError
 from harness.core.files import sha256_file
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)

@@ -53,6 +53,7 @@ def test_what_is_not_known_is_said(harness: Callable[..., Said]) -> None:
     assert json.loads(out)["fits"][0]["ms"] is None
 
 
+@pytest.mark.slow
 def test_a_runs_own_tokens(alone: Path, harness: Callable[..., Said]) -> None:
     told, device = folder.read(alone), devices.load("agx-orin")
     row = devices.find_row(device, "qwen3-0.6b")
@@ -68,6 +69,7 @@ def test_a_runs_own_tokens(alone: Path, harness: Callable[..., Said]) -> None:
     assert f"n = {len(egos)} answers of swarm-tiny for the ego" in " ".join(out.split())
 
 
+@pytest.mark.slow
 def test_a_profile_is_held_against_a_run(alone: Path, harness: Callable[..., Said]) -> None:
     told = folder.read(alone)
     egos = [a for a in told.answers if a.role == "ego"]

@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from html import unescape
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import msgspec
@@ -31,10 +32,10 @@ def of(version: str, day: int) -> dict[str, Any]:
     return {"prompt": prompt, "created": f"2026-01-{day:02d}T12:00:00+00:00"}
 
 
-@pytest.fixture
-def reports(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three runs on a dataset, written in another order than made; one on another; one that was driven."""
-    folder = tmp_path / "reports"
+    folder = tmp_path_factory.mktemp("history") / "reports"
     made_up(folder / "third", episode=fail(0, 1, 2), points=(POINTS["6g"], POINTS["v2x"]), **of("v4", 3))
     made_up(folder / "first", **of("v2", 1))
     made_up(folder / "second", episode=fail(0), **of("v3", 2))
@@ -44,6 +45,12 @@ def reports(tmp_path: Path) -> Path:
     made_up(folder / "driven", closed_loop=True, **of("v2", 5))
     (folder / "begun").mkdir()
     return folder
+
+
+@pytest.fixture
+def reports(made: Path, tmp_path: Path) -> Path:
+    """A copy of these."""
+    return Path(copytree(made, tmp_path / "reports"))
 
 
 def test_a_metric_by_date_of_the_condition_that_most_runs_have(reports: Path, harness: Harness) -> None:

@@ -56,6 +56,7 @@ def test_its_own_are_found_beside_those_that_ship_and_only_there(
     assert "my-model" not in cards.names()
 
 
+@pytest.mark.slow
 def test_weights_lie_beside_its_card(harness: Harness, project: Path) -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
     pytest.importorskip("transformers", reason="needs the transformers extra")

@@ -83,7 +83,7 @@ def test_what_cannot_be_is_one_line_and_nothing_is_written(
 
 @pytest.mark.slow
 def test_the_papers_study_ends_with_how_many_numbers_it_met(harness: Callable[..., Said]) -> None:
-    code, out, err = harness("study", "paper", "--episodes", "20", "--sweep-episodes", "20", "--out", "p")
+    code, out, err = harness("study", "paper", "--episodes", "10", "--sweep-episodes", "10", "--out", "p")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     assert "of 30 numbers within the aim" in out

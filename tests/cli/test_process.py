@@ -18,6 +18,7 @@ from run_on_disk import made_up
 from harness.core.process import LEAST_MB
 
 HARNESS = (sys.executable, "-m", "harness")
+pytestmark = pytest.mark.slow
 # Says when it has come to an import, and waits there.
 WAITS = """
 import sys, time
@@ -58,7 +59,6 @@ def test_a_command_that_is_stopped_while_it_imports_ends_with_a_line(
     assert (process.returncode, said.count(b"\n"), said[:9]) == (code, 1, b"harness: ")
 
 
-@pytest.mark.slow
 def test_a_signal_at_any_moment_of_a_command(tmp_path: Path) -> None:
     """From its start to its end; `benchmarks/campaigns/signals.py` does it hundreds of times."""
     made_up(tmp_path / "run")
@@ -93,8 +93,9 @@ def test_a_console_that_lacks_a_character_gets_another(env: dict[str, str], tmp_
     assert b"Traceback" not in done.stderr
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("closed", [(0,), (1,), (2,), (0, 1, 2)])
+@pytest.mark.parametrize(
+    "closed", [(0, 1, 2), *(pytest.param((number,), marks=pytest.mark.exhaustive) for number in range(3))]
+)
 def test_a_run_without_streams_is_whole(closed: tuple[int, ...], tmp_path: Path) -> None:
     def close() -> None:
         for number in closed:
@@ -133,7 +134,6 @@ def test_a_folder_that_is_gone(command: tuple[str, ...], tmp_path: Path) -> None
     assert done.stderr == b"harness: %s; change to one that is there\n" % reason
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("megabytes", [100, 400, LEAST_MB])
 def test_little_memory(megabytes: int, tmp_path: Path) -> None:
     limit = megabytes << 20
@@ -174,8 +174,9 @@ def test_a_date_of_the_environment_that_is_none(date: str, monkeypatch: pytest.M
     assert {kind: len(different) for kind, different in written.items()} == dict.fromkeys(FORMATS, 1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("date", ["garbage", "99999999999999999999"])
+@pytest.mark.parametrize(
+    "date", ["garbage", pytest.param("99999999999999999999", marks=pytest.mark.exhaustive)]
+)
 def test_a_run_under_a_date_that_is_none(date: str, tmp_path: Path) -> None:
     """Some packages read it while they are imported."""
     done = ended(

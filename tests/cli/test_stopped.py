@@ -40,7 +40,7 @@ def test_who_stops_a_command_hears_that_the_same_one_goes_on(
     assert said.splitlines()[-1] == f"harness: {word}; stopped keeps what is done; {how}"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_stopped_trust_study_says_what_it_keeps(
     harness: Callable[..., tuple[int, str, str]], small_path: Path, tmp_path: Path
 ) -> None:
