@@ -59,7 +59,7 @@ def test_every_moment_played_again_is_the_moment_that_was_asked(driven):
     assert [scene.id for scene in scenes_of(found, names)] == names
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_workers_change_no_byte_of_a_page(driven, tmp_path, monkeypatch):
     one, two = by_workers(gather([driven]), tmp_path, monkeypatch)
     assert len(details(one)) > 8
@@ -68,7 +68,7 @@ def test_workers_change_no_byte_of_a_page(driven, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
-    spec = live_spec_of(episodes=1, first_seed=FROM_LEFT)
+    spec = live_spec_of(episodes=1, first_seed=FROM_LEFT, points=(named_point("single-local"),), seeds=(0,))
     name = f"{NAME},perfect_knowledge=true"
     run(replace(spec, source=replace(spec.source, scenario_name=name)), tmp_path / "run")
     found = read(tmp_path / "run")
@@ -100,7 +100,7 @@ def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
 
 @pytest.mark.slow
 def test_the_cameras_of_a_run_see_by_the_light_that_it_was_driven_in(tmp_path):
-    spec = live_spec_of(episodes=1, first_seed=FROM_LEFT)
+    spec = live_spec_of(episodes=1, first_seed=FROM_LEFT, points=(named_point("single-local"),), seeds=(0,))
     name = f"{NAME},ambient=night"
     run(replace(spec, source=replace(spec.source, scenario_name=name)), tmp_path / "run")
     found = read(tmp_path / "run")

@@ -120,7 +120,7 @@ def test_all_policies_drive_the_same_layouts_and_none_beats_the_plan() -> None:
 
 @pytest.mark.slow
 def test_a_check_of_agents_states_figures_with_intervals_and_n(harness: Any) -> None:
-    command = ("dataset", "scenario", "drive", "all-way-crossing", "--agents", "all", "--episodes", 2)
+    command = ("dataset", "scenario", "drive", "all-way-crossing", "--agents", "all", "--episodes", 1)
     code, out, _ = harness(*command, "--workers", 1, "--json")  # where it is slow, it says how far it is
     found = json.loads(out)
     assert (code, found["scenario"]) == (0, "all-way-crossing:agent_share=1")
