@@ -66,7 +66,7 @@ def off_lag(of: Run) -> set[Place]:
 @pytest.mark.parametrize(
     ("model", "points", "seeds", "least", "layouts"),
     [
-        *(case for driver in DRIVERS for case in few_or_many(driver, (ALONE,), (0,), 1.0, layouts=(4, 40))),
+        *(case for driver in DRIVERS for case in few_or_many(driver, (ALONE,), (0,), 1.0, layouts=(3, 40))),
         *few_or_many("proxy", (ALONE, OVER_6G), (0, 1), 0.8, layouts=(2, 20)),
         *few_or_many("proxy", (named_point("its-g5"),), (0, 1), 0.5, layouts=(2, 20)),
         *few_or_many("proxy-faulty", (ALONE, OVER_6G), (0, 1), 0.4, layouts=(2, 20)),
@@ -104,8 +104,13 @@ def test_what_the_tree_says_is_what_driving_gives(
 CONFLICTS = ("least_ttc_s", "short_ttc", "least_pet_s", "short_pet")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("model", [*DRIVERS, "proxy"])
+@pytest.mark.parametrize(
+    "model",
+    [
+        *(pytest.param(model, marks=pytest.mark.slow) for model in ("cruise", "full-view", "proxy")),
+        *(pytest.param(model, marks=pytest.mark.exhaustive) for model in ("brake", "local-view")),
+    ],
+)
 def test_conflicts_in_a_tree_are_those_of_driving(tmp_path: Path, small: Dataset, model: str) -> None:
     """Of each decision and episode, on a tree that is built today; the shipped ones are older."""
     how: dict[str, Any] = {"points": (ALONE,), "seeds": (0,)}

@@ -3,7 +3,6 @@
 import json
 import sys
 from dataclasses import replace
-from functools import cache
 from importlib.util import find_spec
 
 import numpy as np
@@ -186,9 +185,15 @@ def test_without_scikit_learn_one_line_says_what_to_install(harness, monkeypatch
 
 @pytest.mark.slow
 def test_the_command_says_the_same_to_people_and_to_machines(harness, monkeypatch):
-    driven = cache(lambda seed: _hidden(replace(SCENARIO, parameters=silent), seed))
-    silent = replace(SCENARIO.parameters, radio_share=0.0)
-    monkeypatch.setattr("harness.world.audit._hidden", lambda scenario, seed: driven(seed))
+    """Each layout is driven once, for both."""
+    driven = {}
+
+    def remembered(scenario, seed):
+        if seed not in driven:
+            driven[seed] = _hidden(scenario, seed)
+        return driven[seed]
+
+    monkeypatch.setattr("harness.world.audit._hidden", remembered)
     words = ("dataset", "scenario", "audit", NAME, "--layouts", 20, "--seed", 42, "--workers", 1)
     code, out, err = harness(*words, "--json")
     found = json.loads(out)
