@@ -60,6 +60,12 @@ def shared(dataset: Dataset, scenes: Sequence[Scene]) -> list[SceneGraph]:
     return merged(dataset.scenario, [heard_by_all(scene) for scene in scenes])
 
 
+@pytest.fixture(scope="module")
+def pair(small: Dataset) -> Dataset:
+    """Two of the layouts, for walks whose every question is looked at."""
+    return small.of_episodes({0, 1})
+
+
 # The larger graph
 
 
@@ -254,26 +260,26 @@ class Planner:
         return {"engine": "scripted"}
 
 
-def test_a_set_of_messages_is_one_question_whatever_else_is_done_with_its_answer(small: Dataset) -> None:
+def test_a_set_of_messages_is_one_question_whatever_else_is_done_with_its_answer(pair: Dataset) -> None:
     """`objects` and `both` ask the same; a helper's model is asked only where its intent is sent."""
     asked = {}
     for point in (OBJECTS, BOTH):
-        backend = Planner(small)
-        walked(spec_of(small, points=(point,), ask="used"), backend)
+        backend = Planner(pair)
+        walked(spec_of(pair, points=(point,), ask="used"), backend)
         asked[point] = [r.id for r in backend.asked]
         assert len(asked[point]) == len(set(asked[point]))
-    both = Planner(small)
-    walked(spec_of(small, points=(OBJECTS, BOTH), ask="used"), both)
+    both = Planner(pair)
+    walked(spec_of(pair, points=(OBJECTS, BOTH), ask="used"), both)
     assert {r.id for r in both.asked} == {*asked[OBJECTS], *asked[BOTH]}
     assert not [name for name in asked[OBJECTS] if "/v1" not in name]
     assert [name for name in asked[BOTH] if "/v1" not in name]
     assert [name for name in asked[OBJECTS] if name.endswith("/v1+v2!objects+v3!objects+v4!objects")]
 
 
-def test_a_larger_graph_is_a_prompts_graph(small: Dataset) -> None:
-    backend, spec = Planner(small), spec_of(small, points=(OBJECTS,), ask="used")
+def test_a_larger_graph_is_a_prompts_graph(pair: Dataset) -> None:
+    backend, spec = Planner(pair), spec_of(pair, points=(OBJECTS,), ask="used")
     walked(spec, backend)
-    scenes = {scene.id: scene for scene in all_scenes(small)}
+    scenes = {scene.id: scene for scene in all_scenes(pair)}
     for request in backend.asked:
         if "!objects" in request.id:
             scene = scenes[request.id.partition("/")[0]]
@@ -295,10 +301,10 @@ def test_the_truth_is_no_worse_than_objects_and_these_no_worse_than_nothing(plan
     assert alone <= objects <= oracle
 
 
-def test_the_truth_has_every_sector_of_the_ego_in_sight(small: Dataset) -> None:
-    backend = Planner(small)
-    walked(spec_of(small, points=(ORACLE,), ask="used"), backend)
-    scenes = {scene.id: scene for scene in all_scenes(small)}
+def test_the_truth_has_every_sector_of_the_ego_in_sight(pair: Dataset) -> None:
+    backend = Planner(pair)
+    walked(spec_of(pair, points=(ORACLE,), ask="used"), backend)
+    scenes = {scene.id: scene for scene in all_scenes(pair)}
     asked = [r for r in backend.asked if "!truth" in r.id and r.view]
     assert asked
     for request in asked:
@@ -309,10 +315,10 @@ def test_the_truth_has_every_sector_of_the_ego_in_sight(small: Dataset) -> None:
         assert "100% seen" in request.messages[-1]["content"]
 
 
-def test_helpers_that_see_nothing_add_but_themselves(small: Dataset) -> None:
-    backend = Planner(small)
-    walked(spec_of(small, points=(OBJECTS.changed(messages="blind"),), ask="used"), backend)
-    scenes = {scene.id: scene for scene in all_scenes(small)}
+def test_helpers_that_see_nothing_add_but_themselves(pair: Dataset) -> None:
+    backend = Planner(pair)
+    walked(spec_of(pair, points=(OBJECTS.changed(messages="blind"),), ask="used"), backend)
+    scenes = {scene.id: scene for scene in all_scenes(pair)}
     asked = [r for r in backend.asked if "~blind!objects" in r.id]
     assert asked
     for request in asked:
@@ -321,10 +327,10 @@ def test_helpers_that_see_nothing_add_but_themselves(small: Dataset) -> None:
         assert {*request.view.seen} <= {*own, "v2", "v3", "v4"}
 
 
-def test_shuffled_objects_are_those_of_another_layout_where_they_are_there(small: Dataset) -> None:
+def test_shuffled_objects_are_those_of_another_layout_where_they_are_there(pair: Dataset) -> None:
     """Every question but the ego's own has the list of one other layout, in which the ego is left out."""
-    backend, scenes = Planner(small), {scene.id: scene for scene in all_scenes(small)}
-    walked(spec_of(small, points=(OBJECTS.changed(messages="shuffled"),), ask="used"), backend)
+    backend, scenes = Planner(pair), {scene.id: scene for scene in all_scenes(pair)}
+    walked(spec_of(pair, points=(OBJECTS.changed(messages="shuffled"),), ask="used"), backend)
     sets = [r for r in backend.asked if "!objects" in r.id]
     assert len(sets) > 10
     for request in sets:
@@ -337,7 +343,7 @@ def test_shuffled_objects_are_those_of_another_layout_where_they_are_there(small
         assert request.view is not None
         assert "v1" not in request.view.seen
         for sender, graph in zip(senders, there, strict=True):
-            place = stated(small.scenario.parameters, source.state, sender.partition("!")[0])
+            place = stated(pair.scenario.parameters, source.state, sender.partition("!")[0])
             new = {*request.view.nodes} - {*own.nodes}
             assert place.id in {node.id for node in new} or place.id in own.seen
             assert {node.id for node in new} <= {v.id for v in source.state.vehicles} | {*own.seen}, graph
@@ -398,12 +404,12 @@ def test_a_dry_run_counts_the_questions_of_a_content(small: Dataset) -> None:
         ),
     ],
 )
-def test_a_liar_invents_or_hides(small: Dataset, attack: str, what: Any) -> None:
+def test_a_liar_invents_or_hides(pair: Dataset, attack: str, what: Any) -> None:
     """All helpers lie: what the ego's graph gains is a ghost, or only the helpers themselves."""
-    backend = Planner(small)
+    backend = Planner(pair)
     point = OBJECTS.changed(attack=f"{attack}:share=1")
-    walked(spec_of(small, points=(point,), ask="used"), backend)
-    scenes = {scene.id: scene for scene in all_scenes(small)}
+    walked(spec_of(pair, points=(point,), ask="used"), backend)
+    scenes = {scene.id: scene for scene in all_scenes(pair)}
     asked = [r for r in backend.asked if f"!{attack}&objects" in r.id]
     assert asked
     for request in asked:
@@ -419,21 +425,21 @@ def test_a_ghost_stops_who_believes_it_and_none_is_believed_of_nobody(small: Dat
     assert figure(rows, "1", "success_rate").value < figure(rows, "0", "success_rate").value
 
 
-def test_a_shifted_object_is_another_object(small: Dataset) -> None:
+def test_a_shifted_object_is_another_object(pair: Dataset) -> None:
     """Both places are believed where the ego sees the object itself."""
-    backend = Planner(small)
-    walked(spec_of(small, points=(OBJECTS.changed(attack="shift:share=1:offset_m=12"),)), backend)
+    backend = Planner(pair)
+    walked(spec_of(pair, points=(OBJECTS.changed(attack="shift:share=1:offset_m=12"),)), backend)
     graphs = [r.view for r in backend.asked if "!shift:offset_m=12&objects" in r.id]
     assert any(len(graph.seen) > len({*graph.seen}) for graph in graphs if graph)
 
 
 @pytest.mark.parametrize("text", ["ghost+hide", "hide+ghost"])
-def test_whoever_hides_all_and_invents_a_car_lists_that_car_alone(small: Dataset, text: str) -> None:
+def test_whoever_hides_all_and_invents_a_car_lists_that_car_alone(pair: Dataset, text: str) -> None:
     """In whatever order both are named, and as one question."""
     attack = "+".join(f"{name}:share=1" for name in text.split("+"))
-    backend = Planner(small)
-    walked(spec_of(small, points=(OBJECTS.changed(attack=attack),)), backend)
-    scenes = {scene.id: scene for scene in all_scenes(small)}
+    backend = Planner(pair)
+    walked(spec_of(pair, points=(OBJECTS.changed(attack=attack),)), backend)
+    scenes = {scene.id: scene for scene in all_scenes(pair)}
     asked = [r for r in backend.asked if "+" in r.id]
     assert asked
     for request in asked:
@@ -458,20 +464,20 @@ def test_a_ghost_is_where_it_was_meant_whatever_else_is_moved(small: Dataset, pr
 # The same whatever way
 
 
-def test_one_at_a_time_as_in_batches(small: Dataset, tmp_path: Path) -> None:
+def test_one_at_a_time_as_in_batches(pair: Dataset, tmp_path: Path) -> None:
     points = (POINTS["single-local"], OBJECTS, BOTH)
     one, many = (
-        run(spec_of(small, points=points, batch_size=size), tmp_path / f"{size}").out for size in (1, 8)
+        run(spec_of(pair, points=points, batch_size=size), tmp_path / f"{size}").out for size in (1, 8)
     )
     assert same_files(one, many)
 
 
-def test_whoever_reads_a_run_sees_what_the_ego_was_asked(small: Dataset, tmp_path: Path) -> None:
+def test_whoever_reads_a_run_sees_what_the_ego_was_asked(pair: Dataset, tmp_path: Path) -> None:
     """The prompt of every answer can be shown as it was sent, and a pair for training has it."""
-    spec = spec_of(small, points=(OBJECTS, BOTH, OBJECTS.changed(attack="ghost:share=1/3", name="lied to")))
+    spec = spec_of(pair, points=(OBJECTS, BOTH, OBJECTS.changed(attack="ghost:share=1/3", name="lied to")))
     stored = folder.read(run(spec, tmp_path / "run").out)
     shared = 0
-    for answer, _, messages in as_read(stored, small):
+    for answer, _, messages in as_read(stored, pair):
         assert digest(messages) == answer.prompt_sha256
         shared += any("objects" in key for key in answer.heard)
     assert shared > 10

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from harness.coordination.coordinate import Coordination, coordinate
@@ -102,6 +102,7 @@ def test_a_decision_ends_after_the_egos_inference_and_every_arrival(point, case)
 
 
 @given(points, cases(), st.data())
+@settings(max_examples=30)
 def test_the_order_of_helpers_changes_nothing(point, case, data):
     order = data.draw(st.permutations(range(case[0].valid.shape[1])))
     decision, other = coordinate(point, *case), coordinate(point, *shuffled(case, order))
@@ -119,6 +120,7 @@ def test_more_loss_never_hears_more_helpers_with_the_same_draws(point, case, one
 
 
 @given(points, cases())
+@settings(max_examples=30)
 def test_a_single_decision_is_a_row_of_the_batch(point, case):
     batch = coordinate(point, *case)
     for i in range(4):
@@ -127,6 +129,7 @@ def test_a_single_decision_is_a_row_of_the_batch(point, case):
 
 
 @given(points, cases())
+@settings(max_examples=30)
 def test_a_threshold_above_the_uniform_entropy_is_the_single_local_point(point, case):
     never = point.changed(tau_nats=math.log(case[0].own.shape[-1]) + 1e-9)
     # Helpers who might be asked infer from the start.

@@ -161,7 +161,10 @@ def simulated(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("vehicles", [40, 80, 120, 160])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "vehicles", [40, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in (80, 120)), 160]
+)
 def test_collisions_and_waits_are_those_of_simulated_slots(vehicles):
     """400 000 slots at busy ratios from .13 to .5, with packets of 25 slots behind an AIFS of 8."""
     runs = [simulated(vehicles, 25, 8, 15, 100_000, seed) for seed in range(4)]

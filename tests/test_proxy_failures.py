@@ -9,7 +9,6 @@ import pytest
 from evaluating import decisions, figure, run, same_decisions, scenes_of, spec_of
 from run_on_disk import answers_of
 from scipy.stats import binom
-from tiers import QUICK
 
 from harness.backends import cards
 from harness.backends.base import Request
@@ -57,8 +56,11 @@ def questions(dataset: Dataset, form: str) -> list[Request]:
 
 @pytest.mark.parametrize("form", ["distribution", "recommendation"])
 @pytest.mark.parametrize("how", [how for how in STATUS if how])
-def test_every_failure_has_its_status_whatever_was_answered(how: str, form: str, small: Dataset) -> None:
-    asked = questions(small, form)[:: 7 if QUICK else 1]
+@pytest.mark.parametrize("every", [7, pytest.param(1, marks=pytest.mark.exhaustive)])
+def test_every_failure_has_its_status_whatever_was_answered(
+    how: str, form: str, every: int, small: Dataset
+) -> None:
+    asked = questions(small, form)[::every]
     assert {request.role for request in asked} == {"ego", "helper"}
     for request in asked:
         text, finish_reason = spoil(answers([request])[0], how, request.actions)

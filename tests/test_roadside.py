@@ -198,6 +198,7 @@ def over(name: str, **settings: Any) -> OperatingPoint:
 
 
 @given(radios, cases(), delays)
+@settings(max_examples=30)
 def test_a_relay_loses_and_delays_nothing_that_came_directly(name, case, delay_s):
     direct, relayed = (
         exchange(over(name, edge=edge, edge_delay_s=delay_s), *case) for edge in ("none", "relay")
@@ -210,6 +211,7 @@ def test_a_relay_loses_and_delays_nothing_that_came_directly(name, case, delay_s
 
 
 @given(radios, cases())
+@settings(max_examples=30)
 def test_settings_of_a_unit_that_is_not_there_change_nothing(name, case):
     there = over(name, edge_delay_s=0.5, edge_x_m=9.0, edge_antenna_m=9.0)
     one, other = (exchange(each, *case) for each in (over(name), there))
@@ -218,6 +220,7 @@ def test_settings_of_a_unit_that_is_not_there_change_nothing(name, case):
 
 
 @given(radios, cases(), delays, st.sampled_from(["relay", "fusion"]), st.booleans())
+@settings(max_examples=30)
 def test_a_single_decision_over_a_unit_is_a_row_of_the_batch(name, case, delay_s, edge, on_demand):
     beside = over(name, edge=edge, edge_delay_s=delay_s, on_demand=on_demand, window_s=0.3)
     batch = coordinate(beside, *case)

@@ -51,7 +51,7 @@ def trips(seeds: int, steps: int = 6) -> Trips:
 
 @pytest.mark.slow
 def test_shadowing_is_normal_and_forgets_with_the_distance_moved():
-    n, decorrelation_m = 20_000, 10.0
+    n, decorrelation_m = 8_000, 10.0
     here = np.broadcast_to([[0.0, 0.0], [50.0, 10.0]], (n, 2, 2))
     start = trips(n).shadow(here, decorrelation_m)[:, 0]
     assert start.mean() == pytest.approx(0, abs=0.03)

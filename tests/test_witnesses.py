@@ -1,5 +1,6 @@
 """Success by the number of witnesses, in rows and summary."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,12 +25,19 @@ def driven(small: Dataset, out: Path, scenario: str, *points: str, episodes: int
     return read(run(replace(spec, source=LiveSource(0, episodes, scenario)), out).out)
 
 
-def test_rows_have_witnesses_and_the_dangers_radio(small: Dataset, tmp_path: Path) -> None:
-    name = "occluded-intersection:witnesses=each,radio_share=0.5"
-    done = driven(small, tmp_path / "run", name, "single-local")
-    assert [e.witnesses for e in done.episodes] == [0, 1, 2, 3] * 2
+EACH = "occluded-intersection:witnesses=each,radio_share=0.5"
+
+
+@pytest.fixture(scope="module")
+def done(small: Dataset, once: Callable[..., Path]) -> Run:
+    """Twenty-four layouts: six with each number of witnesses."""
+    return read(once("witnesses", lambda out: driven(small, out, EACH, "single-local", episodes=24)))
+
+
+def test_rows_have_witnesses_and_the_dangers_radio(done: Run) -> None:
+    assert [e.witnesses for e in done.episodes] == [0, 1, 2, 3] * 6
     assert [e.danger_radio is None for e in done.episodes] == [e.danger == "none" for e in done.episodes]
-    scenario = LiveSource(0, 1, name).scenario
+    scenario = LiveSource(0, 1, EACH).scenario
     for e in done.episodes:
         made = scenario.layout(e.layout_seed, scenario.parameters)
         assert e.danger_radio == next((s.radio for s in made.spawns if s.id == made.danger_id), None)
@@ -37,14 +45,12 @@ def test_rows_have_witnesses_and_the_dangers_radio(small: Dataset, tmp_path: Pat
         own = [e.success for e in done.episodes if e.witnesses == k]
         score = done.score("single-local", metric)
         assert score is not None
-        assert (score.value, score.n, score.n_excluded) == (sum(own) / 2, 2, 6)
+        assert (score.value, score.n, score.n_excluded) == (sum(own) / 6, 6, 18)
 
 
 def test_dangers_stand_by_who_can_tell_of_them_beside_the_harmless_layouts(
-    small: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    done: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    name = "occluded-intersection:witnesses=each,radio_share=0.5"
-    done = driven(small, tmp_path / "run", name, "single-local", episodes=24)
     dangers = [e for e in done.episodes if e.danger != "none"]
     groups = {
         f"seen by {k}": [e for e in dangers if e.witnesses == k and not e.danger_radio] for k in range(4)
@@ -84,6 +90,7 @@ def test_where_none_are_declared_nothing_is_said(
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_without_a_witness_messages_make_up_no_gain(small: Dataset, tmp_path: Path) -> None:
     done = driven(
         small, tmp_path / "run", "occluded-intersection:witnesses=0", "single-local", "6g", episodes=12

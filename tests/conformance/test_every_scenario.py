@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import one_way_crossing
 import pytest
-from tiers import QUICK
+from together import act_together
 
 from harness.coordination.consensus import Messages, inverse_distance_weights
 from harness.coordination.trust import Trust
@@ -18,13 +18,21 @@ from harness.evaluate.claims import claims
 from harness.evaluate.live_world import look
 from harness.world import scenarios
 from harness.world.perception.graph import scene_graph, scene_graphs, truth_graph, truth_graphs
-from harness.world.reference import drive
+from harness.world.reference import finish
 from harness.world.scenario import Scenario
 from harness.world.state import Snapshot, WorldState
 from harness.world.world import World
 
-SEEDS = range(2 if QUICK else 6)
-UNLISTED = (0, 6 if QUICK else 40)  # layout seeds
+SEEDS = range(6)
+
+
+def some_or_the_rest(some: range, rest: range) -> pytest.MarkDecorator:
+    """Some layout seeds, and where everything is tested the rest of them."""
+    wide = pytest.param(rest, marks=pytest.mark.exhaustive)
+    return pytest.mark.parametrize("seeds", [some, wide], ids=["some", "the rest"])
+
+
+one_or_the_rest = some_or_the_rest(range(1), range(1, 6))
 
 
 @pytest.fixture(
@@ -56,12 +64,13 @@ def test_equal_seeds_are_equal_layouts_with_the_ego_first_and_its_helpers_next(s
     assert any(one != layouts[0] for one in layouts[1:])
 
 
-def test_whatever_is_not_its_danger_is_where_it_would_be_without_it(scenario: Scenario) -> None:
+@some_or_the_rest(range(10), range(10, 40))
+def test_whatever_is_not_its_danger_is_where_it_would_be_without_it(scenario: Scenario, seeds: range) -> None:
     p = scenario.parameters
     if not hasattr(p, "danger_share"):
         pytest.skip("no dial for dangers")
     safe: dict[str, Any] = {"danger_share": 0.0}
-    for seed in range(40):
+    for seed in seeds:
         found = scenario.layout(seed, p)
         without = scenario.layout(seed, replace(p, **safe))
         rest = [{s for s in of.spawns if s.id != found.danger_id} for of in (found, without)]
@@ -96,15 +105,17 @@ def test_it_travels_as_its_name_and_parameters(scenario: Scenario, monkeypatch: 
 
 
 def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(scenario: Scenario) -> None:
-    for action in scenario.actions:
-        world = World.start(scenario, 1)
-        world.act("SLOWER")
-        text = msgspec.json.encode((world.state(), world.snapshot()))
-        stored = msgspec.json.decode(text, type=tuple[WorldState, Snapshot])
-        thawed, branch = World.thaw(scenario, *stored), world.branch()
-        for then in (action, "IDLE"):
-            for one in (world, thawed, branch):
-                one.act(then)
+    start = World.start(scenario, 1)
+    start.act("SLOWER")
+    text = msgspec.json.encode((start.state(), start.snapshot()))
+    stored = msgspec.json.decode(text, type=tuple[WorldState, Snapshot])
+    every = [
+        (start.branch(), World.thaw(scenario, *stored), start.branch().branch()) for _ in scenario.actions
+    ]
+    acting = [world for worlds in every for world in worlds]
+    for actions in (scenario.actions, ("IDLE",) * len(every)):
+        act_together(acting, np.repeat(actions, 3).tolist())
+        for world, thawed, branch in every:
             assert branch.state() == world.state()
             # A state is kept to the micrometre.
             for mine, its in zip(thawed.state().vehicles, world.state().vehicles, strict=True):
@@ -113,16 +124,22 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(scenario: Scenario)
             assert thawed.outcome.result == world.outcome.result
 
 
-@pytest.mark.slow
-def test_a_driver_who_sees_everything_reaches_the_goal_and_one_who_waits_does_not(scenario: Scenario) -> None:
-    assert {drive(scenario, "full-view", seed).result for seed in SEEDS} == {"cleared"}
-    assert {drive(scenario, "brake", seed).result for seed in SEEDS} - {"cleared"}
+@one_or_the_rest
+def test_a_driver_who_sees_everything_reaches_the_goal_and_one_who_waits_does_not(
+    scenario: Scenario, seeds: range
+) -> None:
+    drivers = ["full-view", "brake"]
+    worlds = [World.start(scenario, seed) for seed in seeds for _ in drivers]
+    results = [outcome.result for outcome in finish(worlds, drivers * len(seeds))]
+    assert {*results[::2]} == {"cleared"}
+    assert {*results[1::2]} - {"cleared"}
 
 
-def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenario) -> None:
+@one_or_the_rest
+def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenario, seeds: range) -> None:
     """All that could speak against a helper is what it claims: everybody is undecided."""
     rule = Trust()
-    for seed in SEEDS:
+    for seed in seeds:
         world, moments = World.start(scenario, seed), list[Scene]()
         while len(moments) < scenario.parameters.decisions and not world.outcome.ended:
             moments.append(look(world, 0, seed, len(moments), ego_alone=False))
@@ -144,12 +161,15 @@ def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenar
             state = fused.state
 
 
-def test_a_graph_is_the_same_without_a_vehicle_that_it_does_not_list(scenario: Scenario) -> None:
+@some_or_the_rest(range(6), range(6, 40))
+def test_a_graph_is_the_same_without_a_vehicle_that_it_does_not_list(
+    scenario: Scenario, seeds: range
+) -> None:
     scenario = replace(scenario, parameters=replace(scenario.parameters, perception=2))
     looks, less = list[tuple[WorldState, str]](), list[tuple[WorldState, str, int]]()
-    for seed in range(*UNLISTED):
-        world = World.start(scenario, seed)
-        world.act(scenario.actions[seed % len(scenario.actions)])
+    worlds = [World.start(scenario, seed) for seed in seeds]
+    act_together(worlds, [scenario.actions[seed % len(scenario.actions)] for seed in seeds])
+    for world in worlds:
         state = world.state()
         looks += [(state, v.id) for v in (state.ego, *state.helpers)]
     graphs = scene_graphs(scenario, looks)
@@ -162,9 +182,10 @@ def test_a_graph_is_the_same_without_a_vehicle_that_it_does_not_list(scenario: S
     assert scenario.name == one_way_crossing.SCENARIO.name or len(less) > 5
 
 
-def test_many_viewers_see_together_what_each_sees_alone(scenario: Scenario) -> None:
+@one_or_the_rest
+def test_many_viewers_see_together_what_each_sees_alone(scenario: Scenario, seeds: range) -> None:
     states = []
-    for seed in SEEDS:
+    for seed in seeds:
         world = World.start(scenario, seed)
         for step in range(scenario.parameters.decisions):
             states.append(world.state())
@@ -177,12 +198,13 @@ def test_many_viewers_see_together_what_each_sees_alone(scenario: Scenario) -> N
     assert truths == [truth_graph(scenario, state) for state in states]
 
 
-def test_many_points_are_projected_as_each_alone_on_the_nearest_point(scenario: Scenario) -> None:
+@pytest.mark.parametrize("on_each", [20, pytest.param(60, marks=pytest.mark.exhaustive)])
+def test_many_points_are_projected_as_each_alone_on_the_nearest_point(
+    scenario: Scenario, on_each: int
+) -> None:
     road, rng, far_m = scenario.road(), np.random.default_rng(1), 2.2
     paths = list(road.paths.values())
-    on = np.concatenate(
-        [path.points[rng.integers(len(path.points), size=20 if QUICK else 60)] for path in paths]
-    )
+    on = np.concatenate([path.points[rng.integers(len(path.points), size=on_each)] for path in paths])
     beyond = np.concatenate([path.points[[0, -1]] for path in paths]) * 1.2
     points = np.concatenate(
         [on, on + rng.normal(0.0, far_m, on.shape), beyond, rng.uniform(-99, 99, on.shape)]

@@ -34,7 +34,7 @@ def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(h
     layouts = json.loads((small_path / "manifest.json").read_text())
     of = ("--episodes", layouts["episodes"], "--first-seed", layouts["seed"])
     run = tmp_path / "run"
-    code, out, err = harness("drive", *draw, *of, "--condition", "6g", "--workers", 2, "--out", run)
+    code, out, err = harness("drive", *draw, *of, "--condition", "6g", "--workers", 1, "--out", run)
     assert (code, err) == (0, "")
     assert f"n = 2 episodes × 1 channel seed; of layout seeds {layouts['seed']} to" in out
     assert (

@@ -1,6 +1,8 @@
 """Live episodes: a hand-played one, what latency does, and what episodes share."""
 
 from dataclasses import replace
+from functools import cache
+from itertools import product
 
 import msgspec
 import numpy as np
@@ -128,11 +130,17 @@ def test_an_episode_that_ends_while_a_decision_is_open_records_it_and_never_acts
     assert (episode.partner is not None, episode.fault, episode.least_gap_m) == (True, "ego", 0.0)
 
 
+@cache
+def by_reference(seed):
+    """How each reference driver ends a layout."""
+    return live.drive_all(SCENARIO, [seed])[0]
+
+
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("seed", [NO_DANGER, FROM_LEFT, ONCOMING])
 def test_a_driver_that_takes_the_lag_drives_as_the_reference_does(driver, seed):
     episodes = driven(spec(driver, first_seed=seed)).episodes
-    outcome = live.drive_all(SCENARIO, [seed])[0][driver]
+    outcome = by_reference(seed)[driver]
     assert len(episodes) == 6
     for episode in episodes:
         assert episode.success == outcome.success
@@ -161,11 +169,17 @@ def test_episodes_are_in_one_world_until_one_acts_otherwise():
                     ]
 
 
-@pytest.mark.slow
-def test_sharing_a_world_changes_nothing():
-    together = driven(spec(), (0, 1, 6))
-    alone = [driven(spec(points=(point,), seeds=(seed,)), (e,)) for point in POINTS.values()
-             for seed in (0, 1) for e in (0, 1, 6)]  # fmt: skip
+@pytest.mark.parametrize(
+    ("points", "seeds", "episodes"),
+    [
+        pytest.param((ALONE, POINTS["6g"]), (0,), (1, 6), marks=pytest.mark.slow),
+        pytest.param(tuple(POINTS.values()), (0, 1), (0, 1, 6), marks=pytest.mark.exhaustive),
+    ],
+)
+def test_sharing_a_world_changes_nothing(points, seeds, episodes):
+    together = driven(spec(points=points, seeds=seeds), episodes)
+    places = product(points, seeds, episodes)
+    alone = [driven(spec(points=(point,), seeds=(seed,)), (e,)) for point, seed, e in places]
     assert together.episodes == [episode for made in alone for episode in made.episodes]
     answers = {answer.id: answer for answer in together.answers}
     for made in alone:
@@ -175,10 +189,12 @@ def test_sharing_a_world_changes_nothing():
     assert sorted(map(repr, together.decisions.table.to_pylist())) == sorted(map(repr, apart))
 
 
-@pytest.mark.slow
-def test_who_is_driven_beside_changes_nothing():
-    together = driven(spec("proxy-faulty"), range(5))
-    apart = [driven(spec("proxy-faulty"), (e,)) for e in range(5)]
+@pytest.mark.parametrize(
+    "count", [pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.exhaustive)]
+)
+def test_who_is_driven_beside_changes_nothing(count):
+    together = driven(spec("proxy-faulty"), range(count))
+    apart = [driven(spec("proxy-faulty"), (e,)) for e in range(count)]
     rows = Decisions.concat([made.decisions for made in apart]).table.to_pylist()
     assert together.decisions.table.to_pylist() == rows
     assert together.answers == [answer for made in apart for answer in made.answers]
@@ -234,7 +250,7 @@ def test_messages_that_the_egos_model_fuses_take_a_second_inference():
     assert sum("+" in asked for asked in script.asked) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_language_model_in_float32_drives_alike_in_any_company():
     pytest.importorskip("torch", reason="needs the transformers extra")
     pytest.importorskip("transformers", reason="needs the transformers extra")

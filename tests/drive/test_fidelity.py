@@ -21,7 +21,7 @@ from harness.studies.fidelity import disagreements, fidelity
 
 Said = tuple[int, str, str]
 MODELS = ("proxy", "cruise", "brake", "local-view")
-LAYOUTS = ("--episodes", "4", "--first-seed", "100", "--seeds", "0:2", "--workers", "1")  # those of `small`
+LAYOUTS = ("--episodes", "4", "--first-seed", "100", "--seeds", "0", "--workers", "1")  # those of `small`
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def made(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of four models, each frozen and driven."""
     folder = tmp_path_factory.mktemp("fidelity")
     for model in MODELS:
-        evaluate(spec_of(small, model), folder / f"eval-{model}")
+        evaluate(spec_of(small, model, seeds=(0,)), folder / f"eval-{model}")
         drive = (*DRIVE, "--model", model, *LAYOUTS, "--quiet", "--out", str(folder / f"drive-{model}"))
         get_command(app)(drive, standalone_mode=False)
     return folder
@@ -51,7 +51,7 @@ def success(run: Path, condition: str) -> pd.Series:
 def test_episodes_are_paired_by_layout_condition_and_seed(runs: list[Path]) -> None:
     found = fidelity(runs)
     assert len(found.table) == 4 * 3
-    assert len(found.episodes) == 4 * 3 * 2 * 4
+    assert len(found.episodes) == 4 * 3 * 4
     row: Any
     for row in found.table.itertuples():
         frozen, closed = (success(Path(f"{kind}-{row.model}"), row.condition) for kind in ("eval", "drive"))

@@ -7,7 +7,7 @@ both worlds have the same places, shadowing and packets.
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,9 @@ from harness.runs import folder
 from harness.runs.folder import Run
 from harness.world.drivers import DRIVERS
 
-LAYOUTS = 40  # of the reference drivers, and half of them for the others, who take ten times as long
 ALONE, OVER_6G = POINTS["single-local"], POINTS["6g"]
 CONTENT = {name: named_point(f"6g:content={name}") for name in OF_HELPERS}
+WITHOUT_TEXT = tuple(point for name, point in CONTENT.items() if name != TEXT)
 SAME = (
     "layout_seed", "danger", "success", "failure", "time_s", "delay_s", "partner", "striker", "fault",
     "least_gap_m", "hard_brakings", "other_crashes", "decisions", "messages", "trigger_rate", "latency_ms",
@@ -50,30 +50,41 @@ def told(of: Run) -> dict[Place, tuple[list[Any], list[tuple[Any, ...]]]]:
     }
 
 
+def few_or_many(*case: Any, layouts: tuple[int, int]) -> Iterator[Any]:
+    """A case on a few layouts, and one on many where everything is tested."""
+    few, many = layouts
+    yield pytest.param(*case, few, marks=pytest.mark.slow)
+    yield pytest.param(*case, many, marks=pytest.mark.exhaustive)
+
+
 def off_lag(of: Run) -> set[Place]:
     """Episodes in which some decision took other than the lag's frames."""
     decisions = of.decisions.records(0, len(of.decisions))
     return {(d.condition, d.seed, d.episode) for d in decisions if d.off_lag}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("model", "points", "seeds", "least"),
+    ("model", "points", "seeds", "least", "layouts"),
     [
-        *((driver, (ALONE,), (0,), 1.0) for driver in DRIVERS),
-        ("proxy", (ALONE, OVER_6G), (0, 1), 0.8),
-        ("proxy", (named_point("its-g5"),), (0, 1), 0.5),
-        ("proxy-faulty", (ALONE, OVER_6G), (0, 1), 0.4),
-        ("proxy", tuple(point for name, point in CONTENT.items() if name != TEXT), (0,), 0.8),
-        ("swarm-tiny-six", (CONTENT[TEXT],), (0,), 0.8),
+        *(case for driver in DRIVERS for case in few_or_many(driver, (ALONE,), (0,), 1.0, layouts=(3, 40))),
+        *few_or_many("proxy", (ALONE, OVER_6G), (0, 1), 0.8, layouts=(2, 20)),
+        *few_or_many("proxy", (named_point("its-g5"),), (0, 1), 0.5, layouts=(2, 20)),
+        *few_or_many("proxy-faulty", (ALONE, OVER_6G), (0, 1), 0.4, layouts=(2, 20)),
+        *few_or_many("proxy", WITHOUT_TEXT, (0,), 0.8, layouts=(2, 20)),
+        *few_or_many("swarm-tiny-six", (CONTENT[TEXT],), (0,), 0.8, layouts=(1, 3)),
     ],
 )
 def test_what_the_tree_says_is_what_driving_gives(
-    tmp_path: Path, model: str, points: Sequence[OperatingPoint], seeds: Sequence[int], least: float
+    tmp_path: Path,
+    model: str,
+    points: Sequence[OperatingPoint],
+    seeds: Sequence[int],
+    least: float,
+    layouts: int,
 ) -> None:
     """Both by default. `least` is the share of episodes that is not left out, at least."""
     spoken = points == (CONTENT[TEXT],)
-    frozen = load(find(DATASET), LAYOUTS if model in DRIVERS else 3 if spoken else LAYOUTS // 2)
+    frozen = load(find(DATASET), layouts)
     how: dict[str, Any] = {"points": points, "seeds": seeds}
     if set(points) & {*CONTENT.values()}:  # the ego's second answer would come after the lag
         how |= {"latency": "ego=0.145,helper=0.145,fusion=0", "prompt": "v12" if spoken else "v2"}
@@ -93,8 +104,13 @@ def test_what_the_tree_says_is_what_driving_gives(
 CONFLICTS = ("least_ttc_s", "short_ttc", "least_pet_s", "short_pet")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("model", [*DRIVERS, "proxy"])
+@pytest.mark.parametrize(
+    "model",
+    [
+        *(pytest.param(model, marks=pytest.mark.slow) for model in ("cruise", "full-view", "proxy")),
+        *(pytest.param(model, marks=pytest.mark.exhaustive) for model in ("brake", "local-view")),
+    ],
+)
 def test_conflicts_in_a_tree_are_those_of_driving(tmp_path: Path, small: Dataset, model: str) -> None:
     """Of each decision and episode, on a tree that is built today; the shipped ones are older."""
     how: dict[str, Any] = {"points": (ALONE,), "seeds": (0,)}

@@ -1,7 +1,8 @@
 """A driven episode, played again and drawn."""
 
+import shutil
 import sys
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,11 @@ def out(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
-def test_an_episode_played_again_ends_as_it_did(out):
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.exhaustive), 7])
+def test_an_episode_played_again_ends_as_it_did(out, every):
+    """Every seventh row is of another layout and condition."""
     row: Any
-    for row in pd.read_csv(out / "episodes.csv", keep_default_na=False).itertuples():
+    for row in pd.read_csv(out / "episodes.csv", keep_default_na=False)[::every].itertuples():
         seen = list(stills(find(out, row.episode, row.condition, row.seed)))
         assert seen[-1].state.time_s == row.time_s
         # Who clears it, late or not, clears it in the played world.
@@ -56,18 +58,39 @@ def typed(monkeypatch, capsys, *words):
 
 
 @pytest.fixture(scope="module")
-def drawn(out, tmp_path_factory):
+def short(out, tmp_path_factory):
+    """The run, as if the time had been up after a decision: a dozen stills an episode."""
+    copy = shutil.copytree(out, tmp_path_factory.mktemp("short") / "run")
+    file = copy / "run.json"
+    file.write_text(file.read_text().replace('"time_limit_s": 10.0', '"time_limit_s": 0.4'))
+    assert 8 < len(list(stills(find(copy, 0, None, None)))) < 16
+    return copy
+
+
+@pytest.fixture(scope="module")
+def drawn(short, tmp_path_factory):
     """A GIF of its first episode by the command, and what that said."""
-    picture = tmp_path_factory.mktemp("drawn") / "episode.gif"
-    done = CliRunner().invoke(app, ["run", "video", str(out), "0", "--out", str(picture)])
+    return gif_of(short, tmp_path_factory.mktemp("drawn") / "episode.gif")
+
+
+def gif_of(run, picture):
+    done = CliRunner().invoke(app, ["run", "video", str(run), "0", "--out", str(picture)])
     return picture, (done.exit_code, done.stdout, done.stderr)
 
 
 @pytest.mark.slow
-def test_an_episode_is_drawn_as_a_gif_in_which_things_move(out, drawn):
-    picture, said = drawn
+def test_an_episode_is_drawn_as_a_gif_in_which_things_move(short, drawn):
+    things_move(short, *drawn)
+
+
+@pytest.mark.exhaustive
+def test_an_episode_is_drawn_to_its_end(out, tmp_path):
+    things_move(out, *gif_of(out, tmp_path / "episode.gif"))
+
+
+def things_move(run, picture, said):
     assert said[:2] == (0, f"wrote {picture}\n")
-    seen = list(stills(find(out, 0, None, None)))
+    seen = list(stills(find(run, 0, None, None)))
     with Image.open(picture) as image:
         frames = [frame.convert("RGB").tobytes() for frame in ImageSequence.Iterator(image)]
     assert len(frames) == len(seen)
@@ -75,20 +98,20 @@ def test_an_episode_is_drawn_as_a_gif_in_which_things_move(out, drawn):
 
 
 @pytest.mark.slow
-def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(out, tmp_path, monkeypatch, capsys):
+def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(short, tmp_path, monkeypatch, capsys):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     film = tmp_path / "episode.mp4"
-    assert typed(monkeypatch, capsys, "run", "video", out, 0, "--out", film)[:2] == (0, f"wrote {film}\n")
+    assert typed(monkeypatch, capsys, "run", "video", short, 0, "--out", film)[:2] == (0, f"wrote {film}\n")
     assert film.read_bytes()[4:8] == b"ftyp"
-    expected = 0.1 * len(list(stills(find(out, 0, None, None)))) + 2.4  # the last still stays
+    expected = 0.1 * len(list(stills(find(short, 0, None, None)))) + 2.4  # the last still stays
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
     assert (frames, seconds) == (round(10 * expected), pytest.approx(expected, abs=0.11))
     assert [p.name for p in tmp_path.iterdir()] == ["episode.mp4"]
 
 
 @pytest.mark.slow
-def test_the_same_episode_gives_the_same_gif(out, drawn, tmp_path):
-    write_video(find(out, 0, None, None), tmp_path / "again.gif", lambda done: None)
+def test_the_same_episode_gives_the_same_gif(short, drawn, tmp_path):
+    write_video(find(short, 0, None, None), tmp_path / "again.gif", lambda done: None)
     assert (tmp_path / "again.gif").read_bytes() == drawn[0].read_bytes()
 
 
@@ -114,6 +137,8 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
 @pytest.mark.slow
 def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, capsys):
     pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
+    # How each is drawn to its end is tested apart.
+    monkeypatch.setattr("harness.report.drawing.video.stills", lambda played: islice(stills(played), 2))
     words = ("--model", "cruise", "--condition", "single-local", "--seeds", "0,1", "--workers", 1)
     layouts = ("--episodes", 4, "--first-seed", FROM_LEFT - 1)
     out = tmp_path / "run"

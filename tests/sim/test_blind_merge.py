@@ -5,10 +5,10 @@ from dataclasses import replace
 import former
 import pytest
 from msgspec import structs
+from together import drive_together, go_on_together
 
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
-from harness.world.reference import drive
 from harness.world.scenarios.blind_merge import RAMP_M, layout, road
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import World
@@ -60,10 +60,10 @@ def test_it_lets_go_first_who_is_on_its_lane_and_minds_nobody_on_the_other():
 def test_who_sees_everything_clears_and_who_cruises_meets_a_danger_or_nobody():
     dangerous = [seed for seed, found in LAYOUTS.items() if found.danger]
     free = [seed for seed, found in LAYOUTS.items() if not found.danger]
-    assert all(drive(SCENARIO, "full-view", seed).success for seed in dangerous[:4])
-    assert {drive(SCENARIO, "cruise", seed).partner for seed in free[:4]} == {None}
-    met = {drive(SCENARIO, "cruise", seed).partner == LAYOUTS[seed].danger_id for seed in dangerous[:6]}
-    assert True in met
+    assert all(out.success for out in drive_together(SCENARIO, "full-view", dangerous[:4]).values())
+    assert {out.partner for out in drive_together(SCENARIO, "cruise", free[:4]).values()} == {None}
+    cruising = drive_together(SCENARIO, "cruise", dangerous[:6])
+    assert any(out.partner == LAYOUTS[seed].danger_id for seed, out in cruising.items())
 
 
 def test_cars_come_when_they_are_drawn_to_and_at_one_band_of_speeds():
@@ -82,11 +82,9 @@ def test_cars_come_when_they_are_drawn_to_and_at_one_band_of_speeds():
 
 @pytest.mark.slow
 def test_nobody_but_the_ego_touches_anybody():
-    for seed in range(15):
-        world = World.start(SCENARIO, seed)
-        world.take("SLOWER")
-        world.advance(round(P.time_limit_s * P.simulation_hz))
-        assert world.outcome.other_crashes == 0
+    worlds = [World.start(SCENARIO, seed) for seed in range(15)]
+    go_on_together(worlds, "SLOWER")
+    assert all(world.ended and world.outcome.other_crashes == 0 for world in worlds)
 
 
 @pytest.mark.parametrize("back_m", [10.0, 30.0, 44.0])

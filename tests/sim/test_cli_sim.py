@@ -54,7 +54,7 @@ def test_a_scenario_check_states_rates_intervals_and_n(harness):
     assert (success["value"], success["high"], success["n"]) == (1.0, 1.0, 3)
     assert found["drivers"]["brake"]["time_out"]["value"] == 1.0
     code, out, _ = harness(
-        "dataset", "scenario", "drive", NAME, "--episodes", 3, "--seed", 178, "--workers", 2
+        "dataset", "scenario", "drive", NAME, "--episodes", 3, "--seed", 178, "--workers", 1
     )
     assert code == 0
     assert out.startswith(f"{NAME}, scenes of v2v-safety-2")

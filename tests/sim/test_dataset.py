@@ -15,6 +15,7 @@ import msgspec
 import pytest
 from evaluating import scenes_of
 from former import SCENARIO
+from together import act_together
 
 from harness.core.errors import UserError
 from harness.core.files import canonical_json, sha256_bytes
@@ -38,6 +39,24 @@ def contents(folder):
 
 
 @pytest.mark.slow
+def test_a_build_that_was_stopped_and_is_continued_has_the_bytes_of_an_undisturbed_one(two_path, tmp_path):
+    out, done = tmp_path / two_path.name, []
+
+    def stopping(count):
+        done.append(count)
+        if sum(done) == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        build(SCENARIO, out, 2, 5, 1, stopping)
+    assert not (out / "manifest.json").exists()
+    again = []
+    build(SCENARIO, out, 2, 5, 1, again.append)
+    assert again == [1, 1], "the one that was there, and the other"
+    assert contents(out) == contents(two_path)
+
+
+@pytest.mark.exhaustive
 def test_a_build_killed_half_way_and_continued_by_two_workers_has_the_bytes_of_an_undisturbed_one(
     small_folder, tmp_path
 ):
@@ -153,34 +172,36 @@ def test_poses_are_kept_to_the_micrometre_so_that_other_machines_write_the_same(
 def test_an_edge_leads_where_the_thawed_world_goes(small):
     """Thawed to the micrometre, so positions agree to a millimetre, and ends to the frame."""
     forest = small.forest
-    for n in range(0, len(forest.ids), 37):
-        [scene] = small.scenes([forest.ids[n]])
-        for place, action in enumerate(small.actions):
-            world = World.thaw(SCENARIO, scene.state, scene.record.snapshot)
-            world.act(action)
-            child = int(forest.child[n, place])
-            if child < 0:
-                end = forest.end(int(forest.edge[n, place]))
-                assert (world.outcome.result, world.outcome.time_s) == (end.result, end.time_s)
-                assert (world.outcome.partner, world.outcome.fault) == (end.partner, end.fault)
-                continue
-            [there] = small.scenes([forest.ids[child]])
-            for mine, its in zip(world.state().vehicles, there.state.vehicles, strict=True):
-                assert (mine.x_m, mine.y_m) == pytest.approx((its.x_m, its.y_m), abs=1e-3)
-                assert mine.speed_mps == pytest.approx(its.speed_mps, abs=1e-3)
+    for n, place, world in acted(small, range(0, len(forest.ids), 37)):
+        child = int(forest.child[n, place])
+        if child < 0:
+            end = forest.end(int(forest.edge[n, place]))
+            assert (world.outcome.result, world.outcome.time_s) == (end.result, end.time_s)
+            assert (world.outcome.partner, world.outcome.fault) == (end.partner, end.fault)
+            continue
+        [there] = small.scenes([forest.ids[child]])
+        for mine, its in zip(world.state().vehicles, there.state.vehicles, strict=True):
+            assert (mine.x_m, mine.y_m) == pytest.approx((its.x_m, its.y_m), abs=1e-3)
+            assert mine.speed_mps == pytest.approx(its.speed_mps, abs=1e-3)
+
+
+def acted(small, nodes):
+    """A node, the place of an action, and the world after it, for every action in some nodes."""
+    places = [(n, place) for n in nodes for place in range(len(small.actions))]
+    scenes = small.scenes([small.forest.ids[n] for n, _ in places])
+    worlds = [World.thaw(SCENARIO, scene.state, scene.record.snapshot) for scene in scenes]
+    act_together(worlds, [small.actions[place] for _, place in places])
+    return [(n, place, world) for (n, place), world in zip(places, worlds, strict=True)]
 
 
 @pytest.mark.slow
 def test_what_becomes_of_an_action_with_the_full_view_driver_is_what_it_drives(small):
     forest = small.forest
-    for n in forest.visited(forest.drivers["cruise"]).tolist()[::5]:
-        [scene] = small.scenes([forest.ids[n]])
-        for place, action in enumerate(small.actions):
-            world = World.thaw(SCENARIO, scene.state, scene.record.snapshot)
-            world.act(action)
-            end = forest.end(int(forest.then_full_view[n, place]))
-            [outcome] = finish([world], ["full-view"])
-            assert (outcome.result, outcome.time_s) == (end.result, end.time_s)
+    some = acted(small, forest.visited(forest.drivers["cruise"]).tolist()[::5])
+    outcomes = finish([world for *_, world in some], ["full-view"] * len(some))
+    for (n, place, _), outcome in zip(some, outcomes, strict=True):
+        end = forest.end(int(forest.then_full_view[n, place]))
+        assert (outcome.result, outcome.time_s) == (end.result, end.time_s)
 
 
 def test_actions_that_come_to_the_same_are_one_edge(small):

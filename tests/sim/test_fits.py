@@ -94,7 +94,7 @@ def test_every_frozen_record_and_tree_fits(small: Dataset):
 
 
 @pytest.mark.slow
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data())
 def test_a_changed_record_fits_where_the_published_schema_says_so(small: Dataset, data: st.DataObject):
     record = changed(plain(data.draw(st.sampled_from(scenes_of(small))).record), data)
@@ -109,7 +109,8 @@ def test_a_changed_record_fits_where_the_published_schema_says_so(small: Dataset
 @given(data=st.data())
 def test_a_changed_tree_fits_where_the_published_schema_says_so(small: Dataset, data: st.DataObject):
     tree = msgspec.to_builtins(data.draw(st.sampled_from(small.trees)))
-    tree["levels"] = tree["levels"][-2:]  # so that not every draw is of the middle of a large one
+    # So that not every draw is of the middle of a large one.
+    tree["levels"] = [level[:3] for level in tree["levels"][-2:]]
     tree = changed(tree, data)
     valid = WholeNumbers(tree_schema()).is_valid(tree)
     if WholeNumbers(released_schema("tree")).is_valid(tree):
@@ -118,7 +119,7 @@ def test_a_changed_tree_fits_where_the_published_schema_says_so(small: Dataset, 
 
 
 @pytest.mark.slow
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data())
 def test_a_changed_manifest_fits_where_the_published_schema_says_so(
     released: dict[str, Any], data: st.DataObject

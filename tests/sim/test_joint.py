@@ -1,6 +1,7 @@
 """Plans for all agents together, and the table of policies beside them."""
 
 import json
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
@@ -11,9 +12,11 @@ from harness.core.arrays import Bools
 from harness.world import joint, policies, scenarios
 from harness.world.joint import NEVER_S, Options, Search
 from harness.world.policies import JOINT, Fate, summary
+from harness.world.scenario import Scenario
 
 SCENES = [f"{name}:agent_share=1" for name in scenarios.names() if scenarios.get(name).seats]
 TWO = "all-way-crossing:agent_share=1"
+FEW = (TWO, "platoon-merge:agent_share=1")
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +25,13 @@ def able() -> dict[int, Options]:
     return joint.options(scenarios.get(TWO), [2])[2]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in FEW else pytest.mark.exhaustive)
+        for name in SCENES
+    ],
+)
 def test_what_a_plan_promises_the_simulator_does(name: str) -> None:
     scenario = scenarios.get(name)
     plan, world = joint.plans(scenario, joint.options(scenario, [1]))[1]
@@ -119,8 +127,20 @@ def test_all_policies_drive_the_same_layouts_and_none_beats_the_plan() -> None:
 
 
 @pytest.mark.slow
-def test_a_check_of_agents_states_figures_with_intervals_and_n(harness: Any) -> None:
-    command = ("dataset", "scenario", "drive", "all-way-crossing", "--agents", "all", "--episodes", 2)
+def test_a_check_of_agents_states_figures_with_intervals_and_n(
+    harness: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its layout is driven once, for both ways to tell of it."""
+    drive_all, driven = policies.drive_all, dict[Any, Any]()
+
+    def remembered(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]:
+        key = scenario.name, tuple(seeds)
+        if key not in driven:
+            driven[key] = drive_all(scenario, seeds)
+        return list(driven[key])
+
+    monkeypatch.setattr(policies, "drive_all", remembered)
+    command = ("dataset", "scenario", "drive", "all-way-crossing", "--agents", "all", "--episodes", 1)
     code, out, _ = harness(*command, "--workers", 1, "--json")  # where it is slow, it says how far it is
     found = json.loads(out)
     assert (code, found["scenario"]) == (0, "all-way-crossing:agent_share=1")

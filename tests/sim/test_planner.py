@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from former import SCENARIO, SETTINGS
 from msgspec import structs
+from together import act_together, drive_together
 
-from harness.world import planner, scenarios
+from harness.world import lockstep, planner, scenarios
 from harness.world.drivers import DRIVERS, choose
 from harness.world.perception.graph import truth_graph, truth_graphs
 from harness.world.planner import (
@@ -21,7 +22,6 @@ from harness.world.planner import (
     plans,
     predicted,
 )
-from harness.world.reference import drive
 from harness.world.state import SIZES_M, VehicleState, WorldState
 from harness.world.world import World
 
@@ -119,7 +119,8 @@ def test_who_overtakes_plans_the_way_back_under_limits_2():
     seeds = 200006, 201020, 202134  # no danger, and a car that comes long after
     for limits, results in ((1, ["time_out", "time_out", "collision"]), (2, ["cleared"] * 3)):
         scenario = scenarios.get(f"do-not-pass:{SETTINGS},limits={limits}")
-        assert [drive(scenario, "full-view", seed).result for seed in seeds] == results
+        driven = drive_together(scenario, "full-view", seeds)
+        assert [driven[seed].result for seed in seeds] == results
 
 
 def test_only_the_full_view_driver_reads_the_truth():
@@ -133,12 +134,10 @@ def test_only_the_full_view_driver_reads_the_truth():
 @pytest.mark.parametrize("name", scenarios.names())
 def test_many_graphs_are_planned_together_as_each_alone(name):
     scenario = scenarios.get(name)
-    states = []
-    for seed in range(4):
-        world = World.start(scenario, seed)
-        for step in range(4):
-            states.append(world.state())
-            world.act(scenario.actions[(seed + step) % len(scenario.actions)])
+    states, worlds = [], [World.start(scenario, seed) for seed in range(4)]
+    for step in range(3):
+        states += [world.state() for world in worlds]
+        act_together(worlds, [scenario.actions[(seed + step) % len(scenario.actions)] for seed in range(4)])
     graphs = truth_graphs(scenario, states)
     assert plans(scenario, graphs) == [plan(scenario, graph) for graph in graphs]
 
@@ -148,9 +147,9 @@ def test_gaps_are_those_of_all_moments_wherever_the_ego_would_touch_somebody(nam
     """Moments in which two are far apart are left out; what is left decides each gap that is not wide."""
     scenario, rng = scenarios.get(name), np.random.default_rng(0)
     road, touched = scenario.road(), 0
-    for seed in range(12):
-        world = World.start(scenario, seed)
-        world.advance(50)
+    worlds = [World.start(scenario, seed) for seed in range(8)]
+    lockstep.advance(worlds, [50] * len(worlds))
+    for world in worlds:
         graph = truth_graph(scenario, world.state())
         speeds = rng.uniform(0.0, 14.0, (8, 1))
         travelled = speeds * STEP_S * np.arange(1, 91)

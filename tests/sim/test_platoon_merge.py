@@ -5,10 +5,10 @@ from itertools import pairwise
 
 import pytest
 from msgspec import structs
+from together import drive_together
 
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
-from harness.world.reference import drive
 from harness.world.scenarios.blind_merge import RAMP_M
 from harness.world.scenarios.platoon_merge import MAIN, SCENARIO, Parameters, layout, road, seats
 from harness.world.state import VehicleState, WorldState
@@ -118,9 +118,9 @@ def test_a_car_on_the_left_lane_is_nobodys_business():
 
 @pytest.mark.slow
 def test_who_sees_everything_clears_and_who_cruises_meets_agents_and_dangers():
-    cruising = {seed: drive(SCENARIO, "cruise", seed) for seed in range(60)}
+    cruising = drive_together(SCENARIO, "cruise", range(60))
     met = [LAYOUTS[seed].danger_id == out.partner for seed, out in cruising.items() if not out.success]
     assert 0.3 < len(met) / len(cruising) < 0.7
     assert 0.1 < sum(met) / len(met) < 0.9
-    assert all(drive(SCENARIO, "full-view", seed).success for seed in range(8))
+    assert all(out.success for out in drive_together(SCENARIO, "full-view", range(8)).values())
     assert all(out.other_crashes == 0 for out in cruising.values())

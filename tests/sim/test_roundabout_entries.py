@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from msgspec.structs import replace as replaced
+from together import drive_together
 
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
-from harness.world.reference import drive
 from harness.world.scenarios.roundabout_entries import (
     PLACE,
     SCENARIO,
@@ -170,8 +170,8 @@ def test_an_agent_has_cleared_where_it_has_left_the_ring_past_the_next_entry(arm
 
 @pytest.mark.slow
 def test_who_sees_everything_clears_and_who_cruises_meets_agents_and_dangers():
-    cruising = {seed: drive(SCENARIO, "cruise", seed) for seed in range(60)}
+    cruising = drive_together(SCENARIO, "cruise", range(60))
     met = [LAYOUTS[seed].danger_id == out.partner for seed, out in cruising.items() if not out.success]
     assert 0.6 < len(met) / len(cruising) < 0.95
     assert 0.1 < sum(met) / len(met) < 0.9
-    assert all(drive(SCENARIO, "full-view", seed).success for seed in range(8))
+    assert all(out.success for out in drive_together(SCENARIO, "full-view", range(8)).values())

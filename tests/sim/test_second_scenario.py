@@ -142,6 +142,8 @@ def test_the_command_drives_and_evaluates_it_and_reports(harness, folder):
     ran = harness("eval", "--model", "proxy", "--dataset", folder, "--out", "run")
     assert ran[0] == 0, ran
     assert harness("report", "run", "--out", "page.html")[0] == 0
-    drove = harness("drive", "--scenario", NAME, "--episodes", "2", "--seeds", "0", "--out", "driven")
+    drove = harness(
+        "drive", "--scenario", NAME, "--episodes", "2", "--seeds", "0", "--workers", "1", "--out", "driven"
+    )
     assert drove[0] == 0, drove
     assert harness("report", "driven", "--out", "driven.html")[0] == 0

@@ -15,6 +15,7 @@ from frames import highway_envs_frame, poses
 from highway_env.envs.intersection_env import IntersectionEnv
 from highway_env.vehicle.behavior import IDMVehicle
 from msgspec import to_builtins
+from together import act_together
 
 from harness.core.files import digest
 from harness.world.lockstep import Fleet
@@ -89,20 +90,31 @@ def test_an_unhindered_cruise_clears_when_the_distance_is_covered():
     assert (outcome.result, outcome.time_s) == ("cleared", pytest.approx(frames / P.simulation_hz))
 
 
-@pytest.mark.slow
-def test_the_same_seed_is_the_same_episode_whatever_ran_before_in_the_process():
+def after_others(*names):
+    """A trajectory's digest where environments of highway-env and another episode ran before."""
     defaults = (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
     try:
-        for name in ("intersection-v0", "highway-v0"):  # the first writes to a class that others share
+        for name in names:
             env = gymnasium.make(name)
             env.reset(seed=3)
             for _ in range(3):
                 env.step(1)
             env.close()
         drive(SCENARIO, "brake", 3)
-        here = digest(trajectory(ONCOMING))
+        return digest(trajectory(ONCOMING))
     finally:
         IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN = defaults
+
+
+@pytest.mark.slow
+def test_the_same_seed_is_the_same_episode_whatever_ran_before():
+    """intersection-v0 writes to a class that others share."""
+    assert after_others("intersection-v0") == digest(trajectory(ONCOMING))
+
+
+@pytest.mark.exhaustive
+def test_the_same_seed_is_the_same_episode_in_a_process_of_its_own():
+    here = after_others("intersection-v0", "highway-v0")
     code = (
         f"import sys; sys.path[:0] = {[str(folder) for folder in Path(__file__).parents[:2]]!r}; "
         "from harness.core.files import digest; import test_world as t; "
@@ -118,9 +130,17 @@ def test_a_world_leaves_highway_envs_classes_as_they_were():
     assert before == (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
 
 
-@pytest.mark.parametrize("seed", [NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING, 3, 12])
 @pytest.mark.parametrize(
-    "actions", [("IDLE",) * 6, ("SLOWER", "FASTER", "SLOWER", "SLOWER", "FASTER", "IDLE")]
+    ("seed", "actions"),
+    [
+        (FROM_LEFT, ("IDLE",) * 6),
+        (ONCOMING, ("SLOWER", "FASTER", "SLOWER", "IDLE")),
+        *(
+            pytest.param(seed, actions, marks=pytest.mark.exhaustive)
+            for seed in (NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING, 3, 12)
+            for actions in (("IDLE",) * 6, ("SLOWER", "FASTER", "SLOWER", "SLOWER", "FASTER", "IDLE"))
+        ),
+    ],
 )
 def test_frames_are_highway_envs_to_the_last_bit(seed, actions):
     ours, theirs = World.start(SCENARIO, seed), World.start(SCENARIO, seed)
@@ -158,7 +178,9 @@ def test_two_seeds_are_two_episodes():
     assert digest(trajectory(FROM_LEFT)) != digest(trajectory(FROM_RIGHT))
 
 
-@pytest.mark.parametrize("seed", [FROM_RIGHT, FROM_LEFT, ONCOMING])
+@pytest.mark.parametrize(
+    "seed", [pytest.param(FROM_RIGHT, marks=pytest.mark.exhaustive), FROM_LEFT, ONCOMING]
+)
 def test_a_collision_ends_the_episode_in_the_frame_in_which_outlines_meet(seed):
     world = World.start(SCENARIO, seed)
     gaps = []
@@ -253,27 +275,26 @@ def alike(one, other):
 def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(seed):
     world = World.start(SCENARIO, seed)
     for behaviour in ("IDLE", "SLOWER", "SLOWER", "FASTER"):
-        for action in ACTIONS:
-            thawed, original = through_json(world), world.branch()
+        thawed, originals = ([make(world) for _ in ACTIONS] for make in (through_json, World.branch))
+        for original in originals:
             original.journey.outcome = Outcome()  # what happened before is not part of a frozen world
-            for then in (action, "IDLE"):
-                thawed.act(then)
-                original.act(then)
-                assert alike(thawed, original)
-                assert thawed.snapshot() == original.snapshot()
-            assert close(asdict(thawed.outcome), asdict(original.outcome))
+        for then in (ACTIONS, ("IDLE",) * len(ACTIONS)):
+            act_together([*thawed, *originals], 2 * then)
+            for one, other in zip(thawed, originals, strict=True):
+                assert alike(one, other)
+                assert one.snapshot() == other.snapshot()
+        for one, other in zip(thawed, originals, strict=True):
+            assert close(asdict(one.outcome), asdict(other.outcome))
         world.act(behaviour)
 
 
 @pytest.mark.slow
 def test_many_seeds_thaw_at_every_step_to_the_same_next_second():
-    for seed in range(20, 32):
-        world = World.start(SCENARIO, seed)
-        for action in ("IDLE", "FASTER", "SLOWER"):
-            thawed = through_json(world)
-            world.act(action)
-            thawed.act(action)
-            assert alike(thawed, world)
+    worlds = [World.start(SCENARIO, seed) for seed in range(20, 32)]
+    for action in ("IDLE", "FASTER", "SLOWER"):
+        thawed = [through_json(world) for world in worlds]
+        act_together([*worlds, *thawed], [action] * 2 * len(worlds))
+        assert all(map(alike, thawed, worlds))
 
 
 @pytest.mark.usefixtures("asleep_at_the_wheel")
