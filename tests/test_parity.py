@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
@@ -25,6 +24,8 @@ from harness.dataset.load import Dataset
 from harness.evaluate.asking import requests
 from harness.training.gguf_export import export
 from harness.training.parity import PASSES, Finding, compare
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 PROMPTS = 3
 

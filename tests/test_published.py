@@ -10,7 +10,6 @@ import former
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -38,6 +37,8 @@ from harness.training.questions import value
 from harness.training.train import Plan, fitting
 from harness.world.reference import drive, finish
 from harness.world.world import World
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 BASE = cards.resolve("swarm-tiny", "transformers")
 PLAN = Plan(
