@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from harness.core.files import canonical_json, sha256_bytes
 from harness.training import lessons
 from harness.world.scenario import Scenario
 
@@ -30,7 +31,9 @@ def drawn_by(once: Any) -> Callable[[Scenario, int, int], list[lessons.Point]]:
         def fill(file: Path) -> None:
             file.write_bytes(msgspec.json.encode(few_points(scenario, seed, number)))
 
-        file = once(f"lessons-{scenario.name}-{seed}-{number}", fill)
+        # A scenario's name does not tell its settings.
+        settings = sha256_bytes(canonical_json(scenario.parameters.stated()).encode())[:16]
+        file = once(f"lessons-{scenario.name}-{settings}-{seed}-{number}", fill)
         return msgspec.json.decode(file.read_bytes(), type=list[lessons.Point])
 
     return points

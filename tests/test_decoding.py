@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -34,6 +33,8 @@ from harness.dataset.load import Dataset
 from harness.evaluate.asking import requests
 from harness.parsing.parse import parse
 from harness.prompts import readout
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 LANES = ("LANE_LEFT", "IDLE", "LANE_RIGHT")

@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -40,6 +39,8 @@ from harness.training.questions import Question, alone, excerpts, kl_nats, with_
 from harness.training.train import STAGES, Plan, Sample, _batches
 from harness.world.reference import drive, finish
 from harness.world.world import World
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 PLAN = Plan({"excerpts": 16, "alone": 16, "messages": 16, "answers": 16}, batch=4)
 CROSSING, PASSING = former.SCENARIO, former.scenes("do-not-pass")

@@ -13,7 +13,6 @@ from msgspec import structs
 
 from harness.world.scene_graph import Node
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("highway_env", reason="needs the sim extra")
 
@@ -43,6 +42,8 @@ from harness.training.questions import Question, alone
 from harness.training.student import Student
 from harness.training.train import Plan
 from harness.world.perception.camera import Sight
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 VERSIONS = (prompts.load("v7"), prompts.load("v8"))
 PLAN = Plan({"excerpts": 4, "alone": 4, "messages": 8, "answers": 6}, batch=2)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 
 import tiny_vl
@@ -19,6 +18,8 @@ from harness.backends.base import Request
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.core.image import Image
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 

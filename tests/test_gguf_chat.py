@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -16,6 +15,8 @@ import tiny_qwen3
 from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.chat_template import ChatTemplate
 from harness.core.errors import UserError
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 MESSAGES = (
     {"role": "system", "content": "You drive.\n <b>é</b> & 'don't' 日本"},

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -19,6 +18,8 @@ from gguf import GGUFReader, TokenType
 from harness.backends.tokens import tokenizer
 from harness.core.errors import UserError
 from harness.training.gguf_export import export
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -18,6 +17,8 @@ from test_gguf_export import edit, remove, save_weights, tensors, weights_of
 
 from harness.core.errors import UserError
 from harness.training.gguf_export import export, projector_of
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 
 @pytest.fixture(scope="module")

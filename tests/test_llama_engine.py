@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
@@ -38,6 +37,8 @@ from harness.dataset.load import Dataset
 from harness.evaluate.asking import requests
 from harness.prompts import readout
 from harness.training.gguf_export import export
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 VOCABULARY = 375
 

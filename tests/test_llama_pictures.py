@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
@@ -39,6 +38,8 @@ from harness.core.files import sha256_file
 from harness.core.image import Image
 from harness.training.gguf_export import export, projector_of
 from harness.training.parity import compare
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 # llama.cpp rounds pixels, their patches' weights and GELU to half precision, in files of any precision; the
 # weights here are so large that two pictures differ by a hundred times as much.

@@ -10,7 +10,6 @@ import former
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -38,6 +37,8 @@ from harness.training.questions import value
 from harness.training.train import Plan, fitting
 from harness.world.reference import drive, finish
 from harness.world.world import World
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 BASE = cards.resolve("swarm-tiny", "transformers")
 PLAN = Plan(
@@ -308,7 +309,8 @@ def test_layouts_with_a_danger_weigh_as_much_as_those_without() -> None:
 
 def test_the_value_rises_where_it_is_what_is_learnt(tmp_path: Path) -> None:
     samples = {"excerpts": 0, "alone": 16, "messages": 8, "answers": 0}
-    plan = replace(PLAN, samples=samples, objective="values")
+    # At this rate the value rises by a fifth, far from what other hardware rounds.
+    plan = replace(PLAN, samples=samples, objective="values", adapt=Adapt(rank=4, rate=1e-1))
     facts = distill(CURRICULUM, plan, tmp_path / "pupil", silent, silent, "cpu")
     assert facts["curves"]["messages"][-1][3] > facts["curves"]["alone"][0][3]
     assert len(facts["curves"]["messages"]) == 2

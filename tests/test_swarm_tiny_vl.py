@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from evaluating import spec_of, with_ego
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
 pytest.importorskip("highway_env", reason="needs the sim extra")
@@ -24,6 +23,8 @@ from harness.evaluate.asking import requests
 from harness.training.answers import cells
 from harness.training.train import Sample, hidden_states
 from harness.world.perception.camera import Sight
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 MODEL, FOLDER = "swarm-tiny-vl", Path(__file__).parents[1] / "models" / "swarm-tiny-vl"
 SCENES = 5

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -29,6 +28,8 @@ from harness.backends.language_model import LanguageModel
 from harness.backends.registry import missing, open_backend
 from harness.backends.weights import find_checkpoint
 from harness.core.errors import UserError
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
@@ -20,6 +19,8 @@ from harness.backends.transformers import memory
 from harness.backends.transformers import session as reading
 from harness.backends.transformers.memory import LEAST_TOKENS, Prefix, Prefixes
 from harness.backends.transformers.session import Reader
+
+pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
 SHAPE: dict[str, Any] = {
     "vocab_size": 64, "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2,
