@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -96,6 +96,7 @@ def heard(draw: Any) -> tuple[Any, Any]:
 
 @pytest.mark.parametrize("rule", POOLS)
 @given(case=heard())
+@settings(max_examples=30)
 def test_whatever_the_rule_a_policy_is_a_distribution_and_lies_between_those_heard(rule: str, case: Any):
     p, weights = case
     fused = POOLS[rule](p, weights)
@@ -107,6 +108,7 @@ def test_whatever_the_rule_a_policy_is_a_distribution_and_lies_between_those_hea
 
 @pytest.mark.parametrize("rule", POOLS)
 @given(case=heard(), data=st.data())
+@settings(max_examples=30)
 def test_the_order_of_helpers_changes_no_policy(rule: str, case: Any, data: Any):
     p, weights = case
     order = [0, *data.draw(st.permutations(range(1, p.shape[1])))]
@@ -115,6 +117,7 @@ def test_the_order_of_helpers_changes_no_policy(rule: str, case: Any, data: Any)
 
 @pytest.mark.parametrize("rule", POOLS)
 @given(case=heard())
+@settings(max_examples=30)
 def test_many_decisions_at_once_are_each_of_them_alone(rule: str, case: Any):
     p, weights = case
     batched = POOLS[rule](p, weights)

@@ -101,7 +101,7 @@ def test_never_is_never_and_always_is_always(share: float) -> None:
     assert {draw_failure(failures, name) for name in made_up(2000)} == {expected}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_intervals_cover_the_declared_rate_as_often_as_they_say() -> None:
     """The failed rate of 400 runs of 150 answers each, by the interval of the summary: 95 % of them."""
     truth = sum(share for how, share in FAULTY.texts.items() if how in FAILED)

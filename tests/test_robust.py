@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -100,6 +100,7 @@ def agreed(draw: Any) -> tuple[np.ndarray, np.ndarray, int]:
 
 @pytest.mark.parametrize("rule", HEADS)
 @given(case=agreed())
+@settings(max_examples=30)
 def test_no_single_helper_flips_a_decision_on_which_all_others_agree(rule: str, case: Any):
     p, distance_m, choice = case
     assert decided(rule, messages(p, distance_m)) == choice
@@ -110,6 +111,7 @@ def test_no_single_helper_flips_a_decision_on_which_all_others_agree(rule: str, 
     p=arrays(float, (4, 3), elements=st.floats(0.01, 1)),
     heard=st.lists(st.booleans(), min_size=3, max_size=3),
 )
+@settings(max_examples=30)
 def test_every_rule_gives_a_distribution_and_the_egos_own_where_it_is_alone(rule: str, p: Any, heard: Any):
     told = messages(p / p.sum(axis=-1, keepdims=True), [10, 10, 10, 10], heard=heard)
     fused = RULES[rule].fuse(told, RULES[rule].start((), 3, 3))

@@ -23,6 +23,7 @@ BUSY = LteMode4(density_per_km=200.0)
 NR = NrMode2(density_per_km=200.0)
 NOISE_DBM = -95 + 10 * np.log10(10 / 50)
 LOST = block_error("lte-qpsk-0.7-190B")
+RADIOS = BUSY, replace(BUSY, subchannels=2), replace(BUSY, environment="tr37885-urban"), NR
 
 
 def place(distances_m, sight=CLEAR, corner_m=np.nan):
@@ -122,24 +123,32 @@ def test_what_stands_between_and_the_corner_cost_reception():
     assert QUIET.loss(place([50 * np.sqrt(2)], BUILDING, 50.0), z, 800.0)[0] == 1.0
 
 
-@pytest.mark.slow
-@settings(deadline=None, max_examples=20)
+@pytest.mark.exhaustive
+@settings(deadline=None, max_examples=25)
 @given(
     density=st.floats(0, 400),
     more=st.floats(1, 200),
     rate=st.sampled_from([5.0, 10.0, 20.0]),
-    radio=st.sampled_from(
-        [BUSY, replace(BUSY, subchannels=2), replace(BUSY, environment="tr37885-urban"), NR]
-    ),
+    radio=st.sampled_from(RADIOS),
 )
 def test_more_load_never_helps_and_distance_never_helps(density, more, rate, radio):
+    no_help(density, more, rate, radio)
+
+
+@pytest.mark.parametrize("radio", RADIOS)
+def test_twice_the_vehicles_never_help_and_distance_never_helps(radio):
+    no_help(density=90.0, more=90.0, rate=10.0, radio=radio)
+
+
+def no_help(density, more, rate, radio):
     distances_m = np.arange(20.0, 600, 40)
     light, heavy = (replace(radio, density_per_km=d, rate_hz=rate) for d in (density, density + more))
-    assert np.all(np.diff(light.reception(distances_m)) <= 2e-3)
+    received = light.reception(distances_m)
+    assert np.all(np.diff(received) <= 2e-3)
     # The evenly spaced interferers of two densities stand elsewhere: ripples of a point. In a town the
     # source's mixture of two ways to choose a resource lets more load help, by 3.3 points at most.
     most = 0.035 if radio.environment == "tr37885-urban" else 0.02
-    assert np.all(heavy.reception(distances_m) <= light.reception(distances_m) + most)
+    assert np.all(heavy.reception(distances_m) <= received + most)
     assert heavy.busy_ratio() >= light.busy_ratio()
 
 

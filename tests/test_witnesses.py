@@ -93,7 +93,7 @@ def test_where_none_are_declared_nothing_is_said(
 @pytest.mark.slow
 def test_without_a_witness_messages_make_up_no_gain(small: Dataset, tmp_path: Path) -> None:
     done = driven(
-        small, tmp_path / "run", "occluded-intersection:witnesses=0", "single-local", "6g", episodes=12
+        small, tmp_path / "run", "occluded-intersection:witnesses=0", "single-local", "6g", episodes=8
     )
     [gain] = [s for s in done.scores if (s.metric, s.interval) == (GAIN, "episodes")]
     assert gain.low is not None

@@ -135,13 +135,17 @@ def test_a_driver_who_sees_everything_reaches_the_goal_and_one_who_waits_does_no
     assert {*results[1::2]} - {"cleared"}
 
 
-@one_or_the_rest
-def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenario, seeds: range) -> None:
+@pytest.mark.parametrize(
+    ("seeds", "decisions"), [(range(1), 3), pytest.param(SEEDS, 10, marks=pytest.mark.exhaustive)]
+)
+def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(
+    scenario: Scenario, seeds: range, decisions: int
+) -> None:
     """All that could speak against a helper is what it claims: everybody is undecided."""
     rule = Trust()
     for seed in seeds:
         world, moments = World.start(scenario, seed), list[Scene]()
-        while len(moments) < scenario.parameters.decisions and not world.outcome.ended:
+        while len(moments) < min(decisions, scenario.parameters.decisions) and not world.outcome.ended:
             moments.append(look(world, 0, seed, len(moments), ego_alone=False))
             world.act(scenario.actions[0])
         said = claims(scenario, moments)

@@ -296,7 +296,7 @@ def test_under_cam_a_lost_beacon_is_still_the_last_one_that_was_sent():
 # -- beacons over a radio ----------------------------------------------------------------------------------
 
 
-def heard(dials, seeds=range(5)):
+def heard(dials, seeds=range(3)):
     """When what each has heard of the other was sent, at each of three decisions."""
     scenario = scenarios.get(f"{NAME},{dials}")
     found, worlds = {}, [World.start(scenario, seed) for seed in seeds]

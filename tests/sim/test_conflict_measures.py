@@ -19,6 +19,9 @@ NORTH = -np.pi / 2
 Pose = tuple[float, float, float, float]
 
 
+FEW = ("do-not-pass", "occluded-intersection", "roundabout-entries")  # lane changes, crossings, curves
+
+
 def ttc_s(ego: Pose, other: Pose, sizes: tuple[tuple[float, float], ...] = (CAR, CAR)) -> float:
     poses, lengths = (np.array(each, dtype=float)[:, None] for each in ((ego, other), sizes))
     return float(times_to_collision(poses[0], lengths[0], poses[1], lengths[1])[0])
@@ -231,8 +234,13 @@ def test_columns_tell_what_was_not_near_from_what_was_not_measured() -> None:
     np.testing.assert_equal(made["short_pet"], [0, np.nan, 1, 0])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", scenarios.names())
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in FEW else pytest.mark.exhaustive)
+        for name in scenarios.names()
+    ],
+)
 def test_a_scenarios_worlds_are_measured_as_a_search_finds(name: str) -> None:
     """Real roads, in lockstep: curves, lane changes and standing vehicles."""
     scenario = scenarios.get(name)

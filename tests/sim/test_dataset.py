@@ -29,18 +29,27 @@ from harness.world.scenarios import argument
 from harness.world.world import World
 
 FIRST_SEED = 178
+FEW = replace(SCENARIO, parameters=replace(SCENARIO.parameters, decisions=3))
 
 
 def contents(folder):
     return {p.name: p.read_bytes() for p in folder.iterdir()}
 
 
+@pytest.fixture(scope="session")
+def three_decisions(once):
+    """Folder of two layouts with three decisions each, which is fast to build and to check."""
+    return once("three-decisions", lambda out: build(FEW, out, 2, 5, 1, lambda done: None))
+
+
 # Building.
 
 
 @pytest.mark.slow
-def test_a_build_that_was_stopped_and_is_continued_has_the_bytes_of_an_undisturbed_one(two_path, tmp_path):
-    out, done = tmp_path / two_path.name, []
+def test_a_build_that_was_stopped_and_is_continued_has_the_bytes_of_an_undisturbed_one(
+    three_decisions, tmp_path
+):
+    out, done = tmp_path / three_decisions.name, []
 
     def stopping(count):
         done.append(count)
@@ -48,12 +57,12 @@ def test_a_build_that_was_stopped_and_is_continued_has_the_bytes_of_an_undisturb
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        build(SCENARIO, out, 2, 5, 1, stopping)
+        build(FEW, out, 2, 5, 1, stopping)
     assert not (out / "manifest.json").exists()
     again = []
-    build(SCENARIO, out, 2, 5, 1, again.append)
+    build(FEW, out, 2, 5, 1, again.append)
     assert again == [1, 1], "the one that was there, and the other"
-    assert contents(out) == contents(two_path)
+    assert contents(out) == contents(three_decisions)
 
 
 @pytest.mark.exhaustive
@@ -239,6 +248,11 @@ def copy(two_path, tmp_path):
     return shutil.copytree(two_path, tmp_path / "copy")
 
 
+@pytest.fixture
+def small_copy(three_decisions, tmp_path):
+    return shutil.copytree(three_decisions, tmp_path / "copy")
+
+
 def rewrite(folder, name, change):
     """Replace a file in layouts.zip by what `change` makes of its bytes."""
     with ZipFile(folder / "layouts.zip") as file:
@@ -413,16 +427,16 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("what", HOSTILE)
-def test_a_scene_that_is_not_what_it_should_be_is_named_and_never_used(copy, what):
-    edit(copy, 3, HOSTILE[what])
-    problems = check(copy)
+def test_a_scene_that_is_not_what_it_should_be_is_named_and_never_used(small_copy, what):
+    edit(small_copy, 3, HOSTILE[what])
+    problems = check(small_copy)
     assert problems
-    name = load(copy).trees[1].levels[2][2].scene
+    name = load(small_copy).trees[1].levels[2][2].scene
     where = f"layouts.zip scene {name}"
     assert all(problem.startswith(where) for problem in problems)
     assert all(len(problem) < 300 and problem.isprintable() for problem in problems)
     with pytest.raises(UserError, match=re.escape(where)):
-        use(copy)
+        use(small_copy)
 
 
 HOSTILE_TREES = {

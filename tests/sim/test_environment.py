@@ -120,7 +120,14 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("env", ["merge-v0", "roundabout-v0", "two-way-v0", "highway-fast-v0"])
+@pytest.mark.parametrize(
+    "env",
+    [
+        "merge-v0",
+        "two-way-v0",
+        *(pytest.param(env, marks=pytest.mark.exhaustive) for env in ("roundabout-v0", "highway-fast-v0")),
+    ],
+)
 def test_its_frames_are_those_of_its_own_step(env):
     scenario = scenarios.get(f"env:{env}")
     theirs, ours = reset(scenario.name, 3), EnvironmentWorld.begun(scenario, 3)

@@ -30,12 +30,17 @@ def test_a_summary_balances_success_over_danger_and_none():
         assert {"balanced", "dangerous", "harmless"}.isdisjoint(summary(outcomes, known))
 
 
+@pytest.mark.exhaustive
+def test_a_check_is_the_same_for_any_number_of_workers():
+    alone, together = (check(SCENARIO, 4, 5, workers, lambda n: None) for workers in (1, 2))
+    assert together == alone
+
+
 @pytest.mark.slow
-def test_a_check_counts_every_episode_once_for_any_number_of_workers():
+def test_a_check_counts_every_episode_once():
     done = []
     alone = check(SCENARIO, 4, 5, 1, done.append)
     assert sum(done) == 4
-    assert check(SCENARIO, 4, 5, 2, lambda n: None) == alone
     for driver in DRIVERS:
         ends = [alone[driver][end] for end in ("success", "collision", "late", "time_out", "off_road")]
         assert sum(e.value for e in ends) == 1.0
