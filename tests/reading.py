@@ -53,8 +53,8 @@ def unpacked(decisions):
     return [d for part in decisions.parts() for block in part.details.blocks(part.ids) for d in block]
 
 
-def by_workers(runs, base, monkeypatch):
-    """The page of some runs as one process writes it, and as two do, of a few scenes each."""
+def by_workers(runs, base, monkeypatch, counts=(1, 2)):
+    """The page of some runs as one process writes it, and as two do, in parts of a few scenes."""
     for name, scenes in (
         ("details.BLOCK", 2),
         ("decisions.BLOCK", 2),
@@ -62,4 +62,4 @@ def by_workers(runs, base, monkeypatch):
         ("page.PARTS_SHARED", 2),
     ):
         monkeypatch.setattr(f"harness.report.{name}", scenes)
-    return [write_report(runs, base / f"{workers}.html", workers=workers).read_text() for workers in (1, 2)]
+    return [write_report(runs, base / f"{workers}.html", workers=workers).read_text() for workers in counts]

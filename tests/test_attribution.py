@@ -181,7 +181,7 @@ def test_a_message_left_out_of_a_pool_is_exact_and_asks_nobody(
     made: Callable[..., Path], judging: Judging
 ) -> None:
     path = made(SIXG)
-    found = attribute(ReplayedRun(path), SIXG.name, 30, 0)
+    found = attribute(ReplayedRun(path), SIXG.name, 14, 0)
     assert not [name for name in judging.asked if "~without" not in name]
     several = list(of_decisions(path, SIXG.name, found))
     assert len(several) > 30
@@ -197,10 +197,10 @@ def test_a_message_left_out_of_a_pool_is_exact_and_asks_nobody(
 @pytest.mark.slow
 def test_helpers_that_were_never_asked_are_asked_first(made: Callable[..., Path], judging: Judging) -> None:
     point = named_point("v2x:max_helpers=1")
-    everybody = attribute(ReplayedRun(made(point)), point.name, 12, 0)
+    everybody = attribute(ReplayedRun(made(point)), point.name, 6, 0)
     path = made(point, ask="used")
     watched = Watched()
-    assert attribute(ReplayedRun(path, progress=watched), point.name, 12, 0) == everybody
+    assert attribute(ReplayedRun(path, progress=watched), point.name, 6, 0) == everybody
     missing = [name for name in judging.asked if "~without" not in name]
     assert missing
     assert {answer.id for answer in folder.read(path).answers}.isdisjoint(missing)
@@ -216,7 +216,7 @@ def test_a_rule_with_memory_keeps_it(made: Callable[..., Path]) -> None:
     """It is the mean of now and of what it remembers, so half of what moves now moves it after step 0."""
     plain, smooth = SIXG, named_point("6g:loss=0,consensus=smooth")
     path = made(plain, smooth)
-    found = attribute(ReplayedRun(path), smooth.name, 30, 0)
+    found = attribute(ReplayedRun(path), smooth.name, 14, 0)
     steps = set()
     for each, d, own in of_decisions(path, smooth.name, found):
         weights = {m.sender: m.weight or 0.0 for m in d.messages} | {"v1": d.own_weight or 0.0}
@@ -233,7 +233,7 @@ def test_a_fusion_call_is_made_again_without_the_message(made: Callable[..., Pat
     """With v3's message it says SLOWER, else FASTER; with nobody's, the ego's own IDLE."""
     fusion = named_point("6g:loss=0,consensus=ego-prompt")
     path = made(fusion)
-    found = attribute(ReplayedRun(path), fusion.name, 20, 0)
+    found = attribute(ReplayedRun(path), fusion.name, 10, 0)
     called = [name for name in judging.asked if "+" in name]
     assert called
     for each, d, _ in of_decisions(path, fusion.name, found):
@@ -242,7 +242,7 @@ def test_a_fusion_call_is_made_again_without_the_message(made: Callable[..., Pat
         assert each.action == ("SLOWER" if with_v3 else "FASTER")
         assert each.instead == ("SLOWER" if "v3" in heard else "FASTER" if heard else "IDLE")
     again = judging.asked.copy()
-    assert attribute(ReplayedRun(path), fusion.name, 20, 0) == found
+    assert attribute(ReplayedRun(path), fusion.name, 10, 0) == found
     assert judging.asked == again
 
 
@@ -271,10 +271,10 @@ def test_a_killed_one_goes_on_and_asks_nothing_twice(made: Callable[..., Path], 
 
     path = made()
     with pytest.raises(Killed):
-        attribute(ReplayedRun(path, progress=Watched(die)), SIXG.name, 30, 0)
+        attribute(ReplayedRun(path, progress=Watched(die)), SIXG.name, 14, 0)
     before = list(judging.asked)
     assert len(before) == 64
-    found = attribute(ReplayedRun(path), SIXG.name, 30, 0)
+    found = attribute(ReplayedRun(path), SIXG.name, 14, 0)
     assert len(judging.asked) == len(set(judging.asked)) > 100
     assert {f"{e.scene}~without-{e.item}/{e.viewer}" for e in found.left_out if e.role != "fusion"} == set(
         judging.asked

@@ -13,7 +13,7 @@ from run_on_disk import Row, made_up
 
 from harness.coordination.operating_point import POINTS
 from harness.core.statistics import mean_of, rate_difference, rate_interval
-from harness.dataset.load import Dataset
+from harness.dataset.load import Dataset, load
 from harness.evaluate.live_world import LiveSource
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
@@ -177,10 +177,11 @@ def test_a_run_of_before_is_read(tmp_path: Path) -> None:
 def test_frozen_and_driven_come_to_the_same_under_either_limits(
     small: Dataset, tmp_path: Path, model: str
 ) -> None:
+    small = load(small.path, 2)
     for limits in (1, 2):
         parameters = {**small.manifest.parameters, "limits": limits}
         dataset = replace(small, manifest=structs.replace(small.manifest, parameters=parameters))
-        frozen = spec_of(dataset, model, limit=2, points=(ALONE,), seeds=(0,))
+        frozen = spec_of(dataset, model, points=(ALONE,), seeds=(0,))
         name = f"{NAME},limits={limits}"
         live = replace(frozen, source=LiveSource(small.manifest.seed, 2, name))
         ends = [

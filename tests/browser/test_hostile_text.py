@@ -127,7 +127,7 @@ def test_nothing_runs_in_the_overview_nor_in_any_decision(browser, attacked):
     foreign = page.evaluate(FOREIGN)
     # Every fourth run: a scene's four answers say eleven payloads each, so that every field still says all.
     scene, runs = next(iter(details(text))), len(gathered(text))
-    for n in range(0, len(PAYLOADS), 4 if runs > 1 else 12):
+    for n in range(0, runs, 4) if runs > 1 else range(0, len(PAYLOADS), 12):
         where = {"scene": scene, "run": str(n % runs), "condition": PAYLOADS[n if runs == 1 else 0]}
         page.evaluate(GO, where)
         page.wait_for_selector("#decision[data-drawn]")

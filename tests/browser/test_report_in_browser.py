@@ -191,7 +191,7 @@ def test_what_a_rules_page_leaves_out_is_said_in_one_line(opened, report, index)
     picture(page, "decision-left-out")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_filters_leave_the_decisions_that_have_what_is_asked(opened, report, index):
     page = opened(report)
     run = index["runs"][0]

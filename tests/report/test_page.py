@@ -607,7 +607,7 @@ def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_pat
             CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_page_of_a_frozen_run_waits_for_no_painter_no_simulator_and_no_pandas(run, tmp_path):
     program = (
         "import sys; from pathlib import Path; from harness.cli.report import write;"

@@ -92,8 +92,7 @@ def test_five_seeds_that_round_alike_are_not_taken_for_exact() -> None:
 
 @pytest.mark.slow
 def test_seeds_are_the_studys_own() -> None:
-    core, *_ = panels(10, 10)
-    one, again, other = (run_paper([core], seeds, lambda done: None) for seeds in ((7,), (7,), (3,)))
+    one, again, other = (run_paper(panels(10, 10), seeds, lambda done: None) for seeds in ((7,), (7,), (3,)))
     assert one.data["ledger"].equals(again.data["ledger"])
     assert not one.data["ledger"].equals(other.data["ledger"])
     assert "100.0 [–, –] %" in " ".join(other.about)

@@ -189,7 +189,7 @@ def test_a_repeat_is_a_run_with_its_own_sampling_seed(
 def test_a_stopped_one_goes_on_as_if_it_had_not_been(
     small: Dataset, tmp_path: Path, wanderer: Wanderer
 ) -> None:
-    whole = repeated(hot(small), tmp_path / "whole")
+    whole = repeated(hot(course(small, 2)), tmp_path / "whole")
     asked = len(wanderer.asked)
 
     class Stopped(Exception):
@@ -199,31 +199,31 @@ def test_a_stopped_one_goes_on_as_if_it_had_not_been(
         raise Stopped
 
     with pytest.raises(Stopped):
-        repeated(hot(small), tmp_path / "stopped", done=stop)
-    again = repeated(hot(small), tmp_path / "stopped")
+        repeated(hot(course(small, 2)), tmp_path / "stopped", done=stop)
+    again = repeated(hot(course(small, 2)), tmp_path / "stopped")
     for one, other in zip(whole.runs, again.runs, strict=True):
         assert same_files(one.path, other.path)
     shutil.rmtree(tmp_path / "stopped/repeat-3")
     wanderer.asked.clear()
-    assert repeated(hot(small), tmp_path / "stopped").scores == whole.scores
+    assert repeated(hot(course(small, 2)), tmp_path / "stopped").scores == whole.scores
     assert 0 < len(wanderer.asked) < asked / 2
     with pytest.raises(UserError, match="begun with --temperature"):
-        repeated(hot(small, temperature=0.8), tmp_path / "stopped")
+        repeated(hot(course(small, 2), temperature=0.8), tmp_path / "stopped")
 
 
 @pytest.mark.slow
 def test_the_cache_keeps_repeats_apart(small: Dataset, tmp_path: Path, wanderer: Wanderer) -> None:
     kept = tmp_path / "completions.sqlite"
-    first = repeated(hot(small), tmp_path / "first", cache=kept)
+    first = repeated(hot(course(small, 2)), tmp_path / "first", cache=kept)
     cached = [sum(a.cached for a in run.answers) for run in first.runs]
     assert cached == [0, 0, 0]
     wanderer.asked.clear()
-    again = repeated(hot(small), tmp_path / "again", cache=kept)
+    again = repeated(hot(course(small, 2)), tmp_path / "again", cache=kept)
     assert wanderer.asked == []
     assert [a.raw for run in again.runs for a in run.answers] == [
         a.raw for run in first.runs for a in run.answers
     ]
-    repeated(hot(small, temperature=0.8), tmp_path / "hotter", cache=kept)
+    repeated(hot(course(small, 2), temperature=0.8), tmp_path / "hotter", cache=kept)
     assert wanderer.asked
 
 

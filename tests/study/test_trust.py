@@ -12,7 +12,7 @@ from evaluating import Watched, figure, live_spec_of, run, spec_of
 from harness.coordination.operating_point import named_point
 from harness.core import resources, versions
 from harness.core.errors import UserError
-from harness.dataset.load import Dataset
+from harness.dataset.load import Dataset, load
 from harness.evaluate.claims import claims
 from harness.evaluate.lifecycle import Evaluated
 from harness.runs.folder import read
@@ -154,8 +154,8 @@ def test_frozen_and_driven_trust_alike(small: Dataset, tmp_path: Path) -> None:
     attacks = ("", ",attack=spoof", ",attack=jump", ",attack=liar+sybil")
     points = tuple(named_point(f"6g:consensus=trust{attack}") for attack in attacks)
     same: Any = {"points": points, "latency": "paper"}
-    frozen = read(run(spec_of(small, **same), tmp_path / "frozen").out)
-    driven = read(run(live_spec_of(episodes=4, first_seed=100, **same), tmp_path / "driven").out)
+    frozen = read(run(spec_of(load(small.path, 2), **same), tmp_path / "frozen").out)
+    driven = read(run(live_spec_of(episodes=2, first_seed=100, **same), tmp_path / "driven").out)
     assert [e.success for e in frozen.episodes] == [e.success for e in driven.episodes]
     trust, other = (done.decisions.of_messages("trust") for done in (frozen, driven))
     assert np.array_equal(trust, other, equal_nan=True)

@@ -29,7 +29,7 @@ Look = tuple[Extent, str, dict[str, Any]]
 
 @pytest.fixture(scope="module")
 def seen(made: Path, small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> list[Look]:
-    """What is seen of a real run at each answer and after it: its extent, the list, and what changes in it."""
+    """What is seen of a real run at each answer and after it: its extent, the list, what changes in it."""
     reports = Path(shutil.copytree(made, tmp_path_factory.mktemp("going") / "reports"))
     browser = visitor(reports)
     spec = spec_of(small, points=(POINTS["single-local"], POINTS["6g"]), tags=("slow",), batch_size=1)

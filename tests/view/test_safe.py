@@ -97,7 +97,7 @@ def test_no_address_is_a_path(path: str, reader: TestClient) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.too_slow])
 @given(
     parts=st.lists(
         st.sampled_from(["..", ".", "", "first", "second", "sweep-tau", "secret", "secret.txt", ".work",
