@@ -33,12 +33,14 @@ FROZEN = ("single-local", "6g", SMOOTHED, "fog", FOG_SMOOTHED, CLOSE, MUMBLED, N
 DRIVEN = (SMOOTHED, FOG_SMOOTHED)
 ACTIONS, PLACES = ("SLOWER", "IDLE", "FASTER"), (1, 2, 3)
 
-MISTAKES = {
+Words = tuple[str, ...]
+# What is typed, and what is said of it.
+MISTAKES: dict[Words, str] = {
     ("--condition", "fogg"): "unknown operating point 'fogg'; did you mean 'fog'? known: 6g, ",
     ("--condition", "fog:loss=0"): "loss is 0.0; it must be left out: channel profile fog has no such",
     ("--condition", "6g:consensus=smooth"): "unknown consensus 'smooth'; did you mean 'smoothing'?",
 }
-NAMES = {
+NAMES: dict[Words, str] = {
     ("--condition", "fog"): "unknown operating point 'fog'; known: 6g, ",
     ("--model", "mine"): "unknown engine in model card",
 }
@@ -67,9 +69,6 @@ class Said(NamedTuple):
     code: int
     out: str
     err: str
-
-
-Words = tuple[str, ...]
 
 
 @pytest.fixture(scope="module")

@@ -215,7 +215,7 @@ PLAIN: dict[str, str] = {
     "sweep_episodes": "10", "study schedule learn out": "written.toml", "run export out": "written/file",
     "report out": "written/page.html",
 }  # fmt: skip
-DEAR = ("prompt examples", "study paper")  # some 2 CPU s, whatever they are given
+DEAR = ("prompt examples", "study closed-loop", "study paper")  # 2 CPU s and more, whatever they are given
 ALWAYS = {"run export": ["--csv"], "study fidelity": ["base/run"], "dataset build": ["--no-audit"]}
 
 
