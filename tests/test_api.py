@@ -14,6 +14,8 @@ from harness import extend
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def folder(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -140,7 +142,6 @@ def test_spellings_of_0_2_work_with_a_warning(small: Dataset) -> None:
     assert not extend.Attack.by_scene
 
 
-@pytest.mark.slow
 def test_a_run_is_evaluated_with_the_command_lines_names(small_path: Path, tmp_path: Path) -> None:
     made = harness.run(
         model="local-view",

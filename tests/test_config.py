@@ -179,6 +179,7 @@ def with_other(value: Any, path: tuple[Any, ...], other: Any) -> Any:
 
 
 @given(st.data())
+@pytest.mark.slow
 def test_a_wrong_leaf_anywhere_in_any_record_is_one_line_that_names_it(data: st.DataObject) -> None:
     kind, good = data.draw(kinds())
     record, table = defstruct("Whole", [("whole", kind)]), {"whole": good}

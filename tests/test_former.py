@@ -26,6 +26,7 @@ def test_an_old_dataset_has_the_scenes_that_it_was_built_of() -> None:
     assert scenarios.get(scenarios.argument(old)).parameters == old.parameters
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("commit", [path.name for path in RECORDS.glob("*") if (path / "drive").is_dir()])
 def test_an_old_driven_run_is_replayed_in_its_own_scenes(commit: str) -> None:
     """Its record lacks the parameters that came later. A scene's name is the digest of what is in it."""

@@ -30,6 +30,8 @@ from harness.report.compare.words import caveats as of_pair
 from harness.runs.folder import read
 from harness.runs.leading import ANY_TIME
 
+pytestmark = pytest.mark.slow
+
 ALONE = {"points": (POINTS["single-local"],), "seeds": (0,)}
 Typed = Callable[..., tuple[int, str, str]]
 

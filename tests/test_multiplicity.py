@@ -44,12 +44,14 @@ def test_false_alarms_among_many_true_nothings_stay_at_five_percent() -> None:
 
 
 @given(st.lists(st.integers(-20, 20), min_size=2, max_size=40).filter(lambda values: len(set(values)) > 1))
+@pytest.mark.slow
 def test_the_p_of_students_interval_is_the_t_tests(values: list[int]) -> None:
     found = p_value(lambda level: episode_interval(np.array(values, dtype=float), level=level))
     assert found == pytest.approx(stats.ttest_1samp(values, 0.0).pvalue, rel=1e-3, abs=LEAST)
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=2, max_size=60), st.floats(0.5, 0.999))
+@pytest.mark.slow
 def test_the_interval_of_a_rate_leaves_0_out_just_where_p_is_less(
     pairs: list[tuple[bool, bool]], level: float
 ) -> None:

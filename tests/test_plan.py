@@ -54,6 +54,7 @@ def test_the_number_is_that_of_the_formula_worked_out_by_hand() -> None:
 
 
 @given(st.floats(0, 1), st.floats(0.02, 0.5), st.floats(0.5, 0.95))
+@pytest.mark.slow
 def test_so_many_layouts_find_the_difference_that_they_were_planned_for(
     v: float, detect: float, power: float
 ) -> None:

@@ -23,6 +23,8 @@ from harness.runs.listing import runs
 from harness.runs.suite import read
 from harness.world import scenarios
 
+pytestmark = pytest.mark.slow
+
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]
 Once = Callable[[str, Callable[[Path], object]], Path]
@@ -81,7 +83,6 @@ def test_a_suite_is_a_run_of_each_dataset_their_means_and_a_page(evaluated: Harn
     assert (DONE / "exits/report.html").is_file()
 
 
-@pytest.mark.slow
 def test_a_run_of_a_suite_is_what_it_is_alone(evaluated: Harness) -> None:
     code, _, err = evaluated("eval", "--dataset", "exits", "--seeds", "0:2", "--out", "alone")
     assert (code, err) == (0, "")
@@ -103,7 +104,6 @@ def test_means_weight_families_alike_and_join_their_intervals(evaluated: Harness
     assert found.n == 6, "four layouts and two"
 
 
-@pytest.mark.slow
 def test_json_has_every_family_and_the_means(project: Harness) -> None:
     code, out, err = project(*EVAL, "--json", "--limit", "1")
     told: dict[str, Any] = json.loads(out, parse_constant=pytest.fail)
@@ -119,7 +119,6 @@ def test_json_has_every_family_and_the_means(project: Harness) -> None:
     )
 
 
-@pytest.mark.slow
 def test_the_same_command_goes_on_and_a_finished_suite_is_refused(evaluated: Harness) -> None:
     before = (DONE / "summary.csv").read_text()
     kept = (DONE / "small/answers.jsonl").stat().st_mtime_ns
@@ -215,7 +214,6 @@ def test_the_page_has_families_by_conditions_and_leads_to_each(evaluated: Harnes
     assert Path("again.html").read_text() == page.replace('href="', f'href="{DONE}/')
 
 
-@pytest.mark.slow
 def test_a_loss_has_one_minus_on_the_page(project: Harness) -> None:
     code, _, err = project(*EVAL, "--control", "shuffled-messages")
     assert (code, err) == (0, "")
@@ -242,7 +240,6 @@ def test_an_exported_suite_leads_to_the_pages_of_its_runs(evaluated: Harness) ->
     rmtree("site")
 
 
-@pytest.mark.slow
 def test_suites_are_reported_side_by_side_and_not_with_runs(evaluated: Harness) -> None:
     code, _, err = evaluated(*EVAL, "--model", "local-view", "--condition", "single-local", "--limit", "1")
     assert (code, err) == (0, "")

@@ -15,6 +15,8 @@ import harness
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 

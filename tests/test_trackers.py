@@ -15,6 +15,8 @@ from harness.core import plugins
 from harness.evaluate.hooks import HOOKS
 from harness.runs.folder import read
 
+pytestmark = pytest.mark.slow
+
 Typed = Callable[..., tuple[int, str, str]]
 
 
@@ -80,7 +82,6 @@ def test_a_hook_is_told_when_a_run_begins_when_answers_arrive_and_when_it_ends(
     assert (end, has_page, done.manifest.name) == ("end", True, "run")
 
 
-@pytest.mark.slow
 def test_a_hook_is_told_of_a_drive_from_the_environment(
     harness: Typed, install: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:

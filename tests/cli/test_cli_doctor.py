@@ -48,6 +48,7 @@ def test_people_read_it_in_eighty_columns(harness: Callable[..., Said]) -> None:
     assert "openai-example: needs a server at http://127.0.0.1:8080/v1 (not tried)" in out
 
 
+@pytest.mark.slow
 def test_what_is_not_installed_is_named_with_the_command_that_installs_it() -> None:
     absent = "sys.modules['torch'] = sys.modules['llama_cpp'] = sys.modules['sparrow_decider'] = None"
     told = json.loads(apart(absent, "--json"))
@@ -89,6 +90,7 @@ def test_a_gpu_is_what_nvidia_smi_says_and_one_that_fails_says_nothing(
         assert json.loads(harness("model", "doctor", "--json")[1])["gpu"] == gpus
 
 
+@pytest.mark.slow
 def test_torch_is_not_loaded_unless_asked() -> None:
     last = "print('torch' in sys.modules, 'transformers' in sys.modules, 'llama_cpp' in sys.modules)"
     assert apart("", after=last).splitlines()[-1] == "False False False"

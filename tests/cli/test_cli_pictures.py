@@ -65,6 +65,7 @@ def test_a_picture_of_any_size_has_its_shape(size_px: tuple[int, int], cells: tu
     assert (len(lines[0].plain), len(lines)) == cells
 
 
+@pytest.mark.slow
 def test_a_terminal_with_colours_is_shown_the_picture_and_any_other_is_told_how(
     harness: Harness, small_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
