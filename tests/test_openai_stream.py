@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from misbehaving import Asked, Play, completion, event, pieces, read_out, serving
 
@@ -234,9 +234,23 @@ json_values = st.recursive(
 )  # fmt: skip
 
 
+SENT = given(st.lists(json_values | st.binary().map(lambda data: b"data: " + data + b"\n")))
+
+
 @pytest.mark.slow
-@given(st.lists(json_values | st.binary().map(lambda data: b"data: " + data + b"\n")))
+@settings(max_examples=30)
+@SENT
 def test_whatever_comes_is_an_answer_or_a_fault(sent: list[Any]) -> None:
+    is_answer_or_fault(sent)
+
+
+@pytest.mark.exhaustive
+@SENT
+def test_whatever_comes_of_more_is_an_answer_or_a_fault(sent: list[Any]) -> None:
+    is_answer_or_fault(sent)
+
+
+def is_answer_or_fault(sent: list[Any]) -> None:
     for wrapped in (sent, [p if isinstance(p, bytes) else {"choices": [{"delta": p}]} for p in sent]):
         stream = taken(*wrapped)
         if stream.fault is None:

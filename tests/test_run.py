@@ -64,9 +64,15 @@ def test_the_batch_size_changes_no_byte_of_the_proxys_run(
     assert same_files(tmp_path / "run", proxy_run)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("trees", "walks", "workers"), [(1, 99, 1), (3, 99, 1), (1, 99, 2), (9, 1, 1), (1, 1, 2)]
+    ("trees", "walks", "workers"),
+    [
+        pytest.param(1, 99, 1, marks=pytest.mark.exhaustive),
+        pytest.param(3, 99, 1, marks=pytest.mark.slow),
+        pytest.param(1, 99, 2, marks=pytest.mark.exhaustive),
+        pytest.param(9, 1, 1, marks=pytest.mark.slow),
+        pytest.param(1, 1, 2, marks=pytest.mark.slow),
+    ],
 )
 def test_how_many_walks_are_taken_at_once_and_by_whom_changes_no_byte(
     trees: int, walks: int, workers: int, proxy_run: Path, small: Dataset, tmp_path: Path,

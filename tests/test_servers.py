@@ -466,8 +466,14 @@ def test_workers_together_have_no_more_at_a_server_than_one_process_may(
     assert 2 < max(busy) <= 4, "the batch size"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("before", "after"), [(1, 3), (3, 1), (3, 2)])
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        pytest.param(1, 3, marks=pytest.mark.slow),
+        pytest.param(3, 1, marks=pytest.mark.exhaustive),
+        pytest.param(3, 2, marks=pytest.mark.exhaustive),
+    ],
+)
 def test_a_run_that_workers_began_or_go_on_with_asks_nothing_twice(
     parted: None, small: Dataset, tmp_path: Path, before: int, after: int
 ) -> None:

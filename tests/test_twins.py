@@ -537,7 +537,7 @@ def test_the_command_prints_writes_and_gates(
 @pytest.mark.slow
 def test_workers_change_nothing(harness: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
     for workers in ("1", "2"):
-        harness("study", "twins", "--sample", "3", "--workers", workers, "--out", workers, "--json")
+        harness("study", "twins", "--sample", "2", "--workers", workers, "--out", workers, "--json")
     for name in ("twins.json", "pairs.jsonl", "index.html"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
 
