@@ -74,6 +74,7 @@ def test_whoever_hears_nobody_knows_what_it_saw(small: Dataset) -> None:
     assert merged(small.scenario, cases) == [case.own for case in cases]
 
 
+@pytest.mark.slow
 def test_it_lists_whatever_anybody_lists_and_each_sender_and_never_the_ego(small: Dataset) -> None:
     for scene, graph in zip(all_scenes(small), shared(small, all_scenes(small)), strict=True):
         ego, *helpers = scene.viewers
@@ -102,6 +103,7 @@ def test_ids_do_not_say_what_is_one_object(small: Dataset) -> None:
         assert places[0] == places[1]
 
 
+@pytest.mark.slow
 def test_what_only_a_helper_sees_is_where_it_is_and_meets_the_ego(small: Dataset) -> None:
     """The danger behind the corner: its conflict is that of the truth, up to errors of sensors and places."""
     met = 0
@@ -417,6 +419,7 @@ def test_a_liar_invents_or_hides(pair: Dataset, attack: str, what: Any) -> None:
         assert what({*scenes[request.id.partition("/")[0]].graphs["v1"].seen}, {*request.view.seen})
 
 
+@pytest.mark.slow
 def test_a_ghost_stops_who_believes_it_and_none_is_believed_of_nobody(small: Dataset) -> None:
     points = [OBJECTS.changed(name=f"{share}", attack=f"ghost:share={share}") for share in (0, 1)]
     rows = walked(spec_of(small, points=tuple(points)), Planner(small))
@@ -464,6 +467,7 @@ def test_a_ghost_is_where_it_was_meant_whatever_else_is_moved(small: Dataset, pr
 # The same whatever way
 
 
+@pytest.mark.slow
 def test_one_at_a_time_as_in_batches(pair: Dataset, tmp_path: Path) -> None:
     points = (POINTS["single-local"], OBJECTS, BOTH)
     one, many = (
@@ -472,6 +476,7 @@ def test_one_at_a_time_as_in_batches(pair: Dataset, tmp_path: Path) -> None:
     assert same_files(one, many)
 
 
+@pytest.mark.slow
 def test_whoever_reads_a_run_sees_what_the_ego_was_asked(pair: Dataset, tmp_path: Path) -> None:
     """The prompt of every answer can be shown as it was sent, and a pair for training has it."""
     spec = spec_of(pair, points=(OBJECTS, BOTH, OBJECTS.changed(attack="ghost:share=1/3", name="lied to")))

@@ -34,6 +34,7 @@ def done(small: Dataset, once: Callable[..., Path]) -> Run:
     return read(once("witnesses", lambda out: driven(small, out, EACH, "single-local", episodes=24)))
 
 
+@pytest.mark.slow
 def test_rows_have_witnesses_and_the_dangers_radio(done: Run) -> None:
     assert [e.witnesses for e in done.episodes] == [0, 1, 2, 3] * 6
     assert [e.danger_radio is None for e in done.episodes] == [e.danger == "none" for e in done.episodes]
@@ -48,6 +49,7 @@ def test_rows_have_witnesses_and_the_dangers_radio(done: Run) -> None:
         assert (score.value, score.n, score.n_excluded) == (sum(own) / 6, 6, 18)
 
 
+@pytest.mark.slow
 def test_dangers_stand_by_who_can_tell_of_them_beside_the_harmless_layouts(
     done: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:

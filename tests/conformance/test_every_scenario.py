@@ -124,6 +124,7 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(scenario: Scenario)
             assert thawed.outcome.result == world.outcome.result
 
 
+@pytest.mark.slow
 @some_or_the_rest(range(1), SEEDS)  # who waits need not fail to arrive in each of them
 def test_a_driver_who_sees_everything_reaches_the_goal_and_one_who_waits_does_not(
     scenario: Scenario, seeds: range
@@ -135,6 +136,7 @@ def test_a_driver_who_sees_everything_reaches_the_goal_and_one_who_waits_does_no
     assert {*results[1::2]} - {"cleared"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seeds", "decisions"), [(range(1), 3), pytest.param(SEEDS, 10, marks=pytest.mark.exhaustive)]
 )
@@ -186,6 +188,7 @@ def test_a_graph_is_the_same_without_a_vehicle_that_it_does_not_list(
     assert scenario.name == one_way_crossing.SCENARIO.name or len(less) > 5
 
 
+@pytest.mark.slow
 @one_or_the_rest
 def test_many_viewers_see_together_what_each_sees_alone(scenario: Scenario, seeds: range) -> None:
     states = []

@@ -113,6 +113,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_a_run_says_who_decided_and_how_all_of_them_ended(driven: Path) -> None:
     there = folder.read(driven)
     table = there.decisions
@@ -159,6 +160,7 @@ def test_the_settings_of_a_run_of_agents_drive_it_again(
     assert (tmp_path / "again" / "episodes.csv").read_bytes() == (driven / "episodes.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_run_has_a_table_of_its_agents_that_adds_up_to_its_episodes(driven: Path) -> None:
     run = load(driven)
     keys = ["condition", "seed", "episode"]
@@ -173,6 +175,7 @@ def test_a_run_has_a_table_of_its_agents_that_adds_up_to_its_episodes(driven: Pa
     assert (paying.lost_s == whole.most_lost_s[paying.index]).all()
 
 
+@pytest.mark.slow
 def test_the_table_of_answers_says_who_decided_with_them(driven: Path) -> None:
     answers = load(driven).answers
     own = answers.role == "ego"
@@ -181,6 +184,7 @@ def test_the_table_of_answers_says_who_decided_with_them(driven: Path) -> None:
     assert 0 < own.sum() < len(answers)
 
 
+@pytest.mark.slow
 def test_a_broken_table_of_agents_is_named(driven: Path, tmp_path: Path) -> None:
     copytree(driven, tmp_path / "run")
     file = tmp_path / "run" / "episodes.csv"

@@ -83,6 +83,7 @@ def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
     assert (ours, theirs) == ("True", "False")
 
 
+@pytest.mark.slow
 def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
     found = read(driven)
     scene = next(iter(found.decisions.scenes))
@@ -117,6 +118,7 @@ def plain(value):
     return json.loads(json.dumps(value))
 
 
+@pytest.mark.slow
 def test_each_condition_is_shown_with_what_only_driving_shows(driven, page):
     found = read(driven)
     for name in ("single-local", "v2x", "6g"):
@@ -139,6 +141,7 @@ def by_scene(run):
     return found
 
 
+@pytest.mark.slow
 def test_a_moment_has_what_was_decided_when_it_acted_and_what_became_of_each_episode(driven, text):
     every, moments = details(text), by_scene(driven)
     ends = {(e.condition, e.seed, e.episode): e for e in read(driven).episodes}
@@ -160,6 +163,7 @@ def test_a_moment_has_what_was_decided_when_it_acted_and_what_became_of_each_epi
     assert any(end["result"] == "collision" for d in every.values() for end in d["runs"][0]["ends"])
 
 
+@pytest.mark.slow
 def test_a_failure_is_shown_where_it_parts_from_a_success_with_its_seed(driven):
     found, moments = read(driven), by_scene(driven)
     failed = {(e.condition, e.seed, e.episode) for e in found.episodes if not e.success}
@@ -188,6 +192,7 @@ def shown(every):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_prompts_are_the_very_ones_that_were_sent(driven, text):
     found = shown(details(text))
     assert all(found.values())
@@ -261,6 +266,7 @@ def test_a_moment_that_cannot_be_played_again_has_neither_picture_nor_prompt(dri
     assert not any(shown(every).values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "edit", "message"),
     [
@@ -279,6 +285,7 @@ def test_a_broken_live_run_is_one_line_that_names_the_file(driven, tmp_path, nam
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_decisions_without_a_step_are_one_line_that_names_the_file(driven, tmp_path):
     copy = copied(driven, tmp_path)
     change(copy, decision=lambda row: row.update(step=None))
@@ -287,6 +294,7 @@ def test_decisions_without_a_step_are_one_line_that_names_the_file(driven, tmp_p
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_what_needs_frozen_scenes_refuses_a_live_run(driven):
     with pytest.raises(UserError, match=r"was driven, .* give a folder made by `harness eval`"):
         ReplayedRun(driven)

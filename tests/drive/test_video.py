@@ -28,6 +28,7 @@ def out(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.exhaustive), 7])
 def test_an_episode_played_again_ends_as_it_did(out, every):
     """Every seventh row is of another layout and condition."""

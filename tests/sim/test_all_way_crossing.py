@@ -159,6 +159,7 @@ def test_who_keeps_its_speed_collides_in_many():
     assert results["local-view"].count("cleared") < results["full-view"].count("cleared")
 
 
+@pytest.mark.slow
 def test_if_nobody_gives_way_many_collide():
     seeds = range(8)
     idle = [[["IDLE"] * P.decisions] * len(agents(LAYOUTS[seed])) for seed in seeds]

@@ -95,6 +95,7 @@ def test_an_ego_that_begins_in_a_collision_is_said_by_the_check_and_by_runs(tmp_
     assert lost in " ".join(said.split())
 
 
+@pytest.mark.slow
 def test_a_sound_environment_loses_nothing_at_once(folder, harness):
     assert load(folder).lost == 0
     code, said, _ = harness("dataset", "check", folder, "--json")
@@ -266,6 +267,7 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from():
     assert world.state() == thawed.state() == branch.state()
 
 
+@pytest.mark.slow
 def test_its_dataset_is_sound_and_pins_its_configuration(folder):
     assert check(folder) == []
     data = load(folder)
@@ -483,6 +485,7 @@ def test_classes_of_highway_env_need_no_listing(monkeypatch):
     assert any(type(v).__name__ == "AggressiveVehicle" for v in env.road.vehicles)
 
 
+@pytest.mark.slow
 def test_what_is_typed_may_be_imported_and_what_a_file_names_may_not(harness, folder, monkeypatch):
     monkeypatch.delenv("SWARMDRIVE_IMPORTS")
     assert harness("dataset", "scenario", "show", OWN)[0] == 0

@@ -66,6 +66,7 @@ def test_who_is_where_and_who_has_a_radio_tells_nothing_of_a_danger(name: str) -
         assert made.buildings == without.buildings
 
 
+@pytest.mark.slow
 def test_blind_seats_are_on_their_path_and_out_of_an_ego_that_stops(name: str) -> None:
     scenario = scenarios.get(f"{name}:witnesses=0")
     for seed in range(8):

@@ -71,6 +71,7 @@ def test_it_waits_for_who_meets_it_and_for_nobody_who_comes_long_after_or_the_ot
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(VAN, late, oncoming))) == "IDLE"
 
 
+@pytest.mark.slow
 def test_a_danger_hits_an_ego_that_does_not_know_of_it():
     dangerous = [seed for seed, found in LAYOUTS.items() if found.danger]
     for seed in dangerous[:3]:

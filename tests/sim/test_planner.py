@@ -131,6 +131,7 @@ def test_only_the_full_view_driver_reads_the_truth():
         choose(SCENARIO, "full-view", hidden, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", scenarios.names())
 def test_many_graphs_are_planned_together_as_each_alone(name):
     scenario = scenarios.get(name)
@@ -142,6 +143,7 @@ def test_many_graphs_are_planned_together_as_each_alone(name):
     assert plans(scenario, graphs) == [plan(scenario, graph) for graph in graphs]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", scenarios.names())
 def test_gaps_are_those_of_all_moments_wherever_the_ego_would_touch_somebody(name):
     """Moments in which two are far apart are left out; what is left decides each gap that is not wide."""

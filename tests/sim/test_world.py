@@ -130,6 +130,7 @@ def test_a_world_leaves_highway_envs_classes_as_they_were():
     assert before == (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "actions"),
     [
@@ -178,6 +179,7 @@ def test_two_seeds_are_two_episodes():
     assert digest(trajectory(FROM_LEFT)) != digest(trajectory(FROM_RIGHT))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [pytest.param(FROM_RIGHT, marks=pytest.mark.exhaustive), FROM_LEFT, ONCOMING]
 )
