@@ -173,7 +173,7 @@ def drawn(checkout: Path, reached: Reach, seed: int, each: int) -> list[Mutant]:
     for room in ROOMS:
         candidates = []
         for name, lines in sorted(reached.items()):
-            if name.startswith(f"harness/{room}/"):
+            if name.startswith(f"harness/{room}/") and name.endswith(".py"):
                 source = (checkout / name).read_text("utf-8")
                 candidates += sorted(m for m in set(mutants(name, source)) if lines.get(m.line))
         draw = random.Random(f"{seed} {room}")
