@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from former import SCENARIO
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tiers import QUICK
 
@@ -19,6 +19,7 @@ NORTH = -np.pi / 2
 Pose = tuple[float, float, float, float]
 
 
+LONG_S = 1e6  # rounding decides whether courses that are so alike ever meet
 FEW = ("do-not-pass", "occluded-intersection", "roundabout-entries")  # lane changes, crossings, curves
 
 
@@ -100,6 +101,8 @@ def test_outlines_touch_at_the_time_to_collision_and_never_before(ego: Pose, oth
 
 
 @given(POSE, POSE, st.floats(-3.2, 3.2), st.floats(-50, 50))
+# Headings that differ by nothing but the smallest of numbers, which a turn rounds off.
+@example((0.0, 0.0, -2.6505507264452935e-207, 1.0), (0.0, -3.0, 0.0, 1.0), 1.0, 0.0)
 def test_neither_order_nor_frame_of_reference_changes_it(
     ego: Pose, other: Pose, turn: float, shift_m: float
 ) -> None:
@@ -110,10 +113,10 @@ def test_neither_order_nor_frame_of_reference_changes_it(
 
     def within(a: Pose, b: Pose, margin_m: float) -> float:
         grown = tuple((length + margin_m, width + margin_m) for length, width in (CAR, TRUCK))
-        return ttc_s(a, b, grown)
+        return min(ttc_s(a, b, grown), LONG_S)
 
-    exact = ttc_s(ego, other, (CAR, TRUCK))
-    assert ttc_s(other, ego, (TRUCK, CAR)) == pytest.approx(exact, abs=1e-6, rel=1e-6)
+    exact = min(ttc_s(ego, other, (CAR, TRUCK)), LONG_S)
+    assert min(ttc_s(other, ego, (TRUCK, CAR)), LONG_S) == pytest.approx(exact, abs=1e-6, rel=1e-6)
     # Rounding may turn a graze into a miss, so both may be by a hair.
     assert within(seen(ego), seen(other), 1e-6) <= exact + 1e-6
     assert within(seen(ego), seen(other), -1e-6) >= exact - 1e-6
