@@ -274,7 +274,7 @@ def first_failure(checkout: Path, tests: Sequence[str], marks: str) -> tuple[str
         listed.write("\n".join(tests))
         listed.flush()
         workers = ["-n", "2"] if len(tests) > FIRST or "::" not in tests[0] else []
-        options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-m", marks, *workers, f"@{listed.name}"]
+        options = ["-x", "--tb=no", "-p", "no:cacheprovider", "-m", marks, *workers, f"@{listed.name}"]
         command = [sys.executable, "-m", "pytest", *options]
         try:
             done = subprocess.run(
