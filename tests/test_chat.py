@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_gguf_chat import Words
+from gguf_words import Words
 
 from harness.backends import cards
 from harness.backends.base import Request

@@ -1,7 +1,5 @@
 """A GGUF's chat template, rendered without transformers as transformers renders it."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
 import tiny_qwen3
+from gguf_words import Words
 
 from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.chat_template import ChatTemplate
@@ -22,28 +21,6 @@ MESSAGES = (
     {"role": "system", "content": "You drive.\n <b>é</b> & 'don't' 日本"},
     {"role": "user", "content": "  Scene 1: truck 14 m "},
 )
-
-
-@dataclass
-class Words:
-    """What a GGUF file says of text, its bytes as tokens."""
-
-    template: str
-    specials: Mapping[str, str] = field(default_factory=lambda: {"eos_token": "<|im_end|>"})
-    bos: int | None = None
-    vocabulary: int = 256
-
-    def encode(self, text: str) -> list[int]:
-        return list(text.encode())
-
-    def decode(self, ids: Sequence[int]) -> str:
-        return bytes(ids).decode()
-
-    def pieces(self, ids: Sequence[int]) -> list[str]:
-        return [chr(byte) for byte in ids]
-
-    def candidates(self, letters: str) -> Sequence[int]:
-        return range(self.vocabulary)
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from dataclasses import replace
+from functools import cache
 from itertools import combinations
 from operator import attrgetter
 
@@ -24,10 +25,14 @@ from harness.world.world import World
 
 SCENARIO = scenarios.get("all-way-crossing")
 P = Parameters()
-LAYOUTS = [layout(seed, P) for seed in range(300 if QUICK else 1500)]
 WAYS = [(approach, "straight") for approach in APPROACHES]
 LEAST_P = 0.001
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a quarter, from the south to the west
+
+
+@cache
+def layouts():
+    return [layout(seed, P) for seed in range(300 if QUICK else 1500)]
 
 
 def agents(found):
@@ -51,18 +56,18 @@ def scene(*ways):
 
 def test_two_to_four_agents_come_from_different_arms_and_one_of_them_crosses():
     counts = {2: 0, 3: 0, 4: 0}
-    for found in LAYOUTS:
+    for found in layouts():
         arms = [spawn.approach for spawn in agents(found)]
         assert arms[0] == "own"
         assert len({*arms}) == len(arms)
         assert {*arms} & {*SIDES}
         assert all(P.arrival_s[0] <= arrival_s(spawn) <= P.arrival_s[1] for spawn in agents(found))
         counts[len(arms)] += 1
-    assert min(counts.values()) > len(LAYOUTS) / 10
+    assert min(counts.values()) > len(layouts()) / 10
 
 
 def test_a_car_that_is_no_agent_keeps_its_distance_from_the_agent_on_its_arm():
-    for found in LAYOUTS:
+    for found in layouts():
         for car in found.spawns:
             before = [a for a in agents(found) if a.approach == car.approach]
             if car.part == "other" and before:
@@ -74,7 +79,7 @@ def test_a_car_that_is_no_agent_keeps_its_distance_from_the_agent_on_its_arm():
 def test_neither_arm_nor_id_tells_who_comes_first():
     for key in (attrgetter("approach"), attrgetter("id")):
         firsts = defaultdict(list)
-        for found in LAYOUTS:
+        for found in layouts():
             for one, other in combinations(sorted(agents(found), key=key), 2):
                 firsts[key(one), key(other)].append(arrival_s(one) < arrival_s(other))
         assert len(firsts) == 6
@@ -84,7 +89,7 @@ def test_neither_arm_nor_id_tells_who_comes_first():
 
 def test_all_arms_have_one_distribution_of_times():
     times = {
-        arm: [arrival_s(a) for found in LAYOUTS for a in agents(found) if a.approach == arm]
+        arm: [arrival_s(a) for found in layouts() for a in agents(found) if a.approach == arm]
         for arm in APPROACHES
     }
     for arm in SECTORS:
@@ -162,6 +167,6 @@ def test_who_keeps_its_speed_collides_in_many():
 @pytest.mark.slow
 def test_if_nobody_gives_way_many_collide():
     seeds = range(8)
-    idle = [[["IDLE"] * P.decisions] * len(agents(LAYOUTS[seed])) for seed in seeds]
+    idle = [[["IDLE"] * P.decisions] * len(agents(layouts()[seed])) for seed in seeds]
     ends = [driven(SCENARIO, seed, plans) for seed, plans in zip(seeds, idle, strict=True)]
     assert sum("collision" in results for results in ends) > len(seeds) / 2

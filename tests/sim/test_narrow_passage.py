@@ -1,6 +1,7 @@
 """A passage that is too narrow for two: who comes first is open, and each side has its seat."""
 
 from dataclasses import replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -30,9 +31,13 @@ from harness.world.world import World
 
 SCENARIO = scenarios.get("narrow-passage")
 P = Parameters()
-LAYOUTS = [layout(seed, P) for seed in range(300 if QUICK else 1500)]
 MIDDLE_M = road().zone_arc_m
 LEAST_P = 0.001
+
+
+@cache
+def layouts():
+    return [layout(seed, P) for seed in range(300 if QUICK else 1500)]
 
 
 def agents(found):
@@ -57,7 +62,7 @@ def scene(ego_m, other_m, speed_mps=8.0):
 
 def test_one_or_two_agents_come_from_either_side_one_behind_the_other():
     counts = set()
-    for found in LAYOUTS:
+    for found in layouts():
         sides = [
             [arrival_s(a) for a in agents(found) if (a.approach, a.route) == way] for way in (OWN, ONCOMING)
         ]
@@ -73,7 +78,7 @@ def test_one_or_two_agents_come_from_either_side_one_behind_the_other():
 
 def test_neither_side_nor_id_tells_who_comes_first():
     first, seconds, by_id = [], [], {}
-    for found in LAYOUTS:
+    for found in layouts():
         there = agents(found)
         own, oncoming = ([arrival_s(a) for a in there if a.approach == way[0]] for way in (OWN, ONCOMING))
         first.append(min(own) < min(oncoming))
@@ -86,7 +91,7 @@ def test_neither_side_nor_id_tells_who_comes_first():
     for share in shares:
         assert binomtest(int(np.sum(share)), len(share)).pvalue > LEAST_P
     times = [
-        [min(arrival_s(a) for a in agents(found) if a.approach == way[0]) for found in LAYOUTS]
+        [min(arrival_s(a) for a in agents(found) if a.approach == way[0]) for found in layouts()]
         for way in (OWN, ONCOMING)
     ]
     assert ks_2samp(times[0], times[1]).pvalue > LEAST_P
@@ -172,5 +177,5 @@ def test_who_sees_everything_waits_and_who_keeps_its_speed_meets_somebody():
 
 def test_if_nobody_gives_way_they_collide():
     for seed in range(4):
-        idle = [["IDLE"] * P.decisions] * len(agents(LAYOUTS[seed]))
+        idle = [["IDLE"] * P.decisions] * len(agents(layouts()[seed]))
         assert "collision" in driven(SCENARIO, seed, idle)

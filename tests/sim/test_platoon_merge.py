@@ -1,6 +1,7 @@
 """The merge into a platoon: rows of cars, who sees whom from which seat, and that somebody must give way."""
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import pytest
@@ -14,7 +15,6 @@ from harness.world.scenarios.platoon_merge import MAIN, SCENARIO, Parameters, la
 from harness.world.state import VehicleState, WorldState
 
 P = Parameters()
-LAYOUTS = {seed: layout(seed, P) for seed in range(600)}
 MEET = road().crossings[MAIN]
 SEAT = seats()[MAIN].scenario
 EGO = VehicleState("v1", "car", "ego", -50.0, RAMP_M, 0.0, 15.0, "ramp", "merge", False)
@@ -23,6 +23,11 @@ OTHER = VehicleState("v5", "car", "other", -64.0, 0.0, 0.0, 15.0, "main", "strai
 BESIDE = structs.replace(OTHER, y_m=-4.0, approach="main left")
 (WALL,) = layout(0, replace(P, wall_end_m=(34.0, 34.0))).buildings
 KNOWN = replace(P, perfect_knowledge=True)  # of each other, but not of who has no radio
+
+
+@cache
+def layouts():
+    return {seed: layout(seed, P) for seed in range(600)}
 
 
 def scene(*vehicles, wall=(WALL,)):
@@ -49,7 +54,7 @@ def members(found):
 
 def test_a_row_has_two_or_three_agents_and_one_place_more_that_may_be_taken():
     counts = {2: 0, 3: 0}
-    for found in LAYOUTS.values():
+    for found in layouts().values():
         counts[len(members(found))] += 1
         times = late_s(found)
         row = [times[id_] for id_ in (*members(found), *([found.danger_id] if found.danger else []))]
@@ -70,7 +75,7 @@ def test_a_row_has_two_or_three_agents_and_one_place_more_that_may_be_taken():
 def test_the_ego_comes_as_often_before_an_agent_as_behind_it_and_no_id_tells():
     """600 layouts; each share is within three standard errors of a half."""
     before: dict[str, list[bool]] = {}
-    for found in LAYOUTS.values():
+    for found in layouts().values():
         times = late_s(found)
         for id_ in members(found):
             before.setdefault(id_, []).append(times[id_] > 0)
@@ -119,7 +124,7 @@ def test_a_car_on_the_left_lane_is_nobodys_business():
 @pytest.mark.slow
 def test_who_sees_everything_clears_and_who_cruises_meets_agents_and_dangers():
     cruising = drive_together(SCENARIO, "cruise", range(60))
-    met = [LAYOUTS[seed].danger_id == out.partner for seed, out in cruising.items() if not out.success]
+    met = [layouts()[seed].danger_id == out.partner for seed, out in cruising.items() if not out.success]
     assert 0.3 < len(met) / len(cruising) < 0.7
     assert 0.1 < sum(met) / len(met) < 0.9
     assert all(out.success for out in drive_together(SCENARIO, "full-view", range(8)).values())

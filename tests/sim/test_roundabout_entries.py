@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -24,9 +25,13 @@ from harness.world.state import VehicleState, WorldState
 from harness.world.world import World
 
 P = Parameters()
-LAYOUTS = {seed: layout(seed, P) for seed in range(600)}
 KNOWN = replace(P, perfect_knowledge=True)  # of each other, but not of who has no radio
 QUARTER_M = PLACE.ring_m * math.pi / 2
+
+
+@cache
+def layouts():
+    return {seed: layout(seed, P) for seed in range(600)}
 
 
 def at(id_, part, arm, leaves, before_m, speed_mps=7.0):
@@ -38,7 +43,7 @@ def at(id_, part, arm, leaves, before_m, speed_mps=7.0):
 
 
 def scene(*vehicles, seed=0):
-    return WorldState("by hand", 0, 1, 1.0, 7.0, vehicles, LAYOUTS[seed].buildings)
+    return WorldState("by hand", 0, 1, 1.0, 7.0, vehicles, layouts()[seed].buildings)
 
 
 def enters_s(found, id_):
@@ -119,7 +124,7 @@ def test_a_car_that_leaves_before_the_ego_is_harmless_and_shows_it():
 
 def test_a_danger_comes_behind_the_car_from_the_west_and_the_ego_does_not_see_it_at_first():
     behind = 0
-    for seed, found in LAYOUTS.items():
+    for seed, found in layouts().items():
         if not found.danger:
             continue
         ego_s, quarter_s = enters_s(found, "v1"), QUARTER_M / P.speed_mps
@@ -139,7 +144,7 @@ def test_a_danger_comes_behind_the_car_from_the_west_and_the_ego_does_not_see_it
 def test_neither_of_two_who_meet_comes_first_more_often_and_no_id_tells():
     """600 layouts; each share is within three standard errors of a half."""
     quarter_s, first = QUARTER_M / P.speed_mps, dict[str, list[bool]]()
-    for found in LAYOUTS.values():
+    for found in layouts().values():
         by_approach = agents(found)
         assert 2 <= len(by_approach) <= 3
         ego_s = enters_s(found, "v1")
@@ -171,7 +176,7 @@ def test_an_agent_has_cleared_where_it_has_left_the_ring_past_the_next_entry(arm
 @pytest.mark.slow
 def test_who_sees_everything_clears_and_who_cruises_meets_agents_and_dangers():
     cruising = drive_together(SCENARIO, "cruise", range(60))
-    met = [LAYOUTS[seed].danger_id == out.partner for seed, out in cruising.items() if not out.success]
+    met = [layouts()[seed].danger_id == out.partner for seed, out in cruising.items() if not out.success]
     assert 0.6 < len(met) / len(cruising) < 0.95
     assert 0.1 < sum(met) / len(met) < 0.9
     assert all(out.success for out in drive_together(SCENARIO, "full-view", range(8)).values())
