@@ -7,8 +7,9 @@
 `reach` runs the tests of a checkout and writes which test runs which line. `try` draws two mutants of each of
 fifteen rooms from lines that OLD's tests run. OLD and NEW are checkouts with the same `harness/`, which is
 changed in both, one mutant at a time, and restored. Each version stops at its first failure. Tests that run
-the line come first, the most specific before the others: those that run the fewest lines. Then come all of
-their files. What OLD catches and NEW has not caught by then is shown to all of NEW's tests.
+the line are tried, 300 at most, the most specific first: those that run the fewest lines. Of few, all tests of
+their files follow, since what a shared fixture runs counts as run by its first test. What OLD catches and NEW
+has not caught by then is shown to all of NEW's tests. With --page, the same command goes on after a kill.
 """
 
 import argparse
@@ -48,6 +49,7 @@ ROOMS = (
     "cli",
 )
 FIRST = 40  # tests that are tried before the others which run the line
+MOST = 300  # tests that are tried of those which run the line
 MOST_S = 1800  # a suite that takes longer has caught a mutant that does not end
 COVERAGE = """[run]
 source = harness
@@ -138,9 +140,12 @@ def compare(given: argparse.Namespace) -> None:
     """Try every mutant on both versions and print a table."""
     old = read_reach(given.old_file)
     new = read_reach(given.new_file)
-    lines: list[list[str]] = []
     heads = ("where", "rule", "instead of", "stands", "old tests", "new tests")
+    lines = read_table(given.page)
+    tried_before = {row[0] for row in lines}
     for mutant in drawn(given.old, old, given.seed, given.each):
+        if f"{mutant.file}:{mutant.line}" in tried_before:
+            continue
         source = (given.old / mutant.file).read_text("utf-8")
         assert source == (given.new / mutant.file).read_text("utf-8"), mutant.file
         before = tried(mutant, given.old, old, "")
@@ -159,6 +164,14 @@ def compare(given: argparse.Namespace) -> None:
         print(" | ".join(row), f"{before.took_s:.0f} s, {after.took_s:.0f} s", flush=True)
         if given.page:
             given.page.write_text(markdown(heads, lines) + "\n", "utf-8")
+
+
+def read_table(page: Path | None) -> list[list[str]]:
+    """Read the rows that a killed run of this script wrote."""
+    if page is None or not page.exists():
+        return []
+    rows = page.read_text("utf-8").splitlines()[2:]
+    return [row.removeprefix("| ").removesuffix(" |").split(" | ") for row in rows]
 
 
 def read_reach(file: Path) -> Reach:
@@ -248,10 +261,11 @@ def tried(mutant: Mutant, checkout: Path, reached: Reach, marks: str, known: str
     source = file.read_text("utf-8")
     lines = Counter(test for rows in reached.values() for tests in rows.values() for test in tests)
     tests = sorted(reached.get(mutant.file, {}).get(mutant.line, []), key=lambda test: (lines[test], test))
-    stages: list[Sequence[str]] = [tests[:FIRST], tests[FIRST:]]
+    stages: list[Sequence[str]] = [tests[:FIRST], tests[FIRST:MOST]]
     if known in lines:
         stages.insert(0, [known])  # it still stands, and catches most likely what it caught before
-    stages.append(sorted({test.split("::")[0] for test in tests}))
+    if len(tests) <= FIRST:
+        stages.append(sorted({test.split("::")[0] for test in tests}))
     if known:
         stages.append(["tests"])
     start, count = perf_counter(), 0
