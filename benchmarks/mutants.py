@@ -7,9 +7,9 @@
 `reach` runs the tests of a checkout and writes which test runs which line. `try` draws two mutants of each of
 fifteen rooms from lines that OLD's tests run. OLD and NEW are checkouts with the same `harness/`, which is
 changed in both, one mutant at a time, and restored. Each version stops at its first failure. Tests that run
-the line are tried, 300 at most, the most specific first: those that run the fewest lines. Of few, all tests of
-their files follow, since what a shared fixture runs counts as run by its first test. What OLD catches and NEW
-has not caught by then is shown to all of NEW's tests. With --page, the same command goes on after a kill.
+the line are tried, 300 at most, the most specific first: those that run the fewest lines. Of few, all tests
+of their files follow, since what a shared fixture runs counts as run by its first test. What OLD catches and
+NEW has not caught by then is shown to all of NEW's tests. With --page, the same command goes on after a kill.
 """
 
 import argparse
