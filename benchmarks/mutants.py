@@ -7,7 +7,7 @@
 `reach` runs the tests of a checkout and writes which test runs which line. `try` draws two mutants of each of
 fifteen rooms from lines that OLD's tests run. OLD and NEW are checkouts with the same `harness/`, which is
 changed in both, one mutant at a time, and restored. Each version stops at its first failure. Tests that run
-the line are tried, 300 at most, the most specific first: those that run the fewest lines. Of few, all tests
+the line are tried, 80 at most, the most specific first: those that run the fewest lines. Of few, all tests
 of their files follow, since what a shared fixture runs counts as run by its first test. What OLD catches and
 NEW has not caught by then is shown to all of NEW's tests. With --page, the same command goes on after a kill.
 """
@@ -49,7 +49,7 @@ ROOMS = (
     "cli",
 )
 FIRST = 40  # tests that are tried before the others which run the line
-MOST = 300  # tests that are tried of those which run the line
+MOST = 80  # tests that are tried of those which run the line
 MOST_S = 1800  # a suite that takes longer has caught a mutant that does not end
 COVERAGE = """[run]
 source = harness
