@@ -37,11 +37,11 @@ quick: .venv/dev ## nine tests of ten in a minute: all that are neither slow nor
 	$(PYTEST) -m "not slow and not exhaustive" --hypothesis-profile quick --cpu-limit 0.5
 
 test: check browser ## every check, and every test that is not exhaustive
-	$(PYTEST) -m "not exhaustive" --cpu-limit 4
+	$(PYTEST) -m "not exhaustive" --cpu-limit 6
 
 # The last share has the tests where no engine is installed, too.
 exhaustive: .venv/dev browser ## the tests that `make test` leaves out; SHARE=K runs the K-th tenth of them, from 0 to 9
-	$(PYTEST) -m exhaustive --cpu-limit 4 $(if $(SHARE),--share $(SHARE))
+	$(PYTEST) -m exhaustive --cpu-limit 6 $(if $(SHARE),--share $(SHARE))
 	$(if $(filter-out 9,$(SHARE)),,$(MAKE) --no-print-directory light)
 
 light: .venv-light/test ## the tests without torch, llama.cpp and a browser, or ONLY some: what needs one is skipped
