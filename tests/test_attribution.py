@@ -281,6 +281,7 @@ def test_a_killed_one_goes_on_and_asks_nothing_twice(made: Callable[..., Path], 
     )
 
 
+@pytest.mark.slow
 def test_an_answer_that_fails_is_counted_and_moves_nothing(
     made: Callable[..., Path], judging: Judging, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -313,6 +314,7 @@ def test_the_decisions_view_has_what_was_left_out_there_alone(made: Callable[...
         assert {e["condition"] for e in here} <= {SIXG.name}
 
 
+@pytest.mark.slow
 def test_a_driver_is_asked_for_the_ego_alone(small: Dataset, tmp_path: Path) -> None:
     point = named_point("single-local")
     done = run(spec_of(small, "local-view", points=(point,), seeds=(0,)), tmp_path / "run")

@@ -170,6 +170,7 @@ def test_a_replay_has_its_blind_answers_and_asks_the_model_for_others(
     assert same_decisions(more.out, done.out)
 
 
+@pytest.mark.slow
 def test_a_sweep_has_them_asks_for_them_or_says_that_it_lacks_them(
     done: Evaluated, small: Dataset, tmp_path: Path
 ) -> None:
@@ -197,6 +198,7 @@ class Counting(Perceiving):
         return super().complete(requests)
 
 
+@pytest.mark.slow
 def test_the_closed_loop_has_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     backend = Counting({})
     monkeypatch.setattr(evaluation, "_open_all", lambda spec: [backend])

@@ -158,6 +158,7 @@ def test_what_is_no_base_url_is_not_asked_and_not_shown(url: str) -> None:
     assert "hunter22" not in str(raised.value)
 
 
+@pytest.mark.slow
 def test_a_run_by_url_states_its_card_and_can_be_typed_again(
     small_path: Path, harness: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -125,6 +125,7 @@ def test_the_same_question_from_another_place_of_a_run_is_answered_under_its_own
     assert (again.request_id, again.cached) == ("00007-3/v1", True)
 
 
+@pytest.mark.slow
 def test_another_model_in_any_respect_is_asked(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
     import tiny_qwen3
@@ -322,6 +323,7 @@ def test_a_run_from_the_cache_is_the_run_that_was_asked(
     assert same_decisions(tmp_path / "replayed", tmp_path / "again")
 
 
+@pytest.mark.slow
 def test_a_served_models_answers_are_kept_and_its_key_is_not(
     small_path: Path, tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -340,6 +342,7 @@ def test_a_served_models_answers_are_kept_and_its_key_is_not(
     assert not any(b"5ecret" in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
 
 
+@pytest.mark.slow
 def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, file: Path) -> None:
     """Its prompts are rendered in another process."""
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
@@ -360,6 +363,7 @@ def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, fil
     assert [a.raw for a in answers] == [a.raw for a in answers_of(tmp_path / "first")]
 
 
+@pytest.mark.slow
 def test_engines_without_a_language_model_are_not_cached(small: Dataset, tmp_path: Path, file: Path) -> None:
     for model in ("proxy", "local-view"):
         card = cards.load(model)

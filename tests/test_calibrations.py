@@ -47,6 +47,7 @@ def test_a_temperature_changes_no_likeliest_action(p: list[float], temperature: 
     assert Correction(1).of(intent) == pytest.approx(intent)
 
 
+@pytest.mark.slow
 def test_the_temperature_that_was_used_is_found_again() -> None:
     """Answers that are honest, made three times as sure of themselves in log space."""
     draws = np.random.default_rng(0)

@@ -82,6 +82,7 @@ def test_it_lists_whatever_anybody_lists_and_each_sender_and_never_the_ego(small
         assert set(graph.seen) == listed - {ego}
 
 
+@pytest.mark.slow
 def test_an_object_of_several_senders_is_one(small: Dataset) -> None:
     graphs = shared(small, all_scenes(small))
     assert all(len(graph.nodes) == len({*graph.seen}) for graph in graphs)
@@ -262,6 +263,7 @@ class Planner:
         return {"engine": "scripted"}
 
 
+@pytest.mark.slow
 def test_a_set_of_messages_is_one_question_whatever_else_is_done_with_its_answer(pair: Dataset) -> None:
     """`objects` and `both` ask the same; a helper's model is asked only where its intent is sent."""
     asked = {}
@@ -351,6 +353,7 @@ def test_shuffled_objects_are_those_of_another_layout_where_they_are_there(pair:
             assert {node.id for node in new} <= {v.id for v in source.state.vehicles} | {*own.seen}, graph
 
 
+@pytest.mark.slow
 def test_with_shuffled_objects_and_words_nothing_is_won(small: Dataset) -> None:
     """A planner hears of dangers that are not there, and of none that is."""
     points = [OBJECTS, OBJECTS.changed(name="shuffled", messages="shuffled")]
@@ -361,6 +364,7 @@ def test_with_shuffled_objects_and_words_nothing_is_won(small: Dataset) -> None:
     assert shuffled <= alone < own
 
 
+@pytest.mark.slow
 def test_a_shuffled_run_is_read_as_it_was_asked(small: Dataset, tmp_path: Path) -> None:
     """A pair for training has the objects of the other layout; energy of them is not counted."""
     point = OBJECTS.changed(messages="shuffled")

@@ -119,6 +119,7 @@ def test_more_loss_never_hears_more_helpers_with_the_same_draws(point, case, one
     assert np.array_equal(more.latency_s, less.latency_s)
 
 
+@pytest.mark.slow
 @given(points, cases())
 @settings(max_examples=30)
 def test_a_single_decision_is_a_row_of_the_batch(point, case):

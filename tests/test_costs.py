@@ -57,6 +57,7 @@ def cost_of(run: str) -> Any:
     return json.loads(Path(run, "run.json").read_text()).get("cost")
 
 
+@pytest.mark.slow
 def test_a_run_states_what_its_questions_cost(
     there: Server, two_path: Path, harness: Typed, tmp_path: Path
 ) -> None:
@@ -77,6 +78,7 @@ def test_a_run_states_what_its_questions_cost(
     assert "cost:" not in said
 
 
+@pytest.mark.slow
 def test_a_limit_stops_before_more_is_asked_and_the_same_command_goes_on(
     there: Server, small_path: Path, harness: Typed
 ) -> None:
@@ -98,6 +100,7 @@ def test_a_limit_stops_before_more_is_asked_and_the_same_command_goes_on(
     assert cost_of("run")["mine"]["asked"] == len(there.asked)
 
 
+@pytest.mark.slow
 def test_a_limit_that_no_tokens_could_reach_stops_the_run(
     tmp_path: Path, small_path: Path, harness: Typed
 ) -> None:
@@ -137,6 +140,7 @@ def test_a_dry_run_says_what_it_would_cost(there: Server, two_path: Path, harnes
     assert there.asked == []
 
 
+@pytest.mark.slow
 def test_a_limit_says_whose_answers_it_does_not_count(
     there: Server, tmp_path: Path, two_path: Path, harness: Typed
 ) -> None:

@@ -252,6 +252,7 @@ def test_batches_change_no_row(small: Dataset, tmp_path: Path) -> None:
     assert not np.isnan(folder.read(one).decisions["inference_j"]).any()
 
 
+@pytest.mark.slow
 def test_a_read_out_writes_one_token(small: Dataset, tmp_path: Path) -> None:
     device, alone = devices.load("agx-orin"), (ALONE,)
     spec = spec_of(

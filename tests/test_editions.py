@@ -115,6 +115,7 @@ def better(files: dict[str, bytes]) -> None:
     files["small/summary.csv"] = "".join(lines).encode()
 
 
+@pytest.mark.slow
 def test_a_file_of_results_has_the_answers_and_the_editions_figures_and_is_computed_again(
     project: Harness, made: Path
 ) -> None:
@@ -305,6 +306,7 @@ def test_a_driver_is_computed_again_from_its_own_answers(project: Harness) -> No
     assert project("benchmark", "verify", "u.zip", "--quiet")[0] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "why"),
     [
@@ -523,6 +525,7 @@ def entry_that_loses(folder: Path, *lost: int) -> Rescored:
     return Rescored(contents, edition, suite, {"made-up": ()}, 0)
 
 
+@pytest.mark.slow
 def test_a_rank_is_one_more_than_the_entries_that_are_clearly_better(tmp_path: Path) -> None:
     """Layouts are drawn again here, of both kinds, to say by other means who is clearly better than whom."""
     lost = {"best": [0, 1], "near": [2, 3, 4], "worse": [*range(30)], "worst": [*range(55)]}

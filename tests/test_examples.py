@@ -221,6 +221,7 @@ def test_the_model_that_ships_takes_earlier_turns(answer: Any, small: Dataset) -
     assert all(c.error is None and c.text and c.prompt_tokens > 400 for c in completions)
 
 
+@pytest.mark.slow
 def test_a_replay_gives_the_run_again(small: Dataset, tmp_path: Path) -> None:
     options: dict[str, Any] = {"points": (POINTS["single-local"], POINTS["6g"]), "seeds": (0,)}
     spec = with_examples(spec_of(small, **options))

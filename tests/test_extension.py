@@ -101,6 +101,7 @@ def values(schema: Any) -> st.SearchStrategy[Any]:
 # -- filled in ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.sampled_from(SHAPES), st.randoms(use_true_random=False))
 def test_whatever_a_model_chooses_fits_and_is_read(shape: Shape, random: Any) -> None:
@@ -153,6 +154,7 @@ def test_a_number_is_one_of_a_hundred_to_a_thousand(
 # -- read -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.fixed_dictionaries({}, optional={k: values(v) for k, v in json.loads(EGO.extension).items()}))
 def test_strict_is_what_the_library_says_of_the_extended_schema(said: Any) -> None:

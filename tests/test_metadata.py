@@ -47,6 +47,7 @@ def _requirements() -> Any:
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("install", ["base", "test", "dev"])
 def test_the_lock_has_all_that_an_install_needs_with_digests(install: str) -> None:
     if install == "dev":

@@ -86,6 +86,7 @@ def test_several_helper_models_take_the_helpers_in_turn(small: Dataset, tmp_path
     assert faulty == {"v3"}
 
 
+@pytest.mark.slow
 def test_stored_runs_are_mixed_as_their_models_are(
     small: Dataset, mix: Path, pure: dict[str, Path], tmp_path: Path
 ) -> None:

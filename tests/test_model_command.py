@@ -131,6 +131,7 @@ def test_a_check_shows_prompt_tokens_thinking_and_a_decision_in_each_way_of_answ
     assert answers[2][3].startswith('1 token, stop: \'{"action_distribution":')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
 def test_weights_are_held_to_the_digest_of_their_card_whenever_they_are_loaded(
     engine: str, tiny: Path
@@ -153,6 +154,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_qwen3.build(tmp_path_factory.mktemp("models") / "short", context_tokens=680)
 
 
+@pytest.mark.slow
 def test_a_way_that_a_model_cannot_answer_in_is_said_and_the_others_are_timed(
     short: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

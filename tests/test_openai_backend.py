@@ -317,6 +317,7 @@ json_values = st.recursive(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @given(json_values, st.sampled_from(["json", "readout"]))
 def test_whatever_json_comes_is_an_answer_or_an_error(payload: Any, answer: AnswerMode) -> None:
     choice = {"message": payload, "logprobs": payload}

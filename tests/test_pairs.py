@@ -109,6 +109,7 @@ def test_layouts_that_numbers_are_of_become_no_training_data_silently(run: Path,
     assert lines_of(run, harness, "--report-seeds-too")
 
 
+@pytest.mark.slow
 def test_report_layouts_that_a_run_calls_others_become_no_training_data(
     tmp_path: Path, harness: Harness
 ) -> None:
@@ -170,6 +171,7 @@ def test_a_driven_run_knows_no_best_action(tmp_path: Path, harness: Harness) -> 
     assert "driven was driven, and only frozen scenes know what each action leads to" in err
 
 
+@pytest.mark.slow
 def test_an_answer_is_rejected_where_it_is_worth_less_by_the_margin(run: Path, harness: Harness) -> None:
     """Half on a lost action is worth .5 less; an unreadable answer is worth nothing; no answer is none."""
 

@@ -3,11 +3,14 @@
 import re
 import sys
 
+import pytest
+
 from harness.parsing import parse
 
 NO_WIDTH = re.compile(r"[\u200b-\u200f\u2060-\u2064\u202a-\u202e\ufeff\u00ad]")
 
 
+@pytest.mark.slow
 def test_the_lists_of_characters_are_all_spaces_but_those_of_json_and_all_without_width():
     every = list(map(chr, range(sys.maxunicode + 1)))
     spaces = {c for c in every if c.isspace()} - set(" \t\r\n")

@@ -107,6 +107,7 @@ def test_every_answer_is_what_its_prompt_asks_for(graph: SceneGraph, data: st.Da
         assert max(parsed.intent) == pytest.approx(max(p.values()))
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(graphs(role="ego"), st.sampled_from(["left", "right", "oncoming"]), st.floats(0, 0.45))
 def test_it_is_unsure_where_a_sector_is_hidden_and_nothing_calls_for_braking(

@@ -135,6 +135,7 @@ def test_a_damaged_dataset_leaves_nothing_behind(
     assert [path.name for path in tmp_path.iterdir()] == ["small"]
 
 
+@pytest.mark.slow
 def test_a_suite_is_a_table_for_each_dataset_under_names_that_are_checked(
     harness: Harness, small_path: Path, two_path: Path, tmp_path: Path
 ) -> None:

@@ -314,6 +314,7 @@ def test_two_rays_reach_further_from_a_higher_antenna():
     assert law.path_loss_db(np.array(100.0), first_m=5.0) == law.path_loss_db(np.array(100.0))
 
 
+@pytest.mark.slow
 def test_a_run_beside_a_unit_hears_more_and_the_condition_says_so(small: Dataset, tmp_path: Path) -> None:
     names = ("its-g5", "its-g5:edge=relay", "its-g5:edge=fusion", "its-g5:edge=relay,edge_x_m=500")
     run = evaluate(spec_of(small, points=tuple(map(named_point, names))), tmp_path / "run").out

@@ -171,6 +171,7 @@ def same_record(one: Path, other: Path) -> bool:
     return answers[0] == answers[1] and same_decisions(one, other)
 
 
+@pytest.mark.slow
 def test_a_replay_is_replayed(proxy_run: Path, small: Dataset, tmp_path: Path) -> None:
     run(spec_of(small, f"replay:{proxy_run}"), tmp_path / "a")
     run(spec_of(small, f"replay:{tmp_path / 'a'}"), tmp_path / "b")
@@ -343,6 +344,7 @@ def test_single_local_never_sends_and_hears_nobody(proxy_run: Path) -> None:
         assert d.latency_ms == 145.0
 
 
+@pytest.mark.slow
 def test_conditions_share_their_luck_so_more_loss_never_lets_more_through(
     small: Dataset, tmp_path: Path
 ) -> None:
@@ -416,6 +418,7 @@ def test_a_driver_decides_alike_in_every_condition_and_sends_nothing(
     assert figure(done, "6g", "success_gain_over_single-local").value == 0
 
 
+@pytest.mark.slow
 def test_the_driver_that_sees_everything_is_the_upper_reference(small: Dataset, tmp_path: Path) -> None:
     best = run(spec_of(small, "full-view"), tmp_path / "full")
     worst = run(spec_of(small, "brake"), tmp_path / "brake")

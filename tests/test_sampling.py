@@ -109,6 +109,7 @@ def said(card: Card, requests: Sequence[Request], batch_size: int = 4) -> list[s
     return [c.text for c in completions]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["json", "constrained"])
 def test_nothing_but_the_seed_moves_an_answer(card: Card, answer: AnswerMode) -> None:
     asked = [ask(i, answer, temperature=1.0, sample=s) for s in (0, 1) for i in range(4)]

@@ -448,6 +448,7 @@ def test_workers_ask_what_one_process_asks(
     assert ids[0] == ids[1] == sorted(answer.id for answer in folder.read(runs[1]).answers)
 
 
+@pytest.mark.slow
 def test_workers_together_have_no_more_at_a_server_than_one_process_may(
     parted: None, small: Dataset, tmp_path: Path
 ) -> None:

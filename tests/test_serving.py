@@ -312,6 +312,7 @@ def test_whatever_is_asked_is_answered_or_refused(answers: TestClient, wire: str
             assert len(said.json()["answers"]) == len(body["questions"])
 
 
+@pytest.mark.slow
 def test_who_may_not_ask_is_told_so(url: str) -> None:
     asked = {"state": "s", "questions": {"a": choice()}}
     assert post(url, "systemone", asked, headers={"host": "evil.example"}).status_code == 403

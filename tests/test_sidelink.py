@@ -234,6 +234,7 @@ def test_settings_that_are_no_radio_s_are_refused():
 # NR Mode 2.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("numerology", "wait_ms"), [(0, 17.5), (1, 8.75), (2, 4.375)])
 def test_a_message_in_nr_waits_17_5_slots_on_average(numerology, wait_ms):
     radio = replace(NR, numerology=numerology)

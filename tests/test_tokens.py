@@ -69,6 +69,7 @@ def test_a_gguf_file_is_read_as_its_model_reads_it(tmp_path: Path) -> None:
     assert made.decode(made.encode(text).ids) == text
 
 
+@pytest.mark.slow
 def test_a_gguf_file_that_nobody_knows_or_without_merges_is_one_line(tmp_path: Path) -> None:
     pytest.importorskip("transformers", reason="needs the transformers extra")
     message = refused(gguf(tmp_path / "odd.gguf", pre="of-my-own"))

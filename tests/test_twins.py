@@ -316,6 +316,7 @@ def test_every_paraphrase_is_of_a_sentence_that_ships() -> None:
 # What a study finds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["proxy", "local-view"])
 def test_who_reads_the_scene_holds_in_every_twin_that_says_the_same(
     family: Dataset, model: str, tmp_path: Path

@@ -82,6 +82,7 @@ def test_the_table_of_three_conditions_fits_into_a_terminal(capsys: pytest.Captu
     assert sum(line.startswith("no danger") for line in lines) == 2
 
 
+@pytest.mark.slow
 def test_where_none_are_declared_nothing_is_said(
     small: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -49,6 +49,7 @@ def test_show_has_settings_sources_and_the_reach(harness: Callable[..., Said], n
         assert vehicle >= building - 1e-6
 
 
+@pytest.mark.slow
 def test_show_says_where_settings_leave_what_the_source_tried(harness: Callable[..., Said]) -> None:
     said = "density_per_km = 1000 is outside what its model was held against, 100 to 300."
     assert said in " ".join(harness("radio", "show", "mode4:density_per_km=1000")[1].split())

@@ -17,6 +17,7 @@ def project(harness: Callable[..., Said], monkeypatch: pytest.MonkeyPatch, tmp_p
     return tmp_path / "project"
 
 
+@pytest.mark.slow
 def test_prompt_show(harness: Callable[..., Said], project: Path) -> None:
     [ego] = project.glob("prompts/*/ego.j2")
     ego.write_text(ego.read_text().replace("You drive", f"{HOSTILE} You drive"))

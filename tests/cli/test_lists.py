@@ -27,6 +27,7 @@ def project(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LISTS)
 def test_a_wrong_file_stands_in_its_list(kind: str, project: Path, harness: Typed) -> None:
     command, sound, needs = LISTS[kind]

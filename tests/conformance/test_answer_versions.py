@@ -97,6 +97,7 @@ def served(name: str) -> Iterator[Card]:
         yield replace(card, server=replace(card.server, base_url=there.url))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "answer"), [(name, answer) for name, (_, modes) in CARDS.items() for answer in modes]
 )

@@ -205,6 +205,7 @@ def test_many_viewers_see_together_what_each_sees_alone(scenario: Scenario, seed
     assert truths == [truth_graph(scenario, state) for state in states]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on_each", [20, pytest.param(60, marks=pytest.mark.exhaustive)])
 def test_many_points_are_projected_as_each_alone_on_the_nearest_point(
     scenario: Scenario, on_each: int

@@ -69,6 +69,7 @@ def test_who_decides_at_a_share_decides_at_a_higher_one(name: str) -> None:
     assert sum(map(len, deciding[1])) < sum(map(len, deciding[2])) < sum(map(len, deciding[3]))
 
 
+@pytest.mark.slow
 def test_agents_act_alone_and_the_world_goes_on_until_all_have_ended() -> None:
     world = World.start(scenarios.get(ALL), 0)
     agents = list(world.journeys)

@@ -30,6 +30,7 @@ from harness.world.world import World
 IDLE, SLOWER, FASTER, UNSURE = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.4, 0.3)
 
 
+@pytest.mark.slow
 def test_an_episode_played_by_hand():
     """Nobody is dangerous. At 1 s the ego is unsure: alone it goes on, over 6G its helpers make it brake.
 
@@ -136,6 +137,7 @@ def by_reference(seed):
     return live.drive_all(SCENARIO, [seed])[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize(
     "seed", [FROM_LEFT, *(pytest.param(seed, marks=pytest.mark.exhaustive) for seed in (NO_DANGER, ONCOMING))]
@@ -152,6 +154,7 @@ def test_a_driver_that_takes_the_lag_drives_as_the_reference_does(driver, seed):
         assert episode.messages == episode.skipped == episode.deadline_misses == 0
 
 
+@pytest.mark.slow
 def test_episodes_are_in_one_world_until_one_acts_otherwise():
     driven_together = driven(spec(first_seed=FROM_LEFT))
     lives = [(c, s) for c in POINTS for s in (0, 1)]
@@ -235,6 +238,7 @@ def test_helpers_that_cannot_be_heard_make_no_difference_but_time():
     assert unheard.latency_ms > alone.latency_ms
 
 
+@pytest.mark.slow
 def test_messages_that_the_egos_model_fuses_take_a_second_inference():
     """Unsure at 1 s, the ego hears three helpers, is asked again with their messages, and is for braking."""
     calling = named_point("6g:consensus=ego-prompt")

@@ -31,6 +31,7 @@ def texts(svg):
     return [t.text for t in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["svg", "png"])
 def test_one_scene_gives_one_picture_byte_for_byte(dataset, tmp_path, format):
     draw(scenes_of(dataset)[3], tmp_path / "scene", format)
@@ -47,6 +48,7 @@ def test_every_vehicle_is_labelled_with_id_and_kind_and_the_file_stays_light(dat
             assert {f"{v.id} {v.kind}" for v in scene.state.vehicles} <= set(texts(svg))
 
 
+@pytest.mark.slow
 def test_what_the_viewer_does_not_see_is_labelled_hidden(dataset):
     scene = scenes_of(dataset)[2]
     for viewer in scene.viewers:

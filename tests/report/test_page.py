@@ -574,6 +574,7 @@ def test_a_broken_decision_is_one_line_that_names_the_file(run, tmp_path, decisi
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("column", ["on_time_1", "fused_IDLE", "triggered"])
 def test_a_missing_column_is_named(run, tmp_path, column):
     copy = copied(run, tmp_path)

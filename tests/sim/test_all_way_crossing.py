@@ -156,6 +156,7 @@ def test_an_agent_has_its_goal_behind_the_junction_on_the_other_side(way):
     assert seat.scenario.cleared(behind, np.array([["own"]]), P).all()
 
 
+@pytest.mark.slow
 def test_who_keeps_its_speed_collides_in_many():
     drives = drive_all(SCENARIO, range(4))
     results = {driver: [outcomes[driver].result for outcomes in drives] for driver in DRIVERS}

@@ -162,11 +162,13 @@ def test_a_car_that_is_heard_to_be_harmless_is_no_tell(monkeypatch):
         np.testing.assert_array_equal(*(getattr(points, name) for points in judged))
 
 
+@pytest.mark.slow
 def test_a_scenario_that_hides_nothing_has_nothing_to_audit():
     with pytest.raises(UserError, match=r"one-way-crossing hides no danger: most are in sight"):
         audit(one_way_crossing.SCENARIO, 10, 0, quiet)
 
 
+@pytest.mark.slow
 def test_too_few_layouts_are_refused(harness):
     code, out, err = harness("dataset", "scenario", "audit", NAME, "--layouts", 4, "--workers", 1)
     assert (code, out) == (2, "")

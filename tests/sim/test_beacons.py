@@ -277,6 +277,7 @@ def test_who_brakes_sends_at_every_check_three_times_more_after_it_and_then_by_d
     assert sent[19] == 166, "the last check that finds it slower: it brakes until frame 168"
 
 
+@pytest.mark.slow
 def test_under_cam_a_lost_beacon_is_still_the_last_one_that_was_sent():
     """The next is measured from it, whoever heard it, so losses do not change when beacons are sent."""
 
@@ -335,6 +336,7 @@ def test_an_environments_vehicles_beacon_over_a_radio_too():
     assert all(0.02 <= state.time_s - last_heard(state, h.id, "v1").time_s <= 1.5 for h in state.helpers)
 
 
+@pytest.mark.slow
 def test_the_loss_of_a_beacon_is_that_of_its_link_when_it_was_sent():
     """Where the radio says .3 for one link and 1 for the others, its share comes, and nothing else."""
     p, n = SCENARIO.parameters, 1000

@@ -181,6 +181,7 @@ def test_traffic_that_it_takes_away_has_gone():
     assert {beacon.sender for beacon in world.state().beacons} <= seen[2]
 
 
+@pytest.mark.slow
 def test_another_environment_does_not_change_its_traffic():
     """highway-env's intersection sets constants of the class of all IDM vehicles."""
     scenario = scenarios.get("env:merge-v0")

@@ -77,6 +77,7 @@ def released() -> dict[str, Any]:
         }
 
 
+@pytest.mark.slow
 def test_the_published_schemas_are_schemas_and_allow_what_is_released(
     small: Dataset, released: dict[str, Any]
 ):

@@ -111,6 +111,7 @@ def outcome(world: World, *actions: str) -> Outcome:
     return finish([world], ["cruise"])[0]
 
 
+@pytest.mark.slow
 def test_passing_and_waiting_both_clear_where_they_should_and_waiting_for_nothing_never_does() -> None:
     seeds = {TWO_WAY.layout(s, TWO_WAY.parameters).danger: s for s in range(20)}
     assert drive(TWO_WAY, "full-view", seeds[None]).success

@@ -165,6 +165,7 @@ def test_the_embankment_hides_a_danger_from_one_side_that_meets_an_ego_whom_othe
         assert driven(always, seed, plans)[0] == "collision"
 
 
+@pytest.mark.slow
 def test_who_sees_everything_waits_and_who_keeps_its_speed_meets_somebody():
     for drives in drive_all(SCENARIO, range(2)):
         results = {driver: outcome.result for driver, outcome in drives.items()}
@@ -175,6 +176,7 @@ def test_who_sees_everything_waits_and_who_keeps_its_speed_meets_somebody():
         )
 
 
+@pytest.mark.slow
 def test_if_nobody_gives_way_they_collide():
     for seed in range(4):
         idle = [["IDLE"] * P.decisions] * len(agents(layouts()[seed]))

@@ -323,6 +323,7 @@ def test_an_episode_without_its_danger_looks_the_same_for_as_long_as_the_ego_doe
     assert hidden_steps > 40
 
 
+@pytest.mark.slow
 def test_a_graph_names_only_its_viewer_the_ego_what_it_lists_and_buildings():
     for seed in (1, 6, 10, 11):
         world = World.start(SCENARIO, seed)

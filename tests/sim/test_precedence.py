@@ -99,6 +99,7 @@ def test_agents_hear_the_beacons_of_those_they_do_not_see() -> None:
     assert heard
 
 
+@pytest.mark.slow
 def test_a_reference_driver_drives_every_agent() -> None:
     scenario = scenarios.get("all-way-crossing:agent_share=1")
     worlds = [World.start(scenario, seed) for seed in range(8)]

@@ -86,6 +86,7 @@ def test_where_it_goes_decides_and_its_indicator_tells():
     assert "v5" not in {c.vehicle for c in scene_graph(SCENARIO, leaves, "v2").conflicts}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sector", ["left", "oncoming"])
 def test_a_danger_hits_an_ego_that_does_not_know_of_it(sector):
     for seed in seeds(sector)[:2]:
@@ -93,6 +94,7 @@ def test_a_danger_hits_an_ego_that_does_not_know_of_it(sector):
         assert drive(SCENARIO, "full-view", seed).success
 
 
+@pytest.mark.slow
 def test_in_a_dangers_place_a_car_that_leaves_is_harmless():
     twins = [
         (seed, spawn)

@@ -94,6 +94,7 @@ def test_a_harmless_car_is_like_a_dangerous_one_but_late(layouts):
         assert bands[0] == pytest.approx(bands[1], abs=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [range(20), pytest.param(range(20, 60), marks=pytest.mark.exhaustive)])
 def test_nobody_touches_anybody_before_the_ego_does(seeds):
     worlds = [World.start(SCENARIO, seed) for seed in seeds]
@@ -129,6 +130,7 @@ def test_an_id_tells_nothing_about_who_else_is_there(layouts):
             assert counts[vehicle] / counts.total() == pytest.approx(1 / 3, abs=0.05)
 
 
+@pytest.mark.slow
 def test_whatever_is_not_the_danger_is_where_it_would_be_without_it():
     for seed in range(300):
         with_danger, without = layout(seed, P), layout(seed, replace(P, danger_share=0.0))

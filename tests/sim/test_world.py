@@ -62,6 +62,7 @@ def test_an_episode_starts_at_14_mps_in_the_egos_lane_before_the_first_decision(
     assert P.ego_start_m[0] <= state.ego.y_m + 0.54 <= P.ego_start_m[1]  # the conflict zone is 0.54 m north
 
 
+@pytest.mark.slow
 def test_the_ego_brakes_and_accelerates_within_its_limits():
     world = World.start(SCENARIO, NO_DANGER)
     speeds = [world.state().ego.speed_mps]

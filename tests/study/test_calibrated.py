@@ -70,6 +70,7 @@ def test_of_a_kinds_rows_one_draw_lies_in_each_equal_part(kinds: list[int], seed
         assert sorted((of * len(of)).astype(int)) == list(range(len(of)))
 
 
+@pytest.mark.slow
 def test_stratified_draws_are_uniform_and_columns_independent() -> None:
     """A row's own draws, over 4 000 generators: any row of a small kind has every value alike often."""
     kinds = np.array([0, 1, 0, 1, 0])

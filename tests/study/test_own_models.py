@@ -134,6 +134,7 @@ def test_another_identity_is_refused_before_a_question(run: Server, harness: Cal
     assert "the model is not what it was (base_url); run again" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "study",
     [

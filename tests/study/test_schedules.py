@@ -302,6 +302,7 @@ def test_schedules_are_compared_from_the_command_line(
     assert "balanced %" in (tmp_path / "other/index.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_same_twice(stored: ReplayedRun):
     once, twice = (
         compare(stored, None, SIXG, ["random", "learnt"], (0, 1), 0.5, counted([stored]), lambda n: None)
@@ -441,6 +442,7 @@ def test_joules_of_choices_are_those_of_the_runs_decisions(small: Dataset, tmp_p
     ).all()
 
 
+@pytest.mark.slow
 def test_a_model_is_opened_once_whatever_it_is_asked(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

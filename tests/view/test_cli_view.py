@@ -111,6 +111,7 @@ def test_bad_input_is_one_line(args: list[str], said: str, harness: Callable[...
     assert said in err
 
 
+@pytest.mark.slow
 def test_an_exported_folder_has_a_list_and_a_page_of_each_run_and_no_path_of_this_machine(
     reports: Path, harness: Callable[..., Said], tmp_path: Path
 ) -> None:

@@ -26,6 +26,7 @@ def scene(reports: Path) -> str:
     return read(reports / "first").decisions.labels("scene")[0]
 
 
+@pytest.mark.slow
 def test_a_note_stays_with_its_run_and_stands_on_its_page(
     browser: TestClient, reports: Path, scene: str
 ) -> None:

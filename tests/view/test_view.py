@@ -118,6 +118,7 @@ def test_a_study_opens_with_its_page_or_its_pictures(browser: TestClient, report
     assert browser.get("/run?path=paper").text == "<p>the paper's numbers"
 
 
+@pytest.mark.slow
 def test_two_runs_are_compared_and_the_older_is_a(browser: TestClient) -> None:
     for query in ("path=first&path=second", "path=second&path=first"):
         page = browser.get(f"/compare?{query}").text
@@ -125,6 +126,7 @@ def test_two_runs_are_compared_and_the_older_is_a(browser: TestClient) -> None:
         assert "latency_p95_ms" in page
 
 
+@pytest.mark.slow
 def test_a_comparison_leads_to_the_same_with_a_and_b_swapped_and_to_all_answers(browser: TestClient) -> None:
     page = browser.get("/compare?path=first&path=second").text
     links = {text: unescape(href) for href, text in re.findall('<a href="([^"]+)">([^<]+)</a>', page)}
