@@ -73,7 +73,7 @@ def test_nobody_asks_so_no_helper_answers(name: str, tmp_path: Path) -> None:
     assert {answer.role for answer in read(tmp_path / "run").answers} == {"ego"}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_workers_change_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "EPISODES_AT_ONCE", 2)
     source = LiveSource(1_000_000, 4)

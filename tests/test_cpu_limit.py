@@ -57,7 +57,7 @@ def test_short():
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_long_tests_fail_unless_they_say_so_or_others_share_what_takes_long(tmp_path: Path) -> None:
     (tmp_path / "test_it.py").write_text(TESTS)
     here = os.pathsep.join([str(Path(__file__).parent), *sys.path])

@@ -300,6 +300,7 @@ def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, as
     assert len(tokenizer("307")["input_ids"]) == 3, "every digit stands alone"
 
 
+@pytest.mark.exhaustive
 def test_a_killed_run_goes_on_to_the_same_model(
     student: Path, drawn_before: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -158,9 +158,7 @@ ONCE = {
 FOLLOWED = {
     "docs/answers.md": (),
     "docs/comparing.md": ("harness eval", "harness compare", "harness run history", "harness plan reports/"),
-    "docs/first-evaluation.md": (),
     "docs/radio.md": ("harness eval", "harness radio check"),
-    "docs/tutorial-prompt.md": ("harness eval", "harness compare", "harness report"),
 }  # fmt: skip
 
 

@@ -348,7 +348,7 @@ def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(done: Evaluated, tmp
     assert again.asked == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_another_process_has_asked_meanwhile_is_not_asked_again(done: Evaluated, tmp_path: Path) -> None:
     """Both looked at the run before either asked."""
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))

@@ -338,7 +338,7 @@ class Slowing(Scripted):
         return Completion(request.id, text, None, None, "stop", None, 1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @COMMANDS
 def test_a_measured_run_repeated_from_its_manifest_by_a_slower_model_has_the_same_rows(
     command: Sequence[str], harness: Callable[..., Any], small_path: Path, tmp_path: Path,

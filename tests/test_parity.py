@@ -104,6 +104,7 @@ def test_the_command_says_each_finding_in_a_line_and_exits_with_1(unlike: Path, 
     assert lines[-1] == f"the engines differ: {PROMPTS} prompts; measured, and what is allowed"
 
 
+@pytest.mark.exhaustive
 def test_a_version_with_examples_is_compared_too(tiny: Path, small_path: Path) -> None:
     arguments = [
         "model",

@@ -240,6 +240,7 @@ def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
     assert (card.adapter, card.letters, card.weights) == (str(taught), "raw", "swarm-tiny")
 
 
+@pytest.mark.exhaustive
 def test_a_killed_teaching_goes_on_to_the_same_adapter(
     taught: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

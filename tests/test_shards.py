@@ -216,7 +216,7 @@ def test_what_no_shard_can_be(options: tuple[str, ...], said: str, harness: Type
     assert not Path("shard").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_dataset_of_shards_is_the_one_that_was_not_split(harness: Typed, tmp_path: Path) -> None:
     assert harness(*BUILD, "--out", "whole/small")[0] == 0
     for n in ("1", "2"):

@@ -25,7 +25,7 @@ def project(harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     return tmp_path / "project"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Path) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     lines = [line for line in (project / "README.md").read_text().splitlines() if line.startswith("$ ")]

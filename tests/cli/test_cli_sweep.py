@@ -20,7 +20,7 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return evaluate(spec_of(small), tmp_path_factory.mktemp("sweep") / "run").out
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_without_an_axis_it_draws_the_papers_panels_beside_the_proxys(
     harness: Callable[..., Said], done: Path
 ) -> None:

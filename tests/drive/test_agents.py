@@ -266,7 +266,7 @@ def test_a_liar_is_one_vehicle_and_lies_to_whoever_asks(tmp_path: Path) -> None:
     assert len({episode for episode, _ in liars[0]}) == 2 == len(liars[0])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_shards_change_no_byte(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harness: Callable[..., tuple[int, str, str]]
 ) -> None:

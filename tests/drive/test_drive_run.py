@@ -117,7 +117,7 @@ def test_killed_at_one_place_of_each_kind_and_resumed_it_is_the_same_run(
     assert {p.name for p in out.iterdir()} == {*FILES, "run.json", "run.toml", "sources"}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_chunk_that_kills_its_worker_is_named_and_the_same_command_goes_on(harness, tmp_path, monkeypatch):
     """A worker is forked with the world in which it dies."""
 
