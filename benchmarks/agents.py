@@ -22,7 +22,7 @@ from pages import harness, markdown, options, write_tables
 from harness.core.figures import DASH, shown
 from harness.core.files import write_whole
 from harness.core.seeds import FIRST
-from harness.core.statistics import rate_difference, rate_interval
+from harness.core.statistics import paired_difference, rate_interval
 from harness.runs.folder import Run, read
 from harness.runs.metrics import METRICS
 from harness.world import scenarios
@@ -204,7 +204,7 @@ def success(run: Run, condition: str) -> dict[int, float]:
 def more(own: Mapping[int, float], other: Mapping[int, float]) -> str:
     """Return by how many points one success is above another, over the layouts that both have."""
     pair = np.array([(own[layout], other[layout]) for layout in own if layout in other], dtype=float)
-    return shown(rate_difference(*pair.T), sign="+") if len(pair) else DASH
+    return shown(paired_difference([pair[:, 0] - pair[:, 1]]), sign="+") if len(pair) else DASH
 
 
 if __name__ == "__main__":

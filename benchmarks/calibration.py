@@ -11,7 +11,6 @@ the page between its marks. What is finished is read and not made again.
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple, get_args
@@ -22,10 +21,10 @@ from harness.coordination.calibrations import FOLDER, Level
 from harness.core.arrays import Floats
 from harness.core.figures import PERCENT, POINTS, Unit, shown
 from harness.core.resources import MARKER
-from harness.core.statistics import Estimate, rate_difference
+from harness.core.statistics import Estimate
 from harness.runs import reliability
 from harness.runs.folder import Run, read
-from harness.runs.metrics import BALANCED, by_episode, entry, halved, metrics_of
+from harness.runs.metrics import BALANCED, by_episode, difference, entry, metrics_of
 from harness.runs.summary import judged_of
 
 SMALLEST = "--only proxy --layouts 2"
@@ -150,7 +149,7 @@ def cooperation(runs: Sequence[tuple[Row, Run]]) -> str:
             scores.append(run.score(condition.replace(HELPED, ALONE, 1), BALANCED))
             texts = [shown(s, unit) if s else "–" for s, unit in zip(scores, UNITS, strict=True)]
             places = run.conditions.index(condition), run.conditions.index(HELPED)
-            change = halved(BALANCED, partial(changed, values, places))
+            change = changed(values, places)
             n = str(len(run.grid.episodes))
             rows.append([row.name, words, n, *texts, "–" if condition == HELPED else shown(change, POINTS)])
     head = (HELPED, "calibration", "layouts", "asks %", "kbit an episode", "latency ms", "balanced success %",
@@ -158,10 +157,11 @@ def cooperation(runs: Sequence[tuple[Row, Run]]) -> str:
     return markdown(head, rows)
 
 
-def changed(values: Mapping[str, Floats], places: tuple[int, int], metric: str) -> Estimate:
-    """Return by how much a metric is higher in the first condition than in the second, paired by layout."""
-    first, second = (values[metric][place].T for place in places)
-    return rate_difference(first, second)
+def changed(values: Mapping[str, Floats], places: tuple[int, int]) -> Estimate:
+    """Return by how much balanced success is higher in the first condition, paired by layout."""
+    first, second = places
+    halves = entry(BALANCED).halves
+    return difference(BALANCED, [(values[half][first].T, values[half][second].T) for half in halves])
 
 
 if __name__ == "__main__":

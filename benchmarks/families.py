@@ -8,10 +8,11 @@ from pages import harness
 
 from harness.core.arrays import Floats
 from harness.core.figures import shown
-from harness.core.statistics import Estimate, mean_of, rate_difference
+from harness.core.statistics import Estimate, known_mean, mean_of, paired_difference
 from harness.runs import folder, suite
 from harness.runs.folder import Run
-from harness.runs.metrics import ALL, BALANCED, METRICS, by_episode, entry, halved
+from harness.runs.metrics import ALL, BALANCED, BASELINE, GAINS, METRICS, by_episode, entry
+from harness.runs.success import by_condition, mean_difference
 
 
 class Row(NamedTuple):
@@ -67,6 +68,9 @@ class Families(NamedTuple):
 
     def estimate(self, condition: str, metric: str) -> Estimate | None:
         """Return a metric's mean over families, of episodes or answers; None if a family has no value."""
+        if metric == GAINS[BALANCED]:
+            families = [by_condition(run.grid, run.episodes) for run in self.runs.values()]
+            return mean_difference([(how, of[condition], of[BASELINE]) for how, of in families])
         over = "answers" if condition == ALL else "episodes"
         wanted = condition, metric, over
         scores = [
@@ -83,12 +87,11 @@ class Families(NamedTuple):
 
     def over(self, other: "Families", condition: str) -> Estimate:
         """Return balanced success less that of other runs in the same condition, paired by episode."""
-
-        def of_family(family: str) -> Estimate:
+        differences = []
+        for family in self.runs:
             mine, theirs = (_halves(each.runs[family], condition) for each in (self, other))
-            return halved(BALANCED, lambda half: rate_difference(mine[half].T, theirs[half].T))
-
-        return mean_of([of_family(family) for family in self.runs])
+            differences += [known_mean(mine[half] - theirs[half], 0) for half in mine]
+        return paired_difference(differences)
 
     @property
     def counted(self) -> str:

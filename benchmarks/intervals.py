@@ -6,10 +6,9 @@ is how alike the seeds, or the answers, of one episode are: their intraclass cor
 changes anything. `<` marks less than 94 %, `>` more than 96 %; with 2 000 runs a cell of exactly 95 % is
 measured within 1 point of it.
 
-`--agree` has another table: what the interval is where two runs agree in all episodes, and how often it holds
-a gain that few episodes show, by all outcomes and not by simulation.
+`benchmarks/differences.py` has paired differences of success over halves and families.
 
-    python benchmarks/intervals.py [--runs 2000] [--seed 0] [--twins | --agree]
+    python benchmarks/intervals.py [--runs 2000] [--seed 0] [--twins]
 """
 
 import argparse
@@ -19,14 +18,13 @@ from dataclasses import asdict, dataclass
 from time import perf_counter
 
 import numpy as np
-from scipy.stats import binom, norm
 
 from harness.core.arrays import Floats
 from harness.core.statistics import (
     Estimate,
     known_mean,
     mean_of,
-    rate_difference,
+    paired_difference,
     rate_interval,
     seed_interval,
     seed_rate_interval,
@@ -40,12 +38,6 @@ RATES = (0.54, 0.75, 0.9, 0.97, 0.99)
 PAIRS = ((0.54, 0.54), (0.54, 0.75), (0.75, 0.9), (0.9, 0.97), (0.97, 0.99), (0.97, 0.97))
 LOSSES = (0.012, 0.1, 0.5)
 ALONE = 0.7  # share of episodes that succeed without a message
-AGREE, SUCCEED = (
-    (20, 50, 100, 200, 600),
-    (1.0, 0.9, 0.5),
-)  # episodes, and the share in which both runs succeed
-COVERED, EXPECTED = (50, 100), np.arange(0.25, 6.1, 0.25).tolist()  # episodes; those that one run alone wins
-UNLIKELY = 1e-7  # an outcome that is not counted
 
 
 @dataclass(frozen=True)
@@ -114,7 +106,7 @@ def gain(before: float, after: float, alike: tuple[float, float], seeds: int) ->
     def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
         for _ in range(runs):
             a, b = paired(rng, before, after, alike, seeds, episodes)
-            yield difference(SUCCESS, b, a), after - before
+            yield difference(SUCCESS, [(b, a)]), after - before
 
     return draw
 
@@ -130,7 +122,7 @@ def rare_change(rate: float, gained: float, seeds: int, loss: float) -> Kind:
             a = np.repeat(hard < rate, seeds, axis=1)
             b = (hard < rate + share) & ~lost
             truth = (rate + share) * (1 - loss) - rate
-            yield difference(SUCCESS, b.astype(float), a.astype(float)), truth
+            yield difference(SUCCESS, [(b.astype(float), a.astype(float))]), truth
 
     return draw
 
@@ -204,6 +196,18 @@ def suite(families: Sequence[Kind]) -> Kind:
     return draw
 
 
+def suite_gain(alike: tuple[float, float], seeds: int) -> Kind:
+    """A paired gain, mean over families with the rates of `PAIRS`."""
+
+    def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
+        truth = float(np.mean([after - before for before, after in PAIRS]))
+        for _ in range(runs):
+            drawn = [paired(rng, before, after, alike, seeds, episodes) for before, after in PAIRS]
+            yield paired_difference([known_mean(b - a, 1) for a, b in drawn]), truth
+
+    return draw
+
+
 def twin_kinds() -> Iterator[tuple[str, str, Kind]]:
     """What is measured of `harness study twins`."""
     for pairs in (6, 18):
@@ -244,46 +248,7 @@ def kinds() -> Iterator[tuple[str, str, Kind]]:
         of_rates = [success(rate, alike, seeds) for rate in RATES]
         yield "success rate, mean over families", row, suite(of_rates)
     for row, seeds, alike in rows:
-        of_pairs = [gain(before, after, (alike, alike), seeds) for before, after in PAIRS]
-        yield "paired gain, mean over families", row, suite(of_pairs)
-
-
-def agreeing(n: int, share: float) -> float:
-    """Half of the interval where two runs agree in all of n episodes and succeed in a share."""
-    both = np.repeat([1.0, 0.0], [round(share * n), n - round(share * n)])
-    return rate_difference(both, both).high
-
-
-def coverage(n: int, both: float, gained: float) -> float:
-    """How often the interval holds a gain: n episodes, in which both runs succeed or one alone, or none."""
-    covered = 0.0
-    for alone in range(n + 1):
-        p_alone = binom.pmf(alone, n, gained)
-        chances = binom.pmf(np.arange(n - alone + 1), n - alone, both / (1 - gained)) * p_alone
-        for same in np.flatnonzero(chances > UNLIKELY).tolist():
-            first = np.repeat([1.0, 1.0, 0.0], [same, alone, n - same - alone])
-            second = np.repeat([1.0, 0.0], [same, n - same])
-            e = rate_difference(first, second)
-            covered += chances[same] * (e.low <= gained <= e.high)
-    return covered
-
-
-def agreement() -> None:
-    """Print the table of two runs that agree, and one line of JSON."""
-    z2 = float(norm.ppf(0.975)) ** 2
-    rows = {f"success in {share:.0%}": [agreeing(n, share) for n in AGREE] for share in SUCCEED}
-    rows["Tango's score interval"] = [z2 / (n + z2) for n in AGREE]
-    print(
-        f"{'all episodes agree: half of the interval, points':<52}"
-        + "".join(f"{f'E = {n}':>9}" for n in AGREE)
-    )
-    for name, halves in rows.items():
-        print(f"{name:<52}" + "".join(f"{100 * half:>9.1f}" for half in halves))
-    least = {n: min(coverage(n, SUCCEED[-1], k / n) for k in EXPECTED) for n in COVERED}
-    for n, share in least.items():
-        gains = f"gains in {EXPECTED[0]} to {EXPECTED[-1]} episodes"
-        print(f"E = {n}, success in half, {gains}: held in {100 * share:.1f} % at least")
-    print(json.dumps({"episodes": AGREE, "halves": rows, "least_coverage": least}))
+        yield "paired gain, mean over families", row, suite_gain((alike, alike), seeds)
 
 
 def main() -> None:
@@ -292,10 +257,7 @@ def main() -> None:
     arguments.add_argument("--runs", type=int, default=2000)
     arguments.add_argument("--seed", type=int, default=0)
     arguments.add_argument("--twins", action="store_true", help="those of `harness study twins` alone")
-    arguments.add_argument("--agree", action="store_true", help="of two runs that agree alone")
     given = arguments.parse_args()
-    if given.agree:
-        return agreement()
     began, found, before = perf_counter(), list[Cell](), ""
     of = TWINS if given.twins else EPISODES
     for n, (heading, row, kind) in enumerate(twin_kinds() if given.twins else kinds()):

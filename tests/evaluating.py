@@ -33,6 +33,7 @@ from harness.prompts import versions as prompts
 from harness.report.details import prompts_of
 from harness.runs import folder
 from harness.runs.decisions import Decisions
+from harness.runs.leading import PAIRED
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, Decision, Episode, Latency, Score
 from harness.runs.summary import Figures, counted
@@ -69,9 +70,10 @@ def run(spec: Spec, out: Path) -> Evaluated:
     return done
 
 
-def figure(done: "Evaluated | Walked", condition: str, metric: str, interval: str = "episodes") -> Score:
+def figure(done: "Evaluated | Walked", condition: str, metric: str, interval: str = "") -> Score:
     """The one row of a summary that says this."""
-    wanted = (condition, metric, interval)
+    usual = PAIRED if "gain" in metric else "episodes"
+    wanted = (condition, metric, interval or usual)
     [score] = [s for s in done.scores if (s.condition, s.metric, s.interval) == wanted]
     return score
 

@@ -12,7 +12,7 @@ from msgspec import structs
 from run_on_disk import Row, made_up
 
 from harness.coordination.operating_point import POINTS
-from harness.core.statistics import mean_of, rate_difference, rate_interval
+from harness.core.statistics import mean_of, paired_difference, rate_interval
 from harness.dataset.load import Dataset, load
 from harness.evaluate.live_world import LiveSource
 from harness.report.compare.difference import compare
@@ -72,11 +72,7 @@ def test_balanced_success_is_the_mean_of_both_halves_with_their_intervals(tmp_pa
 
 def test_the_gain_is_paired_by_episode_in_either_half(tmp_path: Path) -> None:
     gain = made(tmp_path / "run", 0, 1, 7).score("6g", GAINS[BALANCED])
-    halves = [
-        rate_difference(np.array(success, dtype=float)[:, None], np.ones((len(success), 1)))
-        for success in ([0, 0, 1], [1, 1, 1, 1, 0])
-    ]
-    expected = mean_of(halves)
+    expected = paired_difference([np.array([-1.0, -1, 0]), np.array([0.0, 0, 0, 0, -1])])
     assert gain is not None
     assert (gain.value, gain.low, gain.high) == (expected.value, expected.low, expected.high)
     assert gain.n == 8
@@ -97,11 +93,7 @@ def test_two_runs_are_compared_in_it_and_a_gate_takes_it(tmp_path: Path) -> None
     comparison = compare(pair(tmp_path / "a", tmp_path / "b"))
     [of] = [d for d in comparison.conditions[1].differences if d.metric == BALANCED]
     assert (of.a, of.b) == (pytest.approx((2 / 3 + 1) / 2), pytest.approx((2 / 3 + 3 / 5) / 2))
-    halves = [
-        rate_difference(np.array(b, dtype=float), np.array(a, dtype=float))
-        for a, b in (([0, 1, 1], [0, 1, 1]), ([1, 1, 1, 1, 1], [1, 1, 1, 0, 0]))
-    ]
-    assert of.change == mean_of(halves)
+    assert of.change == paired_difference([np.zeros(3), np.array([0.0, 0, 0, -1, -1])])
     assert of.primary
     assert of.p_value is not None
     assert 0 < of.p_value <= 1

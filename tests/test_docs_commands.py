@@ -104,7 +104,7 @@ NOT_RUN = {
         for line in TYPED
         if re.match(r"harness eval --model '?http://", line)
     },
-    "harness benchmark run v2v-safety-1.0 --model proxy --made-by 'Ada, of Example' --out reports/proxy": (
+    "harness benchmark run v2v-safety-1.1 --model proxy --made-by 'Ada, of Example' --out reports/proxy": (
         "takes 20 CPU seconds; tests/test_editions.py runs a small edition"
     ),
     "harness benchmark verify reports/proxy.zip": "as above",

@@ -32,6 +32,7 @@ from harness.dataset.load import Dataset
 from harness.evaluate.asking import answer_of, requests
 from harness.evaluate.latency import inference_s
 from harness.runs.folder import csv_text
+from harness.runs.leading import PAIRED
 from harness.runs.metrics import METRICS, of_decisions
 from harness.runs.records import Answer, Latency, Score, Variant
 
@@ -148,14 +149,11 @@ def test_decisions_that_would_act_in_another_frame_than_the_datasets_lag(played:
 
 
 def test_the_gain_over_single_local_is_paired_by_episode(told: Walked) -> None:
-    """From .25 to .5, whose Wilson's ends of 4 are .0456, .6994 and .1500, .8500.
-
-    All covary: .25 - .125 less 1/4 for two pairs that might differ is none, so the ends join as if alone.
-    """
+    """One of 4 episodes is gained in all seeds: the variance is .75 / 3. Two more differ."""
     row = figure(told, "clear", "success_gain_over_single-local")
-    assert (row.value, row.n) == (0.25, 4)
-    low, high = math.hypot(0.5 - 0.15, 0.6994 - 0.25), math.hypot(0.85 - 0.5, 0.25 - 0.0456)
-    assert (row.low, row.high) == pytest.approx((0.25 - low, 0.25 + high), abs=1e-4)
+    assert (row.value, row.n, row.interval) == (0.25, 4, PAIRED)
+    half = 1.959964 * math.sqrt(0.75 / 3 / 4 + 2 / 4**2)
+    assert (row.low, row.high) == pytest.approx((0.25 - half, 0.25 + half), abs=1e-6)
     assert value(told, "deaf", "success_gain_over_single-local")[0] == 0.0
     gains = {s.condition for s in told.scores if s.metric == "success_gain_over_single-local"}
     assert gains == {"clear", "deaf"}

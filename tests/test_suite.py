@@ -13,13 +13,14 @@ import pytest
 from evaluating import same_files
 from starlette.testclient import TestClient
 
-from harness.core.statistics import mean_of
+from harness.core.statistics import mean_of, paired_difference
 from harness.dataset.build import build
 from harness.report.view.access import cookie
 from harness.report.view.app import app
 from harness.report.words import compared
-from harness.runs.leading import BALANCED
+from harness.runs.leading import BALANCED, PAIRED
 from harness.runs.listing import runs
+from harness.runs.metrics import METRICS, of_ends
 from harness.runs.suite import read
 from harness.world import scenarios
 
@@ -92,7 +93,7 @@ def test_a_run_of_a_suite_is_what_it_is_alone(evaluated: Harness) -> None:
 def test_means_weight_families_alike_and_join_their_intervals(evaluated: Harness) -> None:
     suite = read(DONE)
     assert list(suite.runs) == ["occluded-intersection", "parking-exit"]
-    for metric in ("success_rate", "success_gain_over_single-local", "unsafe_rate", "latency_proxy_ms"):
+    for metric in ("success_rate", "unsafe_rate", "latency_proxy_ms"):
         scores = [run.score("6g", metric) for run in suite.runs.values()]
         expected = mean_of([score.estimate for score in scores if score])
         found = suite.score("6g", metric)
@@ -102,6 +103,20 @@ def test_means_weight_families_alike_and_join_their_intervals(evaluated: Harness
         )
         assert found.value == pytest.approx(sum(s.value for s in scores if s and s.value is not None) / 2)
     assert found.n == 6, "four layouts and two"
+
+
+def test_a_gain_takes_the_layouts_of_all_families_together(evaluated: Harness) -> None:
+    suite = read(DONE)
+    differences = []
+    for run in suite.runs.values():
+        by = dict(zip(run.conditions, of_ends(METRICS["success_rate"], run.grid, run.episodes), strict=True))
+        differences.append((by["6g"] - by["single-local"]).mean(axis=0))
+    expected = paired_difference(differences)
+    gain = suite.score("6g", "success_gain_over_single-local")
+    assert gain
+    assert (gain.value, gain.low, gain.high, gain.n, gain.interval) == (
+        expected.value, expected.low, expected.high, 6, PAIRED,
+    )  # fmt: skip
 
 
 def test_json_has_every_family_and_the_means(project: Harness) -> None:
@@ -114,7 +129,7 @@ def test_json_has_every_family_and_the_means(project: Harness) -> None:
     assert of_family["drivers"]["full-view"]["value"] == 1.0
     rows = {(r["condition"], r["metric"], r["interval"]): r for r in told["mean"]["summary"]}
     assert rows["6g", "success_rate", "episodes"]["n"] == 2
-    assert rows["6g", "success_gain_over_single-local", "episodes"]["ci_low"] is None, (
+    assert rows["6g", "success_gain_over_single-local", PAIRED]["ci_low"] is None, (
         "one episode bounds nothing"
     )
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from harness.evaluate.rescore import Here, Rescored
     from harness.report.board import Line
 
-EDITION = "v2v-safety-1.0"  # taken if none is named
+EDITION = "v2v-safety-1.1"  # taken if none is named
 
 MadeBy = Annotated[str, typer.Option(help="Who made the results, in your words; it stands on a board.")]
 Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Files of results.")]
@@ -109,7 +109,7 @@ def pack(
     except ValueError as error:
         raise UserError(f"--made-by: {error}; give a shorter text") from None
     file = out or runs[0].absolute().with_name(runs[0].absolute().name + ".zip")
-    results.pack(contents, entry, of.metrics, file)
+    results.pack(contents, entry, of.figures, file)
     if not quiet:
         typer.echo(f"packed {printable(of.name)}, digest {of.digest[:12]}, into {printable(file)}")
 

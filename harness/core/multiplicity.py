@@ -2,12 +2,10 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from harness.core.arrays import Floats
-from harness.core.statistics import Estimate, rate_difference
+from harness.core.statistics import Estimate
 
 LEVEL = 0.05  # the chance of a false alarm among all comparisons that are shown together
 LEAST = 1e-12  # below this p-value, levels of confidence are too near 1 to be told apart
@@ -68,31 +66,3 @@ def holm(p_values: Sequence[float], comparisons: int | None = None) -> list[floa
     corrected = np.empty(len(p_values))
     corrected[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
     return [float(p) for p in corrected]
-
-
-@dataclass(frozen=True)
-class SuccessTest:
-    """Result of a test of the difference in success."""
-
-    # `mcnemar` if no seed changes any episode's success, so that an episode is one yes or no; else `interval`
-    method: str
-    p_value: float | None = None  # exact two-sided p-value of McNemar's test; None for an interval
-    low: float | None = None  # lower end of the 95 % interval of B - A over episodes; None for McNemar's test
-    high: float | None = None  # upper end
-
-
-def success_test(a: Floats, b: Floats) -> SuccessTest | None:
-    """Test whether B's success, 0 or 1 by episode and seed, (E, S), differs from A's over episodes.
-
-    None for an interval of one episode.
-    """
-    from scipy.stats import binomtest
-
-    if (a == a[:, :1]).all() and (b == b[:, :1]).all():
-        gains, losses = int((b[:, 0] > a[:, 0]).sum()), int((a[:, 0] > b[:, 0]).sum())
-        p_value = float(binomtest(losses, gains + losses).pvalue) if gains + losses else 1.0
-        return SuccessTest("mcnemar", p_value=p_value)
-    if len(a) < 2:
-        return None
-    difference = rate_difference(b, a)
-    return SuccessTest("interval", low=difference.low, high=difference.high)

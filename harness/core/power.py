@@ -1,8 +1,8 @@
 """How many episodes find a paired difference of success, and which difference so many episodes find.
 
-A difference is found where the 95 % interval of `statistics.rate_difference` leaves out 0. Over n episodes
-its standard error is that of a paired mean (Miller 2024, arXiv:2411.00640, section 5). The interval is wider:
-its error is that of two more pairs that differ, one each way. `benchmarks/plan.py` simulates the power.
+A difference is found where the 95 % interval of `statistics.paired_difference` leaves out 0. Over n episodes
+its standard error is that of a paired mean (Miller 2024, arXiv:2411.00640, section 5). The interval is wider
+by what it counts on and has not seen. `benchmarks/plan.py` simulates the power.
 """
 
 from dataclasses import dataclass
@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
-from harness.core.statistics import LEVEL
+from harness.core.statistics import ALIKE, FEW, LEVEL
 
+UNKNOWN = 1e12  # stands for a variance that is not known
 MOST = 1e9  # episodes; more are as good as never
 HALVINGS = 60  # of a bracket: to the rounding of a number
 
@@ -54,11 +55,20 @@ class Spread:
         from harness.core.special import ndtri
 
         least = (difference * (1 - difference))[..., None]
+        varies = np.minimum(np.maximum(self.variances, least), UNKNOWN)
         of_part = n[..., None] * self.shares
-        error = np.maximum(self.variances, least) / of_part
-        assumed = np.sqrt(np.sum(error + 2 / of_part**2, axis=-1))
-        needed = ndtri(0.5 + LEVEL / 2) * assumed + ndtri(power) * np.sqrt(np.sum(error, axis=-1))
-        return np.asarray(needed / len(self.shares))
+        weights = 1 / (len(self.shares) * of_part)  # of an episode in the mean
+        error = np.sum(weights**2 * of_part * varies, axis=-1)
+        # The interval: each part's variance is mixed with that of all, and two more differ.
+        more = ALIKE / len(self.shares) if len(self.shares) > 1 else 0.0
+        of_all = np.sum(self.shares * varies, axis=-1)[..., None]
+        mixed = (of_part * varies + more * of_all) / (of_part + more)
+        differing = of_part * np.minimum(varies, 1.0)  # episodes, if each that differs does so by 1
+        many = differing.sum(axis=-1)
+        usual = np.sum(differing * weights**2, axis=-1) / many
+        added = 2 * (usual + (weights.max(axis=-1) ** 2 - usual) * np.exp(-many / FEW))
+        assumed = np.sum(weights**2 * of_part * mixed, axis=-1) + added
+        return np.asarray(ndtri(0.5 + LEVEL / 2) * np.sqrt(assumed) + ndtri(power) * np.sqrt(error))
 
 
 def variance(values: Floats, counts: Ints) -> Floats:

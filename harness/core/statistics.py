@@ -15,6 +15,8 @@ from harness.core.arrays import Bools, Floats, Ints
 
 LEVEL = 0.95  # of confidence
 LEAST_MASS = 1e-4  # least probability that is counted of safe actions
+ALIKE = 4.0  # episodes, over all parts of a mean, by which each part varies as all do
+FEW = 6.0  # differing units, up to which an interval counts on rarer and heavier ones than were seen
 ROUNDING = 1e-18  # a smaller sum of squares is rounding only; relative to the mean where that is above 1
 
 
@@ -138,13 +140,54 @@ def seed_rate_interval(values: Floats) -> Estimate:
     return Estimate(value, max(value - half, -1.0), min(value + half, 1.0), counted, len(means) - counted)
 
 
-def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
-    """Return the mean over episodes of a - b, for shares, with an interval from the two of `rate_interval`.
+def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate:
+    """Return the mean of the parts' mean differences, with an interval over episodes.
 
-    The ends of both intervals are combined by the correlation over episodes (Newcombe 1998, method 10; Zou
-    and Donner 2008). The correlation includes two more pairs that differ, one each way (as in Bonett and
-    Price 2012): even if all pairs agree, a few of other episodes might not. Both are `(E,)` or `(E, ...)`,
-    with the same episodes; a pair in which either is NaN is excluded.
+    Parts are strata that weigh alike, such as the layouts with a danger and without of each family: the
+    variance is that of a stratified mean (Cochran 1977, section 5.6). What is rare may not have been seen,
+    so it counts on a little more, in two ways that were found by simulation and whose coverage and power
+    `benchmarks/differences.py` measures. Each of several parts varies as if it had more episodes, `ALIKE` in
+    all parts together, that differ as often as those of all. And two more differ, one each way (as Bonett and
+    Price 2012 add pairs): as heavy as those that differ are on average, or, where few do, as one may be.
+    With k that differ, the squares of both weights are mixed by exp(-k / `FEW`).
+
+    Args:
+        parts: differences from -1 to 1 of each part's episodes, (E,) each; NaN is left out.
+        level: of confidence.
+
+    A part with one episode bounds nothing, so the ends are NaN.
+    """
+    known = [part[~np.isnan(part)] for part in parts]
+    sizes = np.array([len(part) for part in known])
+    n = int(sizes.sum())
+    n_excluded = sum(map(len, parts)) - n
+    if sizes.min() == 0:
+        return Estimate(math.nan, math.nan, math.nan, n, n_excluded)
+    value = float(np.mean([part.mean() for part in known]))
+    if sizes.min() == 1:
+        return Estimate(value, math.nan, math.nan, n, n_excluded)
+    weights = 1 / (len(parts) * sizes)  # of an episode in each part
+    more = ALIKE / len(parts) if len(parts) > 1 else 0.0
+    own = np.array([part.var(ddof=1) for part in known])
+    of_all = float(np.mean(np.concatenate(known) ** 2))
+    variances = (sizes * own + more * of_all) / (sizes + more)
+    effects = np.concatenate([part * weight for part, weight in zip(known, weights, strict=True)])
+    differing = effects[effects != 0]
+    usual = float(np.mean(differing**2)) if len(differing) else 0.0
+    heaviest = float(weights.max()) ** 2
+    added = 2 * (usual + (heaviest - usual) * math.exp(-len(differing) / FEW))
+    half = _normal(level) * math.sqrt(float(np.sum(weights**2 * sizes * variances)) + added)
+    return Estimate(value, max(value - half, -1.0), min(value + half, 1.0), n, n_excluded)
+
+
+def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
+    """Return what `paired_difference` does of one part, with an interval from the two of `rate_interval`.
+
+    It is wider, above all as a mean of several (`mean_of`), and stays for what was computed with it: the
+    edition v2v-safety-1.0. The ends of both intervals are combined by the correlation over episodes (Newcombe
+    1998, method 10; Zou and Donner 2008). The correlation includes two more pairs that differ, one each way
+    (as in Bonett and Price 2012): even if all pairs agree, a few of other episodes might not. Both are `(E,)`
+    or `(E, ...)`, with the same episodes; a pair in which either is NaN is excluded.
     """
     unknown = np.isnan(a) | np.isnan(b)
     x, y = (

@@ -5,7 +5,7 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
@@ -16,6 +16,7 @@ from harness.core.figures import amount
 from harness.core.files import digest
 from harness.core.resources import find, names
 from harness.core.seeds import FIRST, LAST_EPISODE, LAST_SEED
+from harness.core.statistics import Estimate
 from harness.dataset import load
 from harness.dataset.select import Selection
 from harness.evaluate import resolve
@@ -24,9 +25,12 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.settings import FrozenSettings, Settings, parse_seeds
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
+from harness.runs import pinned
 from harness.runs.folder import Run
+from harness.runs.leading import PAIRED
 from harness.runs.metrics import METRICS
-from harness.runs.records import FrozenScenes, Manifest
+from harness.runs.records import FrozenScenes, Manifest, Score
+from harness.runs.success import Pairs, mean_difference
 
 KIND = "editions"
 
@@ -65,6 +69,8 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     latency: str  # of every answer, as `--latency` reads it
     ties: str  # how equally likely actions are taken, as `--ties` reads it
     metrics: Names  # the figures that a file of results states
+    # the kind of the intervals of gains: of all layouts taken together, or combined from those of each half
+    gains: Literal["paired episodes", "episodes"] = "episodes"
     golden: Golden | None = None  # None in a project's own edition that pins nothing
     sealed: str | None = None  # digest of the file of `Seeds` that is still secret; None without one
 
@@ -75,6 +81,17 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def layouts(self, file_sha256: str) -> int | None:
         """Return how many layouts of each dataset a file with this digest has; None for all."""
         return self.golden.layouts if self.golden and self.golden.sha256 == file_sha256 else None
+
+    def figures(self, run: Run) -> list[Score]:
+        """Return the figures of a run that a file of results states."""
+        scores = [score for score in run.scores if score.metric in self.metrics]
+        if self.gains == PAIRED:
+            return scores
+        return [pinned.gain(run, score) if score.interval == PAIRED else score for score in scores]
+
+    def difference(self, pairs: Pairs) -> Estimate:
+        """Return the mean over families of success a - b, with the interval of the edition's gains."""
+        return mean_difference(pairs) if self.gains == PAIRED else pinned.mean_difference(pairs)
 
     def settings(self, dataset: str, **asked: Any) -> Settings:
         """Return the settings of an evaluation on one of the datasets; `asked` says who answers, and how."""

@@ -19,7 +19,7 @@ from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode
-from harness.runs.results import Contents, figures, unpack
+from harness.runs.results import Contents, unpack
 from harness.runs.suite import SuiteRun
 
 
@@ -98,8 +98,8 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
             source = here.source(edition, name) if limit is None else edition.source(name, limit)
             ours = _computed(run, edition.spec(run, source), folder / "computed" / name, progress)
             runs[source.scenario.name] = ours
-            differences[name] = [*differing(run, ours, edition.metrics)]
-            compared += len(figures(ours, edition.metrics))
+            differences[name] = [*differing(run, ours, edition)]
+            compared += len(edition.figures(ours))
     except (UserError, Unanswered, OverflowError) as error:
         where = f"{folder / 'stated'}/"
         raise UserError(f"{printable(file)}: {str(error).replace(where, '')}") from None
@@ -117,14 +117,14 @@ def _computed(stated: Run, spec: Spec, out: Path, progress: Callable[[int], None
     return read(out)
 
 
-def differing(stated: Run, computed: Run, metrics: Sequence[str]) -> Iterator[str]:
-    """Yield what differs between the figures of two runs in some metrics, and between their episodes.
+def differing(stated: Run, computed: Run, edition: Edition) -> Iterator[str]:
+    """Yield what differs between the figures of two runs that an edition names, and between their episodes.
 
     Numbers are compared as they are written, to the last digit; but not a column of episodes that the stated
     run, which may be older, lacks.
     """
     theirs, ours = (
-        {(s.condition, s.metric, s.interval): s for s in figures(run, metrics)} for run in (stated, computed)
+        {(s.condition, s.metric, s.interval): s for s in edition.figures(run)} for run in (stated, computed)
     )
     for key in {**theirs, **ours}:
         if theirs.get(key) != ours.get(key):

@@ -4,21 +4,25 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from markupsafe import Markup
 
 from harness.backends.registry import reads_prompts
+from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
-from harness.core.statistics import Estimate, mean_of
+from harness.evaluate.edition import Edition
 from harness.evaluate.rescore import Rescored
 from harness.report.document import Section, Table, document, forest, reach
 from harness.report.page import save
 from harness.report.templating import visible
 from harness.report.words import cell
+from harness.runs import pinned
+from harness.runs.folder import Run
 from harness.runs.leading import IN_WORDS, lead_of
 from harness.runs.metrics import BASELINE, GAINS, METRICS, SUCCESS, of_ends
 from harness.runs.records import Score
-from harness.runs.success import Success
+from harness.runs.success import Pairs, Success
 from harness.runs.suite import SuiteRun
 
 
@@ -54,9 +58,9 @@ def lines(entries: Sequence[Rescored]) -> list[Line]:
     of_each = [
         Line(
             entry,
-            None if _privileged(entry.suite) else _rank(entry.suite, ranked, by, lead),
+            None if _privileged(entry.suite) else _rank(entry.suite, ranked, edition, lead),
             {name: entry.suite.score(name, lead) for name in dict.fromkeys((by, *edition.condition))},
-            entry.suite.score(by, GAINS[lead]) if by != BASELINE in edition.condition else None,
+            _gain(entry.suite, edition, lead),
         )
         for entry in entries
     ]
@@ -71,21 +75,33 @@ def _value(score: Score | None) -> float:
     return -1.0 if score is None or score.value is None else score.value
 
 
-def _rank(suite: SuiteRun, ranked: Sequence[SuiteRun], condition: str, lead: str) -> int:
+def _rank(suite: SuiteRun, ranked: Sequence[SuiteRun], edition: Edition, lead: str) -> int:
     others = [other for other in ranked if other is not suite]
-    return 1 + sum(difference(other, suite, condition, lead).low > 0 for other in others)
+    differences = [edition.difference(_pairs(other, suite, edition.ranked_by, lead)) for other in others]
+    return 1 + sum(difference.low > 0 for difference in differences)
 
 
-def difference(a: SuiteRun, b: SuiteRun, condition: str, lead: str) -> Estimate:
-    """Return the success of a - b under a condition, the mean over families; layouts are paired."""
-    differences = []
+def _pairs(a: SuiteRun, b: SuiteRun, condition: str, lead: str, base: str = "") -> Pairs:
+    """Return success of a under a condition, and of b under the same or another, by family."""
+    pairs = []
     for family, run in a.runs.items():
-        x, y = (
-            of_ends(METRICS[SUCCESS], each.grid, each.episodes)[each.conditions.index(condition)]
-            for each in (run, b.runs[family])
-        )
-        differences.append(Success.of(run.episodes[: len(run.grid.episodes)], lead).difference(x, y))
-    return mean_of(differences)
+        x = _success(run, condition)
+        y = _success(b.runs[family], base or condition)
+        pairs.append((Success.of(run.episodes[: len(run.grid.episodes)], lead), x, y))
+    return pairs
+
+
+def _success(run: Run, condition: str) -> Floats:
+    values = of_ends(METRICS[SUCCESS], run.grid, run.episodes)
+    return np.asarray(values[run.conditions.index(condition)])
+
+
+def _gain(suite: SuiteRun, edition: Edition, lead: str) -> Score | None:
+    by = edition.ranked_by
+    if by == BASELINE or BASELINE not in edition.condition:
+        return None
+    gain = edition.difference(_pairs(suite, suite, by, lead, BASELINE))
+    return Score.of(by, GAINS[lead], gain, edition.gains)
 
 
 def write(ordered: Sequence[Line], left_out: Collection[str], out: Path) -> Path:
@@ -129,6 +145,11 @@ def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
         "not show that the model named wrote the answers, nor that it never saw these layouts, whose seeds "
         "are public."
     )
+    if edition.gains == pinned.KIND:
+        note += (
+            " Gains and ranks are by the intervals that this edition pins, in which each half of each family "
+            "has one of its own: those of all layouts together, as in v2v-safety-1.1, are narrower."
+        )
     table = Table(f"Entries by {lead} under {by}", heads, rows, note, left=True)
     caveats = [f"Left out: {visible(reason)}" for reason in left_out]
     return document([Section(edition.name, about=[about], caveats=caveats, tables=[table])])

@@ -5,19 +5,18 @@ from typing import Any
 
 from markupsafe import Markup
 
-from harness.core import multiplicity
 from harness.core.covariate import worth
 from harness.core.errors import printable
 from harness.core.figures import PLAIN, Unit
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import Estimate, mean_of
+from harness.core.statistics import Estimate
 from harness.report.caveats import doubted
 from harness.runs import metrics
 from harness.runs.folder import Run
 from harness.runs.leading import ANY_TIME, IN_WORDS, best_of, lead_of
 from harness.runs.metrics import ADJUSTED, BASELINE, GAINS, LATENCY, METRICS, SUCCESS, entry, of_ends, written
 from harness.runs.records import Latency, Manifest, Score, Times, role_word
-from harness.runs.success import Success
+from harness.runs.success import Success, p_of_mean
 from harness.runs.suite import SuiteRun
 
 WORTH = 1.1  # times as many layouts; a corrected figure that is worth less is not shown beside the plain one
@@ -141,14 +140,7 @@ def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
 
     def p_of(condition: str) -> float:
         a, b = (run.conditions.index(name) for name in (condition, base))
-        p = multiplicity.p_value(
-            lambda level: mean_of(
-                [
-                    how.difference(success[a], success[b], level)
-                    for how, success in zip(counting, successes, strict=True)
-                ]
-            )
-        )
+        p = p_of_mean([(how, values[a], values[b]) for how, values in zip(counting, successes, strict=True)])
         return 1.0 if p is None else p
 
     return {condition: p_of(condition) for condition in run.conditions if condition != base}

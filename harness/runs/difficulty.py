@@ -58,7 +58,7 @@ class Pool:
         """Return success a - b, both (S, E), paired by episode and corrected; None if it cannot be."""
 
         def plain(part: Bools) -> Estimate:
-            return metrics.difference(SUCCESS, a[:, part].T, b[:, part].T, level)
+            return metrics.difference(SUCCESS, [(a[:, part].T, b[:, part].T)], level)
 
         return self._corrected(success, plain, known_mean(a - b, 0), -1.0, level)
 

@@ -38,7 +38,7 @@ from harness.runs.decisions import DecisionFiles, Decisions, arrow_file
 from harness.runs.devices import Speed
 from harness.runs.difficulty import FILE as DIFFICULTY
 from harness.runs.difficulty import Layout
-from harness.runs.leading import ANY_TIME
+from harness.runs.leading import ANY_TIME, PAIRED
 from harness.runs.metrics import Grid, World
 from harness.runs.records import (
     Answer,
@@ -206,8 +206,8 @@ class Run:
         candidates = [
             s for s in self.scores if (s.condition, s.metric) == (condition, metric) and s.value is not None
         ]
-        order = {ANY_TIME: 0, "episodes": 1}
-        return min(candidates, key=lambda s: order.get(s.interval, 2), default=None)
+        order = {ANY_TIME: 0, PAIRED: 1, "episodes": 2}
+        return min(candidates, key=lambda s: order.get(s.interval, 3), default=None)
 
     def _scores(self, file: Path) -> tuple[Score, ...]:
         scores = _records(file, Score)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 SUCCESS, BALANCED = "success_rate", "balanced_success_rate"
 ANY_TIME = "any time"  # the kind of an interval over episodes that holds at every look
+PAIRED = "paired episodes"  # the kind of an interval of differences, all of whose parts are taken together
 IN_WORDS = {SUCCESS: "success", BALANCED: "balanced success"}
 
 

@@ -18,13 +18,14 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, POINTS, Unit, shown
 from harness.core.plugins import Plugins
 from harness.core.statistics import (
+    LEVEL,
     Estimate,
     brier,
     episode_interval,
     known_mean,
     mean_of,
     negative_log_likelihood,
-    rate_difference,
+    paired_difference,
     rate_interval,
     safe_target,
     seed_interval,
@@ -522,10 +523,19 @@ def over_episodes(name: str, values: Floats) -> Estimate:
     return rate_interval(means) if rate else in_range(name, episode_interval(means))
 
 
-def difference(name: str, a: Floats, b: Floats, level: float = 0.95) -> Estimate:
-    """Return the interval over episodes of the difference a - b of a metric, both (E, S)."""
-    rate = entry(name).interval == "rate"
-    return rate_difference(a, b, level) if rate else episode_interval(a - b, level=level)
+def difference(name: str, pairs: Sequence[tuple[Floats, Floats]], level: float = LEVEL) -> Estimate:
+    """Return the interval over episodes of the difference a - b of a metric.
+
+    `pairs` are a and b, (E, S) each: one of the metric's own values, or one of each of its halves, in which
+    the episodes of the other are NaN.
+    """
+    if entry(name).interval != "rate":
+        ((a, b),) = pairs
+        return episode_interval(a - b, level=level)
+    result = paired_difference([known_mean(a - b, axis=1) for a, b in pairs], level)
+    if len(pairs) == 1:
+        return result
+    return replace(result, n_excluded=max((result.n_excluded - result.n) // 2, 0))
 
 
 def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False) -> Estimate:
@@ -563,9 +573,9 @@ def known_in(values: Mapping[str, Floats]) -> list[str]:
     ]  # fmt: skip
 
 
-def p_value(name: str, a: Floats, b: Floats) -> float | None:
-    """Return the p-value of no difference a - b, both (E, S), from the interval of `difference`."""
-    return multiplicity.p_value(lambda level: difference(name, a, b, level))
+def p_value(name: str, pairs: Sequence[tuple[Floats, Floats]]) -> float | None:
+    """Return the p-value of no difference, from the interval of `difference`."""
+    return multiplicity.p_value(lambda level: difference(name, pairs, level))
 
 
 def in_range(name: str, e: Estimate) -> Estimate:

@@ -6,7 +6,7 @@ ended, and the figures that its edition names. Its bytes follow from these.
 
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from zipfile import ZipFile, ZipInfo
 
@@ -51,22 +51,22 @@ class Contents(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise ValueError(f"made_by has more than {MOST_LETTERS} letters")
 
 
-def figures(run: Run, metrics: Sequence[str]) -> list[Score]:
-    """Return a run's scores in some metrics."""
-    return [score for score in run.scores if score.metric in metrics]
+def pack(
+    contents: Contents, runs: Mapping[str, Run], figures: Callable[[Run], Sequence[Score]], out: Path
+) -> None:
+    """Write the runs, by dataset, to one file. What a run says of the machine's folders is left out.
 
-
-def pack(contents: Contents, runs: Mapping[str, Run], metrics: Sequence[str], out: Path) -> None:
-    """Write the runs, by dataset, to one file. What a run says of the machine's folders is left out."""
+    `figures` returns those that count of a run.
+    """
     with replacing(out) as part, ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-        for name, data in _files(contents, runs, metrics):
+        for name, data in _files(contents, runs, figures):
             member = ZipInfo(name)  # of 1980, so that the bytes follow from the content
             member.compress_type, member.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
             archive.writestr(member, data)
 
 
 def _files(
-    contents: Contents, runs: Mapping[str, Run], metrics: Sequence[str]
+    contents: Contents, runs: Mapping[str, Run], figures: Callable[[Run], Sequence[Score]]
 ) -> Iterator[tuple[str, bytes]]:
     yield CONTENTS, msgspec.json.format(msgspec.json.encode(contents), indent=1) + b"\n"
     for name, run in runs.items():
@@ -76,7 +76,7 @@ def _files(
         yield f"{name}/run.json", msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n"
         for file in ("answers.jsonl", "episodes.csv"):
             yield f"{name}/{file}", bytes_of(run.path / file, "rows")
-        yield f"{name}/summary.csv", csv_text(Score, figures(run, metrics), manifest.variant).encode()
+        yield f"{name}/summary.csv", csv_text(Score, figures(run), manifest.variant).encode()
 
 
 def unpack(file: Path, folder: Path) -> Contents:

@@ -12,8 +12,7 @@ from harness.core import multiplicity
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.power import Spread, variance
 from harness.core.sequences import any_time
-from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of, resampled
-from harness.runs import metrics
+from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of, paired_difference, resampled
 from harness.runs.leading import ANY_TIME, BALANCED, IN_WORDS, SUCCESS
 from harness.runs.metrics import BASELINE, GAINS, METRICS, Grid, of_ends, over_episodes
 from harness.runs.records import Episode, Score
@@ -60,7 +59,7 @@ class Success:
 
     def difference(self, a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
         """Return success a - b, both (S, E), paired by episode."""
-        return self._mean(lambda part: metrics.difference(SUCCESS, a[:, part].T, b[:, part].T, level))
+        return mean_difference([(self, a, b)], level)
 
     def any_time(self, success: Floats) -> Estimate:
         """Return mean success, (S, E), with an interval over episodes that holds at every look."""
@@ -72,7 +71,7 @@ class Success:
 
     def p_value(self, a: Floats, b: Floats) -> float | None:
         """Return the p-value of no such difference; None without an interval."""
-        return multiplicity.p_value(lambda level: self.difference(a, b, level))
+        return p_of_mean([(self, a, b)])
 
     def spread(self, a: Floats, b: Floats, counts: Ints) -> Spread:
         """Return how much success b - a, both (S, E), varies where episodes count so often, (..., E)."""
@@ -118,6 +117,23 @@ def any_time_scores(grid: Grid, episodes: Sequence[Episode]) -> Iterator[Score]:
             if BASELINE in values and name != BASELINE:
                 gain = by.any_time_difference(of_condition, values[BASELINE])
                 yield Score.of(name, GAINS[by.metric], gain, ANY_TIME)
+
+
+Pairs = Sequence[tuple[Success, Floats, Floats]]  # of each family: how success counts, and both, (S, E)
+
+
+def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
+    """Return the mean over families of success a - b, both (S, E), paired by episode."""
+    parts = []
+    for success, a, b in pairs:
+        differences = known_mean(a - b, 0)
+        parts += [differences[part] for part in success.parts]
+    return paired_difference(parts, level)
+
+
+def p_of_mean(pairs: Pairs) -> float | None:
+    """Return the p-value of no such difference; None without an interval."""
+    return multiplicity.p_value(lambda level: mean_difference(pairs, level))
 
 
 def alike(successes: Sequence[Success]) -> list[Success]:

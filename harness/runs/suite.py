@@ -8,14 +8,18 @@ from typing import Any
 
 import msgspec
 
+from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import text_of, write_whole
 from harness.core.formats import SUITE
 from harness.core.statistics import mean_of
 from harness.runs import folder
 from harness.runs.folder import Run, csv_text
+from harness.runs.leading import BALANCED, PAIRED
 from harness.runs.listing import own_name
+from harness.runs.metrics import BASELINE, GAINS
 from harness.runs.records import Cost, Manifest, Score, Variant
+from harness.runs.success import Success, by_condition, mean_difference
 
 FORMAT = "swarmdrive-suite/1"
 SUMMARY = "summary.csv"  # the means over families
@@ -79,7 +83,21 @@ class SuiteRun:
         for s in first.scores:
             key = s.condition, s.metric, s.interval
             if s.interval != "seed means" and all(key in scores for scores in others_by_key):
-                yield mean([s, *(scores[key] for scores in others_by_key)])
+                together = s.interval == PAIRED and s.metric in GAINS.values()
+                yield self._gain(s) if together else mean([s, *(scores[key] for scores in others_by_key)])
+
+    @cached_property
+    def _success(self) -> list[tuple[Success, dict[str, Floats]]]:
+        return [by_condition(run.grid, run.episodes) for run in self.runs.values()]
+
+    def _gain(self, score: Score) -> Score:
+        """Return a gain over the condition without V2V; the layouts of all families are taken together."""
+        balanced = score.metric == GAINS[BALANCED]
+        pairs = [
+            (how if balanced else how.plain, values[score.condition], values[BASELINE])
+            for how, values in self._success
+        ]
+        return Score.of(score.condition, score.metric, mean_difference(pairs), PAIRED)
 
     def score(self, condition: str, metric: str) -> Score | None:
         """Return a metric's mean over families; None if a family has no value."""

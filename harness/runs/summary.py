@@ -12,12 +12,12 @@ from harness.core.arrays import Floats, Ints
 from harness.core.statistics import (
     Estimate,
     episode_interval,
-    rate_difference,
     rate_interval,
     seed_interval,
     seed_rate_interval,
 )
 from harness.runs.decisions import Decisions
+from harness.runs.leading import PAIRED
 from harness.runs.metrics import (
     ALL,
     BALANCED,
@@ -32,6 +32,8 @@ from harness.runs.metrics import (
     Grid,
     World,
     by_episode,
+    difference,
+    entry,
     halved,
     in_range,
     known_in,
@@ -163,11 +165,10 @@ def _gains(
             def gain_by_seed(each: str, n: int = n) -> Estimate:
                 return seed_rate_interval(values[each][n] - values[each][base])
 
-            def gain_by_episode(each: str, n: int = n) -> Estimate:
-                return rate_difference(values[each][n].T, values[each][base].T)
-
             yield Score.of(condition, gain, halved(name, gain_by_seed, shared=True), "seed means")
-            yield Score.of(condition, gain, halved(name, gain_by_episode), "episodes")
+            parts = entry(name).halves or (name,)
+            pairs = [(values[part][n].T, values[part][base].T) for part in parts]
+            yield Score.of(condition, gain, difference(name, pairs), PAIRED)
 
 
 def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator[Score]:

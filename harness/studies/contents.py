@@ -20,7 +20,6 @@ from harness.coordination.scheduling import NEVER
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.formats import SUITE
-from harness.core.multiplicity import p_value
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, mean_of
 from harness.evaluate.dry_run import lacking
@@ -28,7 +27,7 @@ from harness.evaluate.walk import Decided
 from harness.report.suite import MEAN
 from harness.runs.leading import BALANCED, IN_WORDS, SUCCESS
 from harness.runs.metrics import LATENCY, entry, over_episodes
-from harness.runs.success import Success, alike
+from harness.runs.success import Success, alike, mean_difference, p_of_mean
 from harness.runs.suite import contents_of
 from harness.studies.axes import Setting, axis_of, described, grid
 from harness.studies.play import by_episode, metric_columns
@@ -115,16 +114,18 @@ class Outcome:
 
     def over(self, other: "Outcome", family: str = MEAN, level: float = 0.95, metric: str = "") -> Estimate:
         """Return success less another outcome's, paired by episode; plain if `metric` is."""
-
-        def of(name: str) -> Estimate:
-            how = self.counting[name].plain if metric == SUCCESS else self.counting[name]
-            return how.difference(self.families[name][SUCCESS], other.families[name][SUCCESS], level)
-
-        return mean_of([*map(of, self._of(family))])
+        return mean_difference([*self._pairs(other, family, metric)], level)
 
     def p_over(self, other: "Outcome") -> float | None:
         """Return the p-value of no such difference in the mean over families."""
-        return p_value(lambda level: self.over(other, level=level))
+        return p_of_mean([*self._pairs(other, MEAN)])
+
+    def _pairs(
+        self, other: "Outcome", family: str, metric: str = ""
+    ) -> Iterator[tuple[Success, Floats, Floats]]:
+        for name in self._of(family):
+            how = self.counting[name].plain if metric == SUCCESS else self.counting[name]
+            yield how, self.families[name][SUCCESS], other.families[name][SUCCESS]
 
     def pooled(self, groups: Mapping[str, Bools]) -> Floats:
         """Return success of the episodes of all families that are in a group, (S, n)."""

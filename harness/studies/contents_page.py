@@ -368,7 +368,7 @@ def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
                 rows.append({
                     "model": result.model.name, "condition": result.base.condition, "group": name,
                     "content": content,
-                    **_success(over_episodes(SUCCESS, success), difference(SUCCESS, success.T, intent.T)),
+                    **_success(over_episodes(SUCCESS, success), difference(SUCCESS, [(success.T, intent.T)])),
                 })  # fmt: skip
     return pd.DataFrame(rows)
 

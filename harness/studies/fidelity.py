@@ -116,7 +116,7 @@ def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
 
 def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
     """Return the estimates of `COMPARED` from the success of the same episodes in both worlds, (S, E)."""
-    both = difference(SUCCESS, frozen.T, closed.T)
+    both = difference(SUCCESS, [(frozen.T, closed.T)])
     same = over_episodes("agreement_rate", (frozen == closed).astype(float))
     worlds = [over_episodes(SUCCESS, success) for success in (frozen, closed)]
     return dict(zip(COMPARED, (*worlds, both, same), strict=True))

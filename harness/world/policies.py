@@ -13,7 +13,7 @@ from harness.core.parallel import Workers
 from harness.core.statistics import (
     Estimate,
     episode_interval,
-    rate_difference,
+    paired_difference,
     rate_interval,
     resampled,
     resampled_estimate,
@@ -130,5 +130,5 @@ def summary(fates: Sequence[Fate], best: Sequence[Fate], policy: str) -> dict[st
         **{name: rate_interval(each(costs, name)) for name in ("best_decisions", "gave_away")},
         "regret_s": episode_interval(each(costs, "regret_s")),
         "anarchy": resampled_estimate(anarchy, n),
-        "less_than_joint": rate_difference(each(fates, "success"), each(best, "success")),
+        "less_than_joint": paired_difference([each(fates, "success") - each(best, "success")]),
     }

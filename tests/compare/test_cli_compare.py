@@ -40,7 +40,7 @@ def compared(worse_once: tuple[Path, Path]) -> Comparison:
 @pytest.mark.parametrize(
     ("text", "failed"),
     [
-        ("success_rate < -0.25", []),  # it is -0.25, and its interval ends at -0.70 and at +0.28
+        ("success_rate < -0.25", []),  # it is -0.25, and its interval ends at -1 and at +0.60
         ("success_rate <= -0.25", ["6g"]),
         ("success_rate < -0.01", ["6g"]),
         ("success_rate<-0.01", ["6g"]),
@@ -50,9 +50,9 @@ def compared(worse_once: tuple[Path, Path]) -> Comparison:
         ("late_rate > 0.2", ["6g"]),
         ("late_rate >= 0.3", []),
         ("success_rate.high < 0", []),
-        ("success_rate.high < 0.3", ["6g"]),
-        ("6g:success_rate.low < -0.6", ["6g"]),
-        ("success_rate.low < -0.7", []),
+        ("success_rate.high < 0.6", ["6g"]),
+        ("6g:success_rate.low < -0.9", ["6g"]),
+        ("success_rate.low < -1", []),
         # Alike in all episodes: 0 stands for its ends.
         ("latency_proxy_ms.high >= 0", ["single-local", "6g"]),
         ("latency_proxy_ms > 5", []),
@@ -181,8 +181,8 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
     n = len(scenes)
     for part in (
         "B: ", "proxy · prompt v2 · constrained", "4 episodes × 2 channel seeds of small", "differ in answer",
-        "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-69.9, +28.1] 1.000",
-        "success: 0 gained, 2 lost of 8 episodes × seeds; McNemar's exact test over episodes p = 1.000",
+        "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-100.0, +59.9] 1.000",
+        "success: 0 gained, 2 lost of 8 episodes × seeds",
         "lost: 1 late", f"answers: ego strict → failed: {n} of {n}",
         f"{scenes[0]}/v1, {scenes[1]}/v1, {n - 2} more",
         "FAILED: 6g:late_rate > 0.1 in 6g (+0.25)",
@@ -233,13 +233,16 @@ def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harne
     condition = told["conditions"][1]
     assert condition["metrics"]["success_rate"] | {"low": 0, "high": 0} == {
         "a": 1.0, "b": 0.75, "difference": -0.25, "low": 0, "high": 0, "n": 4, "n_excluded": 0,
-        "p": pytest.approx(0.317, abs=1e-3), "p_holm": 1.0, "primary": True,
+        "p": pytest.approx(0.564, abs=1e-3), "p_holm": 1.0, "primary": True,
     }  # fmt: skip
     assert condition["lost"] == {
         "count": 2, "episodes": 1,
         "listed": [{"episode": 1, "seeds": [0, 1], "a": "success", "b": "late"}],
     }  # fmt: skip
-    assert condition["test"] == {"method": "mcnemar", "p_value": 1.0, "low": None, "high": None}
+    row = condition["metrics"]["success_rate"]
+    assert condition["test"] == {
+        "method": "interval", "p_value": row["p"], "low": row["low"], "high": row["high"],
+    }  # fmt: skip
     scenes = list(dict.fromkeys(answer.scene for answer in answers_of(worse[0])))
     [turned] = told["answers"]
     assert turned == {

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +13,11 @@ from changing import SEEDS, ends
 from evaluating import live_spec_of, spec_of
 from evaluating import run as evaluate
 from run_on_disk import Row, answers_of, change, configure, made_up, rows_of
+from scipy.stats import norm
 
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
-from harness.core.multiplicity import SuccessTest, holm
+from harness.core.multiplicity import holm
 from harness.dataset.load import Dataset, load
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
@@ -66,10 +68,6 @@ def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> Non
             known = 4 if d.metric not in SOME else d.change.n
             assert (d.a, d.change.n, d.change.n_excluded) == (d.b, known, 4 - known)
         assert (of.gained, of.lost) == ((), ())
-    assert c.conditions[0].test == SuccessTest("mcnemar", p_value=1.0)
-    of_all = SuccessTest("interval", low=-0.07, high=0.07)
-    said = words.success(replace(c.conditions[0], test=of_all), c.pair)
-    assert said.endswith("interval over episodes -7.0 to +7.0 points, since others may end differently")
 
 
 def test_the_means_are_those_of_the_runs_own_summary(runs: tuple[Path, Path]) -> None:
@@ -86,9 +84,9 @@ def test_the_means_are_those_of_the_runs_own_summary(runs: tuple[Path, Path]) ->
 
 
 def test_success_and_its_test_by_hand(runs: tuple[Path, Path]) -> None:
-    """Alone 1 of 4 more, from .5 to .75; Wilson's ends of 4 are .1500, .8500 and .3006, .9544.
+    """Alone two of 4 gained and one lost, from .5 to .75: squares deviate by 2.75 from their mean, over 3.
 
-    The covariance is .25 - .375, and the correlation that over .5 · .4330: -.5774.
+    Two more differ, each by a quarter.
     """
     ends(runs[0], "single-local", [["late", "collision", "", ""]] * 2)
     ends(runs[1], "single-local", [["", "", "", "time_out"]] * 2)
@@ -98,24 +96,32 @@ def test_success_and_its_test_by_hand(runs: tuple[Path, Path]) -> None:
     alone = differences(c, "single-local")
     change = alone["success_rate"].change
     assert (alone["success_rate"].a, alone["success_rate"].b, change.value, change.n) == (0.5, 0.75, 0.25, 4)
-    assert (change.low, change.high) == pytest.approx((-0.4613, 0.7469), abs=1e-4)
+    error = math.sqrt(2.75 / 3 / 4 + 2 / 4**2)
+    half = 1.959964 * error
+    assert (change.low, change.high) == pytest.approx((0.25 - half, min(0.25 + half, 1)), abs=1e-6)
     assert alone["unsafe_rate"].change.value == 0, "a collision less, and a time out more"
     assert alone["late_rate"].change.value == -0.25
     assert c.conditions[0].gained == (Flip(0, SEEDS, "late", "success"),
                                       Flip(1, SEEDS, "collision", "success"))  # fmt: skip
     assert c.conditions[0].lost == (Flip(3, SEEDS, "success", "time_out"),)
-    assert c.conditions[0].test == SuccessTest("mcnemar", p_value=1.0), "two against one is nothing"
-    assert c.conditions[1].test == SuccessTest("mcnemar", p_value=2 / 2**4), "four of four, both sides"
+    assert alone["success_rate"].p_value == pytest.approx(2 * norm.sf(0.25 / error), abs=1e-6)
 
 
 def test_success_that_hangs_on_the_seed_has_an_interval_over_episodes(runs: tuple[Path, Path]) -> None:
-    """Episodes go from 0, 1, 0, 0 to 0.5, 1, 0, 0.5: each counts as one yes or no, and they go together."""
+    """Episodes go from 0, 1, 0, 0 to 0.5, 1, 0, 0.5: differences of 0.5, 0, 0, 0.5, of mean square 1/8.
+
+    The two more differ by a quarter of .5 each, or, since few differ, rather by a quarter.
+    """
     ends(runs[0], "6g", [["late", "", "late", "late"], ["", "", "late", ""]])
     ends(runs[1], "6g", [["", "", "late", ""], ["", "", "late", ""]])
     c = found(runs)
     change = differences(c, "6g")["success_rate"].change
-    assert (change.value, change.low, change.high) == pytest.approx((0.25, -0.3196, 0.6553), abs=1e-4)
-    assert c.conditions[1].test == SuccessTest("interval", low=change.low, high=change.high)
+    rare = math.exp(-2 / 6)
+    added = 2 * (0.125**2 * (1 - rare) + 0.25**2 * rare)
+    half = 1.959964 * math.sqrt(0.25 / 3 / 4 + added)
+    assert (change.value, change.low, change.high) == pytest.approx(
+        (0.25, 0.25 - half, 0.25 + half), abs=1e-6
+    )
     assert c.conditions[1].gained == (Flip(0, (0,), "late", "success"), Flip(3, (0,), "late", "success"))
 
 

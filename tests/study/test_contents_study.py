@@ -11,11 +11,11 @@ import pytest
 from evaluating import run, spec_of
 
 from harness.coordination.operating_point import named_point
-from harness.core.statistics import mean_of
+from harness.core.statistics import mean_of, paired_difference
 from harness.dataset.load import Dataset
 from harness.report.suite import MEAN
 from harness.runs.folder import read
-from harness.runs.metrics import BALANCED, SUCCESS, difference, over_episodes
+from harness.runs.metrics import BALANCED, SUCCESS, over_episodes
 from harness.studies.contents import NOTHING, Outcome, holding, witnesses
 from harness.studies.replayed_run import ReplayedRun
 
@@ -99,8 +99,8 @@ def test_a_mean_gives_families_the_same_weight_and_differences_are_paired_within
     each = [over_episodes(SUCCESS, values) for values in a.values()]
     assert better.estimate(SUCCESS) == mean_of(each)
     assert better.estimate(SUCCESS, "two") == each[1]
-    gains = [difference(SUCCESS, a[name].T, b[name].T) for name in a]
-    assert better.over(worse) == better.over(worse, MEAN) == mean_of(gains)
+    gains = paired_difference([(a[name] - b[name]).mean(axis=0) for name in a])
+    assert better.over(worse) == better.over(worse, MEAN) == gains
     p = better.p_over(worse)
     assert p is not None
     assert p < 1e-6
@@ -110,11 +110,9 @@ def test_a_mean_gives_families_the_same_weight_and_differences_are_paired_within
         over_episodes(SUCCESS, v[:, half]) for n, v in a.items() for half in (dangerous[n], ~dangerous[n])
     ]
     assert (balanced.lead, balanced.leading) == (BALANCED, mean_of([mean_of(parts[:2]), mean_of(parts[2:])]))
-    gains = [
-        difference(SUCCESS, a["two"][:, half].T, b["two"][:, half].T)
-        for half in (dangerous["two"], ~dangerous["two"])
-    ]
-    assert balanced.over(worse, "two") == mean_of(gains)
+    of_two = (a["two"] - b["two"]).mean(axis=0)
+    gains = paired_difference([of_two[dangerous["two"]], of_two[~dangerous["two"]]])
+    assert balanced.over(worse, "two") == gains
     assert balanced.over(worse, metric=SUCCESS) == better.over(worse)
     assert Outcome(better.families, {"one": dangerous["one"]}).lead == SUCCESS, "balanced in all or in none"
     assert better.pooled({"one": np.arange(30) < 2, "two": np.arange(90) < 3}).shape == (2, 5)

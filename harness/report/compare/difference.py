@@ -8,13 +8,13 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import printable
-from harness.core.multiplicity import SuccessTest, holm, p_of_bootstrap, p_value, success_test
+from harness.core.multiplicity import holm, p_of_bootstrap, p_value
 from harness.core.statistics import LEVEL, Estimate, known_mean
 from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import Pair, Side
 from harness.runs import percentiles, reliability
 from harness.runs.leading import lead_of
-from harness.runs.metrics import ADJUSTED, METRICS, SUCCESS, difference, entry, halved, known_in
+from harness.runs.metrics import ADJUSTED, METRICS, SUCCESS, difference, entry, known_in
 from harness.runs.sources import prompt_of
 from harness.runs.success import Success
 
@@ -68,7 +68,6 @@ class InCondition:
 
     condition: str  # its name
     differences: tuple[Difference, ...]  # metrics that both runs know
-    test: SuccessTest | None  # of success; None for a single episode whose success depends on the seed
     gained: tuple[Flip, ...]  # episodes from failure to success
     lost: tuple[Flip, ...]  # episodes from success to failure
     decisions: int  # how many both runs have
@@ -186,7 +185,6 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
     return InCondition(
         condition=condition,
         differences=tuple(d for d in differences if d.change.n),
-        test=success_test(a, b),
         gained=tuple(_flips(pair, condition, (a == 0) & (b == 1))),
         lost=tuple(_flips(pair, condition, (a == 1) & (b == 0))),
         decisions=decisions,
@@ -207,11 +205,7 @@ def _difference(pair: Pair, metric: str, condition: str) -> Difference:
     )
 
     def change(level: float) -> Estimate:
-        def change_of(name: str) -> Estimate:
-            a, b = halves[name]
-            return difference(name, b, a, level)
-
-        return halved(metric, change_of)
+        return difference(metric, [(b, a) for a, b in halves.values()], level)
 
     return Difference(metric, before, after, change(LEVEL), p_value(change))
 

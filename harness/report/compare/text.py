@@ -17,6 +17,7 @@ from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import where
+from harness.runs.leading import SUCCESS
 
 WIDTH = 80
 WHOLE = 10**6  # lists are cut by number, never in the middle of an id
@@ -183,13 +184,21 @@ def _in_condition(c: InCondition, most: int) -> dict[str, Any]:
         }
         for d in c.differences
     }  # fmt: skip
-    entry: dict[str, Any] = {"condition": c.condition, "metrics": metrics, "test": c.test and asdict(c.test)}
+    entry: dict[str, Any] = {"condition": c.condition, "metrics": metrics, "test": _test(metrics)}
     for name, some in (("gained", c.gained), ("lost", c.lost)):
         listed = [asdict(t) for t in some[:most]]
         entry[name] = {"count": sum(len(t.seeds) for t in some), "episodes": len(some), "listed": listed}
     flips = [asdict(flip) for flip in c.flips[:most]]
     count = sum(len(flip.seeds) for flip in c.flips)
     return {**entry, "flips": {"count": count, "of": c.decisions, "listed": flips}}
+
+
+def _test(metrics: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
+    """Return what else stands in the row of success, which had a test of its own."""
+    if SUCCESS not in metrics or metrics[SUCCESS]["p"] is None:
+        return None
+    success = metrics[SUCCESS]
+    return {"method": "interval", "p_value": success["p"], "low": success["low"], "high": success["high"]}
 
 
 def _number(value: float) -> float | None:

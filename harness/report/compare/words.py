@@ -22,7 +22,6 @@ from harness.runs.success import Success
 BETTER, WORSE, HINT = "better", "worse", "hint"
 SIGNS = {BETTER: "✓", WORSE: "✗", HINT: "?", "": ""}
 HUNKS = 3  # changes of a prompt's text that are shown beside the numbers
-OTHERS = ", since others may end differently"  # than these, which all end alike
 SHOWN = 6  # metrics that are shown first
 
 
@@ -173,16 +172,10 @@ def differing(comparison: Comparison) -> str:
 
 
 def success(c: InCondition, pair: Pair) -> str:
-    """Return how many successes were gained and lost, and what the test says."""
+    """Return how many successes were gained and lost."""
     gained, lost = (sum(len(t.seeds) for t in flips) for flips in (c.gained, c.lost))
     of = f"{len(pair.episodes) * len(pair.seeds)} episodes" + (" × seeds" if len(pair.seeds) > 1 else "")
-    text = f"success: {gained} gained, {lost} lost of {of}"
-    if c.test is None:
-        return text
-    if c.test.p_value is not None:
-        return f"{text}; McNemar's exact test over episodes p {p_value(c.test.p_value)}"
-    ends = " to ".join(f"{100 * (end or 0.0):+z.1f}" for end in (c.test.low, c.test.high))
-    return f"{text}; 95 % interval over episodes {ends} points{'' if gained or lost else OTHERS}"
+    return f"success: {gained} gained, {lost} lost of {of}"
 
 
 def adjusted(c: InCondition) -> Iterator[str]:
@@ -208,7 +201,7 @@ def many(comparison: Comparison) -> str:
         f"% at most. {sum(p <= LEVEL for p in p_values)} are at most {LEVEL}: {SIGNS[BETTER]} better, "
         f"{SIGNS[WORSE]} worse. The other {len(tested) - len(p_values)} are exploratory and not corrected: "
         f"{hints} are at most {LEVEL} ({SIGNS[HINT]}), and {LEVEL * (len(tested) - len(p_values)):.0f} would "
-        "be by chance alone. Intervals, tests of success and gates are not corrected"
+        "be by chance alone. Intervals and gates are not corrected"
     )
 
 

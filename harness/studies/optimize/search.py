@@ -27,7 +27,7 @@ from harness.report.document import Table
 from harness.runs.folder import Run
 from harness.runs.leading import BALANCED, SUCCESS
 from harness.runs.metrics import METRICS, by_episode
-from harness.runs.success import Success, alike
+from harness.runs.success import Success, alike, mean_difference
 from harness.studies.optimize.candidate import Candidate, chosen, space, write
 from harness.studies.optimize.engines import Engine
 from harness.studies.optimize.tuning import Record, Spent, Tuning, changed, tokens
@@ -152,7 +152,9 @@ def _certificate(old: Sequence[Run], new: Sequence[Run]) -> tuple[Success, list[
         for rule, a, b in zip(rules, map(_success, old), map(_success, new), strict=True)
     ]
     if len(rows) > 1:
-        rows.append({name: mean_of([row[name] for row in rows]) for name in rows[0]})
+        both = {name: mean_of([row[name] for row in rows]) for name in (OLD, NEW)}
+        pairs = zip(rules, map(_success, new), map(_success, old), strict=True)
+        rows.append({**both, "difference": mean_difference([*pairs])})
     return rules[0], rows
 
 

@@ -1,0 +1,31 @@
+"""Differences of success as the edition v2v-safety-1.0 pins them.
+
+Each half of each family has an interval of its own (`rate_difference`), and these are combined. Taken
+together, the same differences have a narrower one: `success.mean_difference`.
+"""
+
+from harness.core.statistics import Estimate, mean_of, rate_difference
+from harness.runs.folder import Run
+from harness.runs.leading import BALANCED
+from harness.runs.metrics import BASELINE, GAINS
+from harness.runs.records import Score
+from harness.runs.success import Pairs, by_condition
+
+KIND = "episodes"  # of its intervals
+
+
+def mean_difference(pairs: Pairs) -> Estimate:
+    """Return the mean over families of success a - b, both (S, E), paired by episode."""
+    families = []
+    for success, a, b in pairs:
+        halves = [rate_difference(a[:, part].T, b[:, part].T) for part in success.parts]
+        families.append(mean_of(halves) if len(halves) > 1 else halves[0])
+    return mean_of(families) if len(families) > 1 else families[0]
+
+
+def gain(run: Run, score: Score) -> Score:
+    """Return a run's gain over the condition without V2V."""
+    success, values = by_condition(run.grid, run.episodes)
+    counted = success if score.metric == GAINS[BALANCED] else success.plain
+    estimate = mean_difference([(counted, values[score.condition], values[BASELINE])])
+    return Score.of(score.condition, score.metric, estimate, KIND)
