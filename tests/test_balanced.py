@@ -12,20 +12,24 @@ from msgspec import structs
 from run_on_disk import Row, made_up
 
 from harness.coordination.operating_point import POINTS
+from harness.core.figures import shown
 from harness.core.statistics import mean_of, paired_difference, rate_interval
 from harness.dataset.load import Dataset, load
 from harness.evaluate.live_world import LiveSource
+from harness.report.caveats import of_run
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
 from harness.report.history import history
 from harness.report.matrix import BEST, WORSE, headline, lines
 from harness.report.runs import Runs
+from harness.report.words import Pairing
+from harness.report.words import headline as of_one
 from harness.runs.folder import Run, read
 from harness.runs.leading import SUCCESS, lead_of
 from harness.runs.listing import runs
 from harness.runs.metrics import BALANCED, GAINS, METRICS, of_ends
-from harness.runs.success import Success, alike
+from harness.runs.success import Success, alike, half_difference
 
 HALVES = METRICS[BALANCED].halves
 BY_DANGER = {name for name, metric in METRICS.items() if metric.half or metric.halves}
@@ -189,3 +193,28 @@ def test_frozen_and_driven_come_to_the_same_under_either_limits(
             assert not e.miss or e.failure == "collision"
             assert not e.false_alarm or not e.success
         assert {(e.time_lost_s, e.miss, e.false_alarm) for e in ends[1]} == {(None, None, None)}
+
+
+def test_the_headline_has_what_cooperation_does_where_there_is_a_danger_and_where_there_is_none(
+    tmp_path: Path,
+) -> None:
+    """Alone all 20 dangers are lost, of which 6g loses 8, and 2 of 20 layouts without."""
+
+    def end(row: Row) -> None:
+        row["danger"] = "left" if row["episode"] < 20 else "none"
+        lost = range(20) if row["condition"] == "single-local" else (*range(8), 20, 21)
+        if row["episode"] in lost:
+            row |= {"success": False, "failure": "late"}
+
+    done = read(made_up(tmp_path / "run", episode=end, episodes=40))
+    pairs = Pairing(done).pairs("6g", "single-local")
+    danger, price = (shown(half_difference(pairs, dangerous), sign="+") for dangerous in (True, False))
+    assert danger.startswith("+60.0 [")
+    assert price.startswith("-10.0 [")
+    said = of_one(done)
+    assert (
+        f"succeeds in 60.0 % of the layouts with a danger, {danger} points against single-local, and" in said
+    )
+    assert f"and in 90.0 % of those without, {price} points; the mean of both is 75.0 %, +25.0 [" in said
+    assert said.endswith("points, a clear difference.")
+    assert "With a danger, success" not in " ".join(of_run(done))

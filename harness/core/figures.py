@@ -70,6 +70,11 @@ def shown(bounded: Bounded, unit: Unit = PERCENT, sign: str = "") -> str:
     return unit.interval(bounded.value, bounded.low, bounded.high, sign)
 
 
+def within(low: float, high: float) -> str:
+    """Write how large a difference may be, either way: `±5.2 points`; its interval excludes larger ones."""
+    return f"±{POINTS.text(max(abs(low), abs(high)))}"
+
+
 def amount(n: int, noun: str) -> str:
     """Write how many there are: `1 layout`, `2 layouts`."""
     return f"{n} {noun}{'s' * (n != 1)}"

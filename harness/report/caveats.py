@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from harness.backends.base import BARE
 from harness.backends.registry import reads_prompts
 from harness.core.errors import printable
-from harness.core.figures import amount
+from harness.core.figures import PERCENT, amount
 from harness.evaluate.examine import MOST_SHARE, recall_findings
 from harness.parsing.status import Status
-from harness.runs import doubts
+from harness.runs import doubts, pinned
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
-from harness.runs.metrics import ALL
+from harness.runs.metrics import ALL, BALANCED, GAINS, entry
 from harness.runs.records import ClosedLoop, Manifest, Score
 from harness.runs.unanswered import tally
 from harness.world.drivers import BLIND
@@ -111,11 +111,24 @@ def unanswered(run: Run) -> Iterator[str]:
         yield f"{tallied}: the model could not be asked, so that this is no result."
 
 
+def _saturated(run: Run) -> Iterator[str]:
+    """Yield each half of balanced success that is 0 or 100 % under every condition, as it can say nothing."""
+    for name, where in zip(entry(BALANCED).halves, ("With a danger", "Without a danger"), strict=True):
+        scores = [run.score(condition, name) for condition in run.conditions]
+        values = {None if score is None else score.value for score in scores}
+        if values in ({0.0}, {1.0}) and len(scores) > 1:
+            same = PERCENT.text(values.pop())
+            yield f"{where}, success is {same} under every condition: none changes that half of the balance."
+
+
 def of_run(run: Run) -> Iterator[str]:
     """What else a reader of a run's page has to know first: few episodes, a stumbling engine, another lag."""
     n = len(run.grid.episodes)
     if n < FEW:
         yield f"Only {n} episodes: the interval of a rate may reach {98 / n**0.5:.0f} points to either side."
+    yield from _saturated(run)
+    if any(score.metric in GAINS.values() and score.interval == pinned.KIND for score in run.scores):
+        yield "Gains have the wider intervals of an earlier version, as the run wrote them."
     if run.manifest.temperature:
         yield (
             f"Answers were sampled at temperature {run.manifest.temperature:g} with sampling seed "

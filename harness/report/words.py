@@ -1,5 +1,6 @@
 """Numbers and findings in the words of the report."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -7,7 +8,8 @@ from markupsafe import Markup
 
 from harness.core.covariate import worth
 from harness.core.errors import printable
-from harness.core.figures import PLAIN, Unit
+from harness.core.figures import PLAIN, POINTS, Unit, within
+from harness.core.figures import shown as shown_estimate
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.caveats import doubted
@@ -16,7 +18,7 @@ from harness.runs.folder import Run
 from harness.runs.leading import ANY_TIME, IN_WORDS, best_of, lead_of
 from harness.runs.metrics import ADJUSTED, BASELINE, GAINS, LATENCY, METRICS, SUCCESS, entry, of_ends, written
 from harness.runs.records import Latency, Manifest, Score, Times, role_word
-from harness.runs.success import Success, p_of_mean
+from harness.runs.success import Pairs, Success, half_difference, mean_difference, p_of_mean
 from harness.runs.suite import SuiteRun
 
 WORTH = 1.1  # times as many layouts; a corrected figure that is worth less is not shown beside the plain one
@@ -47,27 +49,42 @@ def headline(run: Run | SuiteRun) -> str:
     if not best:
         return f"{model} on {run.source}: the run has no success rate."
     lead = lead_of(run)
-    if lead == SUCCESS:
-        text = f"Under {best}, {model} clears {_shown(run, best, lead)} of the episodes"
-    else:
-        text = f"Under {best}, {model} has {_shown(run, best, lead)} balanced success"
-    if isinstance(run, SuiteRun):
-        text += f" (mean over {len(run.runs)} families)"
-    if halves := entry(lead).halves:
-        parts = (_shown(run, best, half) for half in halves)
-        text += ": {} with a danger, {} without".format(*parts)
+    families = f" (mean over {len(run.runs)} families)" if isinstance(run, SuiteRun) else ""
+    value = _shown(run, best, lead)
     if not base:
         several = len(run.conditions) > 1
         of = " without a warning" if doubted(*_runs(run)) else ""
+        what = "clears {} of the episodes" if lead == SUCCESS else "has {} balanced success"
+        text = f"Under {best}, {model} {what.format(value)}{families}"
+        if halves := entry(lead).halves:
+            text += ": {} with a danger, {} without".format(*(_shown(run, best, half) for half in halves))
         return text + (f", and no other condition{of} does better." if several else ".")
-    text += f"; under {base}, {_shown(run, base, lead)}"
-    gain = run.score(best, GAINS[lead]) if base == BASELINE else None
-    if gain is not None and gain.low is not None:
-        p = p_values(run, base)
-        corrected = dict(zip(p, holm(list(p.values())), strict=True))[best]
-        clear = "a clear difference" if corrected <= LEVEL else "the difference may be chance"
-        text += f": {clear}"
-    return text + "."
+    pairs = Pairing(run).pairs(best, base)
+    clear = judged(mean_difference(pairs), corrected_p(run, base, best))
+    if lead == SUCCESS:
+        text = f"Under {best}, {model} clears {value} of the episodes{families}; under {base}, "
+        return f"{text}{_shown(run, base, lead)}: {clear}."
+    shares = [_shown(run, best, half) for half in entry(lead).halves]
+    changes = [shown_change(half_difference(pairs, dangerous)) for dangerous in (True, False)]
+    return (
+        f"Under {best}, {model} succeeds in {shares[0]} of the layouts with a danger, {changes[0]} against "
+        f"{base}, and in {shares[1]} of those without, {changes[1]}{families}; the mean of both is {value}, "
+        f"{clear}."
+    )
+
+
+def shown_change(change: Estimate) -> str:
+    """Write a difference of success with its interval: `+7.7 [+3.1, +12.4] points`."""
+    return f"{shown_estimate(change, POINTS, '+')} points"
+
+
+def judged(change: Estimate, p: float) -> str:
+    """Write a difference of success, and say that it is clear, or what is excluded where it is not."""
+    text = shown_change(change)
+    if math.isnan(change.low):
+        return f"{text}, too few episodes for an interval"
+    unclear = f"not clear, but within {within(change.low, change.high)}"
+    return f"{text}, {'a clear difference' if p <= LEVEL else unclear}"
 
 
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
@@ -131,19 +148,37 @@ def adjusted_lines(run: Run) -> Iterator[str]:
             yield f"{words} % adjusted for difficulty: {'; '.join(cells)}"
 
 
+class Pairing:
+    """Success of the same episodes in two conditions of a run, or of a suite's."""
+
+    def __init__(self, run: Run | SuiteRun) -> None:
+        lead = lead_of(run)
+        self._runs = []
+        for of in _runs(run):
+            success = Success.of(of.episodes[: len(of.grid.episodes)], lead)
+            self._runs.append((success, of_ends(METRICS[SUCCESS], of.grid, of.episodes)))
+        self._places = {condition: place for place, condition in enumerate(run.conditions)}
+
+    def pairs(self, condition: str, base: str) -> Pairs:
+        """Return success in a condition and in the one that it is held against, by family."""
+        a, b = self._places[condition], self._places[base]
+        return [(success, values[a], values[b]) for success, values in self._runs]
+
+
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
     """Return p of each other condition's gain over `base`, in what leads; of a suite the mean gain's."""
-    runs = _runs(run)
-    lead = lead_of(run)
-    counting = [Success.of(of.episodes[: len(of.grid.episodes)], lead) for of in runs]
-    successes = [of_ends(METRICS[SUCCESS], of.grid, of.episodes) for of in runs]
+    pairing, values = Pairing(run), dict[str, float]()
+    for condition in run.conditions:
+        if condition != base:
+            p = p_of_mean(pairing.pairs(condition, base))
+            values[condition] = 1.0 if p is None else p
+    return values
 
-    def p_of(condition: str) -> float:
-        a, b = (run.conditions.index(name) for name in (condition, base))
-        p = p_of_mean([(how, values[a], values[b]) for how, values in zip(counting, successes, strict=True)])
-        return 1.0 if p is None else p
 
-    return {condition: p_of(condition) for condition in run.conditions if condition != base}
+def corrected_p(run: Run | SuiteRun, base: str, condition: str) -> float:
+    """Return one of these after Holm's correction for all of them."""
+    p = p_values(run, base)
+    return dict(zip(p, holm(list(p.values())), strict=True))[condition]
 
 
 def p_value(p: float) -> str:

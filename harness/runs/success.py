@@ -131,6 +131,12 @@ def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
     return paired_difference(parts, level)
 
 
+def half_difference(pairs: Pairs, dangerous: bool) -> Estimate:
+    """Return the same where there is a danger, or where there is none."""
+    parts = [known_mean(a - b, 0)[success.dangerous == dangerous] for success, a, b in pairs]
+    return paired_difference(parts)
+
+
 def p_of_mean(pairs: Pairs) -> float | None:
     """Return the p-value of no such difference; None without an interval."""
     return multiplicity.p_value(lambda level: mean_difference(pairs, level))

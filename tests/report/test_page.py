@@ -347,8 +347,8 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
         ended=ENDED,
     )
     assert headline(found) == (
-        "Under 6g, rule-of-thumb clears 94.0 % of the episodes; under single-local, 68.0 %: a clear "
-        "difference."
+        "Under 6g, rule-of-thumb clears 94.0 % of the episodes; under single-local, 68.0 %: +26.0 [+12.5, "
+        "+39.5] points, a clear difference."
     )
     told = [(figure["value"], figure["interval"]) for figure in figures(found)]
     assert told == [
@@ -385,7 +385,7 @@ def test_where_only_a_doubted_condition_beats_driving_alone_the_headline_does_no
     )
 
 
-def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run, tmp_path):
+def test_a_gap_whose_interval_holds_zero_says_what_is_excluded(run, tmp_path):
     found = scored(
         run,
         tmp_path,
@@ -394,7 +394,9 @@ def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run, tmp_p
         ("v2x", "success_gain_over_single-local", 0.02, -0.03, 0.07),
         ended=ENDED,
     )
-    assert headline(found).endswith("under single-local, 68.0 %: the difference may be chance.")
+    assert headline(found).endswith(
+        "under single-local, 68.0 %: +2.0 [-4.8, +8.8] points, not clear, but within ±8.8 points."
+    )
 
 
 def test_where_nothing_beats_driving_alone_the_headline_says_so(run, tmp_path):

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from harness.core.errors import printable
-from harness.core.figures import POINTS, amount, crossed, shown
+from harness.core.figures import POINTS, amount, crossed, shown, within
 from harness.core.multiplicity import LEVEL
 from harness.prompts.difference import marked
 from harness.prompts.versions import as_it_was
@@ -104,7 +104,8 @@ def findings(comparison: Comparison) -> list[tuple[str, str]]:
         for d in [d for d in c.differences if d.metric == lead]:
             row = line(d)
             p = "" if d.p_corrected is None else f", Holm's p {row.p}"
-            change = f"{IN_WORDS[lead]} {row.change} points {row.interval}: {row.verdict or 'may be chance'}"
+            verdict = row.verdict or f"not clear, but within {within(d.change.low, d.change.high)}"
+            change = f"{IN_WORDS[lead]} {row.change} points {row.interval}: {verdict}"
             findings.append((f"{c.condition}: {change}{p}", row.verdict))
     return findings
 

@@ -13,7 +13,7 @@ import numpy as np
 from harness.backends.swarm import open_each, together
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
-from harness.core.figures import POINTS, as_mapping, shown
+from harness.core.figures import POINTS, as_mapping, shown, within
 from harness.core.files import BROKEN, text_of
 from harness.core.progress import Progress
 from harness.core.seeds import stated
@@ -213,7 +213,8 @@ def _study(
     manifest |= {"certificate": certificate, "looks": again}
     last = rows[-1]
     gain, what = last["difference"], success.words
-    verdict = "clear of zero" if gain.low > 0 else "clearly worse" if gain.high < 0 else "not clear of zero"
+    unclear = f"not clear of zero, but within {within(gain.low, gain.high)}"
+    verdict = "clear of zero" if gain.low > 0 else "clearly worse" if gain.high < 0 else unclear
     verdict = verdict if gain.low == gain.low else "too few layouts for an interval"
     headline = [
         f"{plan.version} against {base.version}: {shown(gain, POINTS, '+')} points of {what} on report "
