@@ -74,7 +74,7 @@ def told(played: Dataset) -> Walked:
     return walked(spec_of(played, points=(ALONE, CLEAR, DEAF), seeds=(0,), ask="all"), Scripted(SAID))
 
 
-def value(told: Walked, condition: str, metric: str, interval: str = "episodes") -> tuple[Any, int, int]:
+def value(told: Walked, condition: str, metric: str, interval: str = "") -> tuple[Any, int, int]:
     score = figure(told, condition, metric, interval)
     return score.value, score.n, score.n_excluded
 

@@ -14,6 +14,7 @@ from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
 from harness.evaluate.live_world import LiveSource
 from harness.runs.folder import Run, read
+from harness.runs.leading import PAIRED
 from harness.runs.metrics import GAIN
 from harness.runs.records import Score
 
@@ -98,7 +99,7 @@ def test_without_a_witness_messages_make_up_no_gain(small: Dataset, tmp_path: Pa
     done = driven(
         small, tmp_path / "run", "occluded-intersection:witnesses=0", "single-local", "6g", episodes=8
     )
-    [gain] = [s for s in done.scores if (s.metric, s.interval) == (GAIN, "episodes")]
+    [gain] = [s for s in done.scores if (s.metric, s.interval) == (GAIN, PAIRED)]
     assert gain.low is not None
     assert gain.high is not None
     assert gain.low <= 0 <= gain.high
