@@ -34,9 +34,10 @@ TUNE_LAYOUTS = 60
 LEVELS = get_args(Level)
 POINTS_PLAYED = ALONE, HELPED = "single-local", "6g"
 HONEST = (
-    "optimal_action_rate", "optimal_brier", "optimal_nll_nats", "calibration_error", "coverage_at_5_risk",
-    "entropy_nats",
+    "optimal_action_rate", "optimal_brier", "optimal_nll_nats", "entropy_nats",
+    "calibration_error_one_optimal", "coverage_at_5_risk_one_optimal",
 )  # fmt: skip
+ECE = HONEST.index("calibration_error_one_optimal")
 COSTS = ("trigger_rate", "bits_per_episode", "latency_proxy_ms", BALANCED)
 UNITS = (PERCENT, Unit(factor=1e-3), Unit(), PERCENT, PERCENT)
 SEEDS = "0,1,2,3,4"
@@ -133,9 +134,10 @@ def probabilities(runs: Sequence[tuple[Row, Run]]) -> str:
                 of_condition[ALONE], of_condition[condition], reliability.calibration_error,
                 len(run.grid.episodes),
             )  # fmt: skip
+            texts.insert(ECE, str(len(of_condition[condition].sure)))
             rows.append([row.name, words, *texts, "–" if condition == ALONE else shown(change, POINTS)])
-    head = ("alone", "calibration", "optimal action %", "Brier", "NLL nats", "ECE %", "coverage %",
-            "entropy nats", "change of ECE, points")  # fmt: skip
+    head = ("alone", "calibration", "optimal action %", "Brier", "NLL nats", "entropy nats",
+            "one optimal action, n", "ECE %", "coverage %", "change of ECE, points")  # fmt: skip
     return markdown(head, rows)
 
 

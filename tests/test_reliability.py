@@ -1,22 +1,34 @@
 """Honest probabilities: figures of judged decisions, by hand and against plain loops."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from run_on_disk import Row, made_up
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Bools, Floats, Ints
+from harness.dataset.load import Dataset
+from harness.report import contents, panels
+from harness.report.compare.difference import compare
+from harness.report.compare.pair import pair
+from harness.report.runs import Runs
+from harness.runs.folder import read
+from harness.runs.metrics import ONE_OPTIMAL, entry
 from harness.runs.reliability import (
     BINS,
+    LEAST,
     Judged,
     brier,
     calibration_error,
     coverage,
+    decisions,
     difference,
     estimate,
     likelihood_nats,
+    mass,
     right,
 )
 
@@ -48,44 +60,44 @@ def judged(sure: list[float], hits: list[float], episode: list[int] | None = Non
 
 
 def test_the_calibration_error_by_hand() -> None:
-    """Thirty decisions make 15 bins of two; in each one is right, and they are as sure as listed."""
-    sure = [0.4 + 0.02 * n for n in range(30)]
-    pairs = [abs(0.5 - (sure[n] + sure[n + 1]) / 2) for n in range(0, 30, 2)]
-    found = estimate(judged(sure, [0.0, 1.0] * 15), calibration_error, 30)
-    assert found.value == pytest.approx(np.mean(pairs))
+    """120 decisions make 15 bins of eight; in each four are right, and they are as sure as listed."""
+    sure = [0.4 + 0.005 * n for n in range(120)]
+    eights = [abs(0.5 - np.mean(sure[n : n + 8])) for n in range(0, 120, 8)]
+    found = estimate(judged(sure, [0.0, 1.0] * 60), calibration_error, 120)
+    assert found.value == pytest.approx(np.mean(eights))
     assert found.low <= found.value
-    assert (found.n, found.n_excluded) == (30, 0)
+    assert (found.n, found.n_excluded) == (120, 0)
 
 
 def test_equally_sure_decisions_are_in_one_bin() -> None:
     """So their order is no matter: .9 is right in half of the decisions, .6 in all."""
-    hits = [1.0, 0.0] * 10 + [1.0] * 20
-    for order in (np.arange(40), np.arange(40)[::-1]):
-        decisions = judged(
-            list(np.array([0.9] * 20 + [0.6] * 20)[order]), list(np.array(hits)[order]), list(order)
+    hits = [1.0, 0.0] * 30 + [1.0] * 60
+    for order in (np.arange(120), np.arange(120)[::-1]):
+        some = judged(
+            list(np.array([0.9] * 60 + [0.6] * 60)[order]), list(np.array(hits)[order]), list(order)
         )
-        assert estimate(decisions, calibration_error, 40).value == pytest.approx((0.4 + 0.4) / 2)
-        assert len(set(decisions.bins().tolist())) == 2
+        assert estimate(some, calibration_error, 120).value == pytest.approx((0.4 + 0.4) / 2)
+        assert len(set(some.bins().tolist())) == 2
 
 
 def test_coverage_by_hand() -> None:
-    """Of the 40 surest two are wrong, which is 5 %; the next is wrong, and then 60 more would be needed."""
-    hits = [1.0] * 38 + [0.0] * 3 + [1.0] * 9
-    sure = [0.99 - 0.01 * n for n in range(50)]
-    assert estimate(judged(sure, hits), coverage, 50).value == 40 / 50
-    assert estimate(judged([0.9] * 50, hits), coverage, 50).value == 0.0  # all or nothing: 3 of 50 are wrong
-    assert estimate(judged(sure, [1.0] * 50), coverage, 50).value == 1.0
+    """Of the 80 surest four are wrong, which is 5 %; the next three are, and then 60 more would be needed."""
+    hits = [1.0] * 76 + [0.0] * 7 + [1.0] * 17
+    sure = [0.99 - 0.005 * n for n in range(100)]
+    assert estimate(judged(sure, hits), coverage, 100).value == 80 / 100
+    assert estimate(judged([0.9] * 100, hits), coverage, 100).value == 0.0  # all or nothing: 7 are wrong
+    assert estimate(judged(sure, [1.0] * 100), coverage, 100).value == 1.0
 
 
 DECISIONS = st.lists(
     st.tuples(st.sampled_from([0.4, 0.5, 0.7, 0.9, 1.0]), st.booleans(), st.integers(0, 5)),
-    min_size=1, max_size=40,
+    min_size=LEAST, max_size=LEAST + 20,
 )  # fmt: skip
 
 
 @given(DECISIONS)
 def test_figures_are_those_of_plain_loops(rows: list[tuple[float, bool, int]]) -> None:
-    decisions = judged([r[0] for r in rows], [float(r[1]) for r in rows], [r[2] for r in rows])
+    some = judged([r[0] for r in rows], [float(r[1]) for r in rows], [r[2] for r in rows])
     levels = sorted({r[0] for r in rows}, reverse=True)
     best, acted, wrong, gaps = 0.0, 0, 0, np.zeros(BINS)
     for level in levels:
@@ -93,20 +105,63 @@ def test_figures_are_those_of_plain_loops(rows: list[tuple[float, bool, int]]) -
         gaps[min(int(BINS * (acted + len(here) / 2) / len(rows)), BINS - 1)] += sum(r[1] - r[0] for r in here)
         acted, wrong = acted + len(here), wrong + sum(not r[1] for r in here)
         best = acted / len(rows) if wrong <= 0.05 * acted else best
-    assert estimate(decisions, coverage, 6).value == pytest.approx(best)
-    error = estimate(decisions, calibration_error, 6)
+    assert estimate(some, coverage, 6).value == pytest.approx(best)
+    error = estimate(some, calibration_error, 6)
     assert error.value == pytest.approx(np.abs(gaps).sum() / len(rows))
     assert error.n == len({r[2] for r in rows})
 
 
 def test_parts_of_a_run_are_judged_as_the_whole() -> None:
-    p = np.array([[0.6, 0.4], [0.2, 0.8], [0.7, 0.3], [0.9, 0.1]])
-    optimal = np.array([[True, False], [True, False], [False, False], [True, True]])
-    whole = Judged.of(p, optimal, np.array([0, 1, 2, 3]))
-    parts = [Judged.of(p[:2], optimal[:2], np.array([0, 1])), Judged.of(p[2:], optimal[2:], np.array([0, 1]))]
-    joined = Judged.joined(parts, [2, 2])
-    assert joined.episode.tolist() == whole.episode.tolist() == [0, 1, 3]
-    assert estimate(joined, calibration_error, 4) == estimate(whole, calibration_error, 4)
+    """Decisions with no optimal action or with two are in no part."""
+    p = np.tile([[0.6, 0.4], [0.2, 0.8], [0.7, 0.3], [0.9, 0.1]], (60, 1))
+    optimal = np.tile([[True, False], [True, False], [False, False], [True, True]], (60, 1))
+    episode = np.repeat(np.arange(60), 4)
+    whole = Judged.of(p, optimal, episode)
+    first = episode < 20
+    parts = [Judged.of(p[first], optimal[first], episode[first]),
+             Judged.of(p[~first], optimal[~first], episode[~first] - 20)]  # fmt: skip
+    joined = Judged.joined(parts, [20, 40])
+    assert joined.episode.tolist() == whole.episode.tolist() == [n for n in range(60) for _ in (0, 1)]
+    assert estimate(joined, calibration_error, 60) == estimate(whole, calibration_error, 60)
+    assert estimate(whole, decisions, 60).value == 120
+
+
+@pytest.fixture(scope="session")
+def trees(small: Dataset) -> tuple[Bools, Ints]:
+    """The optimal actions of all decision points of real trees, as often as it takes, and their episodes."""
+    forest = small.forest
+    times = 1 + 2 * LEAST // int((forest.safe.sum(axis=1) == 1).sum())
+    return np.tile(forest.safe, (times, 1)), np.tile(forest.tree, times)
+
+
+def error(p: Floats, trees: tuple[Bools, Ints]) -> float:
+    optimal, episode = trees
+    return estimate(Judged.of(p, optimal, episode), calibration_error, 4).value
+
+
+def test_a_policy_that_takes_any_optimal_action_has_no_error(trees: tuple[Bools, Ints]) -> None:
+    """However it spreads its probability over them; where none is it may do as it likes."""
+    optimal, _ = trees
+    several = optimal.sum(axis=1) > 1
+    assert several.sum() > (optimal.sum(axis=1) == 1).sum() > LEAST
+    spread = optimal / np.maximum(optimal.sum(axis=1, keepdims=True), 1)
+    assert error(spread, trees) == 0.0
+    assert mass(spread[several], optimal[several]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("action", range(3))
+def test_a_constant_that_is_always_sure_has_what_it_is_wrong(action: int, trees: tuple[Bools, Ints]) -> None:
+    optimal, _ = trees
+    one = optimal[optimal.sum(axis=1) == 1]
+    assert error(np.eye(3)[np.full(len(optimal), action)], trees) == pytest.approx(1 - one[:, action].mean())
+
+
+def test_a_policy_that_is_as_sure_as_it_is_right_has_almost_none(trees: tuple[Bools, Ints]) -> None:
+    """What is optimal is drawn by its probabilities, in as many decisions as there are."""
+    draws = np.random.default_rng(0)
+    p = draws.dirichlet([1.0, 1.0, 1.0], 5000)
+    drawn = (draws.random((5000, 1)) > np.cumsum(p, axis=1)[:, :2]).sum(axis=1)
+    assert error(p, (np.eye(3)[drawn] == 1, np.arange(5000) % 4)) < 0.03
 
 
 def test_differences_are_paired_and_calibrated_policies_have_a_small_error() -> None:
@@ -128,8 +183,67 @@ def test_differences_are_paired_and_calibrated_policies_have_a_small_error() -> 
     assert math.isnan(same.low)
 
 
+@pytest.mark.parametrize("n", [LEAST - 1, LEAST])
+def test_of_few_decisions_only_their_number_is_known(n: int) -> None:
+    few, many = judged([0.9] * n, [1.0] * n), judged([0.8] * 2 * n, [1.0] * 2 * n)
+    known = n == LEAST
+    for figure in (calibration_error, coverage):
+        found = estimate(few, figure, n)
+        assert (found.n, found.n_excluded) == ((n, 0) if known else (0, n))
+        assert math.isnan(found.value) is not known
+        assert math.isnan(difference(few, many, figure, 2 * n)[2].value) is not known
+    assert estimate(few, decisions, n).value == n
+
+
 def test_without_judged_decisions_nothing_is_known() -> None:
     nothing = estimate(judged([], []), coverage, 3)
     assert (nothing.n, nothing.n_excluded) == (0, 3)
     assert math.isnan(nothing.value)
     assert math.isnan(difference(judged([], []), judged([0.5], [1.0]), coverage, 3)[2].value)
+
+
+ECE, COVERAGE = "calibration_error_one_optimal", "coverage_at_5_risk_one_optimal"
+OLDER = "calibration_error", "coverage_at_5_risk"
+
+
+def one_optimal_in_half(row: Row) -> None:
+    """Make IDLE the one action that is optimal at the first of two steps, and all of them at the second."""
+    row.update(dict.fromkeys(("safe_SLOWER", "safe_FASTER"), row["step"] == 1))
+    row |= {"fused_SLOWER": 0.4, "fused_IDLE": 0.6}
+
+
+@pytest.mark.parametrize(("layouts", "known"), [(49, False), (50, True)])
+def test_a_run_says_of_how_many_decisions_its_figures_are(tmp_path: Path, layouts: int, known: bool) -> None:
+    """Alike in its summary, in what its page shows and in a comparison with another."""
+    for name in ("a", "b"):
+        made_up(tmp_path / name, decision=one_optimal_in_half, episodes=layouts)
+    run = read(tmp_path / "a")
+    found = {name: run.score("6g", name) for name in (ECE, COVERAGE, ONE_OPTIMAL)}
+    values = [score and score.value for score in found.values()]
+    assert values == [pytest.approx(0.4) if known else None, 1.0 if known else None, 2 * layouts]
+    assert not {*OLDER} & {score.metric for score in run.scores}
+    line = contents.probabilities(Runs((run,), ("a",), None))[1]
+    assert [group["n"] for group in line["groups"]] == [4 * layouts, 2 * layouts]
+    assert line["groups"][1]["scores"] == [found[ECE], found[COVERAGE]]
+    drawn = panels.reliability(run)
+    assert [(row["condition"], row["n"]) for row in drawn] == (
+        [(name, 2 * layouts) for name in run.conditions] if known else []
+    )
+    compared = {
+        d.metric: d.a for d in compare(pair(tmp_path / "a", tmp_path / "b")).conditions[1].differences
+    }
+    assert compared[ONE_OPTIMAL] == 2 * layouts
+    assert (ECE in compared, COVERAGE in compared) == (known, known)
+
+
+def test_figures_of_an_older_definition_are_read_and_not_shown(tmp_path: Path) -> None:
+    """A run that was written with them keeps them in its table, and its page has neither."""
+    made_up(tmp_path / "run")
+    table = tmp_path / "run" / "summary.csv"
+    line = next(line for line in table.read_text().splitlines() if ",optimal_brier," in line)
+    older = "".join(line.replace("optimal_brier", name) + "\n" for name in OLDER)
+    table.write_text(table.read_text() + older)
+    run = read(tmp_path / "run")
+    assert all(run.score("single-local", name) for name in OLDER)
+    shown = {metric["meaning"] for metric in contents.summary(run)}
+    assert not {entry(name).meaning for name in OLDER} & shown

@@ -12,9 +12,8 @@ from harness.runs.notes import Note
 from harness.runs.notes import notes as notes_of
 from harness.runs.summary import judged_of
 
-HONEST = (
-    "optimal_action_rate", "optimal_brier", "optimal_nll_nats", "calibration_error", "coverage_at_5_risk",
-)  # fmt: skip
+HONEST = ("optimal_action_rate", "optimal_brier", "optimal_nll_nats")
+SURE = ("calibration_error_one_optimal", "coverage_at_5_risk_one_optimal")
 EXAMPLES = 3  # of each status of answers
 MOVED = 5  # decision points whose answers moved most
 
@@ -47,12 +46,15 @@ def probabilities(runs: Runs) -> list[dict[str, Any]]:
     lines = []
     for name, run in zip(runs.names, runs.runs, strict=True):
         flips = run.score("all", "flip_rate_ego")
-        judged = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
-        for condition, decisions in zip(run.conditions, judged, strict=True):
-            scores = [run.score(condition, metric) for metric in HONEST]
+        judged = run.decisions.of_actions("safe").max(axis=-1) == 1.0
+        places = run.decisions.codes("condition", run.conditions)
+        one_optimal = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
+        for place, condition in enumerate(run.conditions):
+            scores, sure = ([run.score(condition, metric) for metric in some] for some in (HONEST, SURE))
             if any(scores):
-                cells = [*scores, flips]
-                lines.append({"run": name, "condition": condition, "n": len(decisions.sure), "cells": cells})
+                n, n_one = int(judged[places == place].sum()), len(one_optimal[place].sure)
+                groups = [{"n": n, "scores": [*scores, flips]}, {"n": n_one, "scores": sure}]
+                lines.append({"run": name, "condition": condition, "groups": groups})
     return lines
 
 

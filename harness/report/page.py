@@ -28,6 +28,7 @@ from harness.report.panels import panels
 from harness.report.runs import Runs
 from harness.report.templating import environment
 from harness.runs.leading import IN_WORDS
+from harness.runs.reliability import LEAST
 
 PARTS_SHARED = 8  # fewest parts for which starting workers takes less time than they save
 HEAD = 1 << 14  # bytes of a page within which it states what it lacks
@@ -150,6 +151,7 @@ def _pieces(
         summaries=[contents.summary(run) for run in runs.runs],
         answers=contents.answers(runs),
         probabilities=contents.probabilities(runs),
+        least=LEAST,
         charts=charts,
         examples=contents.examples(runs),
         attributions=contents.attributions(runs),

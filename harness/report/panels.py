@@ -20,7 +20,7 @@ from harness.runs.folder import Run
 from harness.runs.leading import IN_WORDS, lead_of
 from harness.runs.metrics import LATENCY
 from harness.runs.records import Score, role_word
-from harness.runs.reliability import BINS
+from harness.runs.reliability import BINS, LEAST
 from harness.runs.summary import judged_of
 
 Table = list[dict[str, Any]]
@@ -76,12 +76,12 @@ def panels(runs: Runs) -> Iterator[Panel]:
     if rows := joined(reliability):
         yield Panel(
             "reliability", "probabilities", "Is the policy as often right as it is sure?",
-            "Decisions are grouped by the probability of the likeliest action in the fused policy, in "
-            f"{BINS} bins of equal mass; each point shows how often that action was optimal, so that success "
-            "was still possible after it. The mean distance from the dashed line is the ECE; above the line "
-            "the policy is less sure than it could be. A probability spread over two optimal actions is no "
-            "mistake, but lies above the line. All seeds; decisions in which nothing could succeed are left "
-            "out; 95 % intervals over episodes.",
+            "Decisions in which exactly one action is optimal, so that success is possible after no other, "
+            "are grouped by the probability of the likeliest action in the fused policy, in "
+            f"{BINS} bins of equal mass; each point shows how often that action was the optimal one. The "
+            "mean distance from the dashed line is the ECE; above the line the policy is less sure than it "
+            f"could be. Conditions with fewer than {LEAST} such decisions are left out. All seeds; 95 % "
+            "intervals over episodes.",
             charts.shares(
                 rows, "certainty", "fused probability of the likeliest action", "share optimal", diagonal=True
             ),
@@ -179,10 +179,12 @@ def statuses(run: Run) -> Table:
 
 
 def reliability(run: Run) -> Table:
-    """Return how often the likeliest action was optimal, by how probable fusion held it."""
+    """Return how often the likeliest action was the one optimal action, by how probable fusion held it."""
     rows: Table = []
     judged_by_condition = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
     for condition, judged in zip(run.conditions, judged_by_condition, strict=True):
+        if len(judged.sure) < LEAST:
+            continue
         bins = judged.bins()
         for place in np.unique(bins):
             here = bins == place

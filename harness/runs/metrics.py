@@ -45,6 +45,7 @@ LATENCY, GAIN = "latency_proxy_ms", f"success_gain_over_{BASELINE}"
 GAINS = {SUCCESS: GAIN, BALANCED: f"balanced_success_gain_over_{BASELINE}"}  # by what is gained
 # What is corrected by the layouts' difficulty, by what it corrects
 ADJUSTED = {name: f"adjusted_{name}" for name in (*GAINS, *GAINS.values())}
+ONE_OPTIMAL = "decisions_one_optimal"  # how many decisions the figures of exactly one optimal action are of
 PERCENTILES = (50, 95, 99)
 ALL = "all"  # the condition of a figure that is the same in all of them
 ROLES: tuple[Role, ...] = get_args(Role)
@@ -87,7 +88,8 @@ class Metric:
     # two metrics of a half of the episodes each, whose mean it is
     halves: tuple[str, ...] = ()
     corrects: str = ""  # the metric that it corrects by the layouts' difficulty, where two runs are compared
-    # whether another has taken its place: tables and comparisons keep it, and pages leave it out
+    # whether another has taken its place: tables and, where it is still computed, comparisons keep it, and
+    # pages leave it out
     superseded: bool = False
 
     def __post_init__(self) -> None:
@@ -372,12 +374,21 @@ BUILT_IN = (
     _judged("optimal_nll_nats", f"negative log-likelihood of the optimal actions together, whose probability "
             f"counts as {reliability.LEAST_P} at least", NATS, "lower", reliability.likelihood_nats,
             label="NLL"),
-    Metric("calibration_error", f"expected calibration error of the likeliest action, in {reliability.BINS} "
-           "bins of equal mass, over all decisions", PERCENT, "lower", most=1.0, label="ECE", world="frozen",
-           pooled=reliability.calibration_error),
-    Metric("coverage_at_5_risk", "greatest share of decisions, the surest first, of which 5 % at most are "
-           "not optimal, over all decisions", PERCENT, "higher", most=1.0, label="coverage at 5 % risk",
+    Metric(ONE_OPTIMAL, "number of decisions, of all seeds, in which exactly one action is optimal",
+           Unit(decimals=0), "neither", world="frozen", pooled=reliability.decisions),
+    Metric("calibration_error_one_optimal", "expected calibration error of the likeliest action, in "
+           f"{reliability.BINS} bins of equal mass, over all decisions in which exactly one action is "
+           f"optimal; not known below {reliability.LEAST} of them", PERCENT, "lower", most=1.0, label="ECE",
+           world="frozen", pooled=reliability.calibration_error),
+    Metric("coverage_at_5_risk_one_optimal", "greatest share, the surest first, of the decisions in which "
+           "exactly one action is optimal, of which 5 % at most are not right; not known below "
+           f"{reliability.LEAST} of them", PERCENT, "higher", most=1.0, label="coverage at 5 % risk",
            world="frozen", pooled=reliability.coverage),
+    Metric("calibration_error", "expected calibration error over all decisions, also those in which several "
+           "actions are optimal; in older runs", PERCENT, "lower", most=1.0, world="frozen", superseded=True),
+    Metric("coverage_at_5_risk", "coverage at 5 % risk over all decisions, also those in which several "
+           "actions are optimal; in older runs", PERCENT, "higher", most=1.0, world="frozen",
+           superseded=True),
     Metric("brier", "distance of the fused policy from the uniform one over the safe actions; 0 best, 2 "
            "worst", SCORE, "lower", world="frozen", superseded=True,
            decisions=lambda d: brier(d.of_actions("fused"), safe_target(d.of_actions("safe") == 1.0))),

@@ -5,10 +5,13 @@ is *optimal* if it is of the greatest worth; of several all are. Where nothing c
 actions are alike, and the decision is not judged. A policy is right if its likeliest action is optimal, and
 as sure as that action is probable; of equally likely actions the share that is optimal counts.
 
-Each figure is over all decisions, and none is a mean over episodes. Its interval is a bootstrap (Efron and
-Tibshirani 1993, chapter 13) that resamples whole episodes, since decisions of one are not independent. The
-ends are percentiles of the resampled figures, moved by as much as these are off the figure on average: a
-resample is noisier than the sample, which lifts a calibration error.
+How sure a policy should be of one action is known only where exactly one is optimal. Of several it may take
+any: one that spreads its probability over them makes no mistake, and is less sure than it is right.
+
+Each figure is over all decisions with one optimal action, and none is a mean over episodes. Its interval is a
+bootstrap (Efron and Tibshirani 1993, chapter 13) that resamples whole episodes, since decisions of one are
+not independent. The ends are percentiles of the resampled figures, moved by as much as these are off the
+figure on average: a resample is noisier than the sample, which lifts a calibration error.
 """
 
 import math
@@ -24,6 +27,7 @@ from harness.core.statistics import Estimate, resampled
 LEAST_P = 0.005  # least probability of the optimal actions that is counted in a likelihood
 BINS = 15  # of equal mass
 RISK = 0.05  # greatest share of decisions acted on whose action is not optimal
+LEAST = 100  # fewest decisions of a figure: of fewer, even a calibrated policy has an error of many points
 RESAMPLES = 399  # of episodes
 AT_ONCE = 1 << 17  # how many numbers of resamples are summed at once: they stay in a core's cache
 
@@ -57,7 +61,7 @@ def right(p: Floats, optimal: Bools) -> Floats:
 
 @dataclass(frozen=True)
 class Judged:
-    """Decisions of which the optimal actions are known."""
+    """Decisions in which exactly one action is optimal."""
 
     sure: Floats  # the probability of the likeliest action, (n,)
     right: Floats  # the share of the likeliest actions that is optimal, (n,)
@@ -65,9 +69,9 @@ class Judged:
 
     @classmethod
     def of(cls, p: Floats, optimal: Bools, episode: Ints) -> "Judged":
-        """Judge policies `(n, A)`, and leave out the decisions without an optimal action."""
+        """Judge policies `(n, A)`, and leave out the decisions with no optimal action or with several."""
         hits = right(p, optimal)
-        known = ~np.isnan(hits)
+        known = ~np.isnan(hits) & (optimal.sum(axis=-1) == 1)
         return cls(p.max(axis=-1)[known], hits[known], episode[known])
 
     @classmethod
@@ -85,6 +89,11 @@ class Judged:
 
 
 Figure = Callable[[Floats, Floats, Floats], Floats]
+
+
+def decisions(count: Floats, hits: Floats, sure: Floats) -> Floats:
+    """Return the number of decisions, (R,). `calibration_error` says what the arguments are."""
+    return np.asarray(count.sum(axis=1))
 
 
 def calibration_error(count: Floats, hits: Floats, sure: Floats) -> Floats:
@@ -117,27 +126,32 @@ def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
 
 
 def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
-    """Return a figure of decisions in so many episodes, with its interval over these."""
+    """Return a figure of decisions in so many episodes, with its interval over these.
+
+    Of fewer than `LEAST` decisions only their number is known.
+    """
     return estimates(judged, [figure], episodes)[0]
 
 
 def estimates(judged: Judged, figures: Sequence[Figure], episodes: int) -> list[Estimate]:
     """Return some figures of the same decisions, as `estimate` does each; they share the resamples."""
-    values = [[figure(*sums) for figure in figures] for sums in _sums(judged, episodes)]
-    return [_estimate([part[n] for part in values], judged, episodes) for n in range(len(figures))]
+    known = [figure for figure in figures if _known(figure, judged)]
+    values = [[figure(*sums) for figure in known] for sums in _sums(judged, episodes)] if known else []
+    found = iter(_estimate(parts, judged, episodes) for parts in zip(*values, strict=True))
+    return [next(found) if figure in known else _unknown(episodes) for figure in figures]
 
 
 def difference(a: Judged, b: Judged, figure: Figure, episodes: int) -> tuple[float, float, Estimate]:
     """Return a figure of A's and of B's decisions, and B's less A's, paired by episode.
 
-    Episodes in which either has no decision are left out.
+    Episodes in which either has no decision are left out. Nothing is known if one is left with fewer than
+    `LEAST`, except of their number.
     """
     both = np.intersect1d(a.episode, b.episode)
     a, b = (_of(side, np.isin(side.episode, both)) for side in (a, b))
-    of_a, of_b = (
-        np.concatenate([figure(*sums) for sums in _sums(side, episodes)] or [np.full(1, np.nan)])
-        for side in (a, b)
-    )
+    if not (_known(figure, a) and _known(figure, b)):
+        return math.nan, math.nan, _unknown(episodes)
+    of_a, of_b = (np.concatenate([figure(*sums) for sums in _sums(side, episodes)]) for side in (a, b))
     return float(of_a[0]), float(of_b[0]), _estimate([of_b - of_a], a, episodes)
 
 
@@ -145,10 +159,16 @@ def _of(judged: Judged, which: Bools) -> Judged:
     return Judged(judged.sure[which], judged.right[which], judged.episode[which])
 
 
+def _unknown(episodes: int) -> Estimate:
+    return Estimate(math.nan, math.nan, math.nan, 0, episodes)
+
+
+def _known(figure: Figure, judged: Judged) -> bool:
+    return len(judged.sure) >= (1 if figure is decisions else LEAST)
+
+
 def _estimate(values: Sequence[Floats], judged: Judged, episodes: int) -> Estimate:
     n = len(np.unique(judged.episode))
-    if not n:
-        return Estimate(math.nan, math.nan, math.nan, 0, episodes)
     value, *others = np.concatenate(values).tolist()
     low, high = value + np.percentile(others, (2.5, 97.5)) - np.mean(others)
     low, high = (low, high) if low < high else (math.nan, math.nan)
@@ -157,8 +177,6 @@ def _estimate(values: Sequence[Floats], judged: Judged, episodes: int) -> Estima
 
 def _sums(judged: Judged, episodes: int) -> Iterator[tuple[Floats, Floats, Floats]]:
     """Yield what a `Figure` is of, in parts of some resamples; the first is of the decisions as they are."""
-    if not len(judged.sure):
-        return
     order = np.argsort(-judged.sure, kind="stable")
     sure, hits, episode = judged.sure[order], judged.right[order], judged.episode[order]
     starts = np.flatnonzero(np.diff(sure, prepend=np.inf))

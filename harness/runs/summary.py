@@ -57,7 +57,7 @@ class Figures:
     values: Mapping[str, Floats]  # each metric's values by episode, (C, S, E)
     # the decisions' latencies for each condition and seed, in the order of the grid
     latency_ms: Sequence[Floats]
-    judged: Sequence[Judged]  # the decisions whose optimal actions are known, for each condition
+    judged: Sequence[Judged]  # the decisions with exactly one optimal action, for each condition
     answers: Sequence[tuple[Answer | AnswerFacts, int]]  # the answers, each with its episode
 
     @classmethod
@@ -135,7 +135,7 @@ def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
 
 
 def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
-    """Return each condition's decisions whose optimal actions are known; `cells` (n,) are `Grid.places`."""
+    """Return each condition's decisions with exactly one optimal action; `cells` (n,) are `Grid.places`."""
     fused, optimal = decisions.of_actions("fused"), decisions.of_actions("safe") == 1.0
     condition, _, episode = np.unravel_index(cells, grid.shape)
     rows = [np.flatnonzero(condition == place) for place in range(len(grid.conditions))]
@@ -143,7 +143,7 @@ def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
 
 
 def _of_judged(grid: Grid, judged: Sequence[Judged]) -> Iterator[Score]:
-    """Yield each condition's figures of all decisions, where any is known."""
+    """Yield each condition's figures of all its judged decisions, where there are any."""
     pooled = {metric.name: metric.pooled for metric in METRICS.values() if metric.pooled}
     for condition, decisions in zip(grid.conditions, judged, strict=True):
         if len(decisions.sure):

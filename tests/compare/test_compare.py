@@ -22,7 +22,7 @@ from harness.dataset.load import Dataset, load
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
 from harness.report.compare.pair import pair
-from harness.runs.metrics import BALANCED, METRICS
+from harness.runs.metrics import BALANCED, METRICS, ONE_OPTIMAL
 
 Said = tuple[int, str, str]
 WITNESSED = {name for name in METRICS if name.startswith("success_dangerous_rate_")}
@@ -30,12 +30,15 @@ BY_DANGER = {name for name, metric in METRICS.items() if metric.half} - WITNESSE
 CONFLICTS = {"least_ttc_s", "short_ttc_rate", "short_ttc_decision_rate", "least_pet_s", "short_pet_rate"}
 # Which not every episode has.
 SOME = {
-    "time_to_clear_s", "regret_rate", "delay_s", "time_lost_s", "least_ttc_s", "least_pet_s", *BY_DANGER,
+    "time_to_clear_s", "regret_rate", "delay_s", "time_lost_s", "least_ttc_s", "least_pet_s", ONE_OPTIMAL,
+    *BY_DANGER,
 }  # fmt: skip
 OPTIONAL = {name for name, metric in METRICS.items() if metric.optional} - {
     "time_lost_s", *BY_DANGER, *CONFLICTS,
 }  # fmt: skip
 NAMES = {name for name, metric in METRICS.items() if metric.compared}
+# Of which there are too few decisions here.
+FEW = {name for name, metric in METRICS.items() if metric.pooled} - {ONE_OPTIMAL}
 LIVE = {name for name, metric in METRICS.items() if metric.world == "closed-loop"}
 
 
@@ -55,7 +58,7 @@ def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> Non
     assert c.answers_in_both == {"ego": scenes, "helper": 3 * scenes}
     for of in c.conditions:
         silent = {"effective_loss", "observed_reply_loss"} if of.condition == "single-local" else set()
-        always = set(NAMES) - LIVE - OPTIONAL - {"merge_failed_rate"}
+        always = set(NAMES) - LIVE - OPTIONAL - FEW - {"merge_failed_rate"}
         assert {d.metric for d in of.differences} == always - silent
         for d in of.differences:
             assert d.change.value == 0
@@ -287,7 +290,7 @@ def test_runs_of_other_lengths_and_conditions_are_compared_where_they_meet(
     c = found((runs[0], short.out))
     assert (c.pair.conditions, c.pair.episodes) == (("6g",), (0, 1, 2))
     assert c.settings == ()
-    assert all(d.change.n == 3 or d.metric in BY_DANGER for d in c.conditions[0].differences)
+    assert all(d.change.n == 3 or d.metric in {*BY_DANGER, ONE_OPTIMAL} for d in c.conditions[0].differences)
     assert all(d.change.value == 0 for d in c.conditions[0].differences)
 
 
@@ -316,7 +319,7 @@ def test_live_runs_are_compared_with_live_runs(
         }  # fmt: skip
     told = differences(c, "6g")
     unheard = {"effective_loss", "observed_reply_loss", "merge_failed_rate"}
-    frozen = {name for name, metric in METRICS.items() if metric.world == "frozen"}
+    frozen = {name for name in NAMES if METRICS[name].world == "frozen"}
     by_tree = {
         f"{what}_{half}_rate" for what in ("miss", "false_alarm") for half in ("dangerous", "harmless")
     }

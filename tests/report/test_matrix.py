@@ -175,7 +175,6 @@ def test_every_decision_and_reply_is_counted_once(run, dataset):
     assert len(rows) == sum(episode.decisions for episode in found.episodes)
     judged = sum(bool(forest.value[forest.place[row["scene"]]]) for row in rows)
     assert judged > 0
-    assert sum(row["n"] for row in panels.reliability(found)) == judged
     assert sum(row["n"] for row in panels.errors(found)) == judged
     replies = panels.replies(found)
     assert sum(row["count"] for row in replies) == sum(row["messages"] for row in rows)

@@ -205,7 +205,8 @@ def test_the_page_says_how_honest_the_probabilities_are(run, page):
     """A line a condition, above the picture; figures that others have replaced stay off the page."""
     loaded = read(run)
     rows = loaded.decisions
-    open_rows = (rows.of_actions("safe") == 1.0).any(axis=1)
+    optimal = (rows.of_actions("safe") == 1.0).sum(axis=1)
+    open_rows, one_optimal = optimal > 0, optimal == 1
     table = page.text.split("How honest the probabilities are")[1].split("Layouts are resampled")[0]
     for condition in ("single-local", "v2x", "6g"):
         line = table.split(condition)[1]
@@ -214,6 +215,8 @@ def test_the_page_says_how_honest_the_probabilities_are(run, page):
         for metric in contents.HONEST:
             cell = shown(loaded.score(condition, metric))
             assert f"{cell['value']} {cell['interval']}" in line
+        assert f" – {(one_optimal & here).sum()} – – " in line  # no flip was asked for, and they are too few
+    assert "fewer than 100 such decisions" in page.text
     assert "negative log likelihood" not in page.text
 
 

@@ -78,7 +78,7 @@ class Pair:
         return Pool.of(known, self.episodes) if len(known) > len(self.episodes) else None
 
     def judged(self, side: Side, condition: str) -> Judged:
-        """Return the decisions in `episodes` whose optimal actions are known, by their place there."""
+        """Return the decisions in `episodes` with exactly one optimal action, by their place there."""
         rows, place = self._rows(side, condition)
         p, safe = (side.run.decisions.of_actions(name)[rows] for name in ("fused", "safe"))
         return Judged.of(p, safe == 1.0, place)

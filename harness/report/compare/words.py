@@ -15,7 +15,7 @@ from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.words import as_good_as, p_value, pace
 from harness.runs.leading import IN_WORDS, SUCCESS, lead_of, leading
-from harness.runs.metrics import ADJUSTED, entry
+from harness.runs.metrics import ADJUSTED, ONE_OPTIMAL, entry
 from harness.runs.records import role_word
 from harness.runs.success import Success
 
@@ -74,8 +74,9 @@ def _visible(d: Difference) -> bool:
 def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
     """Choose what is shown first: the primary metrics, and the exploratory ones that changed most clearly.
 
-    Together they are `SHOWN` at most. Those of which one way is better come before all others, and before
-    percentiles, which say again how long a decision takes.
+    Together they are `SHOWN` at most, and the number of decisions where one of them is over some alone. Those
+    of which one way is better come before all others, and before percentiles, which say again how long a
+    decision takes.
     """
 
     def order(d: Difference) -> tuple[bool, float]:
@@ -87,7 +88,10 @@ def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
     changed = [
         d for d in c.differences if not d.primary and _visible(d) and (verdict(d) or d.p_value is None)
     ]
-    return primary, sorted(changed, key=order)[: max(SHOWN - len(primary), 0)]
+    striking = sorted(changed, key=order)[: max(SHOWN - len(primary), 0)]
+    if any(entry(d.metric).pooled for d in striking):
+        striking += [d for d in c.differences if d.metric == ONE_OPTIMAL and d not in striking]
+    return primary, striking
 
 
 def rest(c: InCondition) -> list[Difference]:
