@@ -15,8 +15,9 @@ from harness.backends.base import Backend
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
-from harness.core.sequences import BETS, any_time
+from harness.core.sequences import BETS, any_time, any_time_difference
 from harness.core.shards import Shard
+from harness.core.statistics import paired_difference
 from harness.dataset.load import Dataset
 from harness.dataset.select import Selection
 from harness.evaluate import looks
@@ -79,14 +80,17 @@ def test_of_two_parts_no_pair_of_means_outside_is_left(first: int, second: int) 
     assert e.high - 0.021 <= mean_of_means[left].max() <= e.high
 
 
-def test_differences_are_bets_from_minus_one_to_one() -> None:
-    differences = np.array([1.0] * 20 + [0.0] * 30 + [-1.0] * 2)
-    e, scaled = any_time([differences], -1.0), any_time([(differences + 1) / 2])
-    assert (e.low, e.high, e.value) == pytest.approx(
-        (2 * scaled.low - 1, 2 * scaled.high - 1, differences.mean())
-    )
-    assert e.low > 0
-    assert np.isnan(any_time([np.array([]), differences]).low)
+def test_an_interval_of_differences_at_every_look_is_half_as_wide_again_as_at_one() -> None:
+    """At 100 episodes it is sqrt((1 + 1/9) (ln 10 - 2 ln .05)) = 3.035 standard errors, elsewhere more."""
+    rng = np.random.default_rng(2)
+    for n, errors in ((100, 3.035), (25, 3.219), (1000, 3.259)):
+        differences = rng.choice([1.0, 0.0, -1.0], n, p=(0.3, 0.6, 0.1))
+        parts = [differences[: n // 3], differences[n // 3 :]]
+        once, always = paired_difference(parts), any_time_difference(parts)
+        assert (always.value, always.n) == (once.value, n)
+        wider = (always.high - once.value) / (once.high - once.value)
+        assert wider == pytest.approx(errors / 1.959964, abs=1e-3)
+    assert np.isnan(any_time_difference([np.array([]), differences]).low)
 
 
 def test_the_truth_is_held_at_every_look_of_nearly_all_runs() -> None:

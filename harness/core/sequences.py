@@ -1,10 +1,14 @@
 """Intervals of means that hold at every look at once, so that a run may stop when it has seen enough.
 
-Each value from 0 to 1 is a bet for or against a mean m: capital that never grows on average if m is the mean.
-By Ville's inequality it exceeds 20 with a probability of 5 % at most, whenever one looks, and so the means at
-which it does not are a 95 % confidence sequence: Waudby-Smith and Ramdas 2024, Estimating means of bounded
-random variables by betting, J. R. Stat. Soc. B 86(1), the hedged capital with a grid of bets. How often a run
-that stops holds the truth is simulated by `benchmarks/looks.py`.
+Of shares: each value from 0 to 1 is a bet for or against a mean m: capital that never grows on average if m
+is the mean. By Ville's inequality it exceeds 20 with a probability of 5 % at most, whenever one looks, and so
+the means at which it does not are a 95 % confidence sequence: Waudby-Smith and Ramdas 2024, Estimating means
+of bounded random variables by betting, J. R. Stat. Soc. B 86(1), the hedged capital with a grid of bets.
+
+Of paired differences: the interval of `statistics.paired_difference`, as much wider as the normal mixture of
+Robbins is (Waudby-Smith and others 2024, Time-uniform central limit theory and asymptotic confidence
+sequences, Ann. Stat. 52(6)). It is half as wide as by bets where parts are averaged, and holds for many
+episodes, not for any number. How often runs that stop hold the truth is simulated by `benchmarks/looks.py`.
 """
 
 import math
@@ -13,27 +17,47 @@ from collections.abc import Sequence
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.core.statistics import LEVEL, Estimate
+from harness.core.statistics import LEVEL, Estimate, paired_error
 
 # Shares of what may be bet: any are valid, and these are good for 20 to 5000 values.
 BETS = np.geomspace(0.01, 0.8, 10)
+NARROWEST = 100  # episodes at which an interval of differences is least wide, against that of one look
 MEANS = np.linspace(0.0, 1.0, 1001)  # the means that are tried; ends are the next one outwards
 
 
-def any_time(parts: Sequence[Floats], least: float = 0.0) -> Estimate:
+def any_time(parts: Sequence[Floats]) -> Estimate:
     """Return the mean of means of parts, with an interval that holds at every look.
 
-    Values of one or two parts are independent, of one mean a part, from `least` to 1, (E,); NaN is left out.
-    The capital of two is the product of theirs; the interval has every mean of means that it does not refute.
+    Values of one or two parts are independent, of one mean a part, from 0 to 1, (E,); NaN is left out. The
+    capital of two is the product of theirs; the interval has every mean of means that it does not refute.
     """
     values = [part[~np.isnan(part)] for part in parts]
     n, n_excluded = sum(map(len, values)), sum(map(len, parts)) - sum(map(len, values))
     if not all(map(len, values)):
         return Estimate(math.nan, math.nan, math.nan, n, n_excluded)
-    capitals = [_log_capital((part - least) / (1 - least)) for part in values]
+    capitals = [_log_capital(part) for part in values]
     low, high = _least_mean(capitals), 1 - _least_mean([capital[::-1] for capital in capitals])
     value = float(np.mean([part.mean() for part in values]))
-    return Estimate(value, least + (1 - least) * low, least + (1 - least) * high, n, n_excluded)
+    return Estimate(value, low, high, n, n_excluded)
+
+
+def any_time_difference(parts: Sequence[Floats]) -> Estimate:
+    """Return what `paired_difference` does of the same parts, with an interval that holds at every look."""
+    value, error = paired_error(parts)
+    n = sum(int((~np.isnan(part)).sum()) for part in parts)
+    half = error * _mixture(n)
+    low, high = float(np.maximum(value - half, -1.0)), float(np.minimum(value + half, 1.0))
+    return Estimate(value, low, high, n, sum(map(len, parts)) - n)
+
+
+def _mixture(n: int) -> float:
+    """Return the standard errors that an interval reaches after n episodes.
+
+    A mixture whose prior weighs as n / r episodes reaches sqrt((1 + 1/r) (ln(1 + r) - 2 ln alpha)), which is
+    least at r = 9 for alpha = 0.05.
+    """
+    r = 9 * max(n, 1) / NARROWEST
+    return math.sqrt((1 + 1 / r) * (math.log1p(r) - 2 * math.log(1 - LEVEL)))
 
 
 def _log_capital(values: Floats) -> Floats:

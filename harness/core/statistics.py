@@ -157,15 +157,22 @@ def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate
 
     A part with one episode bounds nothing, so the ends are NaN.
     """
+    value, error = paired_error(parts)
+    n = sum(int((~np.isnan(part)).sum()) for part in parts)
+    half = _normal(level) * error
+    low, high = float(np.maximum(value - half, -1.0)), float(np.minimum(value + half, 1.0))
+    return Estimate(value, low, high, n, sum(map(len, parts)) - n)
+
+
+def paired_error(parts: Sequence[Floats]) -> tuple[float, float]:
+    """Return the mean of `paired_difference` and its standard error; NaN where it is not known."""
     known = [part[~np.isnan(part)] for part in parts]
     sizes = np.array([len(part) for part in known])
-    n = int(sizes.sum())
-    n_excluded = sum(map(len, parts)) - n
     if sizes.min() == 0:
-        return Estimate(math.nan, math.nan, math.nan, n, n_excluded)
+        return math.nan, math.nan
     value = float(np.mean([part.mean() for part in known]))
     if sizes.min() == 1:
-        return Estimate(value, math.nan, math.nan, n, n_excluded)
+        return value, math.nan
     weights = 1 / (len(parts) * sizes)  # of an episode in each part
     more = ALIKE / len(parts) if len(parts) > 1 else 0.0
     own = np.array([part.var(ddof=1) for part in known])
@@ -176,8 +183,7 @@ def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate
     usual = float(np.mean(differing**2)) if len(differing) else 0.0
     heaviest = float(weights.max()) ** 2
     added = 2 * (usual + (heaviest - usual) * math.exp(-len(differing) / FEW))
-    half = _normal(level) * math.sqrt(float(np.sum(weights**2 * sizes * variances)) + added)
-    return Estimate(value, max(value - half, -1.0), min(value + half, 1.0), n, n_excluded)
+    return value, math.sqrt(float(np.sum(weights**2 * sizes * variances)) + added)
 
 
 def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:

@@ -11,7 +11,7 @@ import numpy as np
 from harness.core import multiplicity
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.power import Spread, variance
-from harness.core.sequences import any_time
+from harness.core.sequences import any_time, any_time_difference
 from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of, paired_difference, resampled
 from harness.runs.leading import ANY_TIME, BALANCED, IN_WORDS, SUCCESS
 from harness.runs.metrics import BASELINE, GAINS, METRICS, Grid, of_ends, over_episodes
@@ -67,7 +67,7 @@ class Success:
 
     def any_time_difference(self, a: Floats, b: Floats) -> Estimate:
         """Return success a - b, both (S, E), paired by episode, with an interval that holds at every look."""
-        return any_time([known_mean(a - b, 0)[part] for part in self.parts], -1.0)
+        return any_time_difference([known_mean(a - b, 0)[part] for part in self.parts])
 
     def p_value(self, a: Floats, b: Floats) -> float | None:
         """Return the p-value of no such difference; None without an interval."""
