@@ -27,13 +27,16 @@ from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Site, Unit
 from harness.radio.fading import Trips
 from harness.radio.profiles import CHANNELS
 from harness.radio.propagation import Propagation
-from harness.radio.trace import Point, Table, Trace
+from harness.radio.trace import Point, Spread, Table, Trace
 from harness.world.sight_lines import site
 from harness.world.state import Building, VehicleState, WorldState
 
 SHARES = {"clear": 1.0, "vehicle": 1.0, "building": 0.5}
 TRACE = Trace(
     Table("", "", tuple(Point(0.0, share, sight, 0.02) for sight, share in SHARES.items())), 0.02, "held"
+)
+SPREAD = Trace(
+    Table("", "", (Point(0.0, 1.0, None, Spread(0.01, 0.03)), Point(60.0, 0.5, None, Spread(0.03, 0.2)))), 0.0
 )
 ABOVE = Unit(0.0, 0.0, 5.0)
 DOUBT = (0.3, 0.4, 0.3)
@@ -44,6 +47,7 @@ CROSSES, LOST = 0.9, 0.1  # draws behind the building
 def traced() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(CHANNELS._loaded, "traced", TRACE)
+        patch.setitem(CHANNELS._loaded, "spread", SPREAD)
         yield
 
 
@@ -190,6 +194,7 @@ def cases(draw: st.DrawFn) -> tuple[Intents, Draws]:
 
 RADIOS = ("mode4", "mode2", "its-g5", "traced", "its-g5:loss=0.3")
 radios = st.sampled_from(RADIOS)
+all_radios = st.sampled_from([*RADIOS, "spread"])  # over the last a relay may be faster than the direct link
 delays = st.sampled_from([0.0, 0.01])
 
 
@@ -219,7 +224,7 @@ def test_settings_of_a_unit_that_is_not_there_change_nothing(name, case):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
 
 
-@given(radios, cases(), delays, st.sampled_from(["relay", "fusion"]), st.booleans())
+@given(all_radios, cases(), delays, st.sampled_from(["relay", "fusion"]), st.booleans())
 @settings(max_examples=30)
 def test_a_single_decision_over_a_unit_is_a_row_of_the_batch(name, case, delay_s, edge, on_demand):
     beside = over(name, edge=edge, edge_delay_s=delay_s, on_demand=on_demand, window_s=0.3)
@@ -234,7 +239,7 @@ def test_a_single_decision_over_a_unit_is_a_row_of_the_batch(name, case, delay_s
         np.testing.assert_array_equal(getattr(alone, field.name), getattr(batch, field.name)[3])
 
 
-@given(radios, cases(), delays)
+@given(all_radios, cases(), delays)
 @settings(max_examples=50)
 def test_an_ego_acts_within_the_window_over_a_unit_that_fuses(name, case, delay_s):
     decision = coordinate(over(name, edge="fusion", edge_delay_s=delay_s), *case)

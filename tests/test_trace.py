@@ -11,6 +11,7 @@ from harness.core.errors import UserError
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Site
 from harness.radio.fading import Trips
 from harness.radio.trace import Trace, from_profile, read
+from harness.radio.wrapped import heard_s
 
 PLAIN = "distance_m,reception\n300,0.2\n100,0.8\n"
 SIGHTED = (
@@ -80,7 +81,7 @@ def test_a_reply_comes_after_the_latency_of_its_distance_if_both_messages_cross(
     )  # fmt: skip
     draws = Draws(np.full((3, 2), 0.5), np.full(3, 0.5), Trips(np.array(0), np.array(0), np.array(0), 1))
     object.__setattr__(draws, "packet", np.array([[0.06, 0.06], [0.06, 0.04], [0.9, 0.9]]))
-    assert trace.request(400.0, draws).heard_s == 0.008
+    assert heard_s(trace, trace.request(400.0, draws), links, draws)[:2] == pytest.approx([0.006, 0.006])
     up, delay_s, loss, airtime_s = trace.deliver(links, draws)
     assert up[:2].tolist() == [True, False]
     assert delay_s.tolist() == pytest.approx([0.156, 0.206, np.inf])
@@ -92,7 +93,7 @@ def test_a_reply_comes_after_the_latency_of_its_distance_if_both_messages_cross(
     ("text", "says"),
     [
         ("distance_m\n1\n", "run.csv: has no column reception"),
-        ("distance_m,reception,loss\n1,1,0\n", "'loss'; known: distance_m, latency_ms, reception, sight"),
+        ("distance_m,reception,loss\n1,1,0\n", "'loss'; known: distance_m, latency_ms, latency_p50_ms"),
         ("distance_m,reception\n", "has no rows; give reception at one distance at least"),
         ("distance_m,reception\n1,1\n2,1.2\n", "line 3: reception is '1.2'; it must be a share from 0 to 1"),
         ("distance_m,reception\nfar,1\n", "line 2: distance_m is 'far'; it must be metres, 0 or more"),

@@ -38,18 +38,19 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
 
     It names the profile's source, status and settings.
 
-    Reception is the probability that one message arrives, averaged over shadowing.
+    Reception is the probability that one message arrives, averaged over shadowing. A table's latencies are
+    shown if it has their percentiles.
     """
     from harness.radio.channel import Physical
     from harness.radio.limits import outside
     from harness.radio.profiles import CHANNELS
-    from harness.radio.reception import DISTANCES_M, by_sight
+    from harness.radio.reception import DISTANCES_M, by_sight, latencies_ms
 
     profile_name, channel = channel_of(name)
     profile, settings = CHANNELS.profile(profile_name), asdict(channel)
     beyond = outside(settings, profile.limits)
     curves: dict[str, list[float]] = {}
-    busy = None
+    latencies, busy = latencies_ms(channel, DISTANCES_M), None
     if isinstance(channel, Physical):
         curves = {sight: curve.tolist() for sight, curve in by_sight(channel, DISTANCES_M).items()}
         busy = known(channel.busy_ratio())
@@ -59,6 +60,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
         echo_json({
             "name": name, **about, "settings": settings, "outside": beyond, "reception": reception,
             "busy_ratio": busy,
+            "latency_ms": {"distance_m": DISTANCES_M, **latencies} if latencies else None,
         })  # fmt: skip
         return
     typer.echo(f"{printable(profile_name)} · {printable(profile.model)} · {profile.status}")
@@ -72,9 +74,18 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     if not curves:
         typer.echo("packet loss is the same at every distance and behind every obstacle")
         return
-    heads = ["reception, %", "in sight", "behind a car", "behind a building"]
+    sights = ["in sight", "behind a car", "behind a building"]
     shares = zip(DISTANCES_M, *curves.values(), strict=True)
-    table(heads, [(f"{d} m", *(f"{100 * share:.1f}" for share in row)) for d, *row in shares])
+    table(
+        ["reception, %", *sights],
+        [(f"{d} m", *(f"{100 * share:.1f}" for share in row)) for d, *row in shares],
+    )
+    if latencies:
+        typer.echo()
+        pairs = ([f"{p50:.1f} / {p95:.1f}" for p50, p95 in zip(*both.values(), strict=True)]
+                 for both in latencies.values())  # fmt: skip
+        rows = zip(DISTANCES_M, *pairs, strict=True)
+        table(["latency p50 / p95, ms", *sights], [(f"{d} m", *row) for d, *row in rows])
     if busy is not None:
         typer.echo(f"channel busy ratio {busy:.3f} under the background load")
 

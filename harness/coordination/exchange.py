@@ -5,8 +5,8 @@ In seconds from the start of the decision:
     0                     every vehicle sees the scene; the ego and its helpers infer in parallel
     inference_s[0]        the ego has its own intent. If it is sure enough, or has nobody to ask, it acts now.
                           If it is unsure, it broadcasts one request to the nearest helpers in its radius
-    heard                 the request was on air, and the helpers have it. Only now do they infer, if they
-                          infer on demand
+    heard                 the request was on air, and the helpers have it, each after its own link's latency
+                          if the channel has one. Only now do they infer, if they infer on demand
     ready                 a helper has the request and its own intent, and its reply can leave:
                           max(heard, inference_s[1+h]); on demand heard + inference_s[1+h]
     + slots               replies are on air, one after another or at once, as the profile says; a slot is
@@ -37,6 +37,7 @@ from harness.core.errors import UserError, printable
 from harness.core.statistics import known_mean
 from harness.radio.channel import Channel, Draws, Links
 from harness.radio.roadside import Consulted, by_unit
+from harness.radio.wrapped import heard_s
 
 
 @dataclass(frozen=True)
@@ -174,8 +175,10 @@ def _ask_helpers(
     inference_s = np.nan_to_num(inferred_s(point, intents, draws))
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
 
-    def ready(heard_s: Floats | float) -> Floats:
-        return heard_s + helpers_s if point.ask.on_demand else np.maximum(helpers_s - request_s, heard_s)
+    def ready(has_request_s: Floats | float) -> Floats:
+        if point.ask.on_demand:
+            return has_request_s + helpers_s
+        return np.maximum(helpers_s - request_s, has_request_s)
 
     links = Links(
         asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & opens_round,
@@ -251,8 +254,8 @@ def _ask_directly(
 ) -> Consulted:
     """Let the ego ask the helpers itself, and wait until the last slot has ended."""
     request = channel.request(links.request_bits, draws)
-    heard_s = np.asarray(request.heard_s)[..., None]
-    up, end_s, loss, airtime_s = channel.deliver(replace(links, ready_s=ready(heard_s)), draws)
+    ready_s = ready(heard_s(channel, request, links, draws))
+    up, end_s, loss, airtime_s = channel.deliver(replace(links, ready_s=ready_s), draws)
     requested, delivered = any_of(links.asked), links.asked & up
     replies_s = np.sum(np.where(links.asked, airtime_s, 0.0), axis=-1)
     return Consulted(

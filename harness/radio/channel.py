@@ -7,7 +7,7 @@ this one, with a frozen dataclass that has `request` and `deliver`; profiles are
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -122,6 +122,17 @@ class Draws:
         return self._trips.uniforms(1)
 
     @cached_property
+    def latency(self) -> Floats:
+        """Draws of how long each helper's request and reply take, `(..., H, 2)`, new at every step."""
+        return self.of(f"{self._trips.links}.latency").packet
+
+    @cached_property
+    def first(self) -> "Draws":
+        """The draws of a link that exists even without helpers, as those of one helper."""
+        none = np.zeros((*self.jitter.shape[:-1], 1))
+        return Draws(np.stack([none, none], axis=-1), none, self._trips)
+
+    @cached_property
     def requested(self) -> "Draws":
         """The same draws, but with requests that are always received, whatever the loss."""
         given = self._uniforms.copy()
@@ -175,10 +186,17 @@ class Links:
         )  # fmt: skip
 
 
+# The place of a message's draw among those of its link: a request or another broadcast, or a reply.
+Way = Literal[0, 1]
+REQUEST: Way = 0
+REPLY: Way = 1
+
+
 class Broadcast(NamedTuple):
     """The times of a request's broadcast."""
 
-    # seconds from the decision to ask until the helpers have the request, `(...)` or one number
+    # seconds from the decision to ask until the helpers have the request, `(...)` or one number; NaN if it
+    # depends on the link (`ByLink`)
     heard_s: Floats | float
     airtime_s: Floats | float  # seconds that it occupies the medium, `(...)` or one number
 
@@ -233,6 +251,17 @@ class Physical(Channel, Protocol):
 
     def busy_ratio(self) -> float:
         """Return the channel busy ratio under the background load; NaN if the model does not have it."""
+
+
+@runtime_checkable
+class ByLink(Physical, Protocol):
+    """A physical channel on which a message takes as long as its own link says."""
+
+    def latencies_s(self, site: Site, draws: Draws, way: Way) -> Floats:
+        """Return the seconds from the wish to send until reception on each link, `(..., H)`.
+
+        They may depend on `draws.latency` of this way.
+        """
 
 
 def served_s(ready_s: Floats, slot_s: Floats, range_m: Floats) -> Floats:

@@ -3,7 +3,7 @@
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,8 +22,9 @@ from harness.core.statistics import Estimate, episode_interval, rate_interval, r
 from harness.radio.channel import CLEAR, Channel, Draws, Links, Physical, Site
 from harness.radio.constant import density_coupled_loss
 from harness.radio.fading import Trips
-from harness.radio.trace import SIGHTS
+from harness.radio.trace import SIGHTS, Trace
 from harness.radio.transceiver import Transceiver
+from harness.radio.wrapped import heard_s
 
 DISTANCES_M = (10, 20, 50, 100, 150, 200, 300, 400, 500)
 VEHICLES = (2, 4, 8, 16, 32, 64, 128)
@@ -50,6 +51,18 @@ def by_sight(channel: Physical, distances_m: Sequence[float] | Floats) -> dict[s
     return {name: channel.reception(metres, sight) for name, sight in SIGHTS.items()}
 
 
+def latencies_ms(channel: Channel, distances_m: Sequence[float]) -> dict[str, dict[str, list[float]]]:
+    """Return `p50` and `p95` of a message's latency behind each of `SIGHTS`; nothing if no table has them."""
+    if not (isinstance(channel, Trace) and channel.spread):
+        return {}
+    metres = np.asarray(distances_m, dtype=float)
+    both = {name: channel.percentiles_s(metres, sight) for name, sight in SIGHTS.items()}
+    return {
+        name: {"p50": (1000 * p50_s).tolist(), "p95": (1000 * p95_s).tolist()}
+        for name, (p50_s, p95_s) in both.items()
+    }
+
+
 def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Drawn]:
     """Draw `n` trips with one helper at each distance, in sight along one road."""
     result = []
@@ -63,12 +76,12 @@ def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0
             np.zeros(shape), np.full((n, 1, 2), np.nan),
         )  # fmt: skip
         ones = np.ones(shape, dtype=bool)
-        heard_s = np.broadcast_to(np.asarray(channel.request(400.0, draws).heard_s).reshape(-1, 1), shape)
         links = Links(
-            ones, heard_s, np.full(shape, distance_m), np.full(shape, PAYLOAD_BITS), ones,
+            ones, np.zeros(shape), np.full(shape, distance_m), np.full(shape, PAYLOAD_BITS), ones,
             np.zeros(shape, dtype=bool), 400.0, site,
         )  # fmt: skip
-        up, delay_s, loss, _ = channel.deliver(links, draws)
+        ready_s = np.broadcast_to(heard_s(channel, channel.request(400.0, draws), links, draws), shape)
+        up, delay_s, loss, _ = channel.deliver(replace(links, ready_s=ready_s), draws)
         crossed = draws.packet[..., 1] >= np.broadcast_to(loss, shape)
         crossing, round_trip = (rate_interval(each[:, 0].astype(float)) for each in (crossed, up))
         result.append(Drawn(distance_m, model, crossing, round_trip, float(delay_s.mean())))

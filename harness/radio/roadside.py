@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.radio.channel import Delivery, Draws, Links, Physical, Site, Unit
-from harness.radio.wrapped import Wrapped
+from harness.radio.channel import ByLink, Delivery, Draws, Links, Physical, Site, Unit
+from harness.radio.wrapped import Wrapped, heard_s, innermost
 
 EGO, HELPERS = slice(0, 1), slice(1, None)  # a unit's link to the ego, and those to the helpers
 
@@ -28,8 +28,8 @@ class Relay(Wrapped):
     """A channel with a unit that sends replies once more; requests go directly.
 
     A reply arrives if it reaches the ego, or the unit and from there the ego. The ego takes the one
-    that comes first, which is the direct one. Copies are sent whether or not the ego needs them, since the
-    unit cannot know, and do not wait for other messages.
+    that comes first: the direct one, unless latencies depend on the link. Copies are sent whether or not the
+    ego needs them, since the unit cannot know, and do not wait for other messages.
     """
 
     unit: Unit  # the unit
@@ -40,20 +40,26 @@ class Relay(Wrapped):
         up, delay_s, loss, airtime_s = self.channel.deliver(links, draws)
         has_request = draws.packet[..., 0] >= link_loss(self.channel, links.where, draws, links.request_bits)
         at_unit = links.where.units[self.unit]
-        heard = self.channel.deliver(
+        there = self.channel.deliver(
             replace(links, asked=links.asked & has_request, site=at_unit.select(HELPERS)),
             draws.of(".roadside").requested,
-        ).up
-        heard &= links.asked & has_request
+        )
+        heard = there.up & links.asked & has_request
         copies = draws.of(".roadside-ego")
         copy = self.channel.request(links.payload_bits, replace(copies, given=copies.packet))
+        to_ego = replace(links, site=at_unit.select(EGO))
         copied = heard & (
             copies.packet[..., 1] >= link_loss(self.channel, at_unit.select(EGO), copies, links.payload_bits)
         )
-        copy_end_s = delay_s + self.delay_s + copy.heard_s
+        if isinstance(innermost(self.channel), ByLink):
+            at_unit_s, copy_s = there.delay_s, heard_s(self.channel, copy, to_ego, copies)
+        else:  # all links are as slow, and each copy waits for a turn of its own
+            at_unit_s, copy_s = delay_s, np.asarray(copy.heard_s)
+        copy_end_s = at_unit_s + self.delay_s + copy_s
+        first_s = np.where(copied, np.minimum(delay_s, copy_end_s), delay_s)
         return Delivery(
             up | copied,
-            np.where(heard & ~up, copy_end_s, delay_s),
+            np.where(heard & ~up, copy_end_s, first_s),
             loss,
             airtime_s + np.where(heard, copy.airtime_s, 0.0),
         )
@@ -86,32 +92,33 @@ def by_unit(
     """Let a unit ask the helpers for the ego, and send the ego a policy in time.
 
     The unit sends when the last reply's slot has ended, but not so late that its own wait and time on air
-    take the policy out of the window: it knows the slot that it has taken, and until when the ego waits. An
-    ego without a policy by then acts alone.
+    take the policy out of the window: it knows the slot that it has taken, or a table's latency, and until
+    when the ego waits. An ego without a policy by then acts alone.
 
     `delay_s` lies between what the unit has received and what it sends for that. The `ready_s` of the links
-    is not used: `ready` gives when replies can leave, `(..., H)`, from when helpers have the request,
-    `(..., 1)`. The window closes in `left_s`, `(...)`.
+    is not used: `ready` gives when replies can leave, `(..., H)`, from when helpers have the request, of the
+    same shape or `(..., 1)`. The window closes in `left_s`, `(...)`.
     """
     bits, at_unit = links.request_bits, links.where.units[unit]
+    ego_link, helper_links = (replace(links, site=at_unit.select(ends)) for ends in (EGO, HELPERS))
     to_ego, to_helpers = draws.of(".roadside-ego"), draws.of(".roadside")
     back_draw, request_draw, policy_draw = np.moveaxis(to_ego.first_packets, -1, 0)
 
     def lost(size_bits: float) -> Floats:
-        return link_loss(channel, at_unit.select(EGO), to_ego, size_bits)[..., 0]
+        return link_loss(channel, ego_link.where, to_ego, size_bits)[..., 0]
 
     wanted = np.any(links.asked, axis=-1)
     to_unit = channel.request(2 * bits, draws)
     reached = wanted & (request_draw >= lost(2 * bits))
     ask = channel.request(bits, to_helpers)
-    heard_s = np.asarray(to_unit.heard_s + delay_s + ask.heard_s)
+    unit_s = heard_s(channel, to_unit, ego_link, to_ego.first)
+    ready_s = ready(unit_s + delay_s + heard_s(channel, ask, helper_links, to_helpers))
     asked = links.asked & reached[..., None]
-    ready_s, site = ready(heard_s[..., None]), at_unit.select(HELPERS)
-    replies = channel.deliver(replace(links, asked=asked, ready_s=ready_s, site=site), to_helpers)
+    replies = channel.deliver(replace(helper_links, asked=asked, ready_s=ready_s), to_helpers)
     back = channel.request(bits, replace(to_ego, given=back_draw[..., None]))
-    back_s = delay_s + back.heard_s
+    back_s = delay_s + heard_s(channel, back, ego_link, draws.of(".roadside-policy").first)[..., 0]
     latest_s = left_s - back_s
-    sent = reached & (latest_s >= to_unit.heard_s)
+    sent = reached & (latest_s >= unit_s[..., 0])
     crossed = sent & (policy_draw >= lost(bits))
     replied_s = np.max(np.where(asked, replies.delay_s, 0.0), axis=-1, initial=0.0)
     up = asked & replies.up & (crossed | ~sent)[..., None]

@@ -1,14 +1,15 @@
 """A channel from a user's table of packet reception by distance, such as a run of ns-3 or Veins gives.
 
 The table is a CSV file with the columns `distance_m` and `reception` (share of packets received), and
-optionally `sight` (`clear`, `vehicle` or `building`, with a curve for each) and `latency_ms`, which may be
-blank or `nan` where nothing is received. Values are interpolated linearly between distances; below the first
-distance its values hold.
+optionally `sight` (`clear`, `vehicle` or `building`, with a curve for each) and latencies: `latency_ms`, or
+their median `latency_p50_ms` and 95th percentile `latency_p95_ms`. A latency may be blank or `nan` where
+nothing is received. Values are interpolated linearly between distances; below the first distance its values
+hold, and beyond the last its latencies.
 """
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from itertools import pairwise
@@ -21,11 +22,34 @@ from harness.core.arrays import Floats, Ints
 from harness.core.config import Seconds, convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import sha256_file, text_of
-from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Broadcast, Delivery, Draws, Links, Site
+from harness.radio.channel import (
+    BUILDING,
+    CLEAR,
+    REPLY,
+    VEHICLE,
+    Broadcast,
+    Delivery,
+    Draws,
+    Links,
+    Site,
+    Way,
+)
 from harness.radio.constant import link_up
 
 SIGHTS = {"clear": CLEAR, "vehicle": VEHICLE, "building": BUILDING}
-COLUMNS = {"distance_m", "reception", "sight", "latency_ms"}
+MEAN, SPREAD = "latency_ms", ("latency_p50_ms", "latency_p95_ms")
+COLUMNS = {"distance_m", "reception", "sight", MEAN, *SPREAD}
+P95 = 0.95
+
+
+class Spread(NamedTuple):
+    """The percentiles of a latency that each message draws."""
+
+    p50_s: float  # the median
+    p95_s: float  # 95th percentile
+
+
+What = Literal["reception", "p50_s", "p95_s"]
 
 
 class Point(NamedTuple):
@@ -34,7 +58,8 @@ class Point(NamedTuple):
     distance_m: float  # distance between sender and receiver
     reception: float  # share of packets received
     sight: str | None  # one of `SIGHTS`; None in a table without this column
-    latency_s: float | None  # time from the wish to send until reception; None in a table without this column
+    # time from the wish to send until reception; None in a table without latencies
+    latency_s: float | Spread | None
 
 
 @dataclass(frozen=True)
@@ -51,8 +76,9 @@ class Trace:
     """A channel with the reception of a table.
 
     The table is averaged over shadowing and for one packet size, so a link's own shadowing and a message's
-    bits change nothing, and replies do not wait for each other. The helpers have a request after the table's
-    longest latency.
+    bits change nothing, and replies do not wait for each other. A request reaches each helper after the
+    latency of its own distance. Between two percentiles a message's latency is drawn from the lognormal
+    distribution that has them; that it is lognormal, and that messages draw independently, is assumed.
     """
 
     receptions: Table  # the table
@@ -72,12 +98,29 @@ class Trace:
         return math.nan
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Helpers have a request after the longest latency; its time on air is not known."""
-        return Broadcast(max(self._latency_s(p) for p in self.receptions.points), math.nan)
+        """Helpers have a request after the latency of their own links; its time on air is not known."""
+        return Broadcast(math.nan, math.nan)
+
+    def latencies_s(self, site: Site, draws: Draws, way: Way) -> Floats:
+        if not self.spread:
+            return self._at(site.distance_m, site.sight, "p50_s")
+        from harness.core.special import ndtri
+
+        p50_s, p95_s = self.percentiles_s(site.distance_m, site.sight)
+        return np.asarray(p50_s * (p95_s / p50_s) ** (ndtri(draws.latency[..., way]) / ndtri(P95)))
+
+    @property
+    def spread(self) -> bool:
+        """Whether the table has two percentiles of latencies."""
+        return any(isinstance(point.latency_s, Spread) for point in self.receptions.points)
+
+    def percentiles_s(self, distance_m: Floats, sight: Ints | int) -> tuple[Floats, Floats]:
+        """Return the median and the 95th percentile of a message's latency at these distances."""
+        return self._at(distance_m, sight, "p50_s"), self._at(distance_m, sight, "p95_s")
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         loss = self.loss(links.where, np.zeros(()), links.payload_bits)
-        latency_s = self._at(links.where.distance_m, links.where.sight, "latency_s")
+        latency_s = self.latencies_s(links.where, draws, REPLY)
         delay_s = np.where(links.asked, links.ready_s + latency_s, np.inf)
         return Delivery(link_up(draws.packet, loss), delay_s, loss, np.full_like(loss, np.nan))
 
@@ -92,15 +135,18 @@ class Trace:
     def _last(self) -> list[Point]:
         return list({point.sight: point for point in self.receptions.points}.values())
 
-    def _latency_s(self, point: Point) -> float:
-        return self.latency_s if point.latency_s is None else point.latency_s
+    def _value(self, point: Point, what: What) -> float:
+        if what == "reception":
+            return point.reception
+        latency_s = self.latency_s if point.latency_s is None else point.latency_s
+        return float(getattr(latency_s, what)) if isinstance(latency_s, Spread) else latency_s
 
-    def _at(self, distance_m: Floats, sight: Ints | int, what: Literal["reception", "latency_s"]) -> Floats:
-        """Interpolate a column of the table at these distances, for what stands between."""
+    def _at(self, distance_m: Floats, sight: Ints | int, what: What) -> Floats:
+        """Interpolate a quantity of the table at these distances, for what stands between."""
         values = np.full(np.broadcast_shapes(np.shape(distance_m), np.shape(sight)), np.nan)
         for name, number in SIGHTS.items():
             rows = [p for p in self.receptions.points if p.sight in (None, name)]
-            column = [p.reception if what == "reception" else self._latency_s(p) for p in rows]
+            column = [self._value(p, what) for p in rows]
             last = 0.0 if (what, self.beyond) == ("reception", "zero") else None
             curve = np.interp(distance_m, [p.distance_m for p in rows], column, right=last)
             values = np.where(np.equal(sight, number), curve, values)
@@ -132,7 +178,8 @@ def read(path: Path) -> tuple[Point, ...]:
         for name in rows.fieldnames or ():
             if name not in COLUMNS:
                 raise unknown(f"column of {shown}", name, COLUMNS)
-        points = _with_latencies([_point(f"{shown}, line {rows.line_num}", row) for row in rows])
+        _refuse_mixed_latencies(shown, rows.fieldnames or ())
+        points = [_point(f"{shown}, line {rows.line_num}", row) for row in rows]
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
         raise UserError(f"{shown}: cannot be read as a table ({printable(problem)})") from None
     if not points:
@@ -141,39 +188,58 @@ def read(path: Path) -> tuple[Point, ...]:
     if sights != {None} and sights != {*SIGHTS}:
         lacks = next(name for name in SIGHTS if name not in sights)
         raise UserError(f"{shown}: has no row of sight {lacks!r}; with sight it needs {', '.join(SIGHTS)}")
-    points.sort(key=lambda p: (SIGHTS[p.sight] if p.sight else CLEAR, p.distance_m))
+    points = _with_latencies(sorted(points, key=_place))
     for a, b in pairwise(points):
         if (a.sight, a.distance_m) == (b.sight, b.distance_m):
             raise UserError(f"{shown}: distance_m {a.distance_m:g} stands there twice; give each once")
     return tuple(points)
 
 
-def _with_latencies(points: Sequence[Point]) -> list[Point]:
-    """Give points where nothing is received, which have no latency of their own, that of points beside them.
+def _place(point: Point) -> tuple[int, float]:
+    return SIGHTS[point.sight] if point.sight else CLEAR, point.distance_m
 
-    Reception is interpolated, so that something is received next to them.
+
+def _refuse_mixed_latencies(shown: str, columns: Sequence[str]) -> None:
+    has = [name for name in SPREAD if name in columns]
+    if has and MEAN in columns:
+        raise UserError(f"{shown}: has both {MEAN} and {has[0]}; give {MEAN}, or {' and '.join(SPREAD)}")
+    if len(has) == 1:
+        lacks = next(name for name in SPREAD if name not in has)
+        raise UserError(f"{shown}: has {has[0]} without {lacks}; add {lacks}, or give {MEAN} alone")
+
+
+def _with_latencies(points: Sequence[Point]) -> list[Point]:
+    """Give points where nothing is received, which have no latency of their own, that of a point beside them.
+
+    Reception is interpolated, so that something is received next to them. The point before them comes first,
+    so that no row changes what is nearer. Points are sorted by sight and distance.
     """
-    known = [p for p in points if p.latency_s is not None and not math.isnan(p.latency_s)]
-    longest_s = max((p.latency_s for p in known if p.latency_s is not None), default=None)
-    full = []
-    for point in points:
-        if point.latency_s is not None and math.isnan(point.latency_s):
-            beside = sorted((p.distance_m, p.latency_s) for p in known if p.sight == point.sight)
-            latency_s = longest_s
-            if beside:
-                latency_s = float(np.interp(point.distance_m, *np.array(beside, dtype=float).T))
-            point = point._replace(latency_s=latency_s)
-        full.append(point)
-    return full
+    known = [point for point in points if not _blank(point)]
+    return [point._replace(latency_s=_beside(point, known)) if _blank(point) else point for point in points]
+
+
+def _blank(point: Point) -> bool:
+    return isinstance(point.latency_s, float) and math.isnan(point.latency_s)
+
+
+def _beside(point: Point, known: Iterable[Point]) -> float | Spread | None:
+    """Return the latency of the point before, else after; where this sight has none, of the next sight."""
+
+    def how_far(other: Point) -> tuple[bool, int, bool, float]:
+        after = other.distance_m > point.distance_m
+        return other.sight != point.sight, _place(other)[0], after, abs(other.distance_m - point.distance_m)
+
+    nearest = min(known, key=how_far, default=None)
+    return nearest and nearest.latency_s
 
 
 def _point(where: str, row: dict[str, str]) -> Point:
-    def number(column: str, most: float, allowed: str) -> float:
+    def number(column: str, most: float, allowed: str, least: float = 0.0) -> float:
         try:
             value = float(row[column])
         except (TypeError, ValueError):
             value = math.nan
-        if not 0 <= value <= most:
+        if not least <= value <= most:
             raise UserError(f"{where}: {column} is {printable(row[column])!r}; it must be {allowed}")
         return value
 
@@ -184,11 +250,17 @@ def _point(where: str, row: dict[str, str]) -> Point:
         raise UserError(f"{where}: sight is {printable(sight)!r}; it must be {', '.join(SIGHTS)}")
     distance_m = number("distance_m", 1e6, "metres, 0 or more")
     reception = number("reception", 1.0, "a share from 0 to 1")
-    latency_s = None
-    if "latency_ms" in row:
-        if reception == 0 and row["latency_ms"].strip().lower() in ("", "nan"):
-            latency_s = math.nan
-        else:
-            allowed = "milliseconds, 0 or more; it may be blank where reception is 0"
-            latency_s = number("latency_ms", 1e6, allowed) / 1000
+    latency_s: float | Spread | None = None
+    given = [name for name in (MEAN, *SPREAD) if name in row]
+    if given and reception == 0 and all(row[name].strip().lower() in ("", "nan") for name in given):
+        latency_s = math.nan
+    elif given == [MEAN]:
+        latency_s = number(MEAN, 1e6, "milliseconds, 0 or more; it may be blank where reception is 0") / 1000
+    elif given:
+        allowed = "milliseconds, 0.001 or more; both may be blank where reception is 0"
+        p50_ms, p95_ms = (number(name, 1e6, allowed, 1e-3) for name in SPREAD)
+        if p95_ms < p50_ms:
+            least = f"{SPREAD[0]} of its row, {p50_ms:g}, or more"
+            raise UserError(f"{where}: {SPREAD[1]} is {p95_ms:g}; it must be {least}")
+        latency_s = Spread(p50_ms / 1000, p95_ms / 1000)
     return Point(distance_m, reception, sight, latency_s)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
-from harness.radio.channel import Broadcast, Channel, Delivery, Draws, Links, Physical, Site
+from harness.radio.channel import REQUEST, Broadcast, ByLink, Channel, Delivery, Draws, Links, Physical, Site
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,14 @@ class Wrapped:
 def innermost(channel: Channel) -> Channel:
     """Return the innermost channel, without wrappers."""
     return innermost(channel.channel) if isinstance(channel, Wrapped) else channel
+
+
+def heard_s(channel: Channel, broadcast: Broadcast, links: Links, draws: Draws) -> Floats:
+    """Return when each receiver has a broadcast, `(..., H)`, or `(..., 1)` if all have it at once."""
+    model = innermost(channel)
+    if isinstance(model, ByLink):
+        return model.latencies_s(links.where, draws, REQUEST)
+    return np.asarray(broadcast.heard_s)[..., None]
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,33 @@ def test_show_has_settings_sources_and_the_reach(harness: Callable[..., Said], n
         assert vehicle >= building - 1e-6
 
 
+def test_show_has_both_percentiles_of_a_tables_latency(
+    harness: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "swarmdrive.toml").touch()
+    (tmp_path / "channels").mkdir()
+    parts = {
+        "spread": "latency_p50_ms,latency_p95_ms\n0,1,10,20\n100,1,30,90\n",
+        "mean": "latency_ms\n0,1,5\n",
+    }
+    for name, rows in parts.items():
+        (tmp_path / f"channels/{name}.csv").write_text(f"distance_m,reception,{rows}")
+        (tmp_path / f"channels/{name}.toml").write_text(
+            'model = "trace"\ndescription = "x"\nsource = "x"\nstatus = "assumed"\n'
+            f'[parameters]\nfile = "{name}.csv"\n'
+        )
+    lines = [line.split("  ") for line in harness("radio", "show", "spread")[1].splitlines()]
+    rows_of = {line[0]: [cell.strip() for cell in line[1:] if cell] for line in lines if len(line) > 3}
+    assert rows_of["latency p50 / p95, ms"][0] == "in sight"
+    assert rows_of["50 m"] == ["20.0 / 55.0"] * 3
+    told = json.loads(harness("radio", "show", "spread", "--json")[1])["latency_ms"]
+    assert told["clear"]["p50"][:4] == pytest.approx([12, 14, 20, 30])
+    assert told["building"]["p95"][-1] == pytest.approx(90), "beyond the last row its latency holds"
+    assert "latency p50" not in harness("radio", "show", "mean")[1]
+    assert json.loads(harness("radio", "show", "mean", "--json")[1])["latency_ms"] is None
+
+
 @pytest.mark.slow
 def test_show_says_where_settings_leave_what_the_source_tried(harness: Callable[..., Said]) -> None:
     said = "density_per_km = 1000 is outside what its model was held against, 100 to 300."
