@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from evaluating import run as made
 from evaluating import spec_of
+from msgspec.structs import replace
 
 from harness.backends import cards
 from harness.backends.base import Completion, Request
@@ -16,7 +17,7 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.examine import COUNT, Findings, Moved, examine, keep_findings, recall_findings
 from harness.prompts import versions
 from harness.report.caveats import by_letter, caveats
-from harness.runs.records import Score
+from harness.runs.records import Manifest, Score
 
 CARD = cards.resolve("qwen3-0.6b")
 AGENT = Agent(CARD, versions.load("v2"))
@@ -56,7 +57,7 @@ def test_a_model_that_brakes_for_a_listed_conflict_reads_the_scene() -> None:
     assert found.reads_scene
     assert (found.n, found.letter_share, found.follows_letter, found.label_mass) == (12, 0.97, 12, 0.2)
     assert [s.partition(" follows")[0] for s in found.sentences()] == ["its likeliest action"]
-    assert list(found.sentences(letters=False)) == []
+    assert (found.prompt, found.prompt_sha256, found.answer) == ("v2", AGENT.prompt.sha256, "readout")
 
 
 def test_a_model_that_answers_ever_the_same_does_not_read_the_scene() -> None:
@@ -74,27 +75,56 @@ def test_a_question_without_an_answer_finds_nothing() -> None:
 
 
 def test_findings_are_kept_by_identity_and_a_damaged_file_is_none() -> None:
-    found = Findings("v2", "cyclic", 12, 0.9, 12, 0.2, (Moved("gap", 4, 0, 0.001),))
+    found = Findings("v2", "p", "readout", "cyclic", 12, 0.9, 12, 0.2, (Moved("gap", 4, 0, 0.001),))
+    asked = ("p", "readout")
     folder = kept.folder() / "findings"
     before = set(folder.iterdir()) if folder.is_dir() else set()
     keep_findings({"engine": "e", "weights": "w"}, found)
-    assert recall_findings({"engine": "e", "weights": "w", "helpers": [{}]}) == found
-    assert recall_findings({"engine": "e", "weights": "other"}) is None
+    assert recall_findings({"engine": "e", "weights": "w", "helpers": [{}]}, *asked) == found
+    assert recall_findings({"engine": "e", "weights": "other"}, *asked) is None
+    assert recall_findings({"engine": "e", "weights": "w"}, "another text", "readout") is None
+    assert recall_findings({"engine": "e", "weights": "w"}, "p", "json") is None
     [file] = set(folder.iterdir()) - before
-    file.write_text("{")
-    assert recall_findings({"engine": "e", "weights": "w"}) is None
+    whole = json.loads(file.read_text())
+    unsaid = [
+        {key: value for key, value in whole.items() if key != name} for name in ("prompt_sha256", "answer")
+    ]
+    for damaged in ("{", *map(json.dumps, unsaid), json.dumps(whole | {"answer": "json"})):
+        file.write_text(damaged)
+        assert recall_findings({"engine": "e", "weights": "w"}, *asked) is None
     file.unlink()
 
 
-def test_a_run_of_a_checked_model_says_so_and_a_raw_one_no_share_of_letters(
+def test_a_run_that_asked_a_model_as_it_was_checked_says_so_and_no_other(
     small: Dataset, tmp_path: Path
 ) -> None:
+    """A run of another answer mode, prompt text or weights is not what was found to read nothing."""
     done = made(spec_of(small), tmp_path / "run")
-    assert not any("read the scene" in sentence for sentence in caveats(done.manifest, done.scores))
-    keep_findings(done.manifest.identity, Findings("v2", "raw", 12, 1.0, 12, 1.0, (Moved("gap", 4, 0, 0.0),)))
-    said = [s for s in caveats(done.manifest, done.scores) if "read the scene" in s]
-    assert len(said) == 1
-    assert said[0].startswith("proxy: it does not read the scene")
+    ran = replace(done.manifest, answer="readout", letters="cyclic")
+
+    def said(manifest: Manifest) -> list[str]:
+        return [s for s in caveats(manifest, done.scores) if "read the scene" in s or "letter" in s]
+
+    assert not said(ran)
+    mute = (Moved("gap", 4, 0, 0.0),)
+    sha256 = ran.prompt["sha256"]
+    keep_findings(ran.identity, Findings("v2", sha256, "readout", "cyclic", 12, 1.0, 12, 1.0, mute))
+    scene, letter = said(ran)
+    assert scene.startswith("proxy: it does not read the scene")
+    assert scene.endswith("in 0 of 4 pairs (model check, answer readout, prompt v2).")
+    assert letter.startswith("proxy: its likeliest action follows the letter in 12 of 12 questions")
+    helped = replace(ran, helpers=(ran.agent(0),), identity={**ran.identity, "helpers": [ran.identity]})
+    assert said(helped) == [scene, letter, scene, letter]
+    others = (
+        replace(ran, answer="json"),
+        replace(ran, answer="decision"),
+        replace(ran, prompt={**ran.prompt, "sha256": "of another text under the same name"}),
+        replace(ran, identity={**ran.identity, "weights": "others under the same name"}),
+    )
+    for other in others:
+        assert not said(other)
+    in_json = replace(helped, answer="json")
+    assert said(in_json) == [scene, letter], "of its helper alone"
     for file in (kept.folder() / "findings").iterdir():
         file.unlink()
     assert not list(by_letter(done.scores))

@@ -86,10 +86,10 @@ def check(
     """Load a model, show its prompt and time one answer.
 
     It does so in each answer mode. Twelve fixed questions, and pairs of questions that differ in one fact,
-    show whether its read-outs follow the letter and whether it reads the scene; later pages say so. A model
-    that takes pictures is also asked with a picture and with a blank one. If its card names several engines
-    and its weights are small, each is timed shortly, and a line says which is faster here. Exit code 1 if no
-    answer can be read, or if it ignores the picture; 3 if it answers in no mode.
+    show whether its read-outs follow the letter and whether it reads the scene; later pages of runs asked so
+    say it. A model that takes pictures is also asked with a picture and with a blank one. If its card names
+    several engines and its weights are small, each is timed shortly, and a line says which is faster here.
+    Exit code 1 if no answer can be read, or if it ignores the picture; 3 if it answers in no mode.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities

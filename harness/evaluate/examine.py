@@ -1,7 +1,8 @@
 """Ask a model the fixed questions, and find out what its read-outs follow: the letter, or the scene.
 
-What `harness model check` found is kept in the user's cache by the model's identity. Runs and their pages say
-it; no setting follows from it. It is never read from a run: a stranger's file could say anything.
+What `harness model check` found is kept in the user's cache by what was asked: the model's identity, the
+prompt's digest and the answer mode. Runs that asked the same, and their pages, say it; no setting follows
+from it. It is never read from a run: a stranger's file could say anything.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from harness.backends.base import BARE, Backend, Completion, Request
+from harness.backends.base import BARE, AnswerMode, Backend, Completion, Request
 from harness.core import kept
 from harness.core.errors import UserError
 from harness.core.files import digest
@@ -45,9 +46,11 @@ class Moved(Struct, frozen=True):
 
 
 class Findings(Struct, frozen=True):
-    """What fixed questions showed of a model."""
+    """What fixed questions showed of a model, as it was asked and not otherwise."""
 
     prompt: str  # the prompt version that they were asked with
+    prompt_sha256: str  # digest of its files
+    answer: AnswerMode  # how the model answered
     letters: str  # how the letters of the pairs were read, `raw` or `cyclic`
     n: int  # number of questions that were read over cyclic orders
     letter_share: float  # mean share of the variance that followed the letter
@@ -60,17 +63,18 @@ class Findings(Struct, frozen=True):
         """Whether a conflict in the scene, or its gap, moves the answer."""
         return any(pair.read for pair in self.pairs if pair.fact in ("conflict", "gap"))
 
-    def sentences(self, letters: bool = True) -> Iterator[str]:
-        """Yield what a reader of the model's runs has to know; `letters` says whether they are read out."""
+    def sentences(self) -> Iterator[str]:
+        """Yield what a reader of runs that asked the model so has to know."""
         if not self.reads_scene:
             scene = [pair for pair in self.pairs if pair.fact in ("conflict", "gap")]
             moved, n = sum(pair.moved for pair in scene), sum(pair.n for pair in scene)
             yield (
                 "it does not read the scene: a conflict put in or taken out, or a gap of 0.2 or 5 s, moved "
-                f"its answer in {moved} of {n} pairs (model check, prompt {self.prompt})."
+                f"its answer in {moved} of {n} pairs (model check, answer {self.answer}, "
+                f"prompt {self.prompt})."
             )
         # A model that learnt one order of the letters is read in that order.
-        if letters and self.letters == "cyclic" and self.letter_share > MOST_SHARE:
+        if self.letters == "cyclic" and self.letter_share > MOST_SHARE:
             yield (
                 f"its likeliest action follows the letter in {self.follows_letter} of {self.n} questions "
                 "(model check); --letters cyclic averages that out."
@@ -102,6 +106,8 @@ def examine(
     of_letters, rest = done[: -2 * len(pairs)], iter(done[-2 * len(pairs) :])
     return Findings(
         prompt=agent.prompt.version,
+        prompt_sha256=agent.prompt.sha256,
+        answer=reader.answer,
         letters=str(reader.letters),
         n=len(of_letters),
         letter_share=round(fmean(c.letter_share or 0.0 for c in of_letters), 4),
@@ -137,18 +143,20 @@ def _likelihood(pair: Pair, half: Request, completion: Completion) -> float | No
 
 def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
     """Keep what was found of the model with an identity."""
-    kept.keep(_name(identity), msgspec.json.encode(findings))
+    kept.keep(_name(identity, findings.prompt_sha256, findings.answer), msgspec.json.encode(findings))
 
 
-def recall_findings(identity: Mapping[str, Any]) -> Findings | None:
-    """Return what was found of the model with an identity; None if nobody checked it here."""
-    data = kept.recall(_name(identity))
+def recall_findings(identity: Mapping[str, Any], prompt_sha256: str, answer: str) -> Findings | None:
+    """Return what was found of the model with an identity, asked so; None if nobody asked it so here."""
+    data = kept.recall(_name(identity, prompt_sha256, answer))
     try:
-        return None if data is None else msgspec.json.decode(data, type=Findings)
+        findings = None if data is None else msgspec.json.decode(data, type=Findings)
     except msgspec.MsgspecError:
         return None
+    of = findings and (findings.prompt_sha256, findings.answer)
+    return findings if of == (prompt_sha256, answer) else None
 
 
-def _name(identity: Mapping[str, Any]) -> str:
+def _name(identity: Mapping[str, Any], prompt_sha256: str, answer: str) -> str:
     alone = {key: value for key, value in identity.items() if key != "helpers"}
-    return f"findings/{digest(alone)}.json"
+    return f"findings/{digest([alone, prompt_sha256, answer])}.json"

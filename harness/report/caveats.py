@@ -4,7 +4,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-from harness.backends.base import BARE
 from harness.backends.registry import reads_prompts
 from harness.core.errors import printable
 from harness.core.figures import PERCENT, amount
@@ -192,13 +191,15 @@ def _channels(manifest: Manifest) -> dict[str, doubts.Channel]:
 
 
 def findings_of(manifest: Manifest) -> Iterator[str]:
-    """Yield what `harness model check` found here of the language models of a run."""
+    """Yield what `harness model check` found here of a run's models, if they were asked as in the run."""
     helpers = manifest.identity.get("helpers")
     identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
     agents = [manifest.agent(0), *manifest.helpers]
     for agent, identity in zip(agents, identities, strict=False):
-        if isinstance(identity, Mapping) and (findings := recall_findings(identity)):
-            for sentence in findings.sentences(agent["answer"] in BARE):
+        if not isinstance(identity, Mapping):
+            continue
+        if findings := recall_findings(identity, agent["prompt"]["sha256"], agent["answer"]):
+            for sentence in findings.sentences():
                 yield f"{printable(str(agent['model']['name']), 30)}: {sentence}"
 
 
