@@ -79,7 +79,7 @@ class Driven(NamedTuple):
 def main() -> None:
     """Drive what is missing, and write the page's tables."""
     given, further = options(__doc__, "agents").parse_known_args()
-    made, plans = list[Driven](), dict[str, Plans]()
+    made, plans, ended = list[Driven](), dict[str, Plans](), dict[str, str]()
     for scene in (name for name in scenarios.names() if "agent_share" in scenarios.get(name).dials):
         for driver in DRIVERS:
             layouts = given.layouts or driver.layouts
@@ -92,8 +92,10 @@ def main() -> None:
         file = given.out / f"joint-{scene}.json"
         if given.only in f"{DRIVERS[0].model}-{scene}-1" and not file.exists():
             write_whole(file, jointly(scene, given.layouts or DRIVERS[0].layouts))
-        plans[scene] = solved(json.loads(file.read_bytes())) if file.exists() else {}
-    text = "\n\n".join((*overall(made, plans), *details(made, plans), *by_share(made)))
+        said = json.loads(file.read_bytes()) if file.exists() else None
+        plans[scene] = solved(said) if said else {}
+        ended[scene] = searched(said) if said else ""
+    text = "\n\n".join((*overall(made, plans, ended), *details(made, plans), *by_share(made)))
     print(text)
     if given.page:
         write_tables(given.page, text)
@@ -126,7 +128,13 @@ def solved(said: dict[str, Any]) -> Plans:
     }
 
 
-def overall(made: Sequence[Driven], plans: Mapping[str, Plans]) -> Iterator[str]:
+def searched(said: dict[str, Any]) -> str:
+    """Return in how many layouts the joint plan is the best, and what it is in the others."""
+    n, open_n = said["episodes"], len(said["inexact"])
+    return f" (best found; best in {n - open_n} of {n})" if open_n else f" (best in all {n})"
+
+
+def overall(made: Sequence[Driven], plans: Mapping[str, Plans], ended: Mapping[str, str]) -> Iterator[str]:
     """Yield a table of success, with a row for each scene and model."""
     rows = dict[tuple[str, str], dict[str, str]]()
     for each in (each for each in made if each.share in (0, 1)):
@@ -137,7 +145,7 @@ def overall(made: Sequence[Driven], plans: Mapping[str, Plans]) -> Iterator[str]
         rows.setdefault((each.scene, each.driver.model), layouts).update(success)
     ways = ("n", *ALONE, *CONDITIONS)
     best = {
-        scene: shown(rate_interval(np.array([*plan.values()], dtype=float))) if plan else DASH
+        scene: shown(rate_interval(np.array([*plan.values()], dtype=float))) + ended[scene] if plan else DASH
         for scene, plan in plans.items()
     }
     yield "**Success %**, of the ego where it alone decides, and else of all agents:"

@@ -217,6 +217,11 @@ class Search:
     def bound_s(self) -> float:
         return min(self.cost_s, self.open_s)
 
+    @property
+    def ended(self) -> bool:
+        """Whether no part that may hold a better choice was left out."""
+        return self.open_s >= self.cost_s
+
     def _choose(self, chosen: tuple[int, ...], cost_s: float, left: Sequence[Bools]) -> None:
         """Choose for the next agent; `left` are the options of those that follow."""
         agent = len(chosen)
@@ -282,20 +287,23 @@ def near(
     return meet
 
 
-def plans(scenario: Scenario, able: Mapping[int, Mapping[int, Options]]) -> dict[int, tuple[Plan, World]]:
+def plans(
+    scenario: Scenario, able: Mapping[int, Mapping[int, Options]]
+) -> tuple[dict[int, tuple[Plan, World]], set[int]]:
     """Return the best plan for all agents of each layout that keeps its promise, by the layout's seed.
 
     `able` are the `options`. With a plan comes the world after all have acted so. Layouts without one are
-    left out.
+    left out; of these, the seeds in which the search did not end, so that there may be one, come last.
     """
-    found = dict[int, tuple[Plan, World]]()
+    found, unended = dict[int, tuple[Plan, World]](), set[int]()
     searches = {seed: Search(list(of.values())) for seed, of in able.items()}
     for _ in range(MOST_PLANS):
         best = {seed: plan for seed, search in searches.items() if (plan := _best(search, able[seed]))}
+        unended |= {seed for seed in searches.keys() - best.keys() if not searches[seed].ended}
         worlds = played(scenario, best)
         found |= {seed: (best[seed], worlds[seed]) for seed in best if kept(best[seed], worlds[seed])}
         searches = {seed: searches[seed] for seed in best if seed not in found}
-    return found
+    return found, unended | searches.keys()
 
 
 def _best(search: Search, able: Mapping[int, Options]) -> Plan | None:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from harness.core.arrays import Bools
 from harness.world import joint, policies, scenarios
 from harness.world.joint import NEVER_S, Options, Search
-from harness.world.policies import JOINT, Fate, summary
+from harness.world.policies import JOINT, Fate, best_of, summary
 from harness.world.scenario import Scenario
 
 SCENES = [f"{name}:agent_share=1" for name in scenarios.names() if scenarios.get(name).seats]
@@ -34,7 +35,9 @@ def able() -> dict[int, Options]:
 )
 def test_what_a_plan_promises_the_simulator_does(name: str) -> None:
     scenario = scenarios.get(name)
-    plan, world = joint.plans(scenario, joint.options(scenario, [1]))[1]
+    plans, unended = joint.plans(scenario, joint.options(scenario, [1]))
+    plan, world = plans[1]
+    assert not unended
     assert plan.exact
     assert {agent: j.outcome.time_s for agent, j in world.journeys.items()} == plan.arrives_s
     assert all(j.outcome.success for j in world.journeys.values())
@@ -108,7 +111,8 @@ def test_agents_that_would_meet_do_not_go_together(able: dict[int, Options]) -> 
 def test_the_price_of_anarchy_is_that_of_layouts_which_both_clear() -> None:
     def fate(trips_s: float) -> Fate:
         arrived = float(not np.isnan(trips_s))
-        return Fate(arrived, not arrived, False, trips_s, trips_s - 1, trips_s - 2)
+        sum_s = trips_s if arrived else NEVER_S
+        return Fate(arrived, not arrived, False, sum_s, trips_s - 1, trips_s - 2)
 
     best = [fate(10.0), fate(20.0), fate(np.nan), fate(8.0)]
     some = summary([fate(12.0), fate(np.nan), fate(9.0), fate(10.0)], best, "cruise")
@@ -138,6 +142,28 @@ def test_all_policies_drive_the_same_layouts_and_none_beats_the_plan() -> None:
 
 
 @pytest.mark.slow
+def test_where_the_search_finds_nothing_the_plan_is_that_of_the_best_driver(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(joint, "MOST_NODES", 0)
+    layouts = policies.drive_all(scenarios.get(TWO), range(2, 4))
+    assert any(of[JOINT].success for of in layouts), "a driver brings everybody to its goal in one"
+    for of in layouts:
+        assert not of[JOINT].exact
+        assert of[JOINT].success == any(each.success for each in of.values())
+        assert of[JOINT].sum_s == min(each.sum_s for each in of.values())
+
+
+def test_a_driver_that_does_better_is_the_best_found_and_one_as_good_leaves_the_plan() -> None:
+    plan = Fate(1.0, False, False, 20.0, 1.0, 1.0)
+    worse, as_good = replace(plan, arrived=0.5, sum_s=NEVER_S + 5), replace(plan, lost_s=2.0)
+    assert best_of({"cruise": worse, "full-view": as_good, JOINT: plan}) is plan
+    better = replace(plan, sum_s=19.9)
+    assert best_of({"cruise": worse, "full-view": better, JOINT: plan}) == replace(better, exact=False)
+    assert best_of({"cruise": plan, JOINT: worse}).success
+
+
+@pytest.mark.slow
 def test_a_check_of_agents_states_figures_with_intervals_and_n(
     harness: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,7 +188,12 @@ def test_a_check_of_agents_states_figures_with_intervals_and_n(
     assert found["policies"]["joint"]["success"]["value"] == 1.0
     code, out, _ = harness(*command, "--workers", 1)
     assert code == 0
-    assert "without a joint plan: 0" in out
+    assert "without a joint plan: 0\njoint is the best plan, searched to the end in all 1 episodes" in out
+    unproven = [of | {JOINT: replace(of[JOINT], exact=False)} for of in remembered(scenarios.get(TWO), [2])]
+    monkeypatch.setattr(policies, "drive_all", lambda *_: unproven)
+    _, out, _ = harness(*command, "--workers", 1)
+    assert "joint is the best found, and the best plan in 0 of 1 episodes" in out
+    assert "1 (seeds 2)" in out
 
 
 def test_agents_of_a_scenario_without_seats_are_refused_in_one_line(harness: Any) -> None:
