@@ -17,10 +17,15 @@ from typing import Any
 
 import pytest
 from reference import PAGE, all_typed, blocks, commands, pages, reference, typed
+from typer import TyperException
 from typer.main import get_command
 
 from harness.cli import app
+from harness.core.errors import UserError
+from harness.core.shards import shard_of
+from harness.evaluate.latency import NAMES, declared
 from harness.evaluate.replay import stills
+from harness.evaluate.settings import parse_seeds
 
 Harness = Callable[..., tuple[int, str, str]]
 Copied = Callable[[str], str]
@@ -172,6 +177,14 @@ def lines_of(page: Path) -> list[str]:
     return [command_of(line) for line, _ in shell_of(page)]
 
 
+# Values that a command reads when it runs; a name of a run, model or prompt may be the reader's own.
+READ: dict[str, Callable[[str], object]] = {
+    "latency": lambda text: text in (*NAMES, "run") or declared(text),
+    "seeds": parse_seeds,
+    "shard": shard_of,
+}
+
+
 def name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
@@ -192,9 +205,22 @@ def parsed(args: list[str]) -> tuple[str, list[str]]:
 
 
 def hold_against_options(args: list[str]) -> None:
-    """Fail if the program has no such command or options."""
+    """Fail if the program has no such command or options, or refuses a value for its form."""
     path, rest = parsed(args)
-    COMMANDS[path].make_context(path, rest)
+    given = COMMANDS[path].make_context(path, rest).params
+    for option, read in READ.items():
+        if given.get(option) is not None:
+            read(given[option])
+
+
+def is_whole(words: list[str]) -> bool:
+    """Whether the words behind a command in a sentence make it one that can be typed.
+
+    A bare name, one that ends with an option and one with a placeholder, a word in capitals or with an
+    ellipsis, are not.
+    """
+    placeholder = any(re.fullmatch(r"[A-Z]+", word) or re.search(r"\.\.\.|…", word) for word in words)
+    return bool(words) and not words[-1].startswith("--") and not placeholder
 
 
 def expression(shown: list[str]) -> str:
@@ -391,16 +417,39 @@ def test_commands_that_measured_something_are_still_there(page: Path) -> None:
             hold_against_options(args)
 
 
-@pytest.mark.parametrize("page", [*pages(), *MEASURED], ids=name)
-def test_commands_named_in_a_sentence_exist_with_their_options(page: Path) -> None:
+@pytest.mark.parametrize("page", [*pages(), PAGE, *MEASURED], ids=name)
+def test_commands_named_in_a_sentence_are_taken_and_parts_of_them_exist(page: Path) -> None:
     prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     for mention in re.findall(r"`harness\s+([a-z][^`]*)`", prose):
-        group, *rest = mention.replace("\\|", "|").split()
+        group, *rest = shlex.split(mention.replace("\\|", "|"))
         # `dataset build|check` are two commands.
         each = [[group, one, *rest[1:]] for one in rest[0].split("|")] if rest else [[group]]
-        for path, words in map(parsed, each):
+        for args in each:
+            path, words = parsed(args)
             options = {option for parameter in COMMANDS[path].params for option in parameter.opts}
-            assert {word for word in words if word.startswith("--")} <= options, mention
+            assert {word for word in words if word.startswith("--")} <= {*options, "--help"}, mention
+            if is_whole(words):
+                hold_against_options(args)
+
+
+@pytest.mark.parametrize(
+    ("said", "whole"),
+    [
+        ("", False), ("--against", False), ("--sft", False), ("RUN", False), ("NAME --agents all", False),
+        ("SCENARIO...", False), ("--over x --grid 0,…", False), ("--latency 0.05", True), ("site", True),
+    ],
+)  # fmt: skip
+def test_a_name_a_form_and_a_part_are_no_command_to_type(said: str, whole: bool) -> None:
+    assert is_whole(said.split()) == whole
+
+
+@pytest.mark.parametrize(
+    "said",
+    ["drive --latency 0.05", "eval --seeds 5:", "drive --shard 3/2", "eval --limit few", "study sweep"],
+)
+def test_what_the_program_refuses_is_no_command(said: str) -> None:
+    with pytest.raises((UserError, TyperException)):
+        hold_against_options(said.split())
 
 
 def test_the_reference_is_the_program_and_other_pages_type_its_examples() -> None:

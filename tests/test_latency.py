@@ -86,7 +86,8 @@ def test_anything_else_is_one_line(text: str, harness: Callable[..., Any]) -> No
     code, out, err = harness("eval", "--limit", "1", "--latency", text)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith("harness: --latency '")
-    assert "give card, measured, paper, or seconds of one answer" in err
+    assert "give card, measured, paper, or by role the seconds of one answer, 0 to 3600" in err
+    assert "such as ego=0.171,helper=0.164,fusion=0.2 (ego is needed; a role left out has its time)" in err
     assert "\x1b" not in err
 
 

@@ -81,8 +81,8 @@ def declared(text: str) -> Latency:
     one_each = len(ego) == len(fusion) == 1
     if not (roles_once and one_each and all(0 <= s <= LONGEST_S for s in (*ego, *helper, *fusion))):
         raise UserError(
-            f"--latency {printable(text)!r}: give {', '.join(NAMES)}, or seconds of one answer, "
-            f"0 to {LONGEST_S:g}, such as {EXAMPLE} (ego is needed)"
+            f"--latency {printable(text)!r}: give {', '.join(NAMES)}, or by role the seconds of one "
+            f"answer, 0 to {LONGEST_S:g}, such as {EXAMPLE} (ego is needed; a role left out has its time)"
         )
     several = tuple(helper) if len(helper) > 1 else ()
     return Latency("declared", "declared: --latency " + text, ego[0], helper[0], fusion[0], helpers_s=several)
