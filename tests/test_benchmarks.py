@@ -5,12 +5,16 @@ import re
 import runpy
 import sys
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import pytest
 
+from harness.dataset.load import Dataset
+
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))
+import open_loop  # noqa: E402
 import pages  # noqa: E402
 import rows  # noqa: E402
 import table  # noqa: E402
@@ -53,3 +57,12 @@ def test_a_benchmark_runs_at_its_smallest(
 def test_the_page_names_every_benchmark() -> None:
     page = (BENCHMARKS / "README.md").read_text("utf-8")
     assert set(re.findall(r"python benchmarks/(\w+)\.py", page)) == {script.stem for script in SCRIPTS}
+
+
+@pytest.mark.slow
+def test_no_sequence_clears_more_than_the_one_that_is_found(small: Dataset) -> None:
+    """All sequences of three actions over all decisions, one by one."""
+    forest, weights = small.forest, open_loop.weights(small.dangerous.astype(float))
+    found = forest.sequence_success(open_loop.best(forest, weights)) @ weights
+    every = product(forest.actions, repeat=int(forest.step.max()) + 1)
+    assert found == pytest.approx(max(forest.sequence_success(each) @ weights for each in every))

@@ -69,15 +69,13 @@ def test_the_overview_for_language_models_leads_to_pages_that_exist_under_their_
         assert (docs / page).read_text().startswith(f"# {title}\n"), page
 
 
-def test_the_overviews_scores_are_those_of_the_results_page() -> None:
-    page = (ROOT / "docs/results.md").read_text().replace("<br>", " ").replace("&nbsp;", " ")
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]
-    scores = {name: [alone, cooperating, gain] for name, _, alone, _, cooperating, _, gain in rows}
-    block = (ROOT / "README.md").read_text().partition("## Results\n\n```\n")[2].partition("```")[0]
-    _, *lines = block.splitlines()
-    assert len(lines) > 5
-    for line in lines:
-        name = re.split(r",|  | \(n", line)[0]
-        stated = re.findall(r"-?\d+\.\d \[[^]]+\]", line)
-        assert stated
-        assert stated == scores[name][: len(stated)], name
+def test_the_overviews_gains_are_those_of_the_claims_page() -> None:
+    claims = (ROOT / "docs/claims.md").read_text().replace(" points [", " [")
+    results = (ROOT / "README.md").read_text().partition("## Results\n")[2]
+    block = results.partition("```\n")[2].partition("```")[0]
+    gains = [
+        found[2] for line in block.splitlines() if len(found := re.findall(r"-?\d+\.\d \[[^]]+\]", line)) == 3
+    ]
+    assert len(gains) == 6
+    for gain in gains:
+        assert gain in claims, gain

@@ -8,10 +8,23 @@ from harness.backends.card import Card
 from harness.backends.registry import BUILT_IN
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, sha256_file
-from harness.world.drivers import CONSTANT, CONSTANTS, DRIVERS, UNIFORM, choices, constant
+from harness.world.drivers import (
+    CONSTANT,
+    CONSTANTS,
+    DRIVERS,
+    OPEN_LOOP,
+    OPEN_LOOPS,
+    UNIFORM,
+    choices,
+    constant,
+    open_loop,
+)
 from harness.world.precedence import RULES
+from harness.world.scenario import Scenario
 
-REFERENCES = (*DRIVERS, *RULES, UNIFORM, CONSTANT)
+REFERENCES = (*DRIVERS, *RULES, UNIFORM, CONSTANT, OPEN_LOOP)
+# What the choice of those that look at nothing follows from, by name
+CHOSEN = {CONSTANT: ("constants", CONSTANTS), OPEN_LOOP: ("open_loops", OPEN_LOOPS)}
 
 
 def open(card: Card, **_: Any) -> "DriverBackend":
@@ -36,16 +49,23 @@ class DriverBackend:
             raise ValueError(f"request {requests[0].id} has no scenario; a driver needs its road")
         if self.driver == UNIFORM:
             return [self._answer(request, request.actions) for request in requests]
-        driver = self.driver if self.driver != CONSTANT else constant(scenario)
-        if driver is None:
-            raise UserError(
-                f"driver {CONSTANT}: none was chosen for {printable(scenario.name)}; give brake or cruise"
-            )
-        asked = [(driver, request.view, request.truth) for request in requests]
+        asked = [(self._driver(scenario, request), request.view, request.truth) for request in requests]
         return [
             self._answer(request, [action])
             for request, action in zip(requests, choices(scenario, asked), strict=True)
         ]
+
+    def _driver(self, scenario: Scenario, request: Request) -> str:
+        """Return the driver, or the action that it takes without looking."""
+        if self.driver not in CHOSEN:
+            return self.driver
+        always = constant(scenario)
+        actions = open_loop(scenario) if self.driver == OPEN_LOOP else (always,) if always else None
+        if actions is None or request.view is None:
+            raise UserError(
+                f"driver {self.driver}: none was chosen for {printable(scenario.name)}; give brake or cruise"
+            )
+        return actions[min(request.view.step, len(actions) - 1)]
 
     def _answer(self, request: Request, among: Sequence[str]) -> Completion:
         p = {action: (action in among) / len(among) for action in request.actions}
@@ -54,5 +74,8 @@ class DriverBackend:
 
     def identity(self) -> dict[str, Any]:
         """Return the driver and its answer version, with what the choice of `constant` follows from."""
-        chosen = {"constants": sha256_file(CONSTANTS, "record")} if self.driver == CONSTANT else {}
+        chosen = {}
+        if self.driver in CHOSEN:
+            name, file = CHOSEN[self.driver]
+            chosen = {name: sha256_file(file, "record")}
         return {"engine": "driver", "answers": BUILT_IN["driver"].answers, "driver": self.driver, **chosen}

@@ -216,6 +216,11 @@ class Forest:
         """Return whether an ego that always takes one action succeeds in each episode, (E,)."""
         return self._success(np.full(len(self.tree), self.actions.index(action)))
 
+    def sequence_success(self, actions: Sequence[str]) -> Bools:
+        """Return whether an ego that takes one action after the other, and then the last, succeeds, (E,)."""
+        indices = np.array([self.actions.index(action) for action in actions])
+        return self._success(indices[np.minimum(self.step, len(indices) - 1)])
+
     def _success(self, chosen: Ints) -> Bools:
         return self.succeeds(self.last_edge(chosen), np.arange(len(self.root)))
 

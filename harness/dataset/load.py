@@ -34,7 +34,7 @@ from harness.dataset.verify import (
     scenario_of,
     unusable,
 )
-from harness.world.drivers import CONSTANT, UNIFORM, constant
+from harness.world.drivers import CONSTANT, OPEN_LOOP, UNIFORM, constant, open_loop
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
 from harness.world.seats import places_by
@@ -185,16 +185,18 @@ class Dataset:
     def reference_success(self) -> dict[str, Floats]:
         """Return the success of each reference in each episode, (E,): 0 or 1, of `uniform` its probability.
 
-        The references are the drivers, `uniform`, and `constant` where its action is known.
+        The references are the drivers, `uniform`, and where their actions are known `constant`, `open-loop`.
         """
         parts: dict[str, list[Floats]] = {}
-        action = constant(self.scenario)
+        action, actions = constant(self.scenario), open_loop(self.scenario)
         for start in range(0, len(self.trees), TREES_AT_ONCE):
             forest = self.of_episodes(self.episodes[start : start + TREES_AT_ONCE]).forest
             for name in forest.drivers:
                 parts.setdefault(name, []).append(forest.driver_success(name).astype(float))
             if action in forest.actions:
                 parts.setdefault(CONSTANT, []).append(forest.constant_success(action).astype(float))
+            if actions and set(actions) <= set(forest.actions):
+                parts.setdefault(OPEN_LOOP, []).append(forest.sequence_success(actions).astype(float))
             parts.setdefault(UNIFORM, []).append(forest.uniform_success())
         return {name: np.concatenate(of_trees) for name, of_trees in parts.items()}
 

@@ -10,10 +10,10 @@ from harness.report.words import shown
 from harness.runs.folder import Run
 from harness.runs.metrics import SUCCESS, by_danger, halved, known_in
 from harness.runs.records import Score
-from harness.world.drivers import CONSTANT, UNIFORM, constant
+from harness.world.drivers import CONSTANT, OPEN_LOOP, UNIFORM, constant
 from harness.world.scenario import Scenario
 
-BESIDE = (CONSTANT, UNIFORM)  # rows beside a model's on the terminal, the best first
+BESIDE = (OPEN_LOOP, CONSTANT, UNIFORM)  # rows beside a model's on the terminal, the best first
 
 
 def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
@@ -46,6 +46,7 @@ def label(name: str, scenario: Scenario) -> str:
 def meaning(name: str) -> str:
     """Say what one of `BESIDE` does."""
     return {
+        OPEN_LOOP: "open-loop: always the same sequence of actions, the best in the scenario's tune layouts",
         CONSTANT: "constant: always the action that did best in the scenario's tune layouts",
         UNIFORM: "uniform: every action is equally likely",
     }[name]

@@ -4,10 +4,11 @@
 `full-view` plans with everything in view. `right-hand` and `first-come` know what `local-view` knows, and
 keep a rule of the road with those who keep it, too (`precedence`).
 
-Two references look at nothing at all. `uniform` holds every action for equally likely. `constant` always
+Three references look at nothing at all. `uniform` holds every action for equally likely. `constant` always
 takes the action that did best in a scenario's tune layouts: `constants.csv` has what each clears, and
 `benchmarks/constants.py` writes it. Where `limits` is 2, best is success balanced over dangerous and harmless
-layouts.
+layouts. `open-loop` takes the fixed sequence of actions that did best there, by their trees: `open_loop.csv`,
+which `benchmarks/open_loop.py` writes. After its end the last action is taken again.
 """
 
 import csv
@@ -25,9 +26,10 @@ DRIVERS = ("cruise", "brake", "local-view", "full-view")
 ALWAYS = {"cruise": "IDLE", "brake": "SLOWER"}
 PRIVILEGED = "full-view"  # the only one that may read the truth
 LOOKING = ("local-view", PRIVILEGED, *RULES)  # decide by a scene graph
-UNIFORM, CONSTANT = "uniform", "constant"
-BLIND = (*ALWAYS, UNIFORM, CONSTANT)  # look at nothing
+UNIFORM, CONSTANT, OPEN_LOOP = "uniform", "constant", "open-loop"
+BLIND = (*ALWAYS, UNIFORM, CONSTANT, OPEN_LOOP)  # look at nothing
 CONSTANTS = Path(__file__).with_name("constants.csv")
+OPEN_LOOPS = Path(__file__).with_name("open_loop.csv")
 
 
 def choose(scenario: Scenario, driver: str, graph: SceneGraph | None, truth: SceneGraph | None) -> str:
@@ -51,6 +53,17 @@ def choices(
 def constant(scenario: Scenario) -> str | None:
     """Return the action of the driver `constant` in a scenario; None where nobody has measured it."""
     return _constants().get((scenario.name.partition(":")[0], scenario.parameters.limits))
+
+
+def open_loop(scenario: Scenario) -> tuple[str, ...] | None:
+    """Return the actions of the driver `open-loop`, from the first; None where nobody has measured them."""
+    return _open_loops().get((scenario.name.partition(":")[0], scenario.parameters.limits))
+
+
+@cache
+def _open_loops() -> Mapping[tuple[str, int], tuple[str, ...]]:
+    rows = csv.DictReader(text_of(OPEN_LOOPS).splitlines())
+    return {(row["scenario"], int(row["limits"])): tuple(row["actions"].split()) for row in rows}
 
 
 @cache

@@ -18,7 +18,7 @@ from harness.report.charts import success_latency
 from harness.report.references import in_trees, label
 from harness.runs.folder import read
 from harness.world import scenarios
-from harness.world.drivers import CONSTANTS, choose, constant
+from harness.world.drivers import CONSTANTS, OPEN_LOOPS, choose, constant, open_loop
 
 ALONE = POINTS["single-local"]
 
@@ -59,6 +59,34 @@ def test_the_model_constant_is_the_row_frozen_and_driven(small: Dataset, tmp_pat
         done = read(run(spec, tmp_path / name).out)
         assert [e.success for e in done.episodes] == expected
         assert {d.action for d in done.decisions.records(0, len(done.decisions))} == {"IDLE"}
+
+
+@pytest.mark.slow
+def test_the_model_open_loop_is_the_row_frozen_and_driven(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    actions = ("IDLE", "SLOWER", "FASTER")
+    for module in ("harness.backends.driver", "harness.dataset.load"):
+        monkeypatch.setattr(f"{module}.open_loop", lambda scenario: actions)
+    how: dict[str, Any] = {"points": (ALONE,), "seeds": (0,)}
+    live = live_spec_of("open-loop", len(small.episodes), small.manifest.seed, **how)
+    expected = small.reference_success()["open-loop"].astype(bool).tolist()
+    for name, spec in (("frozen", spec_of(small, "open-loop", **how)), ("driven", live)):
+        done = read(run(spec, tmp_path / name).out)
+        assert [e.success for e in done.episodes] == expected
+        taken = [d.action for d in done.decisions.records(0, len(done.decisions)) if d.episode == 0]
+        assert taken == [*actions, *["FASTER"] * len(taken)][: len(taken)]
+
+
+def test_the_sequence_of_each_scenario_was_chosen_on_tune_layouts() -> None:
+    rows = list(csv.DictReader(OPEN_LOOPS.read_text(encoding="utf-8").splitlines()))
+    assert len({(row["scenario"], row["limits"]) for row in rows}) == len(rows) == 7
+    for row in rows:
+        scenario = scenarios.get(f"{row['scenario']}:limits={row['limits']}")
+        assert purpose(int(row["first_seed"]), int(row["layouts"])) == "tune"
+        assert open_loop(scenario) == tuple(row["actions"].split())
+        assert set(row["actions"].split()) <= set(scenario.actions)
+    assert open_loop(scenarios.get("do-not-pass:limits=1")) is None
 
 
 def test_a_constant_action_clears_what_the_driver_of_that_action_does(small: Dataset) -> None:
