@@ -59,21 +59,27 @@ def placed(
     return replace(layout, spawns=tuple(spawns))
 
 
-def witnesses(parameters: Parameters, seed: int) -> int | None:
+def witnesses(scenario: str, parameters: Parameters, seed: int) -> int | None:
     """Return the number of witnesses that a layout is drawn with; None where none is declared.
 
-    `each` goes by the seed, so seeds in a row are balanced and no draw decides.
+    `each` goes by the seed, so seeds in a row are balanced and no draw decides. `drawn` has a draw of its
+    own, so the seed's number tells nothing.
     """
+    counts = len(LOOKOUTS) + 1
     if parameters.witnesses == "any":
         return None
-    return seed % (len(LOOKOUTS) + 1) if parameters.witnesses == "each" else int(parameters.witnesses)
+    if parameters.witnesses == "each":
+        return seed % counts
+    if parameters.witnesses == "drawn":
+        return int(noise.uniforms((1,), scenario, seed, "witnesses")[0] * counts)
+    return int(parameters.witnesses)
 
 
 def radios(scenario: Scenario, seed: int, danger: str | None) -> dict[str, Any]:
     """Return a layout's `witnesses` and `danger_radio` for a row of a table; None where none is declared."""
     p = scenario.parameters
     radio = has_radio(scenario.name, p, seed) if danger and p.radio_share else None
-    return {"witnesses": witnesses(p, seed), "danger_radio": radio}
+    return {"witnesses": witnesses(scenario.name, p, seed), "danger_radio": radio}
 
 
 def queue(
@@ -107,7 +113,7 @@ def _witnessed(
             f"scenario {scenario.name}: none of {MOST_ATTEMPTS} draws of layout seed {seed} gives "
             f"witnesses={parameters.witnesses}; it needs other parameters"
         )
-    count = witnesses(parameters, seed)
+    count = witnesses(scenario.name, parameters, seed)
     assert count is not None
     order = noise.generator(scenario.name, seed, "radios").permutation(len(LOOKOUTS)).tolist()
     silent = {LOOKOUTS[n] for n in order[count:]}

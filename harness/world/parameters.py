@@ -21,7 +21,7 @@ BOUNDS = {
     "_s": (0.0, MOST_FRAMES), "_m": (-1000.0, 1000.0), "_mps": (0.0, 200.0), "_mps2": (0.0, 200.0),
     "_hz": (0.0, 1000.0), "_share": (0.0, 1.0), "_shares": (0.0, 1.0),
 }  # fmt: skip
-WITNESSES = ("any", "each", "0", "1", "2", "3")
+WITNESSES = ("any", "each", "drawn", "0", "1", "2", "3")
 VERSIONS = (1, 2)
 CLOCKS = ("together", "apart")
 ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
@@ -66,8 +66,8 @@ class Parameters:
     beacon_noise_mps: float = 0.1  # standard deviation of a beacon's speed
     beacon_noise_rad: float = 0.0035  # standard deviation of a beacon's heading
     ambient: str = DAY  # light and weather, one of `harness.world.ambient`
-    # how many helpers have the danger in sight at the first decision: `0` to `3`; `each` of these in a
-    # quarter of the layouts; or `any`, as many as the scene happens to give
+    # how many helpers have the danger in sight at the first decision: `0` to `3`; `each` of these in turn, by
+    # the layout seed modulo 4; `drawn` evenly from these; or `any`, as many as the scene happens to give
     witnesses: str = "any"
     radio_share: float = 0.0  # probability that a vehicle which does not help sends beacons, too
     # version of the rule that says which delay is a failure (`harness.world.outcome`), and of the reference

@@ -4,8 +4,10 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import one_way_crossing
 import pytest
+from scipy.stats import chi2_contingency
 
 from harness.core.errors import UserError
 from harness.world import lookouts, scenarios
@@ -27,17 +29,43 @@ def layout(scenario: Scenario, seed: int, **changed: Any) -> Layout:
     return scenario.layout(seed, replace(scenario.parameters, **changed))
 
 
-def test_a_danger_has_as_many_witnesses_as_are_declared(name: str) -> None:
-    scenario = scenarios.get(f"{name}:witnesses=each")
+def declared(scenario: Scenario, seed: int) -> int | None:
+    return lookouts.witnesses(scenario.name, scenario.parameters, seed)
+
+
+def test_each_goes_by_the_seed() -> None:
+    each = scenarios.get("parking-exit:witnesses=each")
+    assert [declared(each, seed) for seed in range(8)] == [0, 1, 2, 3] * 2
+
+
+def test_drawn_is_even_whatever_the_seed_is_modulo_4_and_of_each_scenario() -> None:
+    count = 4000
+    for name in ("parking-exit", "occluded-intersection"):
+        scenario = scenarios.get(f"{name}:witnesses=drawn")
+        table = np.zeros((4, 4), int)
+        for seed in range(200_000, 200_000 + count):
+            table[seed % 4, declared(scenario, seed)] += 1
+        assert abs(table.sum(axis=0) / count - 0.25).max() < 0.03
+        assert chi2_contingency(table).pvalue > 0.001
+    parking, crossing = (
+        [declared(scenarios.get(f"{name}:witnesses=drawn"), seed) for seed in range(40)]
+        for name in ("parking-exit", "occluded-intersection")
+    )
+    assert parking != crossing
+
+
+@pytest.mark.parametrize("how", ["each", "drawn"])
+def test_a_danger_has_as_many_witnesses_as_are_declared(name: str, how: str) -> None:
+    scenario = scenarios.get(f"{name}:witnesses={how}")
     scenario = replace(scenario, parameters=replace(scenario.parameters, **ALWAYS))
-    for seed in range(8):
+    for seed in range(8 if how == "each" else 4):
         world = World.start(scenario, seed)
         state = world.state()
         viewers = [state.ego, *state.helpers]
         listed = [world.layout.danger_id in graph.seen for graph in
                   scene_graphs(scenario, [(state, viewer.id) for viewer in viewers])]  # fmt: skip
         assert (len(viewers), listed[0]) == (4, False)
-        assert sum(listed) == lookouts.witnesses(scenario.parameters, seed) == seed % 4
+        assert sum(listed) == declared(scenario, seed)
 
 
 def test_only_radios_move_with_the_number_of_witnesses(name: str) -> None:
