@@ -63,7 +63,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "success-latency", "overview", f"{IN_WORDS[lead].capitalize()} and latency",
             "Each point is a condition; the lines through it are 95 % intervals over episodes. Rings: what "
             "the paper reports, with other scenes and another model. A reply that arrives after the "
-            "decision window is not fused." + sentences(references, scenario),
+            "decision window is not fused." + sentences(references, scenario, runs.dataset is not None),
             charts.success_latency(rows, rates, windows_ms, IN_WORDS[lead]),
         )  # fmt: skip
     if rows := joined(statuses):

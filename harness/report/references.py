@@ -43,16 +43,17 @@ def label(name: str, scenario: Scenario) -> str:
     return f"{name} {action}" if action else name
 
 
-def meaning(name: str) -> str:
-    """Say what one of `BESIDE` does."""
+def meaning(name: str, exact: bool = True) -> str:
+    """Say what one of `BESIDE` does; `exact` if its figure is of the trees, and not of a run."""
+    exactly = "computed from the trees; a run of this name draws its actions, and may differ"
     return {
         OPEN_LOOP: "open-loop: always the same sequence of actions, the best in the scenario's tune layouts",
         CONSTANT: "constant: always the action that did best in the scenario's tune layouts",
-        UNIFORM: "uniform: every action is equally likely",
+        UNIFORM: f"uniform: every action is equally likely, {exactly if exact else 'drawn in its run'}",
     }[name]
 
 
-def sentences(references: Mapping[str, Score], scenario: Scenario) -> str:
+def sentences(references: Mapping[str, Score], scenario: Scenario, exact: bool) -> str:
     """Say how well each reference does, the best first, and what those that look at nothing do."""
     if not references:
         return ""
@@ -63,4 +64,4 @@ def sentences(references: Mapping[str, Score], scenario: Scenario) -> str:
     ]
     n = next(iter(references.values())).n
     text = f" Dashed: references that need no model, in the same episodes: {', '.join(rates)}; n = {n}."
-    return " ".join([text, *(f"{meaning(name)}." for name in BESIDE if name in references)])
+    return " ".join([text, *(f"{meaning(name, exact)}." for name in BESIDE if name in references)])

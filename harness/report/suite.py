@@ -156,8 +156,9 @@ def _families(lines: Sequence[Line], place: Place, lead: str) -> Table:
         "families together. It is about other episodes of these families, not about other families. "
         "Dashed lines and the last columns: references, which need no model, in "
         "the same episodes; constant always takes the action that did best in the family's tune layouts, and "
-        "uniform takes every action equally often. Below each family: the number of episodes, and what its "
-        "layout seeds are for; quote only numbers of report seeds."
+        "uniform takes every action equally often, computed from the trees; a run of this name draws its "
+        "actions. Below each family: the number of episodes, and what its layout "
+        "seeds are for; quote only numbers of report seeds."
     )
     heads = ["family", *conditions, "0 to 100 %", *mean.drivers]
     return Table("Families × conditions", heads, rows, note, left=True, total=True)

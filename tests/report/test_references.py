@@ -15,8 +15,9 @@ from harness.coordination.operating_point import POINTS
 from harness.core.seeds import purpose
 from harness.dataset.load import Dataset
 from harness.report.charts import success_latency
-from harness.report.references import in_trees, label
+from harness.report.references import in_trees, label, sentences
 from harness.runs.folder import read
+from harness.runs.metrics import SUCCESS
 from harness.world import scenarios
 from harness.world.drivers import CONSTANTS, OPEN_LOOPS, choose, constant, open_loop
 
@@ -38,6 +39,13 @@ def test_what_any_action_at_all_clears_is_exact(small: Dataset) -> None:
     expected = [by_hand(small, int(root), tree) for tree, root in enumerate(small.forest.root)]
     assert small.reference_success()["uniform"].tolist() == pytest.approx(expected)
     assert 0 < fmean(expected) < 1
+
+
+def test_words_tell_what_trees_say_of_uniform_from_what_a_run_drew(small: Dataset) -> None:
+    found = {name: of[SUCCESS] for name, of in in_trees(small).items()}
+    exact, drawn = (sentences(found, small.scenario, exact) for exact in (True, False))
+    assert "equally likely, computed from the trees; a run of this name draws its actions" in exact
+    assert "equally likely, drawn in its run." in drawn
 
 
 @pytest.mark.slow
