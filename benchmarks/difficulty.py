@@ -10,7 +10,7 @@ most answered layouts, as a share of the plain one's. *Coverage*: how often the 
 answered layouts, drawn from those of the run, and a pool of five times as many holds the run's figure, in
 percent; beside it the plain interval's.
 
-    python benchmarks/difficulty.py [--models proxy swarm-tiny] [--layouts 120] [--answered 20 30 60]
+    python benchmarks/difficulty.py [--models proxy swarm-tiny] [--layouts 120] [--answered 20 30 40 60]
 """
 
 import argparse
@@ -133,7 +133,7 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--models", nargs="+", default=["proxy", "swarm-tiny"])
     arguments.add_argument("--layouts", type=int, default=120)
-    arguments.add_argument("--answered", nargs="+", type=int, default=[20, 30, 60])
+    arguments.add_argument("--answered", nargs="+", type=int, default=[20, 30, 40, 60])
     arguments.add_argument("--studies", type=int, default=1000)
     given = arguments.parse_args()
     cells = list[Cell]()

@@ -24,11 +24,12 @@ from harness.dataset.load import find, load
 from harness.dataset.select import Selection
 from harness.evaluate import frozen_world
 from harness.evaluate.frozen_world import FrozenSource
+from harness.report import words
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
 from harness.report.view.folder import whole
-from harness.report.words import adjusted_lines, figures
+from harness.report.words import adjusted_lines, as_good_as, figures
 from harness.runs.difficulty import FILE, Pool, adjusted_scores
 from harness.runs.folder import read
 from harness.runs.metrics import ADJUSTED, BALANCED, GAIN, SUCCESS, Grid
@@ -193,6 +194,26 @@ def test_a_difference_of_references_is_that_of_all_layouts_and_is_said(
     assert f"Success adjusted for difficulty: B - A {in_all:+.1f} [" in Path("page.html").read_text()
     tiles = {figure["what"].partition(",")[0] for figure in figures(read(runs["cruise"]))}
     assert "adjusted for difficulty" in tiles
+
+
+@pytest.mark.slow
+def test_it_is_shown_by_the_number_of_layouts_whatever_it_says(
+    runs: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    some = read(runs["some"])
+    [line] = [line for line in adjusted_lines(some) if line.startswith("success %")]
+    assert line.count("times as many layouts") == len(some.conditions), "under 6g it gains hardly anything"
+    monkeypatch.setattr(words, "SHOWN_FROM", ASKED)
+    assert [*adjusted_lines(some)]
+    monkeypatch.setattr(words, "SHOWN_FROM", ASKED + 1)
+    assert not [*adjusted_lines(some)]
+    assert not [figure for figure in figures(some) if "adjusted" in figure["what"]]
+
+
+def test_words_say_also_what_is_worse() -> None:
+    plain, wider = Estimate(0.5, 0.4, 0.6, 50, 0), Estimate(0.5, 0.395, 0.605, 50, 0)
+    assert as_good_as(plain, plain) == "as good as 1.0 times as many layouts"
+    assert as_good_as(plain, wider) == "as good as 0.9 times as many layouts"
 
 
 def test_a_view_follows_no_link_out_of_its_folder(tmp_path: Path) -> None:

@@ -21,7 +21,9 @@ from harness.runs.records import Latency, Manifest, Score, Times, role_word
 from harness.runs.success import Pairs, Success, half_difference, mean_difference, p_of_mean
 from harness.runs.suite import SuiteRun
 
-WORTH = 1.1  # times as many layouts; a corrected figure that is worth less is not shown beside the plain one
+# Layouts from which on a corrected figure is shown beside the plain one, whatever both are: intervals of so
+# many hold the truth in 94 % of studies or more, plain and balanced (`benchmarks/difficulty.py`).
+SHOWN_FROM = 40
 
 
 def shown(score: Score) -> dict[str, str]:
@@ -122,21 +124,19 @@ def figures(run: Run) -> list[dict[str, str]]:
 
 
 def as_good_as(plain: Estimate, corrected: Estimate) -> str:
-    """Say how many times as many layouts the plain figure needs; empty if it is about as good."""
-    times = worth(plain, corrected)
-    return f"as good as {times:.1f} times as many layouts" if times >= WORTH else ""
+    """Say how many times as many layouts the plain figure needs, less than 1 where it is better."""
+    return f"as good as {worth(plain, corrected):.1f} times as many layouts"
 
 
 def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
-    """Return success corrected by the layouts' difficulty, and what that is as good as; None if no better.
+    """Return success corrected by the layouts' difficulty, and what that is as good as.
 
-    Nor where an interval of every look leads, which this one is not.
+    None of fewer layouts than `SHOWN_FROM`, and where an interval of every look leads, which this one is not.
     """
     plain, better = run.score(condition, metric), run.score(condition, ADJUSTED[metric])
-    if not plain or not better or plain.interval == ANY_TIME:
+    if not plain or not better or plain.interval == ANY_TIME or plain.n < SHOWN_FROM:
         return None
-    gained = as_good_as(plain.estimate, better.estimate)
-    return (better, gained) if gained else None
+    return better, as_good_as(plain.estimate, better.estimate)
 
 
 def adjusted_lines(run: Run) -> Iterator[str]:

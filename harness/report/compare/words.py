@@ -13,7 +13,7 @@ from harness.report.caveats import looked_at, no_prompt, void
 from harness.report.compare.difference import LOST_BY, Comparison, DecisionFlip, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
-from harness.report.words import as_good_as, p_value, pace
+from harness.report.words import SHOWN_FROM, as_good_as, p_value, pace
 from harness.runs.leading import IN_WORDS, SUCCESS, lead_of, leading
 from harness.runs.metrics import ADJUSTED, ONE_OPTIMAL, entry
 from harness.runs.records import role_word
@@ -184,11 +184,12 @@ def success(c: InCondition, pair: Pair) -> str:
 
 
 def adjusted(c: InCondition) -> Iterator[str]:
-    """Yield how success changed once corrected by the layouts' difficulty, where that is better."""
+    """Yield how success changed once corrected by the layouts' difficulty, from `SHOWN_FROM` layouts on."""
     changes = {d.metric: d.change for d in c.differences}
     for metric, name in IN_WORDS.items():
         better = changes.get(ADJUSTED[metric])
-        if better and (gained := as_good_as(changes[metric], better)):
+        if better and changes[metric].n >= SHOWN_FROM:
+            gained = as_good_as(changes[metric], better)
             yield f"{name} adjusted for difficulty: B - A {shown(better, POINTS, '+')} points, {gained}"
 
 
