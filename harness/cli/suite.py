@@ -131,7 +131,7 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
             for line in lines
         ],
     )  # fmt: skip
-    text.print("references are computed from the trees; a run of uniform draws its actions, and may differ")
+    text.print("references are computed from the trees; a run of uniform draws, and may differ")
     text.print(
         f"n: episodes, each × {amount(len(done.manifest.seeds), 'channel seed')}; seeds: what the layout "
         "seeds are for; 95 % intervals over episodes; gains are paired; the mean gives each family the same "

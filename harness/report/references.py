@@ -45,11 +45,11 @@ def label(name: str, scenario: Scenario) -> str:
 
 def meaning(name: str, exact: bool = True) -> str:
     """Say what one of `BESIDE` does; `exact` if its figure is of the trees, and not of a run."""
-    exactly = "computed from the trees; a run of this name draws its actions, and may differ"
+    exactly = "by the trees; a run of it draws"
     return {
-        OPEN_LOOP: "open-loop: always the same sequence of actions, the best in the scenario's tune layouts",
+        OPEN_LOOP: "open-loop: always the same sequence of actions, the best in tune layouts",
         CONSTANT: "constant: always the action that did best in the scenario's tune layouts",
-        UNIFORM: f"uniform: every action is equally likely, {exactly if exact else 'drawn in its run'}",
+        UNIFORM: f"uniform: every action equally likely, {exactly if exact else 'drawn in its run'}",
     }[name]
 
 

@@ -44,7 +44,7 @@ def test_what_any_action_at_all_clears_is_exact(small: Dataset) -> None:
 def test_words_tell_what_trees_say_of_uniform_from_what_a_run_drew(small: Dataset) -> None:
     found = {name: of[SUCCESS] for name, of in in_trees(small).items()}
     exact, drawn = (sentences(found, small.scenario, exact) for exact in (True, False))
-    assert "equally likely, computed from the trees; a run of this name draws its actions" in exact
+    assert "equally likely, by the trees; a run of it draws" in exact
     assert "equally likely, drawn in its run." in drawn
 
 
