@@ -55,11 +55,9 @@ class Spread:
         from harness.core.special import ndtri
 
         least = (difference * (1 - difference))[..., None]
+        varies = np.minimum(np.maximum(self.variances, least), UNKNOWN)
         of_part = n[..., None] * self.shares
         weights = 1 / (len(self.shares) * of_part)  # of an episode in the mean
-        known = np.minimum(self.variances, UNKNOWN)
-        enough = np.sum(weights**2 * of_part * (known - least), axis=-1) >= 0
-        varies = np.where(enough[..., None], known, np.maximum(known, least))
         error = np.sum(weights**2 * of_part * varies, axis=-1)
         # The interval: each part's variance is mixed with that of all, and two more differ.
         more = ALIKE / len(self.shares) if len(self.shares) > 1 else 0.0
