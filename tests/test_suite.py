@@ -119,6 +119,19 @@ def test_a_gain_takes_the_layouts_of_all_families_together(evaluated: Harness) -
     )  # fmt: skip
 
 
+def test_a_gain_that_no_run_can_have_is_no_traceback(evaluated: Harness, tmp_path: Path) -> None:
+    copytree(DONE, tmp_path / "suite")
+    for summary in tmp_path.glob("suite/*/summary.csv"):
+        stated = "proxy,v2,json,,nowhere,success_gain_over_single-local,0.5,0.1,0.6,4,0,paired episodes\n"
+        summary.write_text(summary.read_text() + stated)
+    suite = read(tmp_path / "suite")
+    strange = suite.score("nowhere", "success_gain_over_single-local")
+    assert strange
+    assert strange.value == 0.5
+    before = read(DONE).score("6g", "success_gain_over_single-local")
+    assert suite.score("6g", "success_gain_over_single-local") == before
+
+
 def test_json_has_every_family_and_the_means(project: Harness) -> None:
     code, out, err = project(*EVAL, "--json", "--limit", "1")
     told: dict[str, Any] = json.loads(out, parse_constant=pytest.fail)

@@ -30,7 +30,7 @@ from harness.runs.folder import Run
 from harness.runs.leading import PAIRED
 from harness.runs.metrics import METRICS
 from harness.runs.records import FrozenScenes, Manifest, Score
-from harness.runs.success import Pairs, mean_difference
+from harness.runs.success import Pairs, is_gain, mean_difference
 
 KIND = "editions"
 
@@ -87,7 +87,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         scores = [score for score in run.scores if score.metric in self.metrics]
         if self.gains == PAIRED:
             return scores
-        return [pinned.gain(run, score) if score.interval == PAIRED else score for score in scores]
+        return [pinned.gain(run, score) if is_gain(score, run.conditions) else score for score in scores]
 
     def difference(self, pairs: Pairs) -> Estimate:
         """Return the mean over families of success a - b, with the interval of the edition's gains."""

@@ -3,7 +3,7 @@
 All that picks, orders or tests by success of single episodes does so here.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.core.power import Spread, variance
 from harness.core.sequences import any_time, any_time_difference
 from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of, paired_difference, resampled
-from harness.runs.leading import ANY_TIME, BALANCED, IN_WORDS, SUCCESS
+from harness.runs.leading import ANY_TIME, BALANCED, IN_WORDS, PAIRED, SUCCESS
 from harness.runs.metrics import BASELINE, GAINS, METRICS, Grid, of_ends, over_episodes
 from harness.runs.records import Episode, Score
 
@@ -117,6 +117,12 @@ def any_time_scores(grid: Grid, episodes: Sequence[Episode]) -> Iterator[Score]:
             if BASELINE in values and name != BASELINE:
                 gain = by.any_time_difference(of_condition, values[BASELINE])
                 yield Score.of(name, GAINS[by.metric], gain, ANY_TIME)
+
+
+def is_gain(score: Score, conditions: Container[str]) -> bool:
+    """Return whether a row is a gain over `BASELINE` that can be computed: a file may state any."""
+    known = score.condition in conditions and BASELINE in conditions
+    return known and score.interval == PAIRED and score.metric in GAINS.values()
 
 
 Pairs = Sequence[tuple[Success, Floats, Floats]]  # of each family: how success counts, and both, (S, E)

@@ -19,7 +19,7 @@ from harness.runs.leading import BALANCED, PAIRED
 from harness.runs.listing import own_name
 from harness.runs.metrics import BASELINE, GAINS
 from harness.runs.records import Cost, Manifest, Score, Variant
-from harness.runs.success import Success, by_condition, mean_difference
+from harness.runs.success import Success, by_condition, is_gain, mean_difference
 
 FORMAT = "swarmdrive-suite/1"
 SUMMARY = "summary.csv"  # the means over families
@@ -83,8 +83,8 @@ class SuiteRun:
         for s in first.scores:
             key = s.condition, s.metric, s.interval
             if s.interval != "seed means" and all(key in scores for scores in others_by_key):
-                together = s.interval == PAIRED and s.metric in GAINS.values()
-                yield self._gain(s) if together else mean([s, *(scores[key] for scores in others_by_key)])
+                of_families = [s, *(scores[key] for scores in others_by_key)]
+                yield self._gain(s) if is_gain(s, self.conditions) else mean(of_families)
 
     @cached_property
     def _success(self) -> list[tuple[Success, dict[str, Floats]]]:
