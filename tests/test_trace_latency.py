@@ -129,6 +129,7 @@ def test_a_relayed_reply_comes_over_the_links_that_it_takes(patch, tmp_path):
     assert heard.exchange_s == pytest.approx(0.15)
 
 
+@pytest.mark.slow
 def test_drawn_latencies_have_the_percentiles_of_the_links_own_row(tmp_path):
     """At 50 m 10 and 20 ms, at 100 m 30 and 90; the median of a lognormal is its geometric mean."""
     trace = load(tmp_path, SPREAD + "50,1,10,20\n100,1,30,90\n")

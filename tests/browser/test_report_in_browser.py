@@ -85,7 +85,7 @@ def test_what_is_read_first_stands_on_the_first_screen(opened, report):
         box = page.locator(what).first.bounding_box()
         assert box["y"] + box["height"] <= 900, what
     assert page.locator(".key > div").count() == 7
-    assert len(page.locator(".headline").inner_text()) < 120
+    assert len(page.locator(".headline").inner_text()) < 280
     assert not page.locator("#metrics table").is_visible(), "all metrics are behind a fold"
     picture(page, "report-first")
 
