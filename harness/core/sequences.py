@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.core.statistics import LEVEL, Estimate, paired_error
+from harness.core.statistics import LEVEL, Estimate, paired_reach
 
 # Shares of what may be bet: any are valid, and these are good for 20 to 5000 values.
 BETS = np.geomspace(0.01, 0.8, 10)
@@ -43,11 +43,7 @@ def any_time(parts: Sequence[Floats]) -> Estimate:
 
 def any_time_difference(parts: Sequence[Floats]) -> Estimate:
     """Return what `paired_difference` does of the same parts, with an interval that holds at every look."""
-    value, error = paired_error(parts)
-    n = sum(int((~np.isnan(part)).sum()) for part in parts)
-    half = error * _mixture(n)
-    low, high = float(np.maximum(value - half, -1.0)), float(np.minimum(value + half, 1.0))
-    return Estimate(value, low, high, n, sum(map(len, parts)) - n)
+    return paired_reach(parts, _mixture(sum(int((~np.isnan(part)).sum()) for part in parts)))
 
 
 def _mixture(n: int) -> float:

@@ -157,14 +157,19 @@ def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate
 
     A part with one episode bounds nothing, so the ends are NaN.
     """
-    value, error = paired_error(parts)
+    return paired_reach(parts, _normal(level))
+
+
+def paired_reach(parts: Sequence[Floats], errors: float) -> Estimate:
+    """Return the mean of `paired_difference` with an interval that reaches so many standard errors."""
+    value, error = _paired_error(parts)
     n = sum(int((~np.isnan(part)).sum()) for part in parts)
-    half = _normal(level) * error
+    half = errors * error
     low, high = float(np.maximum(value - half, -1.0)), float(np.minimum(value + half, 1.0))
     return Estimate(value, low, high, n, sum(map(len, parts)) - n)
 
 
-def paired_error(parts: Sequence[Floats]) -> tuple[float, float]:
+def _paired_error(parts: Sequence[Floats]) -> tuple[float, float]:
     """Return the mean of `paired_difference` and its standard error; NaN where it is not known."""
     known = [part[~np.isnan(part)] for part in parts]
     sizes = np.array([len(part) for part in known])

@@ -61,8 +61,10 @@ def headline(run: Run | SuiteRun) -> str:
         if halves := entry(lead).halves:
             text += ": {} with a danger, {} without".format(*(_shown(run, best, half) for half in halves))
         return text + (f", and no other condition{of} does better." if several else ".")
-    pairs = Pairing(run).pairs(best, base)
-    clear = judged(mean_difference(pairs), corrected_p(run, base, best))
+    pairing = Pairing(run)
+    pairs, p = pairing.pairs(best, base), pairing.p_values(base)
+    corrected = dict(zip(p, holm(list(p.values())), strict=True))
+    clear = judged(mean_difference(pairs), corrected[best])
     if lead == SUCCESS:
         text = f"Under {best}, {model} clears {value} of the episodes{families}; under {base}, "
         return f"{text}{_shown(run, base, lead)}: {clear}."
@@ -164,21 +166,19 @@ class Pairing:
         a, b = self._places[condition], self._places[base]
         return [(success, values[a], values[b]) for success, values in self._runs]
 
+    def p_values(self, base: str) -> dict[str, float]:
+        """Return p of each other condition's gain over `base`."""
+        values = dict[str, float]()
+        for condition in self._places:
+            if condition != base:
+                p = p_of_mean(self.pairs(condition, base))
+                values[condition] = 1.0 if p is None else p
+        return values
+
 
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
     """Return p of each other condition's gain over `base`, in what leads; of a suite the mean gain's."""
-    pairing, values = Pairing(run), dict[str, float]()
-    for condition in run.conditions:
-        if condition != base:
-            p = p_of_mean(pairing.pairs(condition, base))
-            values[condition] = 1.0 if p is None else p
-    return values
-
-
-def corrected_p(run: Run | SuiteRun, base: str, condition: str) -> float:
-    """Return one of these after Holm's correction for all of them."""
-    p = p_values(run, base)
-    return dict(zip(p, holm(list(p.values())), strict=True))[condition]
+    return Pairing(run).p_values(base)
 
 
 def p_value(p: float) -> str:
