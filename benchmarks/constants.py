@@ -9,7 +9,8 @@ which the driver `constant` takes its action.
 
 import argparse
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -49,11 +50,24 @@ def cleared(scenario: Scenario, layouts: int) -> tuple[Bools, dict[str, Bools]]:
     return np.array(dangerous), {action: np.array(of) for action, of in success.items()}
 
 
-def measured(name: str, limits: int, layouts: int) -> Iterator[tuple[object, ...]]:
-    """Print what each action clears in percent, and yield the rows of the table."""
+def scenario_of(name: str, limits: int) -> Scenario:
+    """Return a scenario whose layouts are drawn and judged by a version of the limits."""
     dials = scenarios.get(name).dials
     settings = ",".join(f"{dial}={value}" for dial, value in VERSIONS[limits].items() if dial in dials)
-    dangerous, success = cleared(scenarios.get(f"{name}:{settings}"), layouts)
+    return scenarios.get(f"{name}:{settings}")
+
+
+def write(file: Path, heads: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Write the table of a driver."""
+    with file.open("w", encoding="utf-8", newline="") as out:
+        table = csv.writer(out, lineterminator="\n")
+        table.writerow(heads)
+        table.writerows(rows)
+
+
+def measured(name: str, limits: int, layouts: int) -> Iterator[tuple[object, ...]]:
+    """Print what each action clears in percent, and yield the rows of the table."""
+    dangerous, success = cleared(scenario_of(name, limits), layouts)
     for action, of in success.items():
         halves = [rate_interval(of[half].astype(float)) for half in (dangerous, ~dangerous)]
         rates = (rate_interval(of.astype(float)), mean_of(halves), *halves)
@@ -75,10 +89,7 @@ def main() -> None:
     names = [(limits, name) for limits in VERSIONS for name in given.scenarios]
     rows = [row for limits, name in names for row in measured(name, limits, layouts)]
     if (layouts, given.scenarios) == (LAYOUTS, ALL):
-        with CONSTANTS.open("w", encoding="utf-8", newline="") as file:
-            table = csv.writer(file, lineterminator="\n")
-            table.writerow(HEADS)
-            table.writerows(rows)
+        write(CONSTANTS, HEADS, rows)
 
 
 if __name__ == "__main__":

@@ -9,19 +9,17 @@ actions.
 """
 
 import argparse
-import csv
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from constants import VERSIONS
+from constants import scenario_of, write
 
 from harness.core.arrays import Floats, Ints
 from harness.core.seeds import FIRST, stated
 from harness.dataset.build import build
 from harness.dataset.forest import Forest
 from harness.dataset.load import load
-from harness.world import scenarios
 from harness.world.drivers import OPEN_LOOPS
 
 SMALLEST = "--layouts 1 --scenarios parking-exit"
@@ -71,9 +69,7 @@ def best(forest: Forest, layouts: Floats) -> tuple[str, ...]:
 
 def measured(name: str, limits: int, layouts: int) -> tuple[object, ...]:
     """Print the best sequence of a scenario and return its row."""
-    dials = scenarios.get(name).dials
-    settings = ",".join(f"{dial}={value}" for dial, value in VERSIONS[limits].items() if dial in dials)
-    scenario = scenarios.get(f"{name}:{settings}")
+    scenario = scenario_of(name, limits)
     with tempfile.TemporaryDirectory() as folder:
         build(scenario, Path(folder, "tune"), layouts, FIRST["tune"], 1, lambda done: None)
         data = load(Path(folder, "tune"))
@@ -95,10 +91,7 @@ def main() -> None:
     searched = [each for each in SEARCHED if each[0] in given.scenarios]
     rows = [measured(name, limits, given.layouts) for name, limits in searched]
     if (given.layouts, searched) == (LAYOUTS, list(SEARCHED)):
-        with OPEN_LOOPS.open("w", encoding="utf-8", newline="") as file:
-            table = csv.writer(file, lineterminator="\n")
-            table.writerow(HEADS)
-            table.writerows(rows)
+        write(OPEN_LOOPS, HEADS, rows)
 
 
 if __name__ == "__main__":
