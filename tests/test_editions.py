@@ -17,6 +17,7 @@ from run_on_disk import Row, made_up
 
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
+from harness.core.seeds import purpose
 from harness.dataset.load import Dataset, released
 from harness.evaluate import resolve
 from harness.evaluate.edition import named, of_file
@@ -566,35 +567,21 @@ def test_the_next_edition_tells_apart_what_the_first_does_not(tmp_path: Path) ->
     assert ranks == {"v2v-safety-1.0": [1, 1], "v2v-safety-1.1": [1, 2]}
 
 
-def test_published_seeds_are_those_that_an_edition_committed_to(project: Harness) -> None:
-    seeds, edition = Path("seeds.toml"), Path("editions/mine-1.toml")
-    text = f'edition = "mine-1"\nsalt = "{"0f" * 32}"\nfirst_seed = 123456789\nlayouts = 100\n'
-    seeds.write_text(text)
-    before = edition.read_text()
-    code, out, _ = project("benchmark", "verify", seeds)
-    assert code == 1
-    assert "layout seeds 123456789 to 123456888 (report)" in out
-    assert "not as mine-1 committed to: none" in out
-    digest = next(line for line in out.splitlines() if line.startswith("its digest: ")).split()[-1]
-    edition.write_text(f'sealed = "{digest}"\n{before}')
-    seeds.write_text("# published today\n" + text)
-    code, out, _ = project("benchmark", "verify", seeds, "--json")
-    assert (code, json.loads(out)[0]["equal"]) == (0, True)
-    for old, new in (("123456789", "123456788"), ("= 100", "= 99"), ("0f0f", "0f0e")):
-        seeds.write_text(text.replace(old, new, 1))
-        assert project("benchmark", "verify", seeds, "--quiet")[0] == 1
+def test_sealed_seeds_follow_from_a_commit_alone(harness: Harness) -> None:
+    """By hand: SHA-256 of forty zeros, a space and `blind-merge` is 600244092 modulo 10^9."""
+    code, out, _ = harness("benchmark", "seeds", "0" * 40)
+    assert (code, out.count("harness dataset build")) == (0, 6)
+    shown = re.findall(r"build \\\n  ([^:]+):\S+ \\\n  --seed (\d+)", out)
+    assert shown[-1] == ("blind-merge", "1600244092")
+    assert len({seed for _, seed in shown}) == 6
+    _, out, _ = harness("benchmark", "seeds", "0" * 40, "narrow-passage", "blind-merge", "--json")
+    passage, merge = json.loads(out)
+    assert merge["first_seed"] == 1_600_244_092
+    assert purpose(passage["first_seed"], 100) == "report"
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("first_seed = 200000", "first_seed = 5"), ("layouts = 9", "layouts = 0"),
-        ('salt = "', 'salt = "short"  # '), ("layouts = 9", 'layouts = 9\nmore = "x"'), ("mine-1", "theirs"),
-        ("layouts = 9", "layouts = 2020-01-01"),
-    ],
-)  # fmt: skip
-def test_a_wrong_file_of_seeds_is_one_line(project: Harness, old: str, new: str) -> None:
-    text = f'edition = "mine-1"\nsalt = "{"0f" * 32}"\nfirst_seed = 200000\nlayouts = 9\n'
-    Path("seeds.toml").write_text(text.replace(old, new))
-    code, out, err = project("benchmark", "verify", "seeds.toml")
+@pytest.mark.parametrize("commit", ["", "0" * 39, "0" * 7, "HEAD", "G" * 40, "0" * 41, "A" * 40])
+def test_an_id_that_is_not_whole_is_one_line(harness: Harness, commit: str) -> None:
+    code, out, err = harness("benchmark", "seeds", "--", commit)
     assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "give a whole id" in err

@@ -121,16 +121,12 @@ def verify(
 ) -> None:
     """Compute results again from their answers; compare each figure.
 
-    No model is asked, and nothing in the file is run or believed. Exit code 1 means that a figure differs. A
-    .toml file has layout seeds; it is compared with what its edition committed to.
+    No model is asked, and nothing in the file is run or believed. Exit code 1 means that a figure differs.
     """
     from harness.evaluate.rescore import Here
 
     here, lines = Here(), list[dict[str, Any]]()
     for file in files:
-        if file.suffix == ".toml":
-            lines.append(_seeds(file, as_json or quiet))
-            continue
         with _rescored(file, here, as_json or quiet) as done:
             lines.append(_mapping(file, done))
             if not (as_json or quiet):
@@ -139,25 +135,6 @@ def verify(
         echo_json(lines)
     if not all(line["equal"] for line in lines):
         raise typer.Exit(1)
-
-
-def _seeds(file: Path, silent: bool) -> dict[str, Any]:
-    """Compare a file of layout seeds with what its edition committed to."""
-    from harness.core.seeds import stated
-    from harness.evaluate import edition as editions
-
-    seeds = editions.seeds_of(file)
-    edition = editions.named(seeds.edition)
-    equal = seeds.digest == edition.sealed
-    if not silent:
-        committed = edition.sealed or "none"
-        typer.echo(f"{printable(file)}: {stated(seeds.first_seed, seeds.layouts)}")
-        typer.echo(f"its digest: {seeds.digest}")
-        echo_text(f"{'as' if equal else 'not as'} {edition.name} committed to: {printable(committed)}")
-    return {
-        "file": str(file), "edition": edition.name, "first_seed": seeds.first_seed,
-        "layouts": seeds.layouts, "digest": seeds.digest, "committed": edition.sealed, "equal": equal,
-    }  # fmt: skip
 
 
 @contextmanager
@@ -188,6 +165,41 @@ def _show(file: Path, done: "Rescored") -> None:
     layouts = sum(len(run.grid.episodes) for run in done.suite.runs.values())
     of = f"{done.compared} figures of {layouts} layouts in {len(done.suite.runs)} families"
     typer.echo(f"{'not ' * bool(wrong)}equal to the last digit: {of}")
+
+
+def seeds(
+    commit: Annotated[str, typer.Argument(help="Id of a commit, 40 hex digits.")],
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[SCENARIO]...", help="Scenarios. Default: those of the edition."),
+    ] = None,
+    edition: Annotated[str, typer.Option(help="Edition whose scenarios are sealed.")] = EDITION,
+    as_json: options.Json = False,
+) -> None:
+    """Print how to build sealed layouts, whose seeds follow from a commit.
+
+    Nobody knew its id before it was made, so nobody, the makers included, had looked at these layouts.
+    """
+    from harness.core.seeds import sealed
+    from harness.dataset import load
+    from harness.evaluate import edition as editions
+    from harness.world import scenarios
+
+    if names:
+        of = [scenarios.get(options.typed_scenario(name)) for name in names]
+    else:
+        of = [load.load(load.find(name), 1).scenario for name in editions.named(edition).datasets]
+    lines: list[dict[str, Any]] = [
+        {"scenario": scenarios.argument(each), "first_seed": sealed(commit, each.name.partition(":")[0])}
+        for each in of
+    ]
+    if as_json:
+        echo_json(lines)
+        return
+    for line in lines:
+        typer.echo("harness dataset build \\")
+        typer.echo(f"  {printable(line['scenario'])} \\")
+        typer.echo(f"  --seed {line['first_seed']} --episodes 100 --out FOLDER")
 
 
 def board(

@@ -15,6 +15,7 @@ COMMANDS = {
     "benchmark pack": "benchmark:pack",
     "benchmark verify": "benchmark:verify",
     "benchmark board": "benchmark:board",
+    "benchmark seeds": "benchmark:seeds",
     "study sweep": "sweep",
     "study contents": "contents",
     "study trust": "trust",

@@ -15,7 +15,6 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import amount
 from harness.core.files import digest
 from harness.core.resources import find, names
-from harness.core.seeds import FIRST, LAST_EPISODE, LAST_SEED
 from harness.core.statistics import Estimate
 from harness.dataset import load
 from harness.dataset.select import Selection
@@ -45,16 +44,6 @@ class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     layouts: int  # how many of each dataset it has, from the first
 
 
-class Seeds(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Layout seeds that an edition committed to, in a file that is published once the edition closes."""
-
-    edition: str  # its name
-    salt: Annotated[str, Meta(min_length=32)]  # drawn by chance, so that nobody finds the seeds by trying
-    first_seed: Annotated[int, Meta(ge=FIRST["report"], le=LAST_SEED)]  # of the layouts, the others follow
-    layouts: Annotated[int, Meta(ge=1, le=LAST_EPISODE + 1)]  # how many
-    digest: str  # of the file's tables, hex SHA-256
-
-
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One edition."""
 
@@ -72,7 +61,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     # the kind of the intervals of gains: of all layouts taken together, or combined from those of each half
     gains: Literal["paired episodes", "episodes"] = "episodes"
     golden: Golden | None = None  # None in a project's own edition that pins nothing
-    sealed: str | None = None  # digest of the file of `Seeds` that is still secret; None without one
+    sealed: str | None = None  # what earlier editions of a project may state; nothing reads it
 
     @property
     def golden_file(self) -> Path:
@@ -188,26 +177,14 @@ def named(name: str) -> Edition:
     return of_file(find(KIND, f"{name}.toml"))
 
 
-def seeds_of(file: Path) -> Seeds:
-    """Read a file of layout seeds. Raises UserError if it is wrong."""
-    where = f"file of seeds {printable(file)}"
-    tables, sha256 = _tables(file, where)
-    return convert(tables, Seeds, where, digest=sha256)
-
-
-def _tables(file: Path, where: str) -> tuple[dict[str, Any], str]:
-    """Return the tables of a file and their digest, which does not depend on how they are laid out."""
-    tables = toml(file, where)
-    try:
-        return tables, digest(tables)
-    except (ValueError, TypeError) as error:  # a date, or a number without an end
-        raise UserError(f"{where}: {printable(error)}; give texts and whole numbers") from None
-
-
 def of_file(file: Path) -> Edition:
     """Read an edition's file. Raises UserError if it is wrong."""
     where = f"edition {printable(file)}"
-    tables, sha256 = _tables(file, where)
+    tables = toml(file, where)
+    try:
+        sha256 = digest(tables)  # it does not depend on how the tables are laid out
+    except (ValueError, TypeError) as error:  # a date, or a number without an end
+        raise UserError(f"{where}: {printable(error)}; give texts and whole numbers") from None
     edition = convert(tables, Edition, where, name=file.stem, digest=sha256)
     for what, stated, known in (
         ("metric", edition.metrics, METRICS), ("ranked_by", (edition.ranked_by,), edition.condition),
