@@ -10,7 +10,7 @@ from typing import Any
 import verifiers.v1 as vf
 
 import harness
-from harness.learning.asking import READ_BY, intent, worth
+from harness.learning.asking import READ_BY, driven_worth, intent
 
 __all__ = ["SwarmdriveTrees"]
 
@@ -41,6 +41,7 @@ class DecisionData(vf.TaskData):  # type: ignore[misc]
     danger: bool
     values: list[float]
     optimal: list[bool]
+    constant: int
     answer: str
     role: str
     actions: list[str]
@@ -54,11 +55,12 @@ class DecisionData(vf.TaskData):  # type: ignore[misc]
 
 
 class DecisionTask(vf.Task[DecisionData, vf.State, vf.TaskConfig]):  # type: ignore[misc]
-    """Rewards the expected worth of the distribution that an answer states."""
+    """Rewards the worth of the action that an answer drives, less that of one that is always taken."""
 
     @vf.reward  # type: ignore[untyped-decorator]
-    async def expected_value(self, trace: vf.Trace) -> float:
-        return worth(trace.last_reply, self.data.values, **self.data.read_by())
+    async def advantage(self, trace: vf.Trace) -> float:
+        data = self.data
+        return driven_worth(trace.last_reply, data.values, data.constant, **data.read_by())
 
     @vf.metric  # type: ignore[untyped-decorator]
     async def readable(self, trace: vf.Trace) -> float:
@@ -70,7 +72,10 @@ class SwarmdriveTrees(vf.Taskset[DecisionTask, DecisionsConfig]):  # type: ignor
 
     def load(self) -> Iterator[DecisionTask]:
         options = self.config.model_dump(include=DecisionsConfig.__annotations__.keys() - {"per_level"})
-        for row in harness.environment(**options).rows(self.config.per_level):
+        for n, row in enumerate(harness.environment(**options).rows(self.config.per_level)):
             system, *asked = row.pop("prompt")
-            data = DecisionData(id=row["scene"], prompt=asked, system_prompt=system["content"], **row)
+            # Of a level that has few decisions some are there several times.
+            data = DecisionData(
+                id=f"{row['scene']}-{n}", prompt=asked, system_prompt=system["content"], **row
+            )
             yield DecisionTask(data, self.config.task)

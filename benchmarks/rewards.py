@@ -68,7 +68,7 @@ def main() -> None:
         f"distributions by id, {size} a batch": a_second(
             100 * size, lambda: [values(*each) for each in zip(ids, p[:100], strict=True)]
         ),
-        "texts": a_second(len(texts), lambda: env.expected_value(texts, texts, **columns)),
+        "texts": a_second(len(texts), lambda: env.advantage(texts, texts, **columns)),
         "steps with a chat": a_second(300, step),
     }
     points = f"{args.layouts} layouts of {args.scenario}, {len(values.ids)} decision points"

@@ -304,7 +304,7 @@ def environment(
     scenario: str | None = None, *, seeds: str | int = "train", layouts: int = 32,
     dataset: str | PathLike[str] | None = None, driven: bool = False, then: str | None = None,
     observation: Literal["text", "arrays"] = "text", prompt: str | None = None, answer: str = "json",
-    viewer: str | None = None, reward: Literal["value", "success"] = "value", distributions: bool = False,
+    viewer: str | None = None, reward: Literal["regret", "success"] = "regret", distributions: bool = False,
     workers: int = 1, quiet: bool = False,
 ) -> "Driving":  # fmt: skip
     """Make a Gymnasium environment, whose rewards are exact: docs/learning-environment.md.
@@ -321,7 +321,8 @@ def environment(
         prompt: prompt version. Default: the scenario's.
         answer: what the chat asks for: `json`, or a letter, `readout`.
         viewer: who is asked: a vehicle's id, or `any`. Default: the ego.
-        reward: `value`, the worth of each decision, or `success`, 1 at the end of an episode that succeeds.
+        reward: of a step. `regret`: by how much the decision is worth less than the best there, which is 0 or
+            less. `success`: 1 at the end of an episode that succeeds.
         distributions: whether the action space has distributions; `step` takes both.
         workers: processes that build trees.
         quiet: whether progress is left out.

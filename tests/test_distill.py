@@ -35,8 +35,9 @@ from harness.training.distill import Curriculum, distill
 from harness.training.lessons import Lessons, draw, label
 from harness.training.model import chat
 from harness.training.muon import Muon, orthogonal
-from harness.training.questions import Question, alone, excerpts, kl_nats, with_messages
+from harness.training.questions import Question, alone, excerpts, kl_nats, references, with_messages
 from harness.training.train import STAGES, Plan, Sample, _batches
+from harness.world.drivers import choose, constant
 from harness.world.reference import drive, finish
 from harness.world.world import World
 
@@ -388,6 +389,21 @@ def test_held_out_layouts_are_in_neither_half_twice(few: list[Lessons]) -> None:
         assert apart.episodes == each.episodes[-1:]
         assert (*kept.episodes, *apart.episodes) == each.episodes
         assert kept.scenes + apart.scenes == each.scenes
+
+
+def test_references_are_worth_what_they_take(few: list[Lessons]) -> None:
+    for each in few:
+        questions, actions = list(alone(each)), each.scenario.actions
+        labels = np.stack([question.label for question in questions])
+        weights = [question.weight for question in questions]
+        worth = labels > 0
+        found = references(questions, labels, weights)
+        assert found["uniform"] == pytest.approx(np.average(worth.mean(axis=1), weights=weights))
+        always = actions.index(constant(each.scenario) or "")
+        assert found["constant"] == pytest.approx(np.average(worth[:, always], weights=weights))
+        planned = [actions.index(choose(each.scenario, "local-view", q.graph, None)) for q in questions]
+        taken = worth[np.arange(len(questions)), planned]
+        assert found["local-view"] == pytest.approx(np.average(taken, weights=weights))
 
 
 def test_it_learns_from_every_level_of_a_tree(few: list[Lessons]) -> None:

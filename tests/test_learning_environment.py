@@ -1,6 +1,7 @@
 """`harness.environment`: exact rewards on trees and in the simulator, on layouts that may be learnt from."""
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,7 @@ def test_several_go_side_by_side(make: Make) -> None:
     seen, info = several.reset(seed=1)
     assert seen["numbers"].shape == seen["known"].shape == (3, len(several.envs[0].numbers))
     _, rewards, *_ = several.step([0, 1, 2])
-    assert rewards.tolist() == [values[action] for action, values in enumerate(info["values"])]
+    assert rewards.tolist() == [values[action] - max(values) for action, values in enumerate(info["values"])]
 
 
 @pytest.mark.parametrize("driver", ["cruise", "full-view"])
@@ -104,10 +105,10 @@ def test_whoever_drives_as_a_driver_ends_as_it_does(driver: str, make: Make, sma
         while not over:
             visited.append(info["scene"])
             action = forest.drivers[driver][forest.place[info["scene"]]]
-            worth = info["values"][action]
+            worth, best = info["values"][action], info["values"].max()
             _, reward, over, cut, info = env.step(action)
-            assert (reward, cut) == (worth, False)
-            assert reward == forest.driver_success(driver)[tree], "its own worth stays the same to the end"
+            assert (reward, cut) == (worth - best, False)
+            assert worth == forest.driver_success(driver)[tree], "its own worth stays the same to the end"
         assert info["success"] == forest.driver_success(driver)[tree]
         assert set(visited) <= {forest.ids[n] for n in forest.visited(forest.drivers[driver])}
 
@@ -117,11 +118,34 @@ def test_a_distribution_is_worth_its_mean_and_one_of_its_actions_is_taken(make: 
     for seed in range(40):
         _, info = env.reset(seed=seed)
         _, reward, *_, then = env.step(p * 8)  # is normalised
-        assert reward == pytest.approx(p @ info["values"])
+        assert reward == pytest.approx(p @ info["values"] - info["values"].max())
         taken.append(then["taken"])
         assert env.reset(seed=seed)[1]["scene"] == info["scene"]
         assert env.step(p)[-1]["taken"] == taken[-1]
     assert set(taken) == {0, 1, 2}
+
+
+@pytest.mark.parametrize(
+    "policy", ["always SLOWER", "always FASTER", "cruise", "local-view", "full-view", 1, 2]
+)
+def test_an_episode_earns_its_success_less_whether_it_was_possible(
+    policy: str | int, make: Make, small: Dataset
+) -> None:
+    env, forest = make(), small.forest
+    always = {"always SLOWER": 0, "always FASTER": 2}
+    for tree, seed in enumerate(small.seeds):
+        _, info = env.reset(seed=policy if isinstance(policy, int) else 0, options={"layout_seed": seed})
+        earned, over = 0.0, False
+        while not over:
+            if isinstance(policy, int):
+                action = int(env.np_random.integers(3))
+            elif policy in always:
+                action = always[policy]
+            else:
+                action = forest.drivers[policy][forest.place[info["scene"]]]
+            _, reward, over, _, info = env.step(action)
+            earned += reward
+        assert earned == int(info["success"]) - int(forest.value[forest.root[tree]])
 
 
 def test_success_is_paid_once_at_the_end(make: Make, small: Dataset) -> None:
@@ -212,7 +236,7 @@ def test_arrays_are_of_the_viewers_own_graph(make: Make, small: Dataset) -> None
         ({"dataset": "SMALL", "viewer": "v99"}, "unknown viewer of scene"),
         ({"dataset": "SMALL", "observation": "smell"}, "unknown observation 'smell'"),
         ({"dataset": "SMALL", "reward": "fame"}, "unknown reward 'fame'"),
-        ({"driven": True}, 'reward="value" needs values; give then="local-view", or reward="success"'),
+        ({"driven": True}, 'reward="regret" needs values; give then="local-view", or reward="success"'),
         ({"driven": True, "then": "best"}, "unknown then 'best'"),
     ],
 )
@@ -247,16 +271,16 @@ def test_a_layout_of_report_seeds_is_not_begun(make: Make) -> None:
         driven.rows()
 
 
-def test_rows_are_the_questions_of_points_where_something_can_be_won(make: Make, small: Dataset) -> None:
+def test_rows_are_the_questions_of_points_where_it_matters_what_is_done(make: Make, small: Dataset) -> None:
     env = make(viewer="any")
     rows, values = env.rows(per_level=2), env.values
     assert rows == env.rows(per_level=2)
     assert len({row["viewer"] for row in rows}) > 1
-    levels = [(row["layout_seed"], row["scene"].split("-")[1]) for row in rows]
-    assert max(map(levels.count, levels)) == 2
-    assert len(rows) < len(env.rows(per_level=99)) == (~values.lost).sum()
+    assert {row["scene"] for row in env.rows(per_level=99)} == {
+        values.ids[n] for n in np.flatnonzero(values.decides)
+    }
     for row in rows:
-        assert row["values"] == values([row["scene"]])[0].tolist() != [0, 0, 0]
+        assert row["values"] == values([row["scene"]])[0].tolist() not in ([0, 0, 0], [1, 1, 1])
         assert (row["purpose"], row["danger"]) == ("tune", bool(small.dangerous[row["layout_seed"] - 100]))
         scene = small.scene(row["scene"])
         assert row["prompt"] == env.ask.chat(scene.graphs[row["viewer"]])
@@ -264,17 +288,90 @@ def test_rows_are_the_questions_of_points_where_something_can_be_won(make: Make,
     json.dumps(rows)
 
 
+@pytest.mark.parametrize("per_level", [1, 2, 6])
+def test_every_level_has_as_many_rows_and_both_kinds_of_layouts_weigh_alike(
+    per_level: int, make: Make, small: Dataset
+) -> None:
+    """Of the four layouts as many have a danger as `dangerous` says; the rarer ones have more rows each."""
+    rows = make().rows(per_level=per_level)
+    levels = Counter((row["layout_seed"], row["scene"].split("-")[1]) for row in rows)
+    dangerous = dict(zip(small.seeds, small.dangerous.tolist(), strict=True))
+    sizes = {kind: sum(each == kind for each in dangerous.values()) for kind in (True, False)}
+    assert min(sizes.values()) > 0
+    for (seed, _), count in levels.items():
+        assert count == max(1, round(per_level * len(dangerous) / 2 / sizes[dangerous[seed]]))
+    scenes = Counter(row["scene"] for row in rows)
+    for (seed, level), count in levels.items():
+        there = [n for name, n in scenes.items() if name.split("-")[:2] == [f"{seed - 100:05d}", level]]
+        assert sum(there) == count
+        assert max(there) - min(there) <= 1, "none is repeated before all are there"
+
+
+def test_references_are_what_a_constant_and_those_without_a_model_earn(make: Make, small: Dataset) -> None:
+    env = make()
+    rows, references = env.rows(), env.references()
+    assert list(references) == ["constant", "uniform", "open-loop", "local-view", "full-view"]
+    table, forest = np.array([row["values"] for row in rows]), small.forest
+    constant = np.array([row["constant"] for row in rows])
+    assert {env.actions[n] for n in constant} == {"IDLE"}, "as `constants.csv` says"
+    less = table[np.arange(len(rows)), constant]
+    assert references["constant"] == {
+        "advantage": 0.0,
+        "success": np.mean(
+            [forest.constant_success("IDLE")[kind].mean() for kind in (small.dangerous, ~small.dangerous)]
+        ),
+    }
+    assert references["uniform"]["advantage"] == pytest.approx((table.mean(axis=1) - less).mean())
+    for name in ("local-view", "full-view"):
+        taken = [forest.drivers[name][forest.place[row["scene"]]] for row in rows]
+        assert references[name]["advantage"] == pytest.approx(
+            (table[np.arange(len(rows)), taken] - less).mean()
+        )
+    assert references["full-view"]["success"] == 1
+
+
+def test_a_constant_that_nobody_measured_is_the_best_of_the_trees(
+    make: Make, small: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("harness.learning.trips.constant", lambda scenario: None)
+    forest = small.forest
+    balanced = [
+        np.mean(
+            [forest.constant_success(action)[kind].mean() for kind in (small.dangerous, ~small.dangerous)]
+        )
+        for action in forest.actions
+    ]
+    assert make().rows(per_level=1)[0]["constant"] == int(np.argmax(balanced))
+
+
 def columns(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return {key: [row[key] for row in rows] for key in rows[0] if key != "prompt"}
 
 
-def test_an_answer_is_worth_what_the_distribution_that_it_states_is(make: Make) -> None:
+def stated(*p: float) -> str:
+    return json.dumps({"action_distribution": dict(zip(("SLOWER", "IDLE", "FASTER"), p, strict=True))})
+
+
+def test_an_answer_earns_what_its_likeliest_action_is_worth_less_the_constants(make: Make) -> None:
     env = make()
     row = next(row for row in env.rows() if row["values"] == [0, 1, 1])
-    stated = '{"action_distribution":{"SLOWER":0.4,"IDLE":0.5,"FASTER":0.1}}'
-    said = [stated, f"I think. {stated} ", [{"role": "assistant", "content": stated}], "brake!", ""]
-    worth = env.expected_value([row["prompt"]] * 5, said, **columns([row] * 5), trainer_state=None)
-    assert worth == [pytest.approx(0.6)] * 3 + [0, 0]
+    said = [
+        stated(0.4, 0.5, 0.1), f"I think. {stated(0.1, 0.5, 0.4)} ",
+        [{"role": "assistant", "content": stated(0, 0, 1)}],
+        stated(0.5, 0.3, 0.2), stated(0.4, 0.2, 0.4), "brake!", "",
+    ]  # fmt: skip
+    of_constant = {"IDLE": [0, 0, 0, -1, -0.5, -1, -1], "SLOWER": [1, 1, 1, 0, 0.5, 0, 0]}
+    for action, earned in of_constant.items():
+        given = columns([row | {"constant": env.actions.index(action)}] * len(said))
+        assert env.advantage([row["prompt"]] * len(said), said, **given, trainer_state=None) == earned
+
+
+def test_what_a_distribution_states_is_worth_its_mean(make: Make) -> None:
+    env = make()
+    row = next(row for row in env.rows() if row["values"] == [0, 1, 1]) | {"constant": 1}
+    said = [stated(0.4, 0.5, 0.1), stated(0, 0.2, 0.8), "brake!"]
+    earned = env.expected_advantage([], said, **columns([row] * 3))
+    assert earned == [pytest.approx(-0.4), 0, -1]
 
 
 def test_a_letter_is_worth_its_action(make: Make) -> None:
@@ -282,4 +379,4 @@ def test_a_letter_is_worth_its_action(make: Make) -> None:
     row = next(row for row in env.rows() if row["values"] == [0, 1, 1])
     assert row["prompt"][-1]["content"].endswith("Answer with one letter: A SLOWER, B IDLE, C FASTER.")
     said = ["A", "B", " C\n", "B: it is clear", "BRAKE", "D", "b", ""]
-    assert env.expected_value([], said, **columns([row] * 8)) == [0, 1, 1, 1, 0, 0, 0, 0]
+    assert env.advantage([], said, **columns([row] * 8)) == [-1, 0, 0, 0, -1, -1, -1, -1]

@@ -22,7 +22,7 @@ def test_grpo_takes_steps_on_exact_rewards(small_path: Path, tmp_path: Path) -> 
     rewards: list[float] = []
 
     def watched(*args: Any, **columns: Any) -> list[float]:
-        rewards.extend(env.expected_value(*args, **columns))
+        rewards.extend(env.expected_advantage(*args, **columns))
         return rewards[-len(columns["values"]) :]
 
     model = str(Path(__file__).parent.parent / "models/swarm-tiny")
@@ -40,7 +40,7 @@ def test_grpo_takes_steps_on_exact_rewards(small_path: Path, tmp_path: Path) -> 
     before = trained.detach().clone()
     assert trainer.train().global_step == 2
     assert len(rewards) == 8
-    assert 0 < max(rewards) <= 1, "swarm-tiny writes answers that can be read"
+    assert -1 <= min(rewards) <= max(rewards) <= 1
     assert len({*rewards}) > 1, "samples of one prompt differ, so there is something to learn"
     assert (trained != before).any()
 
@@ -76,12 +76,12 @@ def test_verifiers_scores_a_trace_as_the_trees_do(taskset: Any, small_path: Path
         if row["role"] == "helper":
             continue
         for text, worth, readable in (
-            (STATED.format(0.5, 0.25, 0.25), sum(row["values"]) / 4 + row["values"][0] / 4, 1.0),
-            ("no idea", 0.0, 0.0),
+            (STATED.format(0.5, 0.25, 0.25), row["values"][0] - row["values"][row["constant"]], 1.0),
+            ("no idea", -row["values"][row["constant"]], 0.0),
         ):
             trace = trace_of(task, text)
             asyncio.run(task.score(trace))
-            assert trace.rewards["expected_value"].value == pytest.approx(worth)
+            assert trace.rewards["advantage"].value == pytest.approx(worth)
             assert trace.metrics["readable"] == readable
 
 

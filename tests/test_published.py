@@ -233,8 +233,10 @@ def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
     for held_out, scenario in zip(facts["held_out"], LEARNT, strict=True):
         assert tuple(held_out["likeliest"]) == scenario.actions
         assert sum(held_out["likeliest"].values()) == pytest.approx(1.0)
+        assert list(held_out["references"]) == ["uniform", "constant", "local-view"]
     text = (taught / "README.md").read_text()
     assert "A LoRA adapter of rank 4 for `swarm-tiny`" in text
+    assert "| scenario | the model | `uniform` | `constant` | `local-view` |" in text
     assert "train seeds 100001 to 100002" in text
     card = cards.resolve(str(taught))
     assert (card.adapter, card.letters, card.weights) == (str(taught), "raw", "swarm-tiny")

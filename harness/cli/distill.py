@@ -133,6 +133,8 @@ def command(
             f"{apart['kl_of_the_mean_nats']:.3f}), value {apart['value']:.3f} "
             f"({apart['value_of_the_mean']:.3f}), n = {apart['questions']}"
         )
+        others = (f"{name} {worth:.3f}" for name, worth in apart["references"].items())
+        typer.echo(f"  who needs no model: value {', '.join(others)}")
     typer.echo(
         f"wrote {printable(out)}: {facts['parameters']:,} parameters, {time.monotonic() - begun_s:.0f} s"
     )

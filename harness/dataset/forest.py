@@ -218,8 +218,12 @@ class Forest:
 
     def sequence_success(self, actions: Sequence[str]) -> Bools:
         """Return whether an ego that takes one action after the other, and then the last, succeeds, (E,)."""
+        return self._success(self.sequence(actions))
+
+    def sequence(self, actions: Sequence[str]) -> Ints:
+        """Return what is taken at each point, (N,): one action after the other, then the last again."""
         indices = np.array([self.actions.index(action) for action in actions])
-        return self._success(indices[np.minimum(self.step, len(indices) - 1)])
+        return np.asarray(indices[np.minimum(self.step, len(indices) - 1)])
 
     def _success(self, chosen: Ints) -> Bools:
         return self.succeeds(self.last_edge(chosen), np.arange(len(self.root)))

@@ -1,12 +1,13 @@
 """What a viewer is asked, and what its answer is worth: texts in, rewards out."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from harness.core import noise
+from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable, unknown
 from harness.core.seeds import purpose
 from harness.dataset.load import Dataset, Scene
@@ -65,30 +66,25 @@ def viewer_of(scene: Scene, viewer: str | None, draw: float) -> str:
 
 
 def rows(
-    data: Dataset, values: Values, asking: Asking, viewer: str | None, per_level: int
+    data: Dataset, values: Values, constant: int, asking: Asking, viewer: str | None, at: Ints
 ) -> Iterator[dict[str, Any]]:
-    """Yield a question a row: up to so many decision points of each level of each tree, drawn by layout.
+    """Yield a question a row, about decision points (n,), which may be there several times.
 
-    So the levels of a layout weigh alike, as an episode passes one point of each. Points that are lost are
-    left out. A row has `prompt` (chat messages), and all that `expected_value` needs.
+    A row has `prompt` (chat messages), and all that `advantage` needs.
     """
     forest = data.forest
-    sizes = zip(data.seeds, np.bincount(forest.tree).tolist(), strict=True)
-    draws = np.concatenate([noise.uniforms((n,), "rows", data.scenario.name, seed) for seed, n in sizes])
-    levels = forest.tree * (int(forest.step.max()) + 1) + forest.step
-    order = np.lexsort((draws, levels))
-    order = order[~values.lost[order]]
-    first = np.searchsorted(levels[order], levels[order])
-    chosen = np.sort(order[np.arange(len(order)) - first < per_level])
-    for at, scene in zip(chosen.tolist(), data.scenes([forest.ids[n] for n in chosen]), strict=True):
-        seed = int(forest.seeds[forest.tree[at]])
+    names = list(dict.fromkeys(forest.ids[n] for n in at.tolist()))
+    scenes = dict(zip(names, data.scenes(names), strict=True))
+    for n in at.tolist():
+        scene, seed = scenes[forest.ids[n]], int(forest.seeds[forest.tree[n]])
         name = viewer_of(scene, viewer, float(noise.uniforms((), "viewer", scene.id)))
         graph = scene.graphs[name]
         yield {
             "prompt": asking.chat(graph), "scene": scene.id, "viewer": name,
-            "values": values.table[at].tolist(), "optimal": optimal(values.table[at]).tolist(),
-            "scenario": data.scenario.name, "layout_seed": seed, "purpose": purpose(seed, 1),
-            "danger": forest.dangers[forest.tree[at]] is not None, **asking.read_by(graph.role),
+            "values": values.table[n].tolist(), "optimal": optimal(values.table[n]).tolist(),
+            "constant": constant, "scenario": data.scenario.name, "layout_seed": seed,
+            "purpose": purpose(seed, 1), "danger": forest.dangers[forest.tree[n]] is not None,
+            **asking.read_by(graph.role),
         }  # fmt: skip
 
 
@@ -107,29 +103,66 @@ def intent(
     ).intent
 
 
-def worth(text: str, values: Sequence[float], **read_by: Any) -> float:
-    """Return the expected value of the distribution that an answer states; 0 if it cannot be read.
+def driven_worth(text: str, values: Sequence[float], constant: int, **read_by: Any) -> float:
+    """Return the worth of the action that an answer drives, less that of one that is always taken.
 
-    An answer that cannot be read drives nobody. `values` has the worth of each action, (A,).
+    The likeliest action drives; of equals each does as often. An answer that cannot be read drives nobody:
+    it is worth 0. `values` has the worth of each action, (A,); `constant` is the index of the other.
     """
     p = intent(text, **read_by)
-    return 0.0 if p is None else float(np.dot(p, values))
+    if p is None:
+        return -float(values[constant])
+    likeliest = np.array(p) == max(p)
+    return float(np.mean(np.array(values)[likeliest]) - values[constant])
+
+
+def stated_worth(text: str, values: Sequence[float], constant: int, **read_by: Any) -> float:
+    """Return the mean worth of the distribution that an answer states, less that of the constant.
+
+    It tells answers apart that drive the same action; an answer that cannot be read is worth 0.
+    """
+    p = intent(text, **read_by)
+    return (0.0 if p is None else float(np.dot(p, values))) - float(values[constant])
 
 
 READ_BY = ("answer", "role", "actions", "form", "extension", "reasons_first")
 
 
-def expected_value(
-    prompts: Sequence[Any], completions: Sequence[Any], *, values: Sequence[Sequence[float]], **columns: Any
-) -> list[float]:
-    """Return the reward of each completion: a reward function of TRL's trainers.
+def advantage(
+    prompts: Sequence[Any], completions: Sequence[Any], *, values: Sequence[Sequence[float]],
+    constant: Sequence[int], **columns: Any,
+) -> list[float]:  # fmt: skip
+    """Return the advantage of each completion: a reward function of TRL's trainers.
 
     Args:
         prompts: as the trainer has them; not read.
         completions: texts, or chats whose last message is the answer.
         values: like the further columns, those of the rows that the prompts are from.
+        constant: the action beside which each is judged.
         columns: the further columns of `rows`; others are left alone.
     """
-    texts = [each if isinstance(each, str) else each[-1]["content"] for each in completions]
-    read_by = ({name: columns[name][n] for name in READ_BY} for n in range(len(texts)))
-    return [worth(text, v, **read) for text, v, read in zip(texts, values, read_by, strict=True)]
+    return _rewards(driven_worth, completions, values, constant, columns)
+
+
+def expected_advantage(
+    prompts: Sequence[Any], completions: Sequence[Any], *, values: Sequence[Sequence[float]],
+    constant: Sequence[int], **columns: Any,
+) -> list[float]:  # fmt: skip
+    """Return the advantage of the distribution that each completion states, and not of what it drives.
+
+    It differs between answers that drive the same, so a trainer that samples few answers to a question learns
+    from more of them; but who is unsure and right earns less than who is sure. Arguments: as of `advantage`.
+    """
+    return _rewards(stated_worth, completions, values, constant, columns)
+
+
+def _rewards(
+    of: Callable[..., float], completions: Sequence[Any], values: Sequence[Sequence[float]],
+    constant: Sequence[int], columns: Mapping[str, Any],
+) -> list[float]:  # fmt: skip
+    rewards = []
+    for n, completion in enumerate(completions):
+        text = completion if isinstance(completion, str) else completion[-1]["content"]
+        read_by = {name: columns[name][n] for name in READ_BY}
+        rewards.append(of(text, values[n], constant[n], **read_by))
+    return rewards

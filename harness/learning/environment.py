@@ -1,7 +1,9 @@
 """Driving as a Gymnasium environment: one decision a step, with the worth of every action known.
 
-An action is an index, or a distribution over the actions: then the reward is its expected worth, and the
-action that is taken is drawn from it by the environment's own generator.
+The reward of a step is minus its regret: the worth of what is taken, less the best worth there. Summed over
+an episode it is success, less whether success was possible, where the best takes the rest. An action is an
+index, or a distribution over the actions: then the reward is the mean, and the action that is taken is drawn
+from it by the environment's own generator.
 """
 
 from collections.abc import Mapping
@@ -21,7 +23,7 @@ from harness.learning.values import Values, optimal
 from harness.world.audit import numbers
 
 Observation = Literal["text", "arrays"]
-Reward = Literal["value", "success"]
+Reward = Literal["regret", "success"]
 MOST_CHARS = 100_000  # of a chat message
 MOST = 1e6  # as great as a number of a scene graph may be
 # What messages are written in: line breaks, and letters and signs up to those of East Asia.
@@ -40,17 +42,18 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 # as gymnasium declares it
-    expected_value = staticmethod(asking.expected_value)
+    advantage = staticmethod(asking.advantage)
+    expected_advantage = staticmethod(asking.expected_advantage)
 
     def __init__(
         self, source: Trees | Roads, ask: asking.Asking, *, observation: Observation = "text",
-        viewer: str | None = None, reward: Reward = "value", distributions: bool = False,
+        viewer: str | None = None, reward: Reward = "regret", distributions: bool = False,
     ) -> None:  # fmt: skip
         for name, given, allowed in (("observation", observation, Observation), ("reward", reward, Reward)):
             if given not in get_args(allowed):
                 raise unknown(name, str(given), get_args(allowed))
-        if reward == "value" and isinstance(source, Roads) and not source.then:
-            raise UserError('reward="value" needs values; give then="local-view", or reward="success"')
+        if reward == "regret" and isinstance(source, Roads) and not source.then:
+            raise UserError('reward="regret" needs values; give then="local-view", or reward="success"')
         self.source, self.ask, self.actions = source, ask, source.scenario.actions
         self.viewer, self.reward, self._text = viewer, reward, observation == "text"
         scene = source.begin(source.seeds[0]).scene
@@ -75,12 +78,24 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         return self._trees("values").values
 
     def rows(self, per_level: int = 6) -> list[dict[str, Any]]:
-        """Return the questions of all layouts, for trainers of text models; see `asking.rows`.
+        """Return questions of all layouts, for trainers of text models: a row each (`asking.rows`).
 
-        Raises UserError without trees.
+        They are of decisions that matter, so many of each level of each layout (`values.drawn`). Raises
+        UserError without trees.
         """
         trees = self._trees("rows()")
-        return [*asking.rows(trees.dataset, trees.values, self.ask, self.viewer, per_level)]
+        at = trees.drawn(per_level)
+        return [*asking.rows(trees.dataset, trees.values, trees.constant, self.ask, self.viewer, at)]
+
+    def references(self, per_level: int = 6) -> dict[str, dict[str, float]]:
+        """Return what those earn who need no model: lines to draw beside a training curve.
+
+        Of each, `advantage` is the mean reward over the rows, 0 of `constant`, and `regret` the mean sum of
+        rewards of an episode. `full-view` sees everything. Raises UserError without trees, or if no decision
+        of their layouts matters.
+        """
+        trees = self._trees("references()")
+        return trees.references(trees.drawn(per_level))
 
     def learnt(self) -> dict[str, Any]:
         """Return what a model's card should state of what it learnt from here, as plain values."""
@@ -115,10 +130,11 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         p = self._distribution(action)
         index = np.ndim(action) == 0
         taken = int(action) if index else int(self.np_random.choice(len(p), p=p))
-        worth = float(p @ self.trip.values)
+        values = self.trip.values
+        regret = values.max() - float(p @ values)
         self.trip.take(taken)
         success = self.trip.success
-        reward = worth if self.reward == "value" else float(success or 0)
+        reward = -regret if self.reward == "regret" else float(success or 0)
         observation, info = self._look()
         info |= {"taken": taken} if success is None else {"taken": taken, "success": success}
         return observation, reward, success is not None, False, info

@@ -7,14 +7,22 @@ from typing import Protocol
 
 import numpy as np
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, unknown
 from harness.core.seeds import LAST_SEED, purpose
 from harness.dataset.freeze import edges, record_of
 from harness.dataset.load import Dataset, Scene
 from harness.learning.layouts import refuse, whole
-from harness.learning.values import BEST, Values
-from harness.world.drivers import DRIVERS, PRIVILEGED
+from harness.learning.values import BEST, Values, balanced, best_constant, drawn
+from harness.world.drivers import (
+    CONSTANT,
+    DRIVERS,
+    OPEN_LOOP,
+    PRIVILEGED,
+    UNIFORM,
+    constant,
+    open_loop,
+)
 from harness.world.outcome import Outcome
 from harness.world.reference import drive, finish
 from harness.world.scenario import Scenario
@@ -79,6 +87,41 @@ class Trees:
     @cached_property
     def values(self) -> Values:
         return Values.of(self.dataset.forest, self.then)
+
+    @cached_property
+    def constant(self) -> int:
+        """The action beside which each is judged; the best of these layouts where nobody has measured it."""
+        action = constant(self.scenario)
+        if action is None:
+            return best_constant(self.dataset.forest, self.dataset.dangerous)
+        return self.scenario.actions.index(action)
+
+    def drawn(self, per_level: int) -> Ints:
+        """Return decision points that matter, so many of each level of each tree; see `values.drawn`."""
+        return drawn(self.dataset.forest, self.values.decides, per_level, self.scenario.name)
+
+    def references(self, at: Ints) -> dict[str, dict[str, float]]:
+        """Return of who needs no model the mean `advantage` at points (n,), and balanced `success`."""
+        if not len(at):
+            raise UserError("no decision of these layouts matters; give more layouts")
+        forest, dangerous = self.dataset.forest, self.dataset.dangerous
+        worth = self.values.table[at]
+        less = worth[:, self.constant]
+        always = forest.actions[self.constant]
+        policies: dict[str, tuple[Floats, Floats | Bools]] = {
+            CONSTANT: (less, forest.constant_success(always)),
+            UNIFORM: (worth.mean(axis=-1), forest.uniform_success()),
+        }
+        if actions := open_loop(self.scenario):
+            taken = forest.sequence(actions)[at]
+            policies[OPEN_LOOP] = worth[np.arange(len(at)), taken], forest.sequence_success(actions)
+        for name in ("local-view", PRIVILEGED):
+            taken = forest.drivers[name][at]
+            policies[name] = worth[np.arange(len(at)), taken], forest.driver_success(name)
+        return {
+            name: {"advantage": float((of - less).mean()), "success": balanced(success, dangerous)}
+            for name, (of, success) in policies.items()
+        }
 
     def begin(self, seed: int) -> "TreeTrip":
         seed = whole("layout seed", seed)

@@ -9,6 +9,11 @@ decides from there on:
 
 The worth of a distribution at a decision point is `sum_a p(a) v(a)`, and its gradient in p is v. Where
 success is out of reach after every action, nothing can be learnt: the point is `lost`.
+
+Most points forgive nearly every action, so that one action that is always taken is worth nearly as much as
+the best. So an answer's reward is its *advantage* over such a constant: the worth of the action that it
+drives, less that of the action which did best in tune layouts of the scenario (the driver `constant`). Points
+in which all actions are worth the same are left out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,6 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
+from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import unknown
 from harness.dataset.forest import Forest
@@ -68,6 +74,50 @@ class Values:
     def lost(self) -> Bools:
         """Whether every action is worth nothing, (N,)."""
         return np.asarray(~self.table.any(axis=-1))
+
+    @cached_property
+    def decides(self) -> Bools:
+        """Whether it matters which action is taken, (N,)."""
+        return np.asarray(self.table.max(axis=-1) > self.table.min(axis=-1))
+
+
+def balanced(success: Floats | Bools, dangerous: Bools) -> float:
+    """Return the mean success (E,) of layouts with a danger and without, as far as there are both."""
+    kinds = [success[kind].mean() for kind in (dangerous, ~dangerous) if kind.any()]
+    return float(np.mean(kinds))
+
+
+def best_constant(forest: Forest, dangerous: Bools) -> int:
+    """Return the action that does best if it is always taken, by balanced success; of equals the first."""
+    success = [balanced(forest.constant_success(action), dangerous) for action in forest.actions]
+    return int(np.argmax(success))
+
+
+def drawn(forest: Forest, of: Bools, per_level: int, scenario: str) -> Ints:
+    """Return points among those that are asked for, (N,), so many of each level of each tree, ascending.
+
+    They are drawn by scenario and layout seed. A level that has fewer has them several times, so that levels
+    weigh alike: an episode passes one point of each. Layouts with and without a danger have as many in all,
+    as balanced success weighs them, so of the rarer kind more are drawn.
+    """
+    dangerous = np.array([danger is not None for danger in forest.dangers])
+    alike = np.where(dangerous, dangerous.sum(), (~dangerous).sum())
+    kinds = len(np.unique(dangerous))
+    counts = np.maximum(1, np.round(per_level * len(dangerous) / kinds / alike)).astype(int)
+    sizes = np.bincount(forest.tree).tolist()
+    seeds = forest.seeds.tolist()
+    draws = np.concatenate(
+        [noise.uniforms((size,), "rows", scenario, seed) for size, seed in zip(sizes, seeds, strict=True)]
+    )
+    levels = forest.tree * (int(forest.step.max()) + 1) + forest.step
+    order = np.lexsort((draws, levels))
+    order = order[of[order]]
+    _, first, there = np.unique(levels[order], return_index=True, return_counts=True)
+    chosen = list[Ints]()
+    for start, size in zip(first.tolist(), there.tolist(), strict=True):
+        count = int(counts[forest.tree[order[start]]])
+        chosen.append(order[start + np.arange(count) % size])
+    return np.sort(np.concatenate(chosen)) if chosen else np.array([], np.intp)
 
 
 def optimal(values: Floats) -> Bools:

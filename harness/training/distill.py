@@ -184,6 +184,10 @@ them stand those of always answering the mean label.{before}
 |---|---|---|---|---|---|---|---|
 {held_out}
 
+The value of who needs no model, at the same questions:
+
+{published.references_table(facts)}
+
 | stage | sequences | first loss | last loss |
 |---|---|---|---|
 {losses}

@@ -157,6 +157,10 @@ action is that. `held out` are layouts, and `scenes` are learnt from.
 |---|---|---|---|---|---|---|---|---|---|
 {held_out}
 
+The value of who needs no model, at the same questions:
+
+{references_table(facts)}
+
 | stage | sequences | first loss | last loss | held-out KL at its end |
 |---|---|---|---|---|
 {losses}
@@ -166,6 +170,18 @@ prompts that show nothing but the conflicts, `messages` after it with helpers' m
 `answers` is the JSON text, which states the read-out's own distribution. A stage of no sequences was left
 out. The losses are of different sums and compare within a stage only; curves are in `training.json`.
 """
+
+
+def references_table(facts: Mapping[str, Any]) -> str:
+    """Return a Markdown table of the value of those who need no model, beside the model's, by scenario."""
+    names = dict.fromkeys(name for row in facts["held_out"] for name in row["references"])
+    lines = [f"| scenario | the model | {' | '.join(f'`{name}`' for name in names)} |"]
+    lines.append("|---|---|" + "---|" * len(names))
+    for row in facts["held_out"]:
+        values = [row["value"], *(row["references"].get(name) for name in names)]
+        cells = ["-" if number is None else f"{number:.3f}" for number in values]
+        lines.append(f"| `{row['scenario']}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def _shares(likeliest: Mapping[str, float]) -> str:

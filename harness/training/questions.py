@@ -13,8 +13,9 @@ from harness.dataset.load import Scene
 from harness.evaluate.agent import in_mode
 from harness.prompts.versions import Prompt
 from harness.training.answers import message
-from harness.training.lessons import Lessons
+from harness.training.lessons import TEACHER, Lessons
 from harness.training.model import VISION
+from harness.world.drivers import CONSTANT, UNIFORM, choices, constant
 from harness.world.perception.camera import Sight
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
@@ -112,6 +113,18 @@ def value(labels: Floats, p: Floats, weights: Sequence[float]) -> float:
     Those are the actions that the soft labels (n, A) give any.
     """
     return float(np.average((p * (labels > 0)).sum(axis=1), weights=weights))
+
+
+def references(questions: Sequence[Question], labels: Floats, weights: Sequence[float]) -> dict[str, float]:
+    """Return the value of those who need no model: lines beside a model's, by the driver's name."""
+    scenario = questions[0].scenario
+    each = np.eye(len(scenario.actions))
+    policies = {UNIFORM: np.full(labels.shape, 1 / len(each))}
+    if action := constant(scenario):
+        policies[CONSTANT] = np.tile(each[scenario.actions.index(action)], (len(questions), 1))
+    planned = choices(scenario, [(TEACHER, question.graph, None) for question in questions])
+    policies[TEACHER] = each[[scenario.actions.index(action) for action in planned]]
+    return {name: value(labels, policy, weights) for name, policy in policies.items()}
 
 
 def kl_nats(labels: Floats, p: Floats) -> float:

@@ -19,7 +19,16 @@ from harness.training.answers import CLASSES, answer, evidence, sights
 from harness.training.lessons import Lessons
 from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
 from harness.training.published import Published
-from harness.training.questions import Question, alone, excerpts, key, kl_nats, value, with_messages
+from harness.training.questions import (
+    Question,
+    alone,
+    excerpts,
+    key,
+    kl_nats,
+    references,
+    value,
+    with_messages,
+)
 from harness.training.train import Curve, Plan, Sample, learnt, read_out, restore, run_stage, save
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
@@ -196,7 +205,8 @@ class Student:
         """Return how each scenario's read-out fits the soft labels on held-out layouts.
 
         That is its KL (nats), and its value, balanced over layouts with and without a danger. Beside them
-        stand those of always answering the mean label, and the value of its likeliest action.
+        stand those of always answering the mean label, the value of its likeliest action, and that of who
+        needs no model.
         """
         facts = []
         for each in self.held_out:
@@ -217,6 +227,7 @@ class Student:
                     "value": value(labels, read, weights),
                     "value_of_the_mean": value(labels, mean, weights),
                     "value_of_the_likeliest": value(labels, likeliest, weights),
+                    "references": references(questions, labels, weights),
                     "likeliest": dict(zip(actions, likeliest.mean(axis=0).tolist(), strict=True)),
                 }
             )
