@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import sqlite3
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from evaluating import Scripted, failed, same_decisions, spec_of
 from former import SCENARIO
 from hypothesis import given
 from hypothesis import strategies as st
-from misbehaving import completion, serving
+from misbehaving import Server, completion, serving
 from run_on_disk import UNTIMED, answers_of
 
 from harness.backends import cards
@@ -83,6 +84,7 @@ class Talker(Scripted):
     def __init__(self, lines: dict[str, str | Completion] | None = None, **identity: Any) -> None:
         super().__init__(lines or {})
         self.name = {"engine": "talker", **identity}
+        self.several: Sequence[str] = ()
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         return [json.dumps(request.messages) for request in requests]
@@ -321,6 +323,52 @@ def test_a_run_from_the_cache_is_the_run_that_was_asked(
     evaluate(spec, tmp_path / "replayed", lambda done: None)
     assert answers_of(tmp_path / "replayed") == answers_of(tmp_path / "again")
     assert same_decisions(tmp_path / "replayed", tmp_path / "again")
+
+
+def asked_at(servers: Sequence[Server], file: Path) -> str:
+    """The text that a card with a list of servers gets through the cache."""
+    card = cards.load("openai-example")
+    assert card.server is not None
+    named = replace(card.server, base_url=tuple(there.url for there in servers))
+    card = replace(card, weights="m", server=named)
+    [answer] = cached(open_backend(card), card, file).complete([BASE])
+    return answer.text
+
+
+def saying(text: str) -> AbstractContextManager[Server]:
+    return serving(lambda asked: asked.reply(completion(text)))
+
+
+@pytest.mark.slow
+def test_answers_of_a_strangers_server_are_not_those_of_ones_own(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both list the same model; a card that came from somewhere was run first."""
+    with saying("evil") as evil, saying("good") as good, saying("better") as better:
+        assert asked_at([evil], file) == asked_at([evil], file) == "evil"
+        assert len(evil.asked) == 1
+        assert asked_at([good], file) == "good"
+        assert asked_at([good, better], file) == "good", "it is among today's"
+        assert (len(good.asked), len(better.asked)) == (1, 0)
+        assert asked_at([evil], file) == "evil", "nothing was replaced"
+        monkeypatch.setenv("SWARMDRIVE_SAME_SERVERS", f"{good.url}, http://elsewhere*")
+        assert asked_at([better], file) == "better", "one that the user does not name"
+        monkeypatch.setenv("SWARMDRIVE_SAME_SERVERS", f"{good.url},{better.url[:-5]}*")
+        assert asked_at([good], file) == "good"
+        assert asked_at([better], file) == "good", "the user says that both serve the same"
+        assert asked_at([evil], file) == "evil"
+        assert len(better.asked) == 1
+
+
+def test_an_answer_is_kept_where_one_server_gave_it(file: Path) -> None:
+    """The orders of a read-out's list may come from several, if one breaks down on the way."""
+    for server, asked in ((None, [1, 1]), ("http://other/v1", [1, 1]), ("http://a/v1", [1, 0])):
+        talker = Talker({"00000-0/v1": Completion("00000-0/v1", "x", 1, 1, "stop", None, 1, server=server)})
+        talker.several = ("http://a/v1", "http://b/v1")
+        for count in asked:
+            before = len(talker.asked)
+            Cached(talker, file).complete([BASE])
+            assert len(talker.asked) - before == count
 
 
 @pytest.mark.slow

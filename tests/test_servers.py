@@ -565,8 +565,11 @@ def test_the_shards_lines_are_put_together_and_a_torn_one_is_left_out(tmp_path: 
 
 
 @pytest.mark.slow
-def test_an_answer_of_one_server_is_kept_for_all(small: Dataset, whole: Path, tmp_path: Path) -> None:
-    """The second run has other servers, of which none is asked anything."""
+def test_an_answer_of_one_server_is_kept_for_all_that_serve_the_same(
+    small: Dataset, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second run has other servers, of which none is asked anything, since the user says so."""
+    monkeypatch.setenv("SWARMDRIVE_SAME_SERVERS", "http://127.0.0.1:*")
     for answers in (None, 0):
         with served(answers) as url, served(answers) as beside:
             spec, out = served_spec(small, url, beside), tmp_path / f"run-{answers}"

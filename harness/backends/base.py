@@ -127,6 +127,7 @@ class Completion:
     # whether one letter is the likeliest in every order; None otherwise.
     letter_share: float | None = None
     follows_letter: bool | None = None
+    server: str | None = None  # address of the server that gave it; None in process, or of several servers
     flipped: bool | None = None  # of a replayed read-out, whether its likeliest changed in the reversed list
 
 
@@ -213,6 +214,11 @@ def served(backend: Backend) -> list[Served]:
 def doubt(backend: Backend) -> str | None:
     """Return why cached answers may be of other weights, in a line; None if a backend's identity can tell."""
     return getattr(backend, "doubt", None)
+
+
+def several(backend: Backend) -> Sequence[str]:
+    """Return the addresses of servers of which any may answer; empty if the identity says who answers."""
+    return getattr(backend, "several", ())
 
 
 class Timed(Backend, Protocol):

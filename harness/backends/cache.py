@@ -1,20 +1,36 @@
 """The completion cache: keep completions between runs, so that a model answers the same question only once.
 
+What a server answered is kept under its address. A card may name several servers, whoever wrote it; so an
+answer is taken only if the server that gave it is among those of today, or the user says in the environment
+variable `SWARMDRIVE_SAME_SERVERS` that they serve the same.
+
 The cache only saves time. A run's rows hold its answers, and if the file does not work, the run continues
 without it.
 """
 
 import json
+import os
 import sqlite3
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import fields, replace
+from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from harness.backends.base import Backend, Completion, Rendering, Request, Served, doubt, served, window
+from harness.backends.base import (
+    Backend,
+    Completion,
+    Rendering,
+    Request,
+    Served,
+    doubt,
+    served,
+    several,
+    window,
+)
 from harness.backends.card import Card
 from harness.backends.registry import capabilities
 from harness.core import kept
@@ -38,10 +54,12 @@ NOT_IN_KEY = {
     "scenario": "no language model reads it; its actions are a field of their own",
 }
 # Fields of a completion that describe one request's handling and not the answer.
-_NOT_KEPT = ("request_id", "seconds", "first_token_s", "token_s", "error", "retries", "cached")
+_NOT_KEPT = ("request_id", "seconds", "first_token_s", "token_s", "error", "retries", "cached", "server")
 _KEPT = tuple(f.name for f in fields(Completion) if f.name not in _NOT_KEPT)
 _EXACT = ("float32", "F32")  # number formats in which a batch changes no answer
 _WAIT_S = 30.0  # longest wait for another process that is writing
+# Environment variable: addresses of servers that serve the same, with commas; * stands for any text.
+SAME = "SWARMDRIVE_SAME_SERVERS"
 _AT_ONCE = 500  # keys in one query; SQLite has a limit
 _TABLE = "CREATE TABLE IF NOT EXISTS completions (key TEXT PRIMARY KEY, answer TEXT NOT NULL) WITHOUT ROWID"
 
@@ -116,6 +134,17 @@ def _completion(kept: dict[str, Any]) -> Completion:
     return Completion(request_id="", seconds=None, cached=True, **kept)
 
 
+def _sources(servers: Sequence[str]) -> dict[str, str]:
+    """Return under what the answers of each of several servers are kept, by its address.
+
+    That is the address, or `same` if the user says of all that they serve the same.
+    """
+    patterns = [pattern.strip() for pattern in os.environ.get(SAME, "").split(",")]
+    if all(any(fnmatchcase(server, pattern) for pattern in patterns) for server in servers):
+        return dict.fromkeys(servers, "same")
+    return {server: server for server in servers}
+
+
 def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
     """Put a cache before a card's backend, if there is a file and the backend can show its prompts."""
     if file is None or not capabilities(card.engine).renders:
@@ -134,23 +163,38 @@ class Cached:
         self._file: CompletionFile | None = CompletionFile(file)
         self.window = window(backend)
         self._doubt = doubt(backend)
+        self._sources = _sources(several(backend))
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         prompts = self.backend.rendered(requests)
-        keys = [key(self._identity, p, r, self._batch_size) for p, r in zip(prompts, requests, strict=True)]
-        known = self._try(lambda file: file.find(keys)) or {}
+        keys = [self._keys(prompt, r) for prompt, r in zip(prompts, requests, strict=True)]
+        wanted = [key for each in keys for key in each.values()]
+        known = self._try(lambda file: file.find(wanted)) or {}
         if known and self._doubt:
             _say_once(f"harness: {self._doubt}", digest(self._identity))
-        missing = [r for k, r in zip(keys, requests, strict=True) if k not in known]
+        stored = [next((known[k] for k in each.values() if k in known), None) for each in keys]
+        missing = [r for r, there in zip(requests, stored, strict=True) if there is None]
         answers = iter(self.backend.complete(missing) if missing else [])
-        completions = [
-            replace(known[k], request_id=r.id) if k in known else next(answers)
-            for k, r in zip(keys, requests, strict=True)
-        ]
-        new = {k: c for k, c in zip(keys, completions, strict=True) if c.error is None and not c.cached}
+        completions, new = list[Completion](), dict[str, Completion]()
+        for request, of_request, there in zip(requests, keys, stored, strict=True):
+            completion = next(answers) if there is None else replace(there, request_id=request.id)
+            completions.append(completion)
+            source = self._sources.get(completion.server or "")
+            if source in of_request and completion.error is None and not completion.cached:
+                new[of_request[source]] = completion
         if new:
             self._try(lambda file: file.add(new))
         return completions
+
+    def _keys(self, prompt: str, request: Request) -> dict[str | None, str]:
+        """Return where an answer to a request lies, by its source; None if the identity says who answers."""
+        if not self._sources:
+            return {None: key(self._identity, prompt, request, self._batch_size)}
+        keys: dict[str | None, str] = {}
+        for source in dict.fromkeys(self._sources.values()):
+            identity = {**self._identity, "source": source}
+            keys[source] = key(identity, prompt, request, self._batch_size)
+        return keys
 
     def identity(self) -> dict[str, Any]:
         return self._identity

@@ -17,7 +17,8 @@ from harness.runs.folder import Run, read
 from harness.runs.records import BLIND, Answer, FirstTurn, Latency
 from harness.runs.unanswered import why
 
-_KEPT = [field.name for field in fields(Completion)][2:]  # an answer has the same fields
+# An answer has the same fields, but no row knows its server (docs/decisions/0051).
+_KEPT = [field.name for field in fields(Completion)[2:] if field.name != "server"]
 
 
 def open(card: Card, **_: Any) -> "Replay":

@@ -84,7 +84,7 @@ class OpenAIBackend:
     def identity(self) -> dict[str, Any]:
         """Return the model's identity as its servers state it; what none of them states goes undetected.
 
-        If any of several servers may answer, their URLs are not part of it.
+        If any of several servers may answer, their URLs are not part of it: they are `several`.
         """
         model = self._pool.model
         version = {} if model.version is None else {"version": model.version}
@@ -94,6 +94,11 @@ class OpenAIBackend:
         engine = self._wire.engine
         ours = {"engine": engine, "answers": BUILT_IN[engine].answers, "server": self._server.kind}
         return {**ours, **where, **named, **version, **states}
+
+    @property
+    def several(self) -> Sequence[str]:
+        """The servers' addresses if any of them may answer; empty if there is one, which the identity has."""
+        return self._server.urls if self._server.any_may_answer else ()
 
     @property
     def doubt(self) -> str | None:
@@ -150,6 +155,7 @@ class OpenAIBackend:
             first_s = first_at_s - reply.begun_s
         return replace(
             answer,
+            server=reply.url,
             seconds=seconds,
             batch_size=together,
             retries=reply.retries,
@@ -212,7 +218,9 @@ def _over_orders(request: Request, completions: Sequence[Completion]) -> Complet
     costs = {"seconds": seconds, "first_token_s": seconds, "retries": retries}
     prompt_tokens = total(completion.prompt_tokens for completion in completions)
     average = asdict(average_orders(request.actions, letters_p))
-    return replace(completions[0], prompt_tokens=prompt_tokens, **costs, **average)
+    servers = {completion.server for completion in completions}
+    server = servers.pop() if len(servers) == 1 else None
+    return replace(completions[0], prompt_tokens=prompt_tokens, server=server, **costs, **average)
 
 
 class _Loop:
