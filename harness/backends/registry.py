@@ -97,6 +97,7 @@ BUILT_IN: Mapping[str, Registration] = {
     "openai": Registration(
         "harness.backends.openai.backend:open",
         Capabilities(thinks="card", samples=True),
+        answers=2,  # 2: an answer that was broken off is none, a refusal and parts of a content are read
         card_keys=("vision", "system", "price"),
         required_keys=("weights", "server"),
     ),

@@ -83,7 +83,7 @@ def parse(
     neither is a repair. A closed thought with content is one if the model was not asked to think.
 
     Args:
-        text: the completion as it came.
+        text: the completion as it came; of a refusal, the words of the model or none.
         role: `ego` or `helper`; with the next three, the `Shape` of the answer that was asked for.
         actions: meta-action names, in the environment's order.
         form: one of the role's `FORMS`; None if any of them will do.
@@ -104,7 +104,8 @@ def parse(
         message = errors.printable(error or "no message", 80)
         return _failed(Failure(Status.ENGINE_ERROR, f"the engine failed: {message}"), None)
     if finish_reason == "refusal":
-        return _failed(Failure(Status.REFUSED, "the model refused the question"), None)
+        words = f": {errors.printable(text.strip(), 80)}" if text.strip() else ""
+        return _failed(Failure(Status.REFUSED, f"the model refused the question{words}"), None)
     shape = Shape(role, tuple(actions), form, extension)
     thought: str | None = None
     try:

@@ -199,9 +199,9 @@ class OpenAIBackend:
 
 
 def _over_orders(request: Request, completions: Sequence[Completion]) -> Completion:
-    """Return the completion of a read-out over several orders; if one failed, that one."""
+    """Return the completion of a read-out over several orders; if one failed or is a refusal, that one."""
     retries = sum(completion.retries for completion in completions)
-    if broken := next((completion for completion in completions if completion.error), None):
+    if broken := next((completion for completion in completions if completion.finish_reason != "stop"), None):
         return replace(broken, request_id=request.id, retries=retries)
 
     def total(values: Iterable[Any]) -> Any:

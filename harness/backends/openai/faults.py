@@ -7,6 +7,9 @@ import json
 from contextlib import suppress
 from typing import Any, NamedTuple
 
+from harness.backends.openai.endings import ending
+from harness.core.errors import printable
+
 _WORDS = ("error", "message", "detail")  # where an error or its words stand
 _CODES = ("code", "status", "status_code")
 _REASON = ("metadata", "raw")  # where a router puts the words of the server behind it
@@ -17,6 +20,7 @@ class Fault(NamedTuple):
 
     words: str
     code: int | None = None
+    again: bool = False  # whether another attempt may succeed, though no code says so
 
 
 def may_pass(status: int) -> bool:
@@ -56,6 +60,9 @@ def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
     for stated in (payload, first):
         if isinstance(stated, dict) and (error := stated.get("error")):
             return Fault(error_words({"error": error}), _code(error) or _code(payload))
+    finish = first.get("finish_reason") if isinstance(first, dict) else None
+    if of_chat and ending(finish) == "broken":
+        return Fault(f"the answer was broken off (finish_reason {printable(finish, 40)})", again=True)
     if of_chat and not choices and any(isinstance(payload.get(name), str | list) for name in _WORDS[1:]):
         return Fault(error_words(payload), _code(payload))
     return None

@@ -18,6 +18,7 @@ from yarl import URL
 
 from harness.backends.openai.faults import error_words, fault_in, may_pass, plain_text
 from harness.backends.openai.stream import Stream
+from harness.backends.openai.unpacking import Packed, Unpacker
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable
 
@@ -25,6 +26,7 @@ CONNECT_S = 10.0  # a running server answers sooner
 KEPT_S = 4.0  # time that an idle connection stays open: uvicorn, and so vLLM, closes it after 5
 COMPLETIONS = "/chat/completions"
 MOST_BYTES = 4 * 2**20  # an answer has a few thousand
+MOST_SHOWN = 40  # characters of a body that is no JSON
 SHORTEST_SECRET = 8  # shorter keys are no secrets: many local servers are given `EMPTY`
 _HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
 # Errors that mean that there was no connection.
@@ -93,17 +95,23 @@ class Client:
         data, stream = bytearray(), Stream()
         options: dict[str, Any] = {"data": content, "proxy": self._proxies[base], "allow_redirects": False}
         async with self._session.request(method, URL(url, encoded=True), **options) as response:
-            streamed = response.content_type == "text/event-stream"
-            async for chunk in response.content.iter_any():
-                data += chunk
-                if len(data) > MOST_BYTES:
-                    return Reply(fault=f"the answer is longer than {MOST_BYTES} bytes")
-                if streamed:
-                    stream.take(chunk, time.perf_counter())
-        status, after_s = response.status, _after_s(response.headers.get("retry-after"))
+            status, after_s = response.status, _after_s(response.headers.get("retry-after"))
 
-        def fault(words: str, status: int = status, again: bool = False) -> Reply:
-            return Reply(fault=words, status=status, again=again, after_s=after_s)
+            def fault(words: str, status: int = status, again: bool = False) -> Reply:
+                return Reply(fault=words, status=status, again=again, after_s=after_s)
+
+            streamed = response.content_type == "text/event-stream"
+            try:
+                unpacker = Unpacker(response.headers.get("content-encoding", ""))
+                async for packed in response.content.iter_any():
+                    chunk = unpacker.take(packed, MOST_BYTES + 1 - len(data))
+                    data += chunk
+                    if len(data) > MOST_BYTES:
+                        return Reply(fault=f"the answer is longer than {MOST_BYTES} bytes")
+                    if streamed:
+                        stream.take(chunk, time.perf_counter())
+            except Packed as packed_fault:
+                return fault(str(packed_fault), again=may_pass(status))
 
         if streamed and status == 200:
             if stream.fault:
@@ -116,10 +124,10 @@ class Client:
         if status == 200:
             error = fault_in(payload if readable else plain_text(data), of_chat=url.endswith(COMPLETIONS))
             if error is None:
-                return Reply(payload, fault=None if readable else "the answer is no JSON", status=status)
+                return Reply(payload, fault=None if readable else self._no_json(data), status=status)
             words = f"with HTTP 200: {self._shown(error.words)}"
             if error.code is None:
-                return fault(f"an error {words}")
+                return fault(f"an error {words}", again=error.again)
             return fault(f"error {error.code} {words}", error.code, may_pass(error.code))
         if 300 <= status < 400:
             return fault(f"HTTP {status}: a redirect, which is not followed")
@@ -129,13 +137,20 @@ class Client:
     def _payload(self, data: bytes) -> tuple[Any, bool]:
         """Parse JSON and remove the key from it, however it is escaped. Returns the value and the success."""
         try:
-            payload = json.loads(data.decode("utf-8", "replace"))
+            payload = json.loads(data.decode("utf-8-sig", "replace"))
             if self._key:
                 # Encoded again first, since JSON has many spellings of one text.
                 payload = json.loads(self._without_key(json.dumps(payload, ensure_ascii=False)))
         except (ValueError, RecursionError):
             return None, False
         return payload, True
+
+    def _no_json(self, data: bytes | bytearray) -> str:
+        """Return the fault of a body that is no JSON, with its beginning: it may be markup, or packed."""
+        if not data:
+            return "the answer is no JSON: it is empty"
+        text = self._without_key(data[: MOST_SHOWN * 100].decode("utf-8", "replace"))
+        return f"the answer is no JSON: it begins '{printable(text, MOST_SHOWN)}'"
 
     def _without_key(self, text: str) -> str:
         if not self._key or len(self._key) < SHORTEST_SECRET:

@@ -13,12 +13,13 @@ from harness.backends.card import Card
 from harness.backends.chat import in_parts
 from harness.backends.chat_template import with_system
 from harness.backends.openai.constraint import broken, constraint
+from harness.backends.openai.endings import ending
+from harness.backends.openai.said import NoText, in_texts, refusal, thought
 from harness.backends.servers import MOST_LOGPROBS, Kind, Server
 from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.prompts.readout import letters, spelt, stated
 
-THOUGHTS = ("reasoning_content", "reasoning")  # where servers put a thought; some send both, one of them null
 _REMEDY = "use --answer json, or a server that keeps to it; the kind in its card says how it is asked"
 MOST_TOKENS = 10**7  # more than any context; what a server counts beyond is no count
 # Temperature 0 is not enough: by default some servers penalise repetition (llama_cpp.server by 1.1, vLLM by
@@ -89,38 +90,37 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
     """Read a chat completion, without its time.
 
     A malformed one, or one that breaks the constraint that this kind of server was sent, is an error in one
-    sentence.
+    sentence. The text of a refusal is that of the model that refuses.
     """
     try:
         choice = payload["choices"][0]
-        message = choice["message"]
-        content, thought = message.get("content"), _thought(message)
-        finish, usage = choice.get("finish_reason"), payload.get("usage") or {}
+        message = in_texts(choice["message"])
+        content, thinks, refuses = message.get("content"), thought(message), refusal(message)
+        end, usage = ending(choice.get("finish_reason")), payload.get("usage") or {}
         tokens = tokens_in(usage.get("prompt_tokens")), tokens_in(usage.get("completion_tokens"))
+    except NoText as error:
+        return failed(request, str(error))
     except (LookupError, TypeError, AttributeError):
         return failed(request, "the answer is no chat completion")
+    if refuses or end == "refused" or (end == "filtered" and not content):
+        words = refuses or (content if isinstance(content, str) else "")
+        return Completion(request.id, words, *tokens, "refusal", None, 1)
     if request.bare:
         return _read_out(choice, request, *tokens)
-    if not isinstance(content, str) and not (content is None and thought):
+    if not isinstance(content, str) and not (content is None and thinks):
         if "content" not in message:
             return failed(request, "the answer is no chat completion")
         named = "null" if content is None else type(content).__name__
         return failed(request, f"the answer's content is no text but {named}")
     # An answer that a server's content filter cut off counts as cut off.
-    finish_reason: FinishReason = "length" if finish in ("length", "content_filter") else "stop"
+    finish_reason: FinishReason = "length" if end in ("cut", "filtered") else "stop"
     content = content or ""
     if request.answer == "constrained" and (
         fault := broken(kind, request, content, ended=finish_reason == "stop")
     ):
         return failed(request, f"the server did not keep to the constraint that was sent: {fault}; {_REMEDY}")
-    text = _with_thought(thought, content, finish_reason, request.thinking)
+    text = _with_thought(thinks, content, finish_reason, request.thinking)
     return Completion(request.id, text, *tokens, finish_reason, None, 1)
-
-
-def _thought(message: Mapping[str, Any]) -> str | None:
-    """Return the thought that a server took out of an answer, from the field that has one."""
-    texts = [text for name in THOUGHTS if isinstance(text := message.get(name), str)]
-    return next(filter(None, texts), texts[0] if texts else None)
 
 
 def _with_thought(thought: str | None, content: str, finish_reason: FinishReason, asked: bool) -> str:

@@ -5,14 +5,16 @@ stream raises an exception: an error becomes a fault, in one sentence.
 """
 
 import json
+from codecs import BOM_UTF8
 from contextlib import suppress
 from typing import Any
 
 from harness.backends.openai.faults import Fault, fault_in, may_pass
-from harness.backends.openai.shapes import THOUGHTS
+from harness.backends.openai.said import REFUSAL, THOUGHTS, NoText, in_texts
 
 ASKED = {"stream": True, "stream_options": {"include_usage": True}}  # the last piece has the token counts
 BROKE_OFF = "the stream broke off"
+_TEXTS = ("content", *THOUGHTS, REFUSAL)  # of a message, which come in pieces
 _CUT_OFF = "the stream ends before the answer does"
 
 
@@ -25,6 +27,7 @@ class Stream:
         self.again = True  # whether another attempt may succeed
         self.code: int | None = None  # the HTTP status that an error in it would have had, if it states one
         self._rest = b""
+        self._begun = False  # whether its first line was read, before which a BOM may stand
         self._kind = b""  # of the event
         self._model: str | None = None
         self._texts: dict[str, str] = {}
@@ -37,6 +40,8 @@ class Stream:
         """Add received bytes, which may be cut anywhere, and the time at which they came."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
+            if not self._begun:
+                line, self._begun = line.removeprefix(BOM_UTF8), True
             field, _, value = line.strip().partition(b":")
             if field in (b"event", b""):  # an empty line ends an event
                 self._kind = value.strip() if field else b""
@@ -56,7 +61,9 @@ class Stream:
         try:
             self._piece(json.loads(text), at_s)
         except (ValueError, RecursionError):
-            self.fault, self.again = "a piece of the stream is no JSON", False
+            self.fault, self.again = f"a piece of the stream is no JSON: {text}", False
+        except NoText as error:
+            self.fault, self.again = str(error), False
         except (LookupError, TypeError, AttributeError):
             self.fault, self.again = "a piece of the stream is no part of a chat completion", False
 
@@ -67,8 +74,8 @@ class Stream:
         self._model = piece.get("model") or self._model
         self._usage |= {k: v for k, v in (piece.get("usage") or {}).items() if type(v) is int}
         for choice in (piece.get("choices") or [])[:1]:  # the last piece may have token counts and no choice
-            delta = choice.get("delta") or {}
-            texts = {name: delta[name] for name in ("content", *THOUGHTS) if delta.get(name) is not None}
+            delta = in_texts(choice.get("delta") or {})
+            texts = {name: delta[name] for name in _TEXTS if delta.get(name) is not None}
             for name, text in texts.items():
                 self._texts[name] = self._texts.get(name, "") + text
             if any(texts.values()):

@@ -1,0 +1,59 @@
+"""Read what a message of a server says: the answer, a thought that was taken out of it, and a refusal."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from harness.core.errors import printable
+
+THOUGHTS = ("reasoning_content", "reasoning")  # where servers put a thought; some send both, one of them null
+REFUSAL = "refusal"  # where they put the words of a model that refuses
+# The field of a message that a part of its content belongs to, by the part's type.
+_FIELDS = {
+    "text": "content", "output_text": "content", "thinking": THOUGHTS[0], "reasoning": THOUGHTS[0],
+    "refusal": REFUSAL,
+}  # fmt: skip
+
+
+class NoText(TypeError):
+    """A part of a content that is no text; the message says which, in a line."""
+
+
+def in_texts(message: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a message, or a piece of one, whose content is a text even if it came as a list of parts.
+
+    Thoughts and refusals among the parts go to their fields. Raises NoText for other parts.
+    """
+    if not isinstance(message.get("content"), list):
+        return message
+    texts = {"content": ""}
+    for part in message["content"]:
+        kind = part.get("type", "text") if isinstance(part, dict) else type(part).__name__
+        field = _FIELDS.get(kind) if isinstance(kind, str) and isinstance(part, dict) else None
+        if field is None:
+            raise NoText(f"the answer's content has a part that is no text but {printable(kind, 40)}")
+        texts[field] = texts.get(field, "") + _text(part, kind)
+    stated = {name: value for name, value in message.items() if value and name != "content"}
+    return {**message, **texts, **stated}
+
+
+def _text(part: Mapping[str, Any], kind: str) -> str:
+    """Return the text of a part, which a thought may have in parts of its own."""
+    value = part.get(kind, part.get("text"))
+    inner = value if isinstance(value, list) else [value]
+    stated = [each.get("text") if isinstance(each, dict) else each for each in inner]
+    texts = [text for text in stated if isinstance(text, str)]
+    if len(texts) < len(stated):
+        raise NoText(f"the answer's content has a part of type {kind} without a text")
+    return "".join(texts)
+
+
+def thought(message: Mapping[str, Any]) -> str | None:
+    """Return the thought that a server took out of an answer, from the field that has one."""
+    texts = [text for name in THOUGHTS if isinstance(text := message.get(name), str)]
+    return next(filter(None, texts), texts[0] if texts else None)
+
+
+def refusal(message: Mapping[str, Any]) -> str | None:
+    """Return the words by which a model refuses; None if it does not."""
+    words = message.get(REFUSAL)
+    return words if isinstance(words, str) and words.strip() else None
