@@ -11,7 +11,7 @@ from harness.core.kept import code_sha256
 
 # Versions of what turns answers into decisions. tests/conformance/test_answer_versions.py pins their results
 # and asks for a new version when one moves. Work that was stopped under another version is not resumed.
-PARSER, DECISIONS = 1, 1
+PARSER, DECISIONS = 2, 1
 PACKAGES = ("numpy", "scipy", "jinja2", "highway-env", "torch", "transformers", "llama-cpp-python")
 
 

@@ -7,8 +7,11 @@ templates.
 
 import re
 
+from harness.parsing.relaxed import DECODER
 from harness.parsing.status import Failure, Status
 
+_MAX_BROKEN = 200  # most braces that open no valid JSON, and
+_MAX_TRIED = 4_000_000  # most characters that these tries read in total; behind them any tag counts
 _NAMES = r"(?=[tras])(?:think(?:ing)?|thoughts?|reason(?:ing)?|reflection|analysis|scratchpad)"
 # `<think` may lack its bracket: it is safer to read too much as a thought than too little. The characters
 # that any tag begins with come first, so that the search skips everything else at once.
@@ -32,13 +35,14 @@ def split(text: str, thinking: bool) -> tuple[str | None, str]:
 
     A closing tag without an opening one means that the prompt's template opened the thought: all text before
     it is thought. Text before, between and after closed thoughts belongs to the answer. If the model was
-    asked to think, a text without a closed thought is all thought. Raises Failure for truncated_reasoning.
+    asked to think, a text without a closed thought is all thought. A tag in a string of valid JSON is text.
+    Raises Failure for truncated_reasoning.
     """
     depth = at = 0
     thoughts: list[str] = []
     answers: list[str] = []
     closed = False
-    for tag in _TAG.finditer(text):
+    for tag in _tags(text):
         piece, at = text[at : tag.start()], tag.end()
         if tag.lastgroup == "open":
             (thoughts if depth else answers).append(piece)
@@ -58,3 +62,20 @@ def split(text: str, thinking: bool) -> tuple[str | None, str]:
         raise Failure(Status.TRUNCATED_REASONING, "the thought was not closed, so no answer was begun")
     thought = "\n".join(piece.strip() for piece in thoughts if piece.strip())
     return (thought if closed else None), "\n".join([*answers, text[at:]])
+
+
+def _tags(text: str) -> list[re.Match[str]]:
+    """Return the tags of a text but those inside an object of valid JSON, which stand in its strings."""
+    outside: list[re.Match[str]] = []
+    most_broken = min(_MAX_BROKEN, _MAX_TRIED // (len(text) + 1))
+    opening, end, broken = text.find("{"), 0, 0
+    for tag in _TAG.finditer(text):
+        while 0 <= opening < tag.start() and broken < most_broken:
+            try:
+                _, end = DECODER.raw_decode(text, opening)
+            except (ValueError, RecursionError):
+                broken += 1
+            opening = text.find("{", max(end, opening + 1))
+        if end <= tag.start():
+            outside.append(tag)
+    return outside

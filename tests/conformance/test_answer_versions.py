@@ -14,6 +14,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from corpus import ACTIONS, CASES
 from evaluating import run, scenes_of, spec_of
 from former import DATASET
 from misbehaving import completion, serving
@@ -35,6 +36,7 @@ from harness.core import versions
 from harness.core.files import sha256_bytes
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.asking import requests
+from harness.parsing.parse import parse
 from harness.runs import folder
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "versions.json"
@@ -171,6 +173,15 @@ def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Pa
     known = np.nan_to_num(rows + 0.0, nan=-1)  # and no zero has a sign
     result = {point.name: sha256_bytes(known[condition == point.name].tobytes())[:16] for point in points}
     held("decisions", versions.DECISIONS, result)
+
+
+def test_completions_are_parsed_as_their_version_did() -> None:
+    """A case that is new is added to its version; one that changed wants a new version."""
+    result = {}
+    for case in CASES:
+        parsed = parse(case.text, actions=ACTIONS, **case.asked)
+        result[case.name] = ", ".join([parsed.status, *(parsed.repairs or parsed.faults[1:])])
+    held("completions", versions.PARSER, result)
 
 
 def test_answers_are_read_as_their_version_did() -> None:
