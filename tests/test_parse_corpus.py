@@ -56,6 +56,23 @@ def test_the_corpus_shows_every_status_and_every_repair() -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "detail"),
+    [
+        ("n_conflicting_answers_evidence_in_two_pieces",
+         "beside the answer stands a part of another one, which names no action"),
+        ("n_conflicting_answers_two_one_level_deeper",
+         "if_not repeats what stands beside it in another object"),
+        ("n_conflicting_answers_in_schema_and_beside", "2 answers stand in the text and they differ"),
+        ("n_missing_action_distribution_as_cut_text",
+         "what stands for the distribution is a text, and none of JSON"),
+    ],
+)  # fmt: skip
+def test_the_cause_that_is_named_is_true(name: str, detail: str) -> None:
+    [case] = [case for case in CASES if case.name == name]
+    assert parse(case.text, actions=ACTIONS, **case.asked).detail == detail
+
+
+@pytest.mark.parametrize(
     ("unit", "status", "detail"),
     [
         ('{"a":', Status.SYNTAX, "more than 3 braces that open no JSON object"),

@@ -8,15 +8,12 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from harness.core.errors import printable
-from harness.parsing import values
+from harness.parsing import pieces, values
+from harness.parsing.pieces import FIELDS
+from harness.parsing.relaxed import Repeated
 from harness.parsing.schema import further
 from harness.parsing.status import Failure, Repair, Status, joined, noted
 from harness.prompts.answer_schema import EVIDENCE_CHARS, RISKS, Shape
-
-FIELDS = {
-    "ego": ("maneuver", "confidence", "action_distribution"),
-    "helper": ("evidence", "risk", "recommended_maneuver", "confidence", "action_distribution"),
-}
 
 # Keys that make an object an answer; an ego that states a confidence alone has said nothing yet.
 MARKS = {"ego": ("maneuver", "action_distribution"), "helper": FIELDS["helper"]}
@@ -47,6 +44,9 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
         raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")
     actions, repairs = shape.actions, set(so_far)
     names = tuple(shape.further)
+    if not isinstance(members, Repeated):
+        members, found = pieces.gathered(members, shape.role, actions, names)
+        repairs |= found
     fields, rest = values.sort_fields(members, FIELDS[shape.role] + names, repairs)
     extension = None
     if names:
@@ -61,6 +61,9 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
         fields["action_distribution"] = rest
     elif rest:
         repairs.add(Repair.EXTRA_FIELD)
+    if "action_distribution" in fields:
+        fields["action_distribution"], found = pieces.distribution_in(fields["action_distribution"], actions)
+        repairs |= found
 
     if _is_other_form(fields, shape):
         repairs.add(Repair.OTHER_FORM)

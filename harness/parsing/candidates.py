@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from harness.parsing import mend, relaxed
-from harness.parsing.answer import FIELDS, MARKS
+from harness.parsing import mend, pieces, relaxed
+from harness.parsing.answer import MARKS
+from harness.parsing.pieces import FIELDS
 from harness.parsing.status import Failure, Repair, Status
 from harness.parsing.values import is_schema, match
 
@@ -78,7 +79,10 @@ def candidates(
     if shaped:
         before, *after = [*other_text, text[at:]]
         around = _repairs_around(before, "\n".join(after), reasons_first)
-        return [replace(candidate, repairs=candidate.repairs | around) for candidate in shaped]
+        shaped = [replace(candidate, repairs=candidate.repairs | around) for candidate in shaped]
+        if pieces.are_one([candidate.members for candidate in shaped], role, actions):
+            return [_together(shaped)]
+        return shaped
     if objects.broken is not None:
         mended, rest = mend.mended(text[objects.broken :], FIELDS[role] + actions, cut)
         extra = escapes | _repairs_around(text[: objects.broken], rest, reasons_first) | {Repair.JSON_REPAIR}
@@ -121,6 +125,18 @@ def _around(
     around = _repairs_around(text[:start], rest, reasons_first)
     repairs = frozenset(reading.repairs) | around | {Repair.JSON_REPAIR}
     return Candidate({**members, name: reading.value}, repairs)
+
+
+def _together(candidates: list[Candidate]) -> Candidate:
+    """Return the answer whose pieces some candidates are."""
+    members: dict[str, Any] = {}
+    repairs: frozenset[Repair] = frozenset({Repair.IN_PIECES})
+    lost: frozenset[Repair] = frozenset()
+    for candidate in candidates:
+        members |= candidate.members
+        repairs |= candidate.repairs
+        lost |= candidate.lost
+    return Candidate(members, repairs, lost)
 
 
 def _objects(text: str, cut: bool) -> _Objects:
@@ -172,16 +188,16 @@ def _answers(
     stack = [(value, frozenset[Repair]())]
     while stack:
         node, repairs = stack.pop()
-        if isinstance(node, str) and "{" in node:
-            try:
-                node = relaxed.DECODER.decode(node)
-            except (ValueError, RecursionError):
-                continue
-        if isinstance(node, relaxed.Repeated) or _shaped(node, role, actions) or is_schema(node):
+        node, opened = pieces.decoded(node)
+        repairs |= opened
+        if is_schema(node) and not isinstance(node, relaxed.Repeated):
+            in_schema = pieces.in_schema(node, role, actions)
+            yield from [(members, repairs | extra) for members, extra in in_schema] or [(node, repairs)]
+        elif isinstance(node, relaxed.Repeated) or _shaped(node, role, actions):
             yield node, repairs
         elif isinstance(node, dict | list):
             children = list(node.values()) if isinstance(node, dict) else node
-            stack += [(child, frozenset({Repair.NESTED})) for child in reversed(children)]
+            stack += [(child, repairs | {Repair.NESTED}) for child in reversed(children)]
 
 
 def _repairs_around(before: str, after: str, reasons_first: bool) -> frozenset[Repair]:

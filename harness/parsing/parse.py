@@ -11,11 +11,11 @@ from typing import Any, Literal
 from msgspec import Struct
 
 from harness.core import errors
-from harness.parsing import candidates, reasoning
+from harness.parsing import candidates, pieces, reasoning
 from harness.parsing.answer import Answer, read
 from harness.parsing.candidates import Candidate
 from harness.parsing.mend import unreadable
-from harness.parsing.status import Failure, Repair, Status, noted
+from harness.parsing.status import Failure, Repair, Status
 from harness.parsing.strict import fitting
 from harness.prompts.answer_schema import ROLES, Shape
 
@@ -177,10 +177,15 @@ def _choose(objects: list[Candidate], shape: Shape, divides: bool) -> Answer:
     """Return the one answer among the candidates; an echo of the template is not a second answer."""
     answers: list[Answer] = []
     failures: list[Failure] = []
+    partial = True  # whether no candidate that failed names an action
     for candidate in objects:
-        with noted(failures):
+        try:
             answer = read(candidate.members, candidate.repairs, shape, divides)
             answers.append(answer.without(candidate.lost) if candidate.lost else answer)
+        except Failure as failure:
+            failures.append(failure)
+            fields = pieces.fields_of(candidate.members, shape.role, shape.actions)
+            partial = partial and not pieces.decides(fields, shape.role)
     serious = [failure for failure in failures if failure.status is not Status.SCHEMA_ECHO]
     if not answers:
         raise _none_read(objects, failures, serious)
@@ -190,6 +195,8 @@ def _choose(objects: list[Candidate], shape: Shape, divides: bool) -> Answer:
         count = len(answers) + len(serious)
         faults = _distinct([Status.CONFLICTING_ANSWERS, *(f for each in serious for f in each.faults)])
         detail = f"{count} answers stand in the text and they differ"
+        if agree and partial:
+            detail = "beside the answer stands a part of another one, which names no action"
         raise Failure(Status.CONFLICTING_ANSWERS, detail, faults=faults)
     return last.mended(Repair.REPEATED_ANSWER) if len(answers) > 1 else last
 

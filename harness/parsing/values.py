@@ -190,4 +190,6 @@ def _no_distribution(value: object, actions: Sequence[str]) -> Failure:
         return Failure(Status.LABEL_ONLY, "the distribution is one action's name, without probabilities")
     if is_placeholder(value):
         return Failure(Status.SCHEMA_ECHO, "the template's placeholder stands where the distribution belongs")
+    if isinstance(value, str):
+        return Failure(Status.MISSING_ACTION, "what stands for the distribution is a text, and none of JSON")
     return Failure(Status.MISSING_ACTION, "what stands for the distribution names no actions")

@@ -1,0 +1,130 @@
+"""Put an answer together that stands in pieces, in a text, or where the types of its schema would."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from harness.core.errors import printable
+from harness.parsing import relaxed
+from harness.parsing.status import Failure, Repair, Status
+from harness.parsing.values import match
+from harness.prompts.answer_schema import NAMED
+
+FIELDS = {
+    "ego": ("maneuver", "confidence", "action_distribution"),
+    "helper": ("evidence", "risk", "recommended_maneuver", "confidence", "action_distribution"),
+}
+_DISTRIBUTION = "action_distribution"
+_OF_A_SCHEMA = ("$schema", "properties")
+
+Found = tuple[dict[str, Any], frozenset[Repair]]  # members, and the repairs that finding them took
+
+
+def decoded(value: object) -> tuple[Any, frozenset[Repair]]:
+    """Return what a text states as JSON, or nearly so, with the repairs; another value as it is."""
+    if not isinstance(value, str) or "{" not in value:
+        return value, frozenset()
+    text = value.strip()
+    try:
+        return relaxed.DECODER.decode(text), frozenset({Repair.NESTED})
+    except (ValueError, RecursionError):
+        pass
+    if not text.startswith("{"):
+        return value, frozenset()
+    try:
+        reading = relaxed.read(text, 0)
+    except (relaxed.Broken, relaxed.Unfinished):
+        return value, frozenset()
+    if reading.end < len(text) or reading.closed_by_end:
+        return value, frozenset()
+    return reading.value, frozenset({Repair.NESTED, *reading.repairs})
+
+
+def fields_of(members: dict[str, Any], role: str, actions: Sequence[str]) -> set[str]:
+    """Return the fields of an answer that an object has; actions of its own are a distribution."""
+    names = {match(key, FIELDS[role]) for key in members}
+    if any(match(key, actions) for key in members):
+        names.add(_DISTRIBUTION)
+    return {name for name in names if name}
+
+
+def decides(fields: set[str], role: str) -> bool:
+    """Return whether fields of an answer say which action is taken."""
+    return not fields.isdisjoint((_DISTRIBUTION, NAMED[role]))
+
+
+def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list[Found]:
+    """Return the answers in a JSON Schema: beside its keywords, and under `properties` in place of types."""
+    found: list[Found] = []
+    own = {key: value for key, value in schema.items() if key not in _OF_A_SCHEMA}
+    if _states(own, role, actions):
+        found.append((own, frozenset({Repair.EXTRA_FIELD})))
+    members = _properties(schema)
+    inner = type(members)({key: _properties(value) for key, value in members.items()})
+    if members is not schema and _states(inner, role, actions):
+        found.append((inner, frozenset({Repair.NESTED})))
+    return found
+
+
+def distribution_in(value: object, actions: Sequence[str]) -> tuple[Any, frozenset[Repair]]:
+    """Return the distribution that stands in a text or under a schema's `properties`, with the repairs."""
+    value, repairs = decoded(value)
+    inner = _properties(value)
+    if inner is value or not _states({_DISTRIBUTION: inner}, "ego", actions):
+        return value, repairs
+    return inner, repairs | {Repair.NESTED}
+
+
+def _properties(value: Any) -> Any:
+    inner = value.get("properties") if isinstance(value, dict) else None
+    return inner if isinstance(inner, dict) else value
+
+
+def _states(members: dict[str, Any], role: str, actions: Sequence[str]) -> bool:
+    """Return whether members name an action, or give a number or a text for one, and not its type."""
+    shares = [value for key, value in members.items() if match(key, (_DISTRIBUTION,))]
+    for each in (members, *(share for share in shares if isinstance(share, dict))):
+        stated = [value for key, value in each.items() if match(key, (NAMED[role], *actions))]
+        if stated and all(isinstance(value, str | float) for value in stated):
+            return True
+    return False
+
+
+def gathered(members: dict[str, Any], role: str, actions: Sequence[str], apart: Sequence[str]) -> Found:
+    """Return an answer with the fields that it has one level deeper, but for those in members `apart`.
+
+    Raises Failure conflicting_answers if two members have the same field.
+    """
+    given = fields_of(members, role, actions)
+    repairs: frozenset[Repair] = frozenset()
+    whole, taken = dict(members), set(given)
+    for key, value in members.items():
+        if match(key, (*FIELDS[role], *actions, *apart)):
+            continue
+        piece, opened = decoded(value)
+        if not isinstance(piece, dict) or isinstance(piece, relaxed.Repeated):
+            continue
+        fields = fields_of(piece, role, actions)
+        if not fields or fields & given or _two_forms(fields | given, role):
+            continue
+        if fields & taken or _two_forms(fields | taken, role):
+            detail = f"{printable(key, 40)} repeats what stands beside it in another object"
+            raise Failure(Status.CONFLICTING_ANSWERS, detail)
+        del whole[key]
+        whole |= piece
+        taken |= fields
+        repairs |= opened - {Repair.NESTED} | {Repair.IN_PIECES}
+    return (whole, repairs) if repairs else (members, repairs)
+
+
+def _two_forms(fields: set[str], role: str) -> bool:
+    return _DISTRIBUTION in fields and not fields.isdisjoint((NAMED[role], "confidence"))
+
+
+def are_one(pieces: Sequence[dict[str, Any]], role: str, actions: Sequence[str]) -> bool:
+    """Return whether several objects are pieces of one answer: one decides, and none repeats another."""
+    if len(pieces) < 2 or any(isinstance(piece, relaxed.Repeated) for piece in pieces):
+        return False
+    fields = [fields_of(piece, role, actions) for piece in pieces]
+    together = set().union(*fields)
+    alone = sum(map(len, fields)) == len(together) and all(fields)
+    return alone and sum(decides(each, role) for each in fields) == 1 and not _two_forms(together, role)
