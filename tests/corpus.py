@@ -9,7 +9,10 @@ from harness.parsing.status import Status
 
 FOLDER = Path(__file__).parent / "completions"
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
-ASKED = {"role", "form", "extension", "thinking", "reasons_first", "divides", "finish_reason", "error"}
+ASKED = {
+    "role", "form", "extension", "placeholders", "thinking", "reasons_first", "divides", "finish_reason",
+    "error",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,10 @@ from harness.prompts.answer_schema import Shape, answer_schema
 unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 # Texts that prompts write in the place of a helper's evidence.
-PLACEHOLDERS = ("max 12 words", "Max. 12 words.", "one short sentence", "<evidence>", "...", "string")
+PLACEHOLDERS = (
+    "max 12 words", "Max. 12 words.", "one short sentence", "<evidence>", "...", "string", "low|medium|high",
+    "low|medium", "SLOWER or IDLE", "0 to 1",
+)  # fmt: skip
 ROLES = st.sampled_from(["ego", "helper"])
 
 
@@ -52,7 +55,7 @@ def judged_strict(text: str, shape: Shape) -> bool:
         return False
     if not validator(shape).is_valid(value):
         return False
-    if value.get("evidence") in PLACEHOLDERS:
+    if value.get("evidence") in (*PLACEHOLDERS, *shape.placeholders):
         return False
     if "action_distribution" not in value:
         return math.isfinite(value["confidence"])

@@ -92,9 +92,10 @@ def test_strict_is_what_the_published_schema_and_the_sum_say_of_the_corpus(case:
     if case.status is Status.ENGINE_ERROR:
         return  # not judged by its text
     text = case.text.removeprefix("<think>\n\n</think>")
-    assert (case.status is Status.STRICT) == judged_strict(
-        text, Shape(case.asked["role"], ACTIONS, case.asked.get("form"), case.asked.get("extension", ""))
-    )
+    asked = {name: case.asked[name] for name in ("form", "extension") if name in case.asked}
+    shown = tuple(case.asked.get("placeholders", ()))
+    shape = Shape(case.asked["role"], ACTIONS, **asked, placeholders=shown)
+    assert (case.status is Status.STRICT) == judged_strict(text, shape)
 
 
 PROSE = st.text(st.characters(exclude_characters="{｛<＜[&\\`~", codec="utf-8"), max_size=60)

@@ -48,6 +48,7 @@ class Request:
     # a request of their own (`harness.evaluate.flip`); empty if that is not asked.
     flips: tuple[tuple[Mapping[str, str], ...], ...] = ()
     extension: str = ""  # further members of its answer (`Shape.extension`)
+    placeholders: tuple[str, ...] = ()  # of its prompt (`Shape.placeholders`)
     sums: Sums = "refuse"  # what is done where probabilities of `json` do not sum to 1: fail, or divide
     thinking: bool = False  # whether the model is asked to think first (if its template can switch that)
     reasons_first: bool = False  # whether the prompt asks for reasons before the answer
@@ -67,7 +68,7 @@ class Request:
         """What the JSON of its answer is to be, even a helper's: a bare distribution if it is `bare`."""
         if self.bare:
             return Shape("ego", self.actions, "distribution")
-        return Shape(self.role, self.actions, self.form, self.extension)
+        return Shape(self.role, self.actions, self.form, self.extension, self.placeholders)
 
     @property
     def bare(self) -> bool:

@@ -49,6 +49,7 @@ NOT_IN_KEY = {
     "timed": "how the answer is sent; whoever measures asks past the cache",
     "reasons_first": "how the answer is read; the prompt asks for it in words",
     "sums": "how the answer is read",
+    "placeholders": "how the answer is read; they stand in the rendered prompt",
     "view": "no language model reads it",
     "truth": "no language model reads it",
     "scenario": "no language model reads it; its actions are a field of their own",

@@ -123,6 +123,7 @@ class Agent:
         return Request(
             id="", messages=(), role=role, actions=actions, max_tokens=self.most_tokens(role),
             form=self.prompt.form(role), extension=self.prompt.extension.get(role, ""),
+            placeholders=self.prompt.placeholders[role],
             answer=self.answer, sums=self.sums, thinking=self.thinking,
             reasons_first=role in self.prompt.reasons_first,
         )  # fmt: skip

@@ -68,7 +68,7 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
     if _is_other_form(fields, shape):
         repairs.add(Repair.OTHER_FORM)
     if shape.role == "helper":
-        return replace(_helper(fields, actions, repairs, divides), extension=extension)
+        return replace(_helper(fields, shape, repairs, divides), extension=extension)
     if "maneuver" in fields:
         intent, mass, maneuver, _ = _judgement(fields, "maneuver", actions, repairs, divides)
         if Repair.OTHER_FORM in repairs and mass is None:
@@ -85,15 +85,15 @@ def _is_other_form(fields: dict[str, Any], shape: Shape) -> bool:
     return bool(shape.form) and ("action_distribution" in fields) == (shape.form != "distribution")
 
 
-def _helper(fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair], divides: bool) -> Answer:
+def _helper(fields: dict[str, Any], shape: Shape, repairs: set[Repair], divides: bool) -> Answer:
     failures: list[Failure] = []
     with noted(failures):
         intent, mass, maneuver, confidence = _judgement(
-            fields, "recommended_maneuver", actions, repairs, divides
+            fields, "recommended_maneuver", shape.actions, repairs, divides
         )
     with noted(failures):
         risk = _risk(fields.get("risk"), repairs)
-    evidence = _evidence(fields.get("evidence"), repairs)
+    evidence = _evidence(fields.get("evidence"), shape, repairs)
     if failures and Repair.EVIDENCE_ECHO in repairs:
         failures.append(Failure(Status.SCHEMA_ECHO, "the evidence is the prompt's placeholder for it"))
     if failures:
@@ -173,11 +173,11 @@ def _confidence(value: object, repairs: set[Repair]) -> float:
     return abs(stated)
 
 
-def _evidence(value: object, repairs: set[Repair]) -> str | None:
+def _evidence(value: object, shape: Shape, repairs: set[Repair]) -> str | None:
     if not isinstance(value, str):
         repairs.add(Repair.MISSING_EVIDENCE)
         return None
-    if values.is_placeholder_text(value):
+    if values.is_placeholder_text(value, shape):
         repairs.add(Repair.EVIDENCE_ECHO)
         return None
     if len(value) > EVIDENCE_CHARS:

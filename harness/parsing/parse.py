@@ -71,6 +71,7 @@ def parse(
     actions: Sequence[str],
     form: str | None = None,
     extension: str = "",
+    placeholders: Sequence[str] = (),
     thinking: bool = False,
     reasons_first: bool = False,
     divides: bool = False,
@@ -84,10 +85,11 @@ def parse(
 
     Args:
         text: the completion as it came; of a refusal, the words of the model or none.
-        role: `ego` or `helper`; with the next three, the `Shape` of the answer that was asked for.
+        role: `ego` or `helper`; with the next four, the `Shape` of the answer that was asked for.
         actions: meta-action names, in the environment's order.
         form: one of the role's `FORMS`; None if any of them will do.
         extension: schemas of further members; empty for none.
+        placeholders: what the prompt shows in place of values, which is no evidence.
         thinking: whether the text must hold a closed thought: the model was asked to think, and the engine
             did not take the thought out of the text.
         reasons_first: whether the prompt asked for reasons before the answer; then prose there is no repair.
@@ -106,7 +108,7 @@ def parse(
     if finish_reason == "refusal":
         words = f": {errors.printable(text.strip(), 80)}" if text.strip() else ""
         return _failed(Failure(Status.REFUSED, f"the model refused the question{words}"), None)
-    shape = Shape(role, tuple(actions), form, extension)
+    shape = Shape(role, tuple(actions), form, extension, tuple(placeholders))
     thought: str | None = None
     try:
         answer = None if thinking else fitting(text, shape)

@@ -54,7 +54,7 @@ def _answer(answer: Any, shape: Shape, extension: dict[str, Any] | None) -> Answ
         intent = recommended(maneuver, confidence, actions)
     if shape.role == "ego":
         return Answer(intent, mass, None, frozenset(), extension)
-    if is_placeholder_text(answer.evidence):
+    if is_placeholder_text(answer.evidence, shape):
         return None
     message = {
         "evidence": answer.evidence.encode("utf-8", "replace").decode(),  # a lone surrogate is legal JSON

@@ -8,11 +8,13 @@ import math
 import re
 import unicodedata
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 from harness.core.errors import printable
 from harness.parsing.relaxed import Repeated
 from harness.parsing.status import Failure, Repair, Status, joined, noted
+from harness.prompts.answer_schema import RISKS, Shape
 
 EXACT = 0.001 + 1e-9  # the slack admits 0.333 * 3, whose binary sum is slightly below 0.999
 ROUNDED = 0.025 + 1e-9
@@ -20,15 +22,17 @@ _LARGEST = 1e9  # of the numbers whose sum is worth saying; larger ones may over
 
 _NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?")
 _NON_FINITE = re.compile(r"[-+]?(?:nan|inf|infinity)", re.IGNORECASE)
+_RANGE = r"(?:(?:a )?number (?:from|between) )?0(?:\.0)?\s*(?:\.\.|-|–|to|and)\s*1(?:\.0)?"
 _PLACEHOLDER = re.compile(
-    r"p\d*|p_\w+|prob(?:ability)?\w*|(?:number|float|value|x)(?: from)?|<.*>|\.{2,}|…"
-    r"|(?:(?:a )?number (?:from|between) )?0(?:\.0)?\s*(?:\.\.|-|–|to|and)\s*1(?:\.0)?",
+    rf"p\d*|p_\w+|prob(?:ability)?\w*|(?:number|float|value|x)(?: from)?|<.*>|\.{{2,}}|…|{_RANGE}",
     re.IGNORECASE,
 )
-# What a prompt writes in the place of words: how many, or what kind of text.
+_BETWEEN_CHOICES = re.compile(r"[|/,]|\bor\b")
+# What any prompt may write in the place of words: how many, or what kind of text. What the one that asked
+# writes is known from its template.
 _WORDS = re.compile(
     r"(?:at most|max(?:imum)?(?: of)?|up to|under|in)\.? \d+ (?:words?|characters?)"
-    r"|(?:one|a) short sentence|text|string|<.*>|\.{2,}|…",
+    rf"|(?:one|a) short sentence|text|string|<.*>|\.{{2,}}|…|{_RANGE}",
     re.IGNORECASE,
 )
 
@@ -173,11 +177,34 @@ def is_placeholder(value: object) -> bool:
     return isinstance(value, str) and bool(_PLACEHOLDER.fullmatch(value.strip()))
 
 
-def is_placeholder_text(value: object) -> bool:
-    """Return whether a text is a prompt's placeholder for words: max 12 words, <text>."""
-    return isinstance(value, str) and bool(
-        _WORDS.fullmatch(value.strip().strip(".").strip() or value.strip())
-    )
+def is_placeholder_text(text: str, shape: Shape) -> bool:
+    """Return whether a text stands in a prompt in place of a value: max 12 words, <text>, low|medium.
+
+    It is one of the prompt that asked, of any prompt, or several of the choices of one of these.
+    """
+    if _WORDS.fullmatch(text.strip().strip(".").strip() or text.strip()):
+        return True
+    written, choices = _written(shape.placeholders, shape.actions)
+    chosen = _choices(text)
+    return _folded(text) in written or (len(chosen) > 1 and any(chosen <= each for each in choices))
+
+
+@lru_cache(maxsize=64)
+def _written(
+    placeholders: tuple[str, ...], actions: tuple[str, ...]
+) -> tuple[frozenset[str], tuple[frozenset[str], ...]]:
+    """Return the placeholders of a prompt, folded, and the choices that each of them offers."""
+    offered = [*map(_choices, placeholders), _choices("|".join(RISKS)), _choices("|".join(actions))]
+    return frozenset(map(_folded, placeholders)), tuple(offered)
+
+
+def _choices(text: str) -> frozenset[str]:
+    parts = map(_folded, _BETWEEN_CHOICES.split(text))
+    return frozenset(part for part in parts if part)
+
+
+def _folded(text: str) -> str:
+    return " ".join(text.replace('"', " ").casefold().split()).strip(". ")
 
 
 def is_schema(value: object) -> bool:

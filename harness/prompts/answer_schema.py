@@ -28,6 +28,7 @@ class Shape(NamedTuple):
     # JSON text of the schemas of further members by name (`harness.prompts.extension`), which come first;
     # empty for none
     extension: str = ""
+    placeholders: tuple[str, ...] = ()  # what the prompt shows in place of values, which is no evidence
 
     @property
     def forms(self) -> tuple[str, ...]:
@@ -49,11 +50,12 @@ def answer_schema(
     scenario: str | None = None,
     form: str | None = None,
     extension: str = "",
+    placeholders: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of one role's answer; the arguments are a `Shape`'s.
 
     An answer has one of two forms: a distribution, or one action with a confidence. `scenario` stands in the
-    title only. Raises UserError for an unknown role.
+    title only, and `placeholders` nowhere. Raises UserError for an unknown role.
     """
     if role not in ROLES:
         raise errors.unknown("role", role, ROLES)

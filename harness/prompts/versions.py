@@ -29,6 +29,7 @@ from harness.prompts.examples import EXAMPLES, Examples
 from harness.prompts.examples import read as read_examples
 from harness.prompts.extension import ANSWER
 from harness.prompts.extension import read as read_extension
+from harness.prompts.placeholders import placeholders
 from harness.prompts.template import Template
 
 if TYPE_CHECKING:
@@ -118,7 +119,14 @@ class Prompt:
         return self.ego_answer if role == "ego" else self.helper_answer
 
     def shape(self, role: str, actions: Sequence[str]) -> Shape:
-        return Shape(role, tuple(actions), self.form(role), self.extension.get(role, ""))
+        extension = self.extension.get(role, "")
+        return Shape(role, tuple(actions), self.form(role), extension, self.placeholders[role])
+
+    @cached_property
+    def placeholders(self) -> Mapping[str, tuple[str, ...]]:
+        """What each role's template shows in place of an answer's values."""
+        texts = self.texts if self._templates else {}  # which raises what is wrong with a text
+        return {role: placeholders(resolved(text)) for role, text in texts.items()}
 
     def most_answer_tokens(self, role: str) -> int:
         """Return the most tokens of an answer: `max_answer_tokens`, and one a character of what is added."""
