@@ -61,6 +61,8 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
         fields["action_distribution"] = rest
     elif rest:
         repairs.add(Repair.EXTRA_FIELD)
+    if "confidence" in fields:  # which has no sum to tell percent by
+        fields["confidence"] = values.in_percent(fields["confidence"], list(rest.values()))
     if "action_distribution" in fields:
         fields["action_distribution"], found = pieces.distribution_in(fields["action_distribution"], actions)
         repairs |= found

@@ -9,9 +9,11 @@ from harness.parsing.relaxed import DECODER
 from harness.parsing.status import Failure, Status
 
 _MAX_CHARS = 4000  # json_repair's time grows faster than its input
-# What a repair could mistake for a number or drop unseen: operators, comparisons, literals, half a number.
+# What a repair could mistake for a number or drop unseen: operators, comparisons, denials, currencies,
+# literals, half a number.
 _AMBIGUOUS = re.compile(
-    r"[~≈<>()+*/^=%|]|(?<![\w.])-?(?:true|false|null|none|nan|inf(?:inity)?)\b|\d\s*-|\d\.(?!\d)",
+    r"[~≈<>()+*/^=%|$€£]|[!¬]\w"
+    r"|(?<![\w.])-?(?:true|false|null|none|nan|inf(?:inity)?)\b|\d\s*-|\d\.(?!\d)",
     re.IGNORECASE,
 )
 _HOLE = "\ue000"  # stands for a value that has been read; in no language's text

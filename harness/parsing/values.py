@@ -27,6 +27,8 @@ _PLACEHOLDER = re.compile(
     rf"p\d*|p_\w+|prob(?:ability)?\w*|(?:number|float|value|x)(?: from)?|<.*>|\.{{2,}}|…|{_RANGE}",
     re.IGNORECASE,
 )
+_NOT = ("!", "¬", "~", "-", "−")
+_PERCENT_WORDS = ("%", "percent", "per cent")
 _BETWEEN_CHOICES = re.compile(r"[|/,]|\bor\b")
 # What any prompt may write in the place of words: how many, or what kind of text. What the one that asked
 # writes is known from its template.
@@ -40,9 +42,14 @@ Intent = tuple[float, ...]
 
 
 def match(name: str, known: Sequence[str]) -> str | None:
-    """Return the known name that is meant: the same, or the only one with other case and separators."""
+    """Return the known name that is meant: the same, or the only one with other case and separators.
+
+    A name behind a sign that denies it, such as !SLOWER, is not meant.
+    """
     if name in known:
         return name
+    if name.lstrip().startswith(_NOT):
+        return None
     similar = [candidate for candidate in known if _plain(candidate) == _plain(name)]
     return similar[0] if len(similar) == 1 else None
 
@@ -170,6 +177,12 @@ def check_range(name: str, value: float) -> None:
     """Raise `Failure` out_of_range unless a value is in 0..1."""
     if not 0 <= value <= 1:
         raise Failure(Status.OUT_OF_RANGE, f"{printable(name, 40)} is {value:.4g}, outside 0..1")
+
+
+def in_percent(value: object, rest: Sequence[object]) -> object:
+    """Return a number as a text with a percent sign if a member beside it, in `rest`, states that unit."""
+    stated = any(isinstance(each, str) and each.strip().casefold() in _PERCENT_WORDS for each in rest)
+    return f"{value}%" if stated and type(value) is float else value
 
 
 def is_placeholder(value: object) -> bool:
