@@ -152,7 +152,13 @@ class Replay:
 
 
 class Kept(Replay):
-    """Has a run's answers and nobody else to ask, so that a stranger's run opens no model."""
+    """Has a run's answers and nobody else to ask, so that a stranger's run opens no model.
+
+    A delay that it states of an answer is not taken: only rules declare such, and they are asked.
+    """
+
+    def _completion(self, request: Request, answer: Answer) -> Completion:
+        return replace(super()._completion(request, answer), slow_s=0.0)
 
     def _model(self, role: str, requests: Sequence[Request]) -> Backend:
         """Raise UserError: the run has no such answer."""

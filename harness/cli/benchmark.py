@@ -176,9 +176,10 @@ def seeds(
     edition: Annotated[str, typer.Option(help="Edition whose scenarios are sealed.")] = EDITION,
     as_json: options.Json = False,
 ) -> None:
-    """Print how to build sealed layouts, whose seeds follow from a commit.
+    """Print how to build sealed layouts.
 
-    Nobody knew its id before it was made, so nobody, the makers included, had looked at these layouts.
+    Their seeds follow from a commit. Nobody knew its id before it was made, so nobody, the makers included,
+    had looked at these layouts.
     """
     from harness.core.seeds import sealed
     from harness.dataset import load

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
+from harness.backends import cards
 from harness.backends.card import Card
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
@@ -31,7 +32,7 @@ from harness.runs.metrics import METRICS
 from harness.runs.records import FrozenScenes, Manifest, Score
 from harness.runs.success import Pairs, is_gain, mean_difference
 
-KIND = "editions"
+KIND, DRIVER = "editions", "driver"
 
 Names = Annotated[tuple[str, ...], Meta(min_length=1, description="a list of names, one or more")]
 Digests = Annotated[dict[str, str], Meta(min_length=1, description="a table of digests by name")]
@@ -139,6 +140,8 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             ("conditions", conditions, self.condition), ("seeds", m.seeds, parse_seeds(self.seeds)),
             ("latency", m.latency_source, self.latency), ("ties", m.ties, self.ties),
             ("device profile", m.device_profile and m.device_profile.name, None),
+            ("sums", m.sums, "refuse"), ("image", m.image, "own"), ("flip", m.flip, False),
+            ("temperature", m.temperature, 0.0), ("sampling seed", m.sampling_seed, 0),
         ):  # fmt: skip
             if own != wanted:
                 yield f"its {what}: {printable(own)}, not {printable(wanted)}"
@@ -150,6 +153,8 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if prompt.sha256 != self.prompts[prompt.version]:
             raise self._differs(f"prompt {prompt.version}", prompt.sha256, self.prompts[prompt.version])
         card = convert(m.model, Card, f"{printable(run.path)}: its model")
+        if card.engine == DRIVER:  # the one that is here says what it may see
+            card = cards.load(card.name)
         how: Any = (m.answer, m.thinking, m.image, m.letters, m.sums, m.flip)
         return Spec(
             Agent(card, prompt, *how), source, resolve.points(self.condition), parse_seeds(self.seeds),

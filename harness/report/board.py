@@ -39,9 +39,12 @@ class Line:
 
     @property
     def name(self) -> str:
-        """The agents in words; of a rule without the prompt that it does not read."""
-        variant, model = self.entry.suite.variant, self.entry.suite.manifest.model
-        return str(variant) if reads_prompts(str(model["engine"])) else f"{variant.model} · a rule"
+        """The agents in words, with all that entries may choose; of a rule without the prompt."""
+        variant, manifest = self.entry.suite.variant, self.entry.suite.manifest
+        if not reads_prompts(str(manifest.model["engine"])):
+            return f"{variant.model} · a rule"
+        orders = " · cyclic letters" if manifest.letters == "cyclic" else ""
+        return f"{variant}{' · thinking' if manifest.thinking else ''}{orders}"
 
 
 def lines(entries: Sequence[Rescored]) -> list[Line]:

@@ -200,7 +200,7 @@ PLAIN: dict[str, str] = {
     "dataset build name": "occluded-intersection",
     "dataset scenario show name": "do-not-pass", "dataset scenario drive name": "do-not-pass",
     "dataset scenario audit name": "do-not-pass", "radio show name": "6g", "radio check name": "mode4",
-    "edition": "small",
+    "edition": "small", "commit": "0" * 40, "benchmark seeds names": "narrow-passage",
     "model check name": "proxy", "model pull name": "proxy", "model device show name": "laptop-cpu",
     "model device check name": "laptop-cpu", "model parity model": "models/evil-weights", "port": "0",
     "serve model": "mine", "budget": "1", "limit": "1", "episodes": "1", "seeds": "0:1", "workers": "1",
