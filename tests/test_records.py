@@ -22,6 +22,7 @@ import harness as package
 from harness.backends.card import Card
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
+from harness.core.versions import versions
 from harness.evaluate.lifecycle import RunStart
 from harness.report.view.access import cookie
 from harness.report.view.app import app
@@ -197,7 +198,9 @@ BEGUN = "drive --model local-view --episodes 40 --seeds 0 --workers 1 --conditio
     [pytest.param("8cccefb", marks=pytest.mark.exhaustive), pytest.param("0103f23", marks=pytest.mark.slow)],
 )
 def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: Typed) -> None:
-    """The part that it had is taken as it is. Its bare name has come to mean other scenes."""
+    """The part that it had is taken as it is. Its bare name has come to mean other scenes, and its parser
+    read answers otherwise, so that it goes on only where it says that it has the present one.
+    """
     begun = kept(f"{commit}/begun")
     [part] = begun.glob(".work/episodes-*/answers.jsonl")
     answers = part.read_bytes()
@@ -205,6 +208,11 @@ def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: 
     code, _, error = harness(*typed)
     assert (code, error.count("\n")) == (2, 1)
     assert "with --scenario occluded-intersection:limits=2" in error
+    code, _, error = harness(*typed, "--scenario", NAME)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "was begun with another version of parser; repeat its settings (version of parser 1)" in error
+    config = begun / ".work/config.json"
+    config.write_text(json.dumps(json.loads(config.read_text()) | {"versions": versions()}))
     code, _, error = harness(*typed, "--scenario", NAME)
     assert (code, error) == (0, "")
     assert len(folder.read(begun).episodes) == 40

@@ -100,9 +100,10 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
     """Return the record of a stopped run in a folder, or None. Raises UserError if it is another run."""
     begun = work.begun(out, RunStart)
     if begun:
-        now = {**_comparable(spec.settings()), "shard": shard, **_rules(versions())}
-        stored = {**_comparable(begun.settings), "shard": begun.shard, **_rules(begun.versions)}
+        now = {**_comparable(spec.settings()), "shard": shard}
+        stored = {**_comparable(begun.settings), "shard": begun.shard}
         work.same(out, now, stored, partial(_options, spec, shlex.join(begun.command)))
+        work.same(out, _rules(versions()), _rules(begun.versions))
     return begun
 
 
