@@ -107,7 +107,7 @@ def pieces(*texts: str, finish_reason: str | None = "stop", usage: bool = True, 
 def completion(content: Any = "hello", finish_reason: str = "stop", **message: Any) -> dict[str, Any]:
     """What a decent server answers."""
     choice = {"index": 0, "finish_reason": finish_reason, "message": {"content": content, **message}}
-    return {"choices": [choice], "usage": {"prompt_tokens": 12, "completion_tokens": 3}}
+    return {"choices": [choice], "usage": {"prompt_tokens": 12, "completion_tokens": 20}}
 
 
 def read_out(*likeliest: tuple[str, float]) -> dict[str, Any]:

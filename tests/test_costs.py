@@ -30,7 +30,7 @@ currency = "EUR"
 source = "paper"
 basis = "none declared"
 """
-EACH = (12 * 1000 + 3 * 2000) / 1e6  # of an answer of 12 tokens read and 3 written, which the server states
+EACH = (12 * 1000 + 20 * 2000) / 1e6  # of an answer of 12 tokens read and 20 written, which the server states
 
 
 @pytest.fixture(autouse=True)
@@ -67,7 +67,7 @@ def test_a_run_states_what_its_questions_cost(
     assert cost_of("run") == {
         "mine": {
             "currency": "EUR", "amount": pytest.approx(asked * EACH), "asked": asked, "uncounted": 0,
-            "read_tokens": 12 * asked, "written_tokens": 3 * asked,
+            "read_tokens": 12 * asked, "written_tokens": 20 * asked,
         }
     }  # fmt: skip
     assert f"cost: {asked * EACH:.4g} EUR for {asked} questions to mine" in said
@@ -87,7 +87,7 @@ def test_a_limit_stops_before_more_is_asked_and_the_same_command_goes_on(
     first = len(there.asked)
     assert code == 3
     assert re.search(
-        r"harness: [\d.]+ EUR of --max-cost 1.44 are spent; all answers are kept, and the same", said
+        r"harness: [\d.]+ EUR of --max-cost 4.16 are spent; all answers are kept, and the same", said
     )
     # Chunks of 64 are asked whole, and those on their way when it is spent still come.
     assert 80 <= first <= 80 + 3 * 64

@@ -83,11 +83,11 @@ def test_a_plain_question_is_asked_greedily_and_answered(monkeypatch: pytest.Mon
     }  # fmt: skip
     assert "Authorization" not in asked.headers
     assert (done.request_id, done.text, done.finish_reason, done.error) == ("s/v1", GOOD, "stop", None)
-    assert (done.prompt_tokens, done.completion_tokens, done.retries, done.batch_size) == (12, 3, 0, 1)
+    assert (done.prompt_tokens, done.completion_tokens, done.retries, done.batch_size) == (12, 20, 0, 1)
     assert done.seconds is not None
     assert done.seconds > 0
     assert backend.identity() == {
-        "engine": "openai", "answers": 1, "server": "generic", "base_url": there.url + "/", "model": "m",
+        "engine": "openai", "answers": 2, "server": "generic", "base_url": there.url + "/", "model": "m",
         "listed": {"id": "m", "owned_by": "tests"},
     }  # fmt: skip
 
@@ -354,9 +354,17 @@ def test_tokens_that_are_no_counts_are_unknown(count: Any) -> None:
 
 
 def test_tokens_that_are_counts_are_known() -> None:
-    made = {**completion("a"), "usage": {"prompt_tokens": 10**7, "completion_tokens": 0}}
+    made = {**completion("a"), "usage": {"prompt_tokens": 10**7, "completion_tokens": 1}}
     said = read(made, request())
-    assert (said.prompt_tokens, said.completion_tokens) == (10**7, 0)
+    assert (said.prompt_tokens, said.completion_tokens) == (10**7, 1)
+
+
+@pytest.mark.parametrize(("written", "tokens"), [(160, 10), (160, 9), (161, 10), (0, 0), (1, 0), (150, 1)])
+def test_a_text_has_a_token_for_each_sixteen_characters_at_least(written: int, tokens: int) -> None:
+    """Who counts fewer has not counted, and latency and joules do not follow from it."""
+    usage = {"prompt_tokens": 12, "completion_tokens": tokens}
+    said = read({**completion("a" * written), "usage": usage}, request())
+    assert said.completion_tokens == (tokens if 16 * tokens >= written else None)
 
 
 # -- thoughts -----------------------------------------------------------------------------------------------

@@ -272,7 +272,7 @@ def test_the_best_on_tune_layouts_is_certified_on_report_layouts(
     assert family["difference"]["n"] == 3
     assert len(model.chats) == record["questions"] + record["certificate"]["questions"]
     for cost in (record, record["certificate"]):
-        assert cost["tokens"] == 15 * cost["questions"], "the server counts 12 tokens in and 3 out"
+        assert cost["tokens"] == 32 * cost["questions"], "the server counts 12 tokens in and 20 out"
     page = (tmp_path / "reports" / "new" / "index.html").read_text()
     assert "read once, after the search" in page
     assert best in page

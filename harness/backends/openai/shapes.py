@@ -22,6 +22,7 @@ from harness.prompts.readout import letters, spelt, stated
 
 _REMEDY = "use --answer json, or a server that keeps to it; the kind in its card says how it is asked"
 MOST_TOKENS = 10**7  # more than any context; what a server counts beyond is no count
+MOST_CHARACTERS = 16  # of a token, on average over a text: whoever counts fewer tokens has not counted
 # Temperature 0 is not enough: by default some servers penalise repetition (llama_cpp.server by 1.1, vLLM by
 # the checkpoint's generation_config.json), and JSON repeats itself.
 _PENALTY: Mapping[Kind, str] = {
@@ -97,7 +98,9 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
         message = in_texts(choice["message"])
         content, thinks, refuses = message.get("content"), thought(message), refusal(message)
         end, usage = ending(choice.get("finish_reason")), payload.get("usage") or {}
-        tokens = tokens_in(usage.get("prompt_tokens")), tokens_in(usage.get("completion_tokens"))
+        written = 0 if request.bare or not isinstance(content, str) else len(content)
+        counts = usage.get("prompt_tokens"), usage.get("completion_tokens")
+        tokens = tokens_in(counts[0]), tokens_in(counts[1], written)
     except NoText as error:
         return failed(request, str(error))
     except (LookupError, TypeError, AttributeError):
@@ -169,6 +172,10 @@ def answering_model(payload: Any) -> str | None:
     return model if isinstance(model, str) else None
 
 
-def tokens_in(value: Any) -> int | None:
-    """Return a count of tokens as a server states it; None if it is none."""
-    return value if type(value) is int and 0 <= value <= MOST_TOKENS else None
+def tokens_in(value: Any, characters: int = 0) -> int | None:
+    """Return a count of tokens as a server states it of so many characters; None if it is none.
+
+    Latency and energy follow from counts, so one that the text cannot have is not taken.
+    """
+    least = math.ceil(characters / MOST_CHARACTERS)
+    return value if type(value) is int and least <= value <= MOST_TOKENS else None
