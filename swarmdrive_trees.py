@@ -10,7 +10,7 @@ from typing import Any
 import verifiers.v1 as vf
 
 import harness
-from harness.learning.asking import READ_BY, driven_worth, intent
+from harness.learning.asking import READ_BY, earned, intent
 
 __all__ = ["SwarmdriveTrees"]
 
@@ -60,7 +60,7 @@ class DecisionTask(vf.Task[DecisionData, vf.State, vf.TaskConfig]):  # type: ign
     @vf.reward  # type: ignore[untyped-decorator]
     async def advantage(self, trace: vf.Trace) -> float:
         data = self.data
-        return driven_worth(trace.last_reply, data.values, data.constant, **data.read_by())
+        return earned(trace.last_reply, data.values, data.constant, **data.read_by())
 
     @vf.metric  # type: ignore[untyped-decorator]
     async def readable(self, trace: vf.Trace) -> float:

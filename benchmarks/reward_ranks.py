@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from constants import scenario_of
+from open_loop import SEARCHED
 from rows import Row, finish
 from scipy.stats import kendalltau
 
@@ -31,10 +32,7 @@ from harness.world import drivers
 
 SMALLEST = "--layouts 1 --scenarios parking-exit --models proxy"
 TABLE = ""
-SCENARIOS = (
-    "occluded-intersection", "hard-brake-ahead", "do-not-pass", "roundabout-entry", "parking-exit",
-    "blind-merge",
-)  # fmt: skip
+SCENARIOS = tuple(name for name, limits in SEARCHED if limits == 2)  # of the suite v2v-safety-2
 MODELS: Mapping[str, Mapping[str, str]] = {
     "proxy": {}, "swarm-tiny-six-v2": {"answer": "readout", "latency": "paper"},
 }  # fmt: skip

@@ -17,6 +17,7 @@ from contextlib import closing, contextmanager
 from dataclasses import fields, replace
 from fnmatch import fnmatchcase
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -165,11 +166,16 @@ class Cached:
         self.window = window(backend)
         self._doubt = doubt(backend)
         self._sources = _sources(several(backend))
+        # What an answer is kept under, by its source; None where the identity says who answers
+        self._identities: dict[str | None, Mapping[str, Any]] = {None: self._identity}
+        if self._sources:
+            named = dict.fromkeys(self._sources.values())
+            self._identities = {source: {**self._identity, "source": source} for source in named}
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         prompts = self.backend.rendered(requests)
         keys = [self._keys(prompt, r) for prompt, r in zip(prompts, requests, strict=True)]
-        wanted = [key for each in keys for key in each.values()]
+        wanted = list(chain.from_iterable(each.values() for each in keys))
         known = self._try(lambda file: file.find(wanted)) or {}
         if known and self._doubt:
             _say_once(f"harness: {self._doubt}", digest(self._identity))
@@ -188,14 +194,11 @@ class Cached:
         return completions
 
     def _keys(self, prompt: str, request: Request) -> dict[str | None, str]:
-        """Return where an answer to a request lies, by its source; None if the identity says who answers."""
-        if not self._sources:
-            return {None: key(self._identity, prompt, request, self._batch_size)}
-        keys: dict[str | None, str] = {}
-        for source in dict.fromkeys(self._sources.values()):
-            identity = {**self._identity, "source": source}
-            keys[source] = key(identity, prompt, request, self._batch_size)
-        return keys
+        """Return where an answer to a request lies, by its source."""
+        return {
+            source: key(identity, prompt, request, self._batch_size)
+            for source, identity in self._identities.items()
+        }
 
     def identity(self) -> dict[str, Any]:
         return self._identity

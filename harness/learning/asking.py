@@ -103,26 +103,28 @@ def intent(
     ).intent
 
 
-def driven_worth(text: str, values: Sequence[float], constant: int, **read_by: Any) -> float:
-    """Return the worth of the action that an answer drives, less that of one that is always taken.
+Worth = Callable[[Sequence[float], Sequence[float]], float]  # of a distribution, by what actions are worth
 
-    The likeliest action drives; of equals each does as often. An answer that cannot be read drives nobody:
-    it is worth 0. `values` has the worth of each action, (A,); `constant` is the index of the other.
-    """
-    p = intent(text, **read_by)
-    if p is None:
-        return -float(values[constant])
+
+def driven(p: Sequence[float], values: Sequence[float]) -> float:
+    """Return the worth of the action that a distribution drives: the likeliest; of equals each as often."""
     likeliest = np.array(p) == max(p)
-    return float(np.mean(np.array(values)[likeliest]) - values[constant])
+    return float(np.mean(np.array(values)[likeliest]))
 
 
-def stated_worth(text: str, values: Sequence[float], constant: int, **read_by: Any) -> float:
-    """Return the mean worth of the distribution that an answer states, less that of the constant.
+def stated(p: Sequence[float], values: Sequence[float]) -> float:
+    """Return the mean worth of a distribution, which tells apart those that drive the same action."""
+    return float(np.dot(p, values))
 
-    It tells answers apart that drive the same action; an answer that cannot be read is worth 0.
+
+def earned(text: str, values: Sequence[float], constant: int, worth: Worth = driven, **read_by: Any) -> float:
+    """Return what an answer is worth, less the action that is always taken.
+
+    An answer that cannot be read drives nobody: it is worth 0. `values` has the worth of each action, (A,);
+    `constant` is the index of the other.
     """
     p = intent(text, **read_by)
-    return (0.0 if p is None else float(np.dot(p, values))) - float(values[constant])
+    return (0.0 if p is None else worth(p, values)) - float(values[constant])
 
 
 READ_BY = ("answer", "role", "actions", "form", "extension", "reasons_first")
@@ -141,7 +143,7 @@ def advantage(
         constant: the action beside which each is judged.
         columns: the further columns of `rows`; others are left alone.
     """
-    return _rewards(driven_worth, completions, values, constant, columns)
+    return _rewards(driven, completions, values, constant, columns)
 
 
 def expected_advantage(
@@ -153,16 +155,16 @@ def expected_advantage(
     It differs between answers that drive the same, so a trainer that samples few answers to a question learns
     from more of them; but who is unsure and right earns less than who is sure. Arguments: as of `advantage`.
     """
-    return _rewards(stated_worth, completions, values, constant, columns)
+    return _rewards(stated, completions, values, constant, columns)
 
 
 def _rewards(
-    of: Callable[..., float], completions: Sequence[Any], values: Sequence[Sequence[float]],
+    worth: Worth, completions: Sequence[Any], values: Sequence[Sequence[float]],
     constant: Sequence[int], columns: Mapping[str, Any],
 ) -> list[float]:  # fmt: skip
     rewards = []
     for n, completion in enumerate(completions):
         text = completion if isinstance(completion, str) else completion[-1]["content"]
         read_by = {name: columns[name][n] for name in READ_BY}
-        rewards.append(of(text, values[n], constant[n], **read_by))
+        rewards.append(earned(text, values[n], constant[n], worth, **read_by))
     return rewards

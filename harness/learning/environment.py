@@ -90,9 +90,9 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
     def references(self, per_level: int = 6) -> dict[str, dict[str, float]]:
         """Return what those earn who need no model: lines to draw beside a training curve.
 
-        Of each, `advantage` is the mean reward over the rows, 0 of `constant`, and `regret` the mean sum of
-        rewards of an episode. `full-view` sees everything. Raises UserError without trees, or if no decision
-        of their layouts matters.
+        Of each, `advantage` is the mean reward over the rows, 0 of `constant`, and `success` what it drives
+        on their layouts, balanced over those with and without a danger. `full-view` sees everything. Raises
+        UserError without trees, or if no decision of their layouts matters.
         """
         trees = self._trees("references()")
         return trees.references(trees.drawn(per_level))

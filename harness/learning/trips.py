@@ -98,7 +98,8 @@ class Trees:
 
     def drawn(self, per_level: int) -> Ints:
         """Return decision points that matter, so many of each level of each tree; see `values.drawn`."""
-        return drawn(self.dataset.forest, self.values.decides, per_level, self.scenario.name)
+        data = self.dataset
+        return drawn(data.forest, data.dangerous, self.values.decides, per_level, self.scenario.name)
 
     def references(self, at: Ints) -> dict[str, dict[str, float]]:
         """Return of who needs no model the mean `advantage` at points (n,), and balanced `success`."""

@@ -93,14 +93,13 @@ def best_constant(forest: Forest, dangerous: Bools) -> int:
     return int(np.argmax(success))
 
 
-def drawn(forest: Forest, of: Bools, per_level: int, scenario: str) -> Ints:
+def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario: str) -> Ints:
     """Return points among those that are asked for, (N,), so many of each level of each tree, ascending.
 
     They are drawn by scenario and layout seed. A level that has fewer has them several times, so that levels
     weigh alike: an episode passes one point of each. Layouts with and without a danger have as many in all,
     as balanced success weighs them, so of the rarer kind more are drawn.
     """
-    dangerous = np.array([danger is not None for danger in forest.dangers])
     alike = np.where(dangerous, dangerous.sum(), (~dangerous).sum())
     kinds = len(np.unique(dangerous))
     counts = np.maximum(1, np.round(per_level * len(dangerous) / kinds / alike)).astype(int)
