@@ -12,7 +12,7 @@ it writes the tables of the page, of all that is there, between its marks.
 
 import json
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -95,7 +95,8 @@ def main() -> None:
         said = json.loads(file.read_bytes()) if file.exists() else None
         plans[scene] = solved(said) if said else {}
         ended[scene] = searched(said) if said else ""
-    text = "\n\n".join((*overall(made, plans, ended), *details(made, plans), *by_share(made)))
+    tables = (*overall(made, plans, ended), *by_halves(made), *details(made, plans), *by_share(made))
+    text = "\n\n".join(tables)
     print(text)
     if given.page:
         write_tables(given.page, text)
@@ -174,6 +175,28 @@ def details(made: Sequence[Driven], plans: Mapping[str, Plans]) -> Iterator[str]
             for name, point in CONDITIONS.items()
         ]  # fmt: skip
         yield markdown(("they hear", "success %", "above nothing", "above the plan", *FIGURES), rows)
+
+
+def by_halves(made: Sequence[Driven]) -> Iterator[str]:
+    """Yield a table of what the first model gains by what all hear, with a danger and without."""
+    rows = []
+    for each in (each for each in made if each.share == 1 and each.driver == DRIVERS[0]):
+        dangers = {episode.layout_seed: episode.danger != "none" for episode in each.run.episodes}
+        halves = [{layout for layout in dangers if dangers[layout] == half} for half in (True, False)]
+        silence = success(each.run, CONDITIONS["nothing"])
+        row = {"scene": each.scene, "n": ", ".join(str(len(half)) for half in halves)}
+        for name in list(CONDITIONS)[1:]:
+            heard = success(each.run, CONDITIONS[name])
+            row[name] = ", ".join(more(part(heard, half), silence) for half in halves)
+        rows.append(row)
+    if rows:
+        yield f"**Above nothing by halves**, {DRIVERS[0].model}: with a danger, without; *n* layouts of each:"
+        yield markdown(tuple(rows[0]), [tuple(row.values()) for row in rows])
+
+
+def part(success_by_layout: Mapping[int, float], layouts: Container[int]) -> dict[int, float]:
+    """Return the success in these layouts."""
+    return {layout: value for layout, value in success_by_layout.items() if layout in layouts}
 
 
 def by_share(made: Sequence[Driven]) -> Iterator[str]:
