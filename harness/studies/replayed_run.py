@@ -3,48 +3,40 @@
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from harness.backends.base import AnswerMode, Backend, Letters, Request, Sums, same_model
+from harness.backends.base import Backend, Request, same_model
 from harness.backends.cache import default_file
 from harness.backends.card import Card
 from harness.backends.cards import find_own
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
-from harness.coordination.calibrations import file_of
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.exchange import Exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
-from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import chosen
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import alone, canonical_json, sha256_file
-from harness.core.formats import SOURCES
+from harness.core.files import alone, canonical_json
 from harness.core.progress import Progress
 from harness.dataset.load import Scene
 from harness.evaluate import device
-from harness.evaluate.agent import Agent, ImageMode
 from harness.evaluate.asking import EGO, Asker, wanted_in
-from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
+from harness.evaluate.of_run import check_prompts, points_of, spec_of
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Fuses
-from harness.prompts import versions
-from harness.radio.networks import network
-from harness.radio.profiles import CHANNELS
 from harness.runs.folder import dataset_of, read
 from harness.runs.records import Answer
-from harness.runs.sources import PROMPTS, prompt_of
 from harness.runs.success import Success, alike
 from harness.runs.unanswered import tally
 from harness.studies.axes import Setting
@@ -103,24 +95,7 @@ class ReplayedRun:
         manifest = self.run.manifest
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
-
-        def same(now: Any, recorded: Any) -> bool:
-            return bool(now == msgspec.json.decode(msgspec.json.encode(recorded)))
-
-        stated: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
-            "channel profile": (manifest.channels, CHANNELS.unchanged),
-            "network": (manifest.networks, lambda name, then: same(asdict(network(name)), then)),
-            "calibration": (manifest.calibrations, lambda name, then: same(sha256_file(file_of(name)), then)),
-            "schedule": (manifest.schedules, lambda name, then: same(SCHEDULES.file_sha256(name), then)),
-        }
-        for what, (by_name, unchanged) in stated.items():
-            for name, recorded in by_name.items():
-                if not unchanged(name, recorded):
-                    raise UserError(
-                        f"{printable(folder)}: {what} {printable(name)} has changed since; restore it or run "
-                        "again"
-                    )
-        self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
+        self.points = points_of(self.run)
         self.dataset = dataset_of(self.run, dataset).of_episodes(self.run.grid.episodes)
         self.episodes = len(self.dataset.episodes)
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
@@ -131,9 +106,10 @@ class ReplayedRun:
         self._opened: dict[int, Backend] = {}
         missing = tally(self.run).missing  # a lost message is a part of the run; what it lacks is asked again
         answers = {a.id: a for a in self.run.answers if a.error is None or a.role not in missing}
+        times = PAPER if latency == "paper" else manifest.latency
         self._asker = Asker(
-            self._spec(), self._open, PAPER if latency == "paper" else manifest.latency, folder / MORE,
-            answers, self._count_answered, self._set_left,
+            spec_of(self.run, self.dataset), self._open, times, folder / MORE, answers,
+            self._count_answered, self._set_left,
         )  # fmt: skip
 
     def _set_left(self, count: int) -> None:
@@ -311,35 +287,6 @@ class ReplayedRun:
         except BlockingIOError:
             raise UserError(f"{printable(self.run.path)} is being written by another process; wait") from None
 
-    def _spec(self) -> Spec:
-        manifest = self.run.manifest
-        ego, *helpers = map(self._agent, (manifest.agent(0), *manifest.helpers))
-        return Spec(
-            ego, FrozenSource(self.dataset), (), manifest.seeds, tuple(helpers),
-            batch_size=manifest.batch_size, dtype=manifest.dtype,
-            temperature=manifest.temperature, sampling_seed=manifest.sampling_seed, ask="used",
-            ties=manifest.ties,
-        )  # fmt: skip
-
-    def _agent(self, stated: Mapping[str, Any]) -> Agent:
-        card = convert(stated["model"], Card, f"{printable(self.run.path)}: its model")
-        if (version := stated["prompt"]["version"]) not in versions.names():
-            shown = printable(self.run.path)
-            raise UserError(f"{shown}: prompt {printable(version)} is not here; {self._restore(stated)}")
-        prompt = versions.load(version)
-        return Agent(
-            card, prompt, cast("AnswerMode", stated["answer"]), stated["thinking"],
-            cast("ImageMode", stated["image"]), cast("Letters", stated["letters"]),
-            cast("Sums", stated["sums"]),
-        )  # fmt: skip
-
-    def _restore(self, stated: Mapping[str, Any]) -> str:
-        """What to do if a prompt is not here as it was: a study asks with the user's prompts, not a run's."""
-        if prompt_of(self.run, stated["prompt"]) is None:
-            return "restore it or run again"
-        kept = self.run.path / SOURCES / PROMPTS / stated["prompt"]["version"]
-        return f"copy {printable(kept)} to prompts/, or run again"
-
     def _open(self) -> Backend:
         """This process's backend, opened once: a forked process may not ask its parent's."""
         if (process := os.getpid()) not in self._opened:
@@ -348,18 +295,13 @@ class ReplayedRun:
         return self._opened[process]
 
     def _newly_opened(self) -> Backend:
-        spec, shown, manifest = self._asker.spec, printable(self.run.path), self.run.manifest
-        for agent, stated in zip(spec.agents, (manifest.agent(0), *manifest.helpers), strict=True):
-            if agent.prompt.sha256 != stated["prompt"]["sha256"]:
-                version = agent.prompt.version
-                raise UserError(
-                    f"{shown}: prompt {printable(version)} has changed since; {self._restore(stated)}"
-                )
+        spec, shown = self._asker.spec, printable(self.run.path)
+        check_prompts(self.run, spec)
         cards = [find_own(card, self._models, shown, _GIVE_IT) for card in spec.cards]
         opens = partial(open_backend, dtype=spec.dtype, batch_size=spec.batch_size)
         models = open_each(cards, opens)
         identity = together(cards, models).identity()
-        stored, now = manifest.identity, msgspec.json.decode(canonical_json(identity))
+        stored, now = self.run.manifest.identity, msgspec.json.decode(canonical_json(identity))
         if not same_model(stored, now):
             changes = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
             raise UserError(

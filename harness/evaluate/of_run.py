@@ -1,0 +1,98 @@
+"""The evaluation that a finished run is; prompts, channels and networks must be as they were."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any, cast
+
+import msgspec
+
+from harness.backends.base import AnswerMode, Letters, Sums
+from harness.backends.card import Card
+from harness.coordination.calibrations import file_of
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.schedules import SCHEDULES
+from harness.core.config import convert
+from harness.core.errors import UserError, printable
+from harness.core.files import sha256_file
+from harness.core.formats import SOURCES
+from harness.dataset.load import Dataset
+from harness.evaluate.agent import Agent, ImageMode
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.spec import Spec
+from harness.prompts import versions
+from harness.radio.networks import network
+from harness.radio.profiles import CHANNELS
+from harness.runs.folder import Run
+from harness.runs.sources import PROMPTS, prompt_of
+
+
+def spec_of(run: Run, dataset: Dataset) -> Spec:
+    """Return the evaluation of a run's frozen scenes, with all that decides its answers; without conditions.
+
+    Raises UserError if a prompt of it is not here.
+    """
+    manifest = run.manifest
+    ego, *helpers = (_agent(run, stated) for stated in (manifest.agent(0), *manifest.helpers))
+    return Spec(
+        ego, FrozenSource(dataset), (), manifest.seeds, tuple(helpers),
+        batch_size=manifest.batch_size, dtype=manifest.dtype,
+        temperature=manifest.temperature, sampling_seed=manifest.sampling_seed, ask="used",
+        ties=manifest.ties,
+    )  # fmt: skip
+
+
+def points_of(run: Run) -> dict[str, OperatingPoint]:
+    """Return a run's operating points by name.
+
+    Raises UserError if a channel, network, calibration or schedule of them has changed since.
+    """
+    manifest = run.manifest
+    stated: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
+        "channel profile": (manifest.channels, CHANNELS.unchanged),
+        "network": (manifest.networks, lambda name, then: _same(asdict(network(name)), then)),
+        "calibration": (manifest.calibrations, lambda name, then: _same(sha256_file(file_of(name)), then)),
+        "schedule": (manifest.schedules, lambda name, then: _same(SCHEDULES.file_sha256(name), then)),
+    }
+    for what, (by_name, unchanged) in stated.items():
+        for name, recorded in by_name.items():
+            if not unchanged(name, recorded):
+                raise UserError(
+                    f"{printable(run.path)}: {what} {printable(name)} has changed since; restore it or run "
+                    "again"
+                )
+    return {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
+
+
+def check_prompts(run: Run, spec: Spec) -> None:
+    """Raise UserError if a prompt of a run has changed since."""
+    stated = (run.manifest.agent(0), *run.manifest.helpers)
+    for agent, each in zip(spec.agents, stated, strict=True):
+        if agent.prompt.sha256 != each["prompt"]["sha256"]:
+            version = printable(agent.prompt.version)
+            raise UserError(
+                f"{printable(run.path)}: prompt {version} has changed since; {_restore(run, each)}"
+            )
+
+
+def _same(now: Any, recorded: Any) -> bool:
+    return bool(now == msgspec.json.decode(msgspec.json.encode(recorded)))
+
+
+def _agent(run: Run, stated: Mapping[str, Any]) -> Agent:
+    card = convert(stated["model"], Card, f"{printable(run.path)}: its model")
+    if (version := stated["prompt"]["version"]) not in versions.names():
+        raise UserError(
+            f"{printable(run.path)}: prompt {printable(version)} is not here; {_restore(run, stated)}"
+        )
+    return Agent(
+        card, versions.load(version), cast("AnswerMode", stated["answer"]), stated["thinking"],
+        cast("ImageMode", stated["image"]), cast("Letters", stated["letters"]), cast("Sums", stated["sums"]),
+    )  # fmt: skip
+
+
+def _restore(run: Run, stated: Mapping[str, Any]) -> str:
+    """What to do if a prompt is not here as it was: nothing is asked with a run's prompts."""
+    if prompt_of(run, stated["prompt"]) is None:
+        return "restore it or run again"
+    kept = run.path / SOURCES / PROMPTS / stated["prompt"]["version"]
+    return f"copy {printable(kept)} to prompts/, or run again"
