@@ -1,6 +1,7 @@
 """Runs on disk: one made up, and any run changed by hand. All are written by the harness's one writer."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +88,8 @@ def made_up(
         "latency": Latency("card", "made up", 0.145, 0.145, 0.145), "identity": {"engine": "proxy"},
         "cached_answers": 0, "engine_errors": 0, "versions": {"harness": "0"},
     }  # fmt: skip
-    return _write(out, {**manifest, **stated}, rows, ends, said)
+    whole = formats.upgraded(msgspec.to_builtins({**manifest, **stated}))
+    return _write(out, msgspec.convert(whole, Manifest), rows, ends, said)
 
 
 def change(
@@ -95,19 +97,39 @@ def change(
     decision: Change = lambda row: None,
     episode: Change = lambda row: None,
     answer: Change = lambda row: None,
+    **stated: Any,
 ) -> None:
-    """Change each row of a run's tables; the summary and what an episode has from decisions stay.
+    """Change each row of a run's tables and fields of run.json, and what follows from them.
 
     A row is a mapping by column, None where unknown.
     """
-    read = folder.read(run)
-    rows = [_changed(row, decision) for row in read.decisions.table.to_pylist()]
-    ends = [_changed(msgspec.structs.asdict(one), episode) for one in read.episodes]
-    said = [_changed(msgspec.structs.asdict(one), answer) for one in read.answers]
+    read, rows, ends, said = _rows(run, decision, episode, answer)
+    whole = {**msgspec.to_builtins(read.manifest), **stated}
+    _write(run, msgspec.convert(whole, Manifest), rows, ends, said)
+
+
+def damage(
+    run: Path,
+    decision: Change = lambda row: None,
+    episode: Change = lambda row: None,
+    answer: Change = lambda row: None,
+) -> None:
+    """Change each row of a run's tables, and nothing that follows from them; it need not be possible."""
+    read, rows, ends, said = _rows(run, decision, episode, answer)
     decisions = _decisions(rows, read.actions, read.decisions.helpers)
-    manifest = read.manifest
-    folder.write(
-        run, manifest, decisions, _all(ends, Episode), [folder.lines(_all(said, Answer))], read.scores
+    lines = folder.lines(_all(said, Answer))
+    folder.write(run, read.manifest, decisions, _all(ends, Episode), [lines], read.scores)
+
+
+def _rows(
+    run: Path, decision: Change, episode: Change, answer: Change
+) -> tuple[folder.Run, list[Row], list[Row], list[Row]]:
+    read = folder.read(run)
+    return (
+        read,
+        [_changed(row, decision) for row in read.decisions.table.to_pylist()],
+        [_changed(msgspec.structs.asdict(one), episode) for one in read.episodes],
+        [_changed(msgspec.structs.asdict(one), answer) for one in read.answers],
     )
 
 
@@ -129,9 +151,9 @@ def answers_of(run: Path) -> list[Answer]:
 
 
 def _write(
-    out: Path, stated: Mapping[str, Any], rows: Sequence[Row], ends: Sequence[Row], said: Sequence[Row]
+    out: Path, manifest: Manifest, rows: Sequence[Row], ends: Sequence[Row], said: Sequence[Row]
 ) -> Path:
-    manifest = msgspec.convert(formats.upgraded(msgspec.to_builtins(stated)), Manifest)
+    _settle(rows, ends)
     helpers = max((int(name[7:]) for name in rows[0] if name.startswith("helper_")), default=0)
     decisions = _decisions(rows, manifest.actions, helpers)
     answers = _all(said, Answer)
@@ -142,6 +164,17 @@ def _write(
     summary = Figures.of(world, grid, decisions, episodes, answers).scores()
     folder.write(out, manifest, decisions, episodes, [folder.lines(answers)], summary)
     return out
+
+
+def _settle(rows: Sequence[Row], ends: Sequence[Row]) -> None:
+    """Let the last decision of each episode leave what became of it, where frozen scenes say what is left."""
+    success = {(end["condition"], end["seed"], end["episode"]): end["success"] for end in ends}
+    last = {
+        (row["condition"], row["seed"], row["episode"]): row for row in sorted(rows, key=itemgetter("step"))
+    }
+    for key, row in last.items():
+        if row.get(f"safe_{row['action']}") is not None:
+            row[f"safe_{row['action']}"] = success[key]
 
 
 def _decisions(rows: Sequence[Row], actions: Sequence[str], helpers: int) -> Decisions:

@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from run_on_disk import change, configure, made_up, rows_of
+from run_on_disk import configure, damage, made_up, rows_of
 
 import harness
 from harness.coordination.operating_point import POINTS
@@ -289,12 +289,12 @@ def test_names_of_folders_are_no_columns(tmp_path: Path) -> None:
 
 def test_text_of_any_kind_is_read_as_it_was_written(run: Path) -> None:
     said = 'a "b",\n\r\n=1 null NaN \u202e'
-    change(run, episode=lambda row: row.update(failure=said, partner=said))
+    damage(run, episode=lambda row: row.update(failure=said, partner=said))
     assert {(e.failure, e.partner, e.fault) for e in folder.read(run).episodes} == {(said, said, None)}
 
 
 def test_a_change_by_hand_is_read_again(run: Path) -> None:
-    change(
+    damage(
         run, decision=lambda row: row.update(latency_ms=3.0), episode=lambda row: row.update(failure="late")
     )
     read = folder.read(run)
@@ -329,7 +329,7 @@ def test_a_condition_of_another_version_may_have_other_settings(run: Path) -> No
 
 
 def test_an_answer_to_messages_that_is_no_fusion_calls_is_named(run: Path) -> None:
-    change(run, answer=lambda row: row.update(heard=["v2"]))
+    damage(run, answer=lambda row: row.update(heard=["v2"]))
     assert "heard messages, and is no fusion call's" in refused(run, "answers.jsonl")
 
 

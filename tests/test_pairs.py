@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
-from run_on_disk import Row, answers_of, change, configure, made_up, rows_of
+from run_on_disk import Row, answers_of, change, configure, damage, made_up, rows_of
 
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
@@ -157,7 +157,7 @@ def test_a_run_of_scenes_that_its_dataset_has_not_is_one_line(
 ) -> None:
     scene = next(iter(read(run).decisions.scenes))
     here = {"scene": scene, **({"viewer": "v2"} if name == "answer" else {})}
-    change(run, **{name: lambda row: here.items() <= row.items() and row.update(changed)})
+    damage(run, **{name: lambda row: here.items() <= row.items() and row.update(changed)})
     code, out, err = harness("run", "export", run, "--sft", "pairs.jsonl", "--report-seeds-too")
     assert (code, out, err.count("\n")) == (2, "", 1), err
     assert said in err

@@ -54,6 +54,7 @@ def test_tables_load(run: str) -> None:
 
 
 READERS = {
+    "check": "run check {run}",
     "report": "report {run} --out page.html",
     "csv": "run export {run} --csv --out out",
     "jsonl": "run export {run} --jsonl --out out",

@@ -1,5 +1,6 @@
-"""`harness run`: list finished runs, follow a metric over them, merge shards, export and film a run."""
+"""`harness run`: list and check finished runs, follow a metric, merge shards, export and film a run."""
 
+import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,10 +9,11 @@ import typer
 
 from harness.cli import drive, options
 from harness.cli.progress import bar
-from harness.cli.terminal import WIDTH, echo_json, echo_wrong
+from harness.cli.terminal import WIDTH, echo_json, echo_text, echo_wrong
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
-from harness.core.figures import DASH, PERCENT, dataset_size
+from harness.core.figures import DASH, PERCENT, amount, dataset_size
+from harness.core.formats import SUITE
 from harness.runs.leading import BALANCED
 
 if TYPE_CHECKING:
@@ -116,6 +118,61 @@ def _mapping(line: "Line") -> dict[str, object]:
     return {
         "run": line.name, "date": line.date.isoformat(), "model": variant.model, "prompt": variant.prompt,
         "answer": variant.answer, "tags": line.run.manifest.tags, **numbers,
+    }  # fmt: skip
+
+
+def check(
+    runs: options.Runs,
+    dataset: options.RunsDataset = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Compute runs again from their own answers; compare each number.
+
+    No model is asked, but rules are. A driven run has its tables held against each other alone. Exit code 1
+    means that a number differs.
+    """
+    lines = [_checked(run, dataset, as_json or quiet) for run in _runs_in(runs)]
+    if as_json:
+        echo_json(lines)
+    if not all(line["equal"] for line in lines):
+        raise typer.Exit(1)
+
+
+def _runs_in(folders: list[Path]) -> list[Path]:
+    """Return the folders of runs, those of a suite in its place."""
+    from harness.runs import suite
+
+    runs = list[Path]()
+    for folder in folders:
+        is_suite = (folder / SUITE).is_file()
+        runs += [run.path for run in suite.read(folder).runs.values()] if is_suite else [folder]
+    return runs
+
+
+def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object]:
+    """Check a run, say what came of it, and return it."""
+    from harness.evaluate.recompute import differences
+    from harness.runs.contradictions import contradictions
+    from harness.runs.folder import dataset_of, read
+
+    run = read(path)
+    if run.world == "frozen":
+        reading = bar(f"reading {printable(path.name, 30)}", quiet=silent, grows=True)
+        with tempfile.TemporaryDirectory(prefix="harness-") as folder, reading as progress:
+            wrong = differences(run, dataset_of(run, dataset), Path(folder) / "run", progress)
+        how = "computed again from its answers"
+    else:
+        wrong = list(contradictions(run))
+        how = "whose tables were held against each other, since it was driven"
+    if not silent:
+        rows = f"{amount(len(run.scores), 'figure')} and {amount(len(run.decisions), 'decision')}"
+        typer.echo(f"{printable(path)}: {'not ' * bool(wrong)}equal: {rows}, {how}")
+        for difference in wrong:
+            echo_text(f"  {difference}")
+    return {
+        "run": str(path), "world": run.world, "equal": not wrong, "figures": len(run.scores),
+        "decisions": len(run.decisions), "differences": wrong,
     }  # fmt: skip
 
 

@@ -5,29 +5,20 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from msgspec import structs
 
-from harness.backends.base import Backend, Completion, Request
-from harness.backends.card import Card
-from harness.backends.registry import open_backend
-from harness.backends.replay import Kept
-from harness.core import work
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.figures import amount
 from harness.core.files import sha256_file
 from harness.evaluate import edition as editions
 from harness.evaluate.edition import Edition
 from harness.evaluate.frozen_world import FrozenSource
-from harness.evaluate.run import evaluate
-from harness.evaluate.spec import Spec
+from harness.evaluate.recompute import computed
 from harness.runs.folder import Run, read
-from harness.runs.records import Episode, Latency
+from harness.runs.records import Episode
 from harness.runs.results import Contents, unpack
 from harness.runs.suite import SuiteRun
-
-RULES = ("driver", "proxy")  # engines that are no models
 
 
 @dataclass(frozen=True)
@@ -105,7 +96,7 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
         for name, run in edition.entry(stated, limit).items():
             source = here.source(edition, name) if limit is None else edition.source(name, limit)
             place = folder / "computed" / name
-            ours, otherwise = _computed(run, edition.spec(run, source), place, progress)
+            ours, otherwise = computed(run, edition.spec(run, source), place, progress)
             runs[source.scenario.name] = ours
             differences[name] = [*differing(run, ours, edition)]
             if otherwise:
@@ -116,43 +107,6 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
         raise UserError(f"{printable(file)}: {str(error).replace(where, '')}") from None
     suite = SuiteRun(folder / "computed", edition.name, edition.description, runs)
     return Rescored(contents, edition, suite, differences, compared, golden=limit is not None)
-
-
-class _Held:
-    """Asks a rule, which is here, and counts the answers that a run states otherwise."""
-
-    def __init__(self, rule: Backend, kept: Kept) -> None:
-        self._rule, self._kept, self.wrong = rule, kept, 0
-
-    def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        stated, here = self._kept.complete(requests), self._rule.complete(requests)
-        self.wrong += sum(a.text != b.text for a, b in zip(stated, here, strict=True))
-        return here
-
-    def identity(self) -> dict[str, Any]:
-        return self._kept.identity()
-
-    def latency(self) -> Latency:
-        return self._kept.latency()
-
-
-def _computed(stated: Run, spec: Spec, out: Path, progress: Callable[[int], None]) -> tuple[Run, int]:
-    """Compute a run again, and count the answers that the rule here gives otherwise; 0 of other models."""
-    kept, held = Kept(stated), list[_Held]()
-
-    def opens(card: Card, **options: Any) -> Backend:
-        if card.engine not in RULES:
-            return kept
-        held.append(_Held(open_backend(card, **options), kept))
-        return held[-1]
-
-    try:
-        evaluate(spec, out, progress, opens=opens)
-    except KeyboardInterrupt as stop:
-        stop.__notes__ = []  # that the folder keeps what is done: it is deleted
-        raise
-    work.tidy(out)
-    return read(out), sum(each.wrong for each in held)
 
 
 def differing(stated: Run, computed: Run, edition: Edition) -> Iterator[str]:

@@ -9,6 +9,7 @@ from typing import Any
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
+from harness.runs.contradictions import refuse
 from harness.runs.folder import Run, dataset_of, read
 from harness.runs.records import ClosedLoop, FrozenScenes
 from harness.world import scenarios
@@ -64,9 +65,13 @@ def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs
             folder that theirs is in.
 
     Raises:
-        UserError: a folder is no run, its dataset is gone or has changed, or two are not of the same scenes.
+        UserError: a folder is no run or contradicts itself, its dataset is gone or has changed, or two are
+            not of the same scenes.
     """
     runs = [read(path) for path in dict.fromkeys(paths)]
+    if not isinstance(dataset, Dataset):  # else they were just made
+        for run in runs:
+            refuse(run)
     first, *rest = runs
     for run in rest:
         if _scenes(first) != _scenes(run):

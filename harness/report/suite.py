@@ -17,6 +17,7 @@ from harness.report.document import Section, Table, document, linked
 from harness.report.drawing import colours
 from harness.report.page import save
 from harness.report.references import in_trees
+from harness.runs.contradictions import refuse
 from harness.runs.folder import Run, dataset_of
 from harness.runs.leading import IN_WORDS, lead_of
 from harness.runs.metrics import BASELINE, GAINS, entry
@@ -53,6 +54,9 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
         suite: what was run.
         datasets: by family, those that were read already; others are read.
     """
+    if datasets is None:  # else they were just made
+        for run in suite.runs.values():
+            refuse(run)
     datasets, gains, lead = datasets or {}, BASELINE in suite.conditions, lead_of(suite)
     of_trees = {
         family: in_trees((datasets.get(family) or dataset_of(run)).of_episodes(run.grid.episodes))

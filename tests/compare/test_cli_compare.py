@@ -115,8 +115,7 @@ def test_a_condition_with_colons_in_its_name_has_gates_too(runs: tuple[Path, Pat
             row["condition"] = name
 
     for run in runs:
-        change(run, decision=renamed, episode=renamed)
-        configure(run, conditions=config["conditions"])
+        change(run, decision=renamed, episode=renamed, conditions=config["conditions"])
     code, out, _ = harness("compare", *runs, "--fail-if", f"{name}:success_rate >= 0")
     assert code == 1
     assert f"FAILED: {name}:success_rate >= 0 in {name} (+0)" in " ".join(out.split())

@@ -12,7 +12,7 @@ import pytest
 from changing import SEEDS, ends
 from evaluating import live_spec_of, spec_of
 from evaluating import run as evaluate
-from run_on_disk import Row, answers_of, change, configure, made_up, rows_of
+from run_on_disk import Row, answers_of, change, configure, damage, made_up, rows_of
 from scipy.stats import norm
 
 from harness.coordination.operating_point import POINTS
@@ -362,8 +362,8 @@ def test_what_cannot_be_compared_is_refused(
         lambda run: configure(run, seeds=["x"]),
         lambda run: configure(run, conditions=[{"name": "6g", "wheels": 4}]),
         lambda run: configure(run, format="swarmdrive-run/1"),
-        lambda run: change(run, decision=lambda row: row.update(latency_ms=float("inf"))),
-        lambda run: change(run, answer=lambda row: row.update(verdict="good")),
+        lambda run: damage(run, decision=lambda row: row.update(latency_ms=float("inf"))),
+        lambda run: damage(run, answer=lambda row: row.update(verdict="good")),
     ],
 )
 def test_a_damaged_run_is_one_line(

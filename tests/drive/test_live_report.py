@@ -10,7 +10,7 @@ from driving import FROM_LEFT
 from evaluating import live_spec_of, run
 from former import NAME, SCENARIO
 from reading import Page, by_workers, details
-from run_on_disk import change, rows_of
+from run_on_disk import change, damage, rows_of
 
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
@@ -288,7 +288,7 @@ def test_a_broken_live_run_is_one_line_that_names_the_file(driven, tmp_path, nam
 @pytest.mark.slow
 def test_decisions_without_a_step_are_one_line_that_names_the_file(driven, tmp_path):
     copy = copied(driven, tmp_path)
-    change(copy, decision=lambda row: row.update(step=None))
+    damage(copy, decision=lambda row: row.update(step=None))
     with pytest.raises(UserError, match=r"decisions.parquet is broken .step is unknown") as error:
         written(copy)
     assert "\n" not in str(error.value)

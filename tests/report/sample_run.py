@@ -28,7 +28,7 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
     asker = Asker(spec, _nobody, PAPER, answers={answer.id: answer for answer in answers})
     world = FrozenWorld(dataset, spec.points, SEEDS)
     decided = list(chain.from_iterable(walk(world, spec.points, asker, spec.ties)))
-    decisions = table(decided, world.columns(), dataset.actions)
+    decisions = table(decided, world.columns(), dataset.actions).rounded()
     answers = [answer for answer in answers if answer.scene in decisions.scenes]
     grid = Grid(tuple(point.name for point in spec.points), SEEDS, dataset.episodes)
     episodes = counted(grid, decisions, world.episodes())
@@ -43,7 +43,7 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
     folder.write(
         out,
         msgspec.convert(formats.upgraded(msgspec.to_builtins({**manifest, **stated})), Manifest),
-        decisions.rounded(),
+        decisions,
         episodes,
         [folder.lines(folder.ordered(answers, decisions))],
         Figures.of("frozen", grid, decisions, episodes, answers).scores(),

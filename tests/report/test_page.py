@@ -19,7 +19,7 @@ import typer
 from evaluating import scenes_of, spec_of
 from msgspec import structs
 from reading import Page, by_workers, details, packed
-from run_on_disk import answers_of, change, configure, rows_of
+from run_on_disk import answers_of, change, configure, damage, rows_of
 from sample_run import write_run
 from typer.testing import CliRunner
 
@@ -562,7 +562,7 @@ def test_a_table_that_is_not_whole_is_refused(run, tmp_path, change, message):
     [
         (
             lambda row: row.update(scene="x") if (row["episode"], row["step"]) == (0, 0) else None,
-            "decisions.parquet has scene 'x', which its dataset has not; make the run again",
+            "answers.jsonl has scene '00000-0-[0-9a-f]+', which decisions.parquet has not",
         ),
         (set_in_first("condition", "v3x"), "decisions.parquet is broken .unknown condition 'v3x'"),
         (set_in_first("seed", 9), "decisions.parquet is broken .a decision of another seed or episode"),
@@ -573,7 +573,7 @@ def test_a_table_that_is_not_whole_is_refused(run, tmp_path, change, message):
 )
 def test_a_broken_decision_is_one_line_that_names_the_file(run, tmp_path, decision, message):
     copy = copied(run, tmp_path)
-    change(copy, decision)
+    damage(copy, decision)
     with pytest.raises(UserError, match=message) as error:
         written(copy)
     assert "\n" not in str(error.value)

@@ -14,6 +14,7 @@ from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.core.places import nameless
 from harness.report.words import facts
+from harness.runs.contradictions import refuse
 from harness.runs.difficulty import Pool
 from harness.runs.folder import Run, read
 from harness.runs.metrics import by_episode, metrics_of
@@ -103,10 +104,12 @@ def pair(a: Path, b: Path) -> Pair:
     """Read two runs.
 
     Raises:
-        UserError: a folder is no finished run, or the two have not the same scenes and seeds, or no condition
-            or episode in common.
+        UserError: a folder is no finished run or contradicts itself, or the two have not the same scenes and
+            seeds, or no condition or episode in common.
     """
     first, second = read(a), read(b)
+    for run in (first, second):
+        refuse(run)
     shown = f"{printable(a)} and {printable(b)}"
     if first.world != second.world:
         raise UserError(

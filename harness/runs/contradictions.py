@@ -1,0 +1,109 @@
+"""Hold the tables of a run against each other: each follows from others, and a file can state any number."""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from harness.core.errors import UserError, printable
+from harness.core.figures import amount
+from harness.runs import pinned
+from harness.runs.difficulty import adjusted_scores
+from harness.runs.folder import Run
+from harness.runs.metrics import BASELINE, GAINS, METRICS
+from harness.runs.records import Episode, Score
+from harness.runs.success import any_time_scores
+from harness.runs.summary import Figures, counted
+
+CLOSE = 1e-6  # how near numbers stay that were only written and read again
+
+
+def refuse(run: Run) -> None:
+    """Raise UserError if a table of a run contradicts those that it follows from."""
+    found = list(contradictions(run))
+    if found:
+        more = f", and {len(found) - 1} more" if len(found) > 1 else ""
+        shown = printable(run.path)
+        raise UserError(
+            f"{shown} contradicts itself: {found[0]}{more}; make the run again, or list all by "
+            f"`harness run check {shown}`"
+        )
+
+
+def contradictions(run: Run) -> Iterator[str]:
+    """Yield, in words, what the tables of a run say otherwise than those that they follow from."""
+    yield from _of_episodes(run)
+    undecided = (answer.scene for answer in run.answers if answer.scene not in run.decisions.scenes)
+    if (scene := next(undecided, None)) is not None:
+        yield f"answers.jsonl has scene {printable(scene)!r}, which decisions.parquet has not"
+    yield from _of_scores(run.scores, _scores(run))
+
+
+def _scores(run: Run) -> Iterator[Score]:
+    """Yield the figures that follow from a run's decisions, episodes, answers and layouts."""
+    reached = run.decisions.scenes
+    answers = [answer for answer in run.answers if answer.scene in reached]
+    with np.errstate(all="ignore"):  # a file can state any number
+        yield from Figures.of(run.world, run.grid, run.decisions, run.episodes, answers).scores()
+    if run.manifest.world.looks:
+        yield from any_time_scores(run.grid, run.episodes)
+    if run.layouts:
+        yield from adjusted_scores(run.grid, run.episodes, run.layouts)
+    for score in run.scores:
+        gains = score.metric in GAINS.values() and {score.condition, BASELINE} <= {*run.conditions}
+        if gains and score.interval == pinned.KIND:  # an older run's
+            yield pinned.gain(run, score)
+
+
+def _of_scores(stated: Iterable[Score], computed: Iterable[Score]) -> Iterator[str]:
+    """Yield which figures are others than those computed, or are none of them."""
+    here = {(score.condition, score.metric, score.interval): score for score in computed}
+    for score in stated:
+        metric, where = printable(score.metric), f"{printable(score.condition)} ({printable(score.interval)})"
+        other = here.get((score.condition, score.metric, score.interval))
+        if score.metric not in METRICS.built_in:  # a package's own, which may not be here
+            continue
+        if other is None:
+            yield f"summary.csv has {metric} {score.value} in {where}, which its other tables do not have"
+            continue
+        for what in ("value", "low", "high"):
+            a, b = getattr(score, what), getattr(other, what)
+            if not close(a, b):
+                end = "" if what == "value" else f", {what} end,"
+                yield f"summary.csv has {metric}{end} {a} in {where}, and its other tables make it {b}"
+
+
+def _of_episodes(run: Run) -> Iterator[str]:
+    """Yield which columns of episodes.csv say otherwise than decisions.parquet."""
+    computed = counted(run.grid, run.decisions, run.episodes)
+    for name in Episode.__struct_fields__:
+        pairs = zip(run.episodes, computed, strict=True)
+        wrong = sum(not close(getattr(a, name), getattr(b, name)) for a, b in pairs)
+        if wrong:
+            yield f"episodes.csv has another {name} in {amount(wrong, 'row')} than decisions.parquet"
+    wrong = sum(a.success != b for a, b in zip(run.episodes, _ends(run), strict=True) if b is not None)
+    if wrong:
+        yield f"episodes.csv has another success in {amount(wrong, 'row')} than the last decision leaves"
+
+
+def _ends(run: Run) -> Sequence[bool | None]:
+    """Return whether success is still possible after each episode's last action; None where it is unknown.
+
+    After it nothing is decided any more. Only the trees of frozen scenes know.
+    """
+    decisions, ends = run.decisions, list[bool | None]([None] * len(run.episodes))
+    places, steps = run.grid.places(decisions), decisions.whole("step")
+    order = np.lexsort((steps, places))
+    last = order[np.flatnonzero(np.diff(places[order], append=-1))]
+    actions = decisions.codes("action", run.actions)[last]
+    possible = decisions.of_actions("safe")[last, actions]
+    for place, of_last in zip(places[last].tolist(), possible.tolist(), strict=True):
+        ends[place] = None if math.isnan(of_last) else of_last == 1.0
+    return ends
+
+
+def close(a: object, b: object) -> bool:
+    """Return whether two values are the same, numbers up to how they are written."""
+    if isinstance(a, float) and isinstance(b, float):
+        return math.isclose(a, b, rel_tol=CLOSE, abs_tol=CLOSE)
+    return a == b

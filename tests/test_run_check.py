@@ -1,0 +1,169 @@
+"""A run is held against its own answers, and its tables against each other."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from run_on_disk import Row, damage, made_up
+
+from harness.runs.folder import read
+
+Harness = Callable[..., tuple[int, str, str]]
+Tamper = Callable[[Path], object]
+
+
+@pytest.fixture
+def run(proxy_run: Path, tmp_path: Path) -> Path:
+    """A run that a test may change."""
+    return Path(shutil.copytree(proxy_run, tmp_path / "reports/run"))
+
+
+def table(name: str, before: str, after: str) -> Tamper:
+    """Replace a text in a CSV table once."""
+
+    def tamper(run: Path) -> None:
+        text = (run / name).read_text()
+        assert before in text
+        (run / name).write_text(text.replace(before, after, 1))
+
+    return tamper
+
+
+def score(metric: str, column: str, value: object, interval: str = "episodes") -> Tamper:
+    """State another number of a figure under 6g."""
+
+    def tamper(run: Path) -> None:
+        head, *lines = (run / "summary.csv").read_text().splitlines()
+        names = head.split(",")
+        rows = [dict(zip(names, line.split(","), strict=True)) for line in lines]
+        here = {"condition": "6g", "metric": metric, "interval": interval}
+        [row] = [row for row in rows if here.items() <= row.items()]
+        row[column] = str(value)
+        text = "\n".join([head, *(",".join(row.values()) for row in rows)])
+        (run / "summary.csv").write_text(text + "\n")
+
+    return tamper
+
+
+def added(metric: str, interval: str) -> Tamper:
+    """Add a figure that is shown before others."""
+
+    def tamper(run: Path) -> None:
+        with (run / "summary.csv").open("a") as file:
+            file.write(f"proxy,v2,json,,6g,{metric},0.987,0.98,0.99,200,0,{interval}\n")
+
+    return tamper
+
+
+def faster(row: Row) -> None:
+    row["latency_ms"] = 20.0
+
+
+def won(row: Row) -> None:
+    row |= {"success": True, "failure": "", "outcome": "success"}
+
+
+IN_TABLES = {
+    "a figure": (
+        score("success_rate", "value", 0.987),
+        "summary.csv has success_rate 0.987 in 6g (episodes)",
+    ),
+    "an end of its interval": (score("success_rate", "ci_low", 0.9), "success_rate, low end, 0.9 in 6g"),
+    "a figure over seeds": (
+        score("latency_proxy_ms", "value", 20.0, "seed means"),
+        "has latency_proxy_ms 20.0 in 6g (seed means)",
+    ),
+    "one that holds at every look": (
+        added("success_rate", "any time"), "has success_rate 0.987 in 6g (any time), which its other tables",
+    ),
+    "success corrected for difficulty": (
+        added("adjusted_success_rate", "episodes"), "has adjusted_success_rate 0.987 in 6g (episodes), which",
+    ),
+    "success of episodes": (
+        lambda run: damage(run, episode=won), "episodes.csv has another success in ",
+    ),
+    "latency of decisions": (
+        lambda run: damage(run, decision=faster), "episodes.csv has another latency_ms in ",
+    ),
+}  # fmt: skip
+
+
+def test_a_run_that_nobody_changed_is_equal(run: Path, harness: Harness) -> None:
+    code, out, _ = harness("run", "check", run)
+    assert code == 0
+    figures, decisions = len(read(run).scores), len(read(run).decisions)
+    assert out.endswith(
+        f"equal: {figures} figures and {decisions} decisions, computed again from its answers\n"
+    )
+    code, out, _ = harness("run", "check", run, "--json")
+    assert json.loads(out)[0] | {"equal": True, "differences": []} == json.loads(out)[0]
+
+
+@pytest.mark.parametrize("changed", IN_TABLES)
+def test_tables_that_contradict_each_other_are_named_and_are_neither_shown_nor_compared(
+    changed: str, run: Path, proxy_run: Path, harness: Harness
+) -> None:
+    tamper, said = IN_TABLES[changed]
+    tamper(run)
+    code, out, _ = harness("run", "check", run)
+    assert code == 1
+    assert said in " ".join(out.split())
+    for typed in (("report", run), ("compare", proxy_run, run), ("compare", run, proxy_run)):
+        gate = ("--fail-if", "success_rate < 1") if typed[0] == "compare" else ()
+        code, out, error = harness(*typed, *gate)
+        assert (code, out, error.count("\n")) == (2, "", 1)
+        assert f"{run} contradicts itself: " in error
+        assert said in error
+    assert not (run / "report.html").exists()
+
+
+def reworded(answer: Row) -> None:
+    """Let the ego be sure to brake."""
+    if answer["viewer"] == "v1":
+        answer["raw"] = '{"SLOWER": 1.0, "IDLE": 0.0, "FASTER": 0.0}'
+        answer["intent"] = (1.0, 0.0, 0.0)
+
+
+def test_answers_are_asked_of_the_rule_that_is_here(run: Path, harness: Harness) -> None:
+    damage(run, answer=reworded)
+    code, out, _ = harness("run", "check", run)
+    assert code == 1
+    assert "answers.jsonl has" in out
+    assert "otherwise than the rule here" in " ".join(out.split())
+
+
+def test_a_table_that_agrees_with_the_others_and_not_with_the_answers_is_found(
+    run: Path, harness: Harness
+) -> None:
+    """A column that nothing else follows from."""
+    file = run / "decisions.parquet"
+    read_table = pq.read_table(file)
+    place = read_table.column_names.index("fusion_ms")
+    kind = read_table.schema.field("fusion_ms")
+    pq.write_table(read_table.set_column(place, kind, pa.array([1.0] * len(read_table), kind.type)), file)
+    code, out, _ = harness("run", "check", run)
+    assert code == 1
+    assert "decisions.parquet has another fusion_ms in" in out
+
+
+def test_a_driven_run_has_its_tables_held_against_each_other(tmp_path: Path, harness: Harness) -> None:
+    made_up(tmp_path / "driven", closed_loop=True)
+    code, out, _ = harness("run", "check", tmp_path / "driven")
+    assert code == 0
+    assert "whose tables were held against each other, since it was driven" in " ".join(out.split())
+    damage(tmp_path / "driven", decision=faster)
+    assert harness("run", "check", tmp_path / "driven")[0] == 1
+
+
+def test_what_is_no_number_or_none_of_its_scenes_is_a_line_and_no_traceback(
+    run: Path, harness: Harness
+) -> None:
+    score("success_rate", "value", 1e308)(run)
+    damage(run, answer=lambda row: row.update(scene="x") if row["viewer"] == "v2" else None)
+    code, out, _ = harness("run", "check", run)
+    assert code in (1, 2)
+    assert "Traceback" not in out
