@@ -152,7 +152,8 @@ def test_a_page_says_what_else_bounds_its_numbers(small: Dataset, tmp_path: Path
     done = evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path / "run")
     assert list(of_run(folder.read(done.out))) == [
         "Only 4 episodes: the interval of a rate may reach 49 points to either side.",
-        "Without a danger, success is 100.0 % under every condition: none changes that half of the balance.",
+        "Without a danger, success is 100.0 % under every condition in 1 layout: none changes that half of "
+        "the balance here. In other layouts one may, by as much as the interval of its gain says.",
         "6g:messages=shuffled is a control: the ego hears what helpers say in another layout, while a "
         "decision's page shows what its own helpers say.",
         "6g:messages=blind is a control: the ego hears helpers that are shown nothing.",

@@ -236,6 +236,12 @@ def test_of_many_layouts_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> Non
     assert not source.layouts(LEAST - 1)
 
 
+def uncorrected(run: Path) -> None:
+    """Take the figures that are corrected for difficulty out of a run's summary."""
+    lines = (run / "summary.csv").read_text().splitlines(keepends=True)
+    (run / "summary.csv").write_text("".join(line for line in lines if ",adjusted_" not in line))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "says"),
@@ -257,6 +263,7 @@ def test_a_strangers_difficulty_is_one_line(
     assert (code, out, error.count("\n")) == (2, "", 1)
     assert says in error
     (copy / FILE).unlink()  # as in a run of an earlier version
+    uncorrected(copy)
     assert read(copy).layouts == ()
     assert harness("compare", copy, copy)[0] == 0
 
@@ -269,6 +276,9 @@ def test_runs_that_differ_in_how_hard_a_layout_is_are_compared_as_they_are(
     copy = Path(shutil.copytree(runs["some"], tmp_path / "copy"))
     text = (copy / FILE).read_text()
     (copy / FILE).write_text(text.replace("0.0,0.0,0.09", "1.0,0.0,0.09", 1))
+    with pytest.raises(UserError, match=r"contradicts itself: summary.csv has adjusted_"):
+        pair(copy, runs["faulty"])
+    uncorrected(copy)
     assert pair(copy, runs["faulty"]).pool is None
     assert pair(runs["faulty"], copy).pool is None
 

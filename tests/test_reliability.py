@@ -20,6 +20,7 @@ from harness.runs.metrics import ONE_OPTIMAL, entry
 from harness.runs.reliability import (
     BINS,
     LEAST,
+    LEAST_EPISODES,
     Judged,
     brier,
     calibration_error,
@@ -90,14 +91,15 @@ def test_coverage_by_hand() -> None:
 
 
 DECISIONS = st.lists(
-    st.tuples(st.sampled_from([0.4, 0.5, 0.7, 0.9, 1.0]), st.booleans(), st.integers(0, 5)),
+    st.tuples(st.sampled_from([0.4, 0.5, 0.7, 0.9, 1.0]), st.booleans()),
     min_size=LEAST, max_size=LEAST + 20,
 )  # fmt: skip
 
 
 @given(DECISIONS)
-def test_figures_are_those_of_plain_loops(rows: list[tuple[float, bool, int]]) -> None:
-    some = judged([r[0] for r in rows], [float(r[1]) for r in rows], [r[2] for r in rows])
+def test_figures_are_those_of_plain_loops(rows: list[tuple[float, bool]]) -> None:
+    episodes = [n % LEAST_EPISODES for n in range(len(rows))]
+    some = judged([r[0] for r in rows], [float(r[1]) for r in rows], episodes)
     levels = sorted({r[0] for r in rows}, reverse=True)
     best, acted, wrong, gaps = 0.0, 0, 0, np.zeros(BINS)
     for level in levels:
@@ -105,10 +107,10 @@ def test_figures_are_those_of_plain_loops(rows: list[tuple[float, bool, int]]) -
         gaps[min(int(BINS * (acted + len(here) / 2) / len(rows)), BINS - 1)] += sum(r[1] - r[0] for r in here)
         acted, wrong = acted + len(here), wrong + sum(not r[1] for r in here)
         best = acted / len(rows) if wrong <= 0.05 * acted else best
-    assert estimate(some, coverage, 6).value == pytest.approx(best)
-    error = estimate(some, calibration_error, 6)
+    assert estimate(some, coverage, LEAST_EPISODES).value == pytest.approx(best)
+    error = estimate(some, calibration_error, LEAST_EPISODES)
     assert error.value == pytest.approx(np.abs(gaps).sum() / len(rows))
-    assert error.n == len({r[2] for r in rows})
+    assert error.n == LEAST_EPISODES
 
 
 def test_parts_of_a_run_are_judged_as_the_whole() -> None:
@@ -130,13 +132,14 @@ def test_parts_of_a_run_are_judged_as_the_whole() -> None:
 def trees(small: Dataset) -> tuple[Bools, Ints]:
     """The optimal actions of all decision points of real trees, as often as it takes, and their episodes."""
     forest = small.forest
-    times = 1 + 2 * LEAST // int((forest.safe.sum(axis=1) == 1).sum())
-    return np.tile(forest.safe, (times, 1)), np.tile(forest.tree, times)
+    times = LEAST_EPISODES + 2 * LEAST // int((forest.safe.sum(axis=1) == 1).sum())
+    again = np.repeat(np.arange(times), len(forest.tree))  # layouts that are alike, and not the same
+    return np.tile(forest.safe, (times, 1)), np.tile(forest.tree, times) + len(small.episodes) * again
 
 
 def error(p: Floats, trees: tuple[Bools, Ints]) -> float:
     optimal, episode = trees
-    return estimate(Judged.of(p, optimal, episode), calibration_error, 4).value
+    return estimate(Judged.of(p, optimal, episode), calibration_error, int(episode.max()) + 1).value
 
 
 def test_a_policy_that_takes_any_optimal_action_has_no_error(trees: tuple[Bools, Ints]) -> None:
@@ -161,7 +164,7 @@ def test_a_policy_that_is_as_sure_as_it_is_right_has_almost_none(trees: tuple[Bo
     draws = np.random.default_rng(0)
     p = draws.dirichlet([1.0, 1.0, 1.0], 5000)
     drawn = (draws.random((5000, 1)) > np.cumsum(p, axis=1)[:, :2]).sum(axis=1)
-    assert error(p, (np.eye(3)[drawn] == 1, np.arange(5000) % 4)) < 0.03
+    assert error(p, (np.eye(3)[drawn] == 1, np.arange(5000) % 40)) < 0.03
 
 
 def test_differences_are_paired_and_calibrated_policies_have_a_small_error() -> None:
@@ -180,7 +183,7 @@ def test_differences_are_paired_and_calibrated_policies_have_a_small_error() -> 
     assert 0.08 < change.low < change.value < change.high < 0.2
     _, _, same = difference(honest, boasting, coverage, 300)  # the order of decisions is the same
     assert same.value == 0.0
-    assert math.isnan(same.low)
+    assert (same.low, same.high) == (-3 / 300, 3 / 300), "what no resample shows may be in other episodes"
 
 
 @pytest.mark.parametrize("n", [LEAST - 1, LEAST])
@@ -193,6 +196,15 @@ def test_of_few_decisions_only_their_number_is_known(n: int) -> None:
         assert math.isnan(found.value) is not known
         assert math.isnan(difference(few, many, figure, 2 * n)[2].value) is not known
     assert estimate(few, decisions, n).value == n
+
+
+def test_many_decisions_of_few_layouts_are_few() -> None:
+    """Other channel seeds repeat them where nobody is heard."""
+    for layouts, known in ((LEAST_EPISODES - 1, False), (LEAST_EPISODES, True)):
+        some = judged([0.9] * 20 * layouts, [1.0] * 20 * layouts, [n % layouts for n in range(20 * layouts)])
+        found = estimate(some, calibration_error, layouts)
+        assert math.isnan(found.value) is not known
+    assert (found.low, found.high) == pytest.approx((0.1 - 3 / layouts, 0.1 + 3 / layouts))
 
 
 def test_without_judged_decisions_nothing_is_known() -> None:

@@ -12,6 +12,7 @@ from harness.core.kept import code_sha256
 # Versions of what turns answers into decisions. tests/conformance/test_answer_versions.py pins their results
 # and asks for a new version when one moves. Work that was stopped under another version is not resumed.
 PARSER, DECISIONS = 2, 1
+FIGURES = 2  # of what summary.csv has of decisions and answers; runs that state none are of 1
 PACKAGES = ("numpy", "scipy", "jinja2", "highway-env", "torch", "transformers", "llama-cpp-python")
 
 
@@ -22,6 +23,7 @@ def versions(packages: Sequence[str] = PACKAGES) -> Any:
     """Return the versions of the harness, Python, the platform and those packages that are installed."""
     installed = {
         "harness": __version__, "parser": str(PARSER), "decisions": str(DECISIONS),
+        "figures": str(FIGURES),
         "python": platform.python_version(), "platform": platform.platform(),
     }  # fmt: skip
     for name in packages:

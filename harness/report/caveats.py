@@ -117,7 +117,11 @@ def _saturated(run: Run) -> Iterator[str]:
         values = {None if score is None else score.value for score in scores}
         if values in ({0.0}, {1.0}) and len(scores) > 1:
             same = PERCENT.text(values.pop())
-            yield f"{where}, success is {same} under every condition: none changes that half of the balance."
+            layouts = amount(max(score.n for score in scores if score), "layout")
+            yield (
+                f"{where}, success is {same} under every condition in {layouts}: none changes that half of "
+                "the balance here. In other layouts one may, by as much as the interval of its gain says."
+            )
 
 
 def of_run(run: Run) -> Iterator[str]:

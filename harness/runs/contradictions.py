@@ -7,6 +7,7 @@ import numpy as np
 
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
+from harness.core.versions import FIGURES
 from harness.runs import pinned
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run
@@ -31,12 +32,15 @@ def refuse(run: Run) -> None:
 
 
 def contradictions(run: Run) -> Iterator[str]:
-    """Yield, in words, what the tables of a run say otherwise than those that they follow from."""
+    """Yield, in words, what the tables of a run say otherwise than those that they follow from.
+
+    Of a run by rules of another version, means are held against the others, and no intervals.
+    """
     yield from _of_episodes(run)
     undecided = (answer.scene for answer in run.answers if answer.scene not in run.decisions.scenes)
     if (scene := next(undecided, None)) is not None:
         yield f"answers.jsonl has scene {printable(scene)!r}, which decisions.parquet has not"
-    yield from _of_scores(run.scores, _scores(run))
+    yield from _of_scores(run, _scores(run))
 
 
 def _scores(run: Run) -> Iterator[Score]:
@@ -55,18 +59,22 @@ def _scores(run: Run) -> Iterator[Score]:
             yield pinned.gain(run, score)
 
 
-def _of_scores(stated: Iterable[Score], computed: Iterable[Score]) -> Iterator[str]:
+def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
     """Yield which figures are others than those computed, or are none of them."""
     here = {(score.condition, score.metric, score.interval): score for score in computed}
-    for score in stated:
+    current = run.manifest.versions.get("figures", "1") == str(FIGURES)
+    for score in run.scores:
         metric, where = printable(score.metric), f"{printable(score.condition)} ({printable(score.interval)})"
         other = here.get((score.condition, score.metric, score.interval))
-        if score.metric not in METRICS.built_in:  # a package's own, which may not be here
+        own = METRICS.built_in.get(score.metric)
+        if own is None or own.superseded:  # of a package, which may not be here, or of an older definition
+            continue
+        if own.pooled and not current:
             continue
         if other is None:
             yield f"summary.csv has {metric} {score.value} in {where}, which its other tables do not have"
             continue
-        for what in ("value", "low", "high"):
+        for what in ("value", "low", "high") if current else ("value",):
             a, b = getattr(score, what), getattr(other, what)
             if not close(a, b):
                 end = "" if what == "value" else f", {what} end,"

@@ -28,7 +28,9 @@ LEAST_P = 0.005  # least probability of the optimal actions that is counted in a
 BINS = 15  # of equal mass
 RISK = 0.05  # greatest share of decisions acted on whose action is not optimal
 LEAST = 100  # fewest decisions of a figure: of fewer, even a calibrated policy has an error of many points
+LEAST_EPISODES = 30  # fewest that these are of: other seeds often repeat the decisions of a layout
 RESAMPLES = 399  # of episodes
+SAME = 1e-9  # how near figures are that differ by rounding alone
 AT_ONCE = 1 << 17  # how many numbers of resamples are summed at once: they stay in a core's cache
 
 
@@ -128,7 +130,7 @@ def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
 def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
     """Return a figure of decisions in so many episodes, with its interval over these.
 
-    Of fewer than `LEAST` decisions only their number is known.
+    Of fewer than `LEAST` decisions, or `LEAST_EPISODES` episodes with any, only their number is known.
     """
     return estimates(judged, [figure], episodes)[0]
 
@@ -164,14 +166,22 @@ def _unknown(episodes: int) -> Estimate:
 
 
 def _known(figure: Figure, judged: Judged) -> bool:
-    return len(judged.sure) >= (1 if figure is decisions else LEAST)
+    if figure is decisions:
+        return len(judged.sure) > 0
+    return len(judged.sure) >= LEAST and len(np.unique(judged.episode)) >= LEAST_EPISODES
 
 
 def _estimate(values: Sequence[Floats], judged: Judged, episodes: int) -> Estimate:
+    """Return a figure, the first of its values, with the interval of the others, its resamples.
+
+    Where all are alike, what is not seen in n episodes is in at most 3 / n of others (95 %: Hanley and
+    Lippman-Hand 1983).
+    """
     n = len(np.unique(judged.episode))
     value, *others = np.concatenate(values).tolist()
     low, high = value + np.percentile(others, (2.5, 97.5)) - np.mean(others)
-    low, high = (low, high) if low < high else (math.nan, math.nan)
+    if high - low < SAME:
+        low, high = value - 3 / n, value + 3 / n
     return Estimate(value, float(low), float(high), n, episodes - n)
 
 

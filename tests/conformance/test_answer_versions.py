@@ -187,3 +187,17 @@ def test_completions_are_parsed_as_their_version_did() -> None:
 def test_answers_are_read_as_their_version_did() -> None:
     """`test_real_answers` says what each answer is read as; here its file is held to the version."""
     held("parser", versions.PARSER, sha256_bytes(REAL_ANSWERS.read_bytes()))
+
+
+@pytest.mark.slow
+def test_figures_are_those_of_their_version(tmp_path: Path) -> None:
+    """Of a run's tables follow the same values and intervals; a new metric is added to its version."""
+    points = [POINTS["single-local"], POINTS["6g"]]
+    done = run(spec_of(load(find(DATASET), limit=60), seeds=(0, 1), points=points), tmp_path / "run")
+    rows = dict[str, list[str]]()
+    for score in folder.read(done.out).scores:
+        numbers = (f"{each:.5g}" for each in (score.value, score.low, score.high) if each is not None)
+        rows.setdefault(score.metric, []).append(f"{score.condition} {score.interval} {' '.join(numbers)}")
+    result = {metric: sha256_bytes("\n".join(of).encode())[:16] for metric, of in rows.items()}
+    assert "calibration_error_one_optimal" in result
+    held("figures", versions.FIGURES, result)

@@ -1,5 +1,6 @@
 """What changed from one run to another: metrics, episodes, answers and settings."""
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import Pair, Side
 from harness.runs import percentiles, reliability
 from harness.runs.leading import lead_of
-from harness.runs.metrics import ADJUSTED, METRICS, SUCCESS, difference, entry, known_in
+from harness.runs.metrics import ADJUSTED, METRICS, ONE_OPTIMAL, SUCCESS, difference, entry, known_in
 from harness.runs.sources import prompt_of
 from harness.runs.success import Success
 
@@ -173,7 +174,11 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
     ]
     judged_a, judged_b = (pair.judged(side, condition) for side in (pair.a, pair.b))
     for metric in METRICS.values():
-        if metric.pooled:
+        if metric.name == ONE_OPTIMAL:  # it says what others are of, and is no figure of a policy
+            first, second = float(len(judged_a.sure)), float(len(judged_b.sure))
+            count = Estimate(second - first, math.nan, math.nan, len(pair.episodes), 0)
+            differences.append(Difference(metric.name, first, second, count, None))
+        elif metric.pooled:
             first, second, change = reliability.difference(
                 judged_a, judged_b, metric.pooled, len(pair.episodes)
             )

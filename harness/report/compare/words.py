@@ -86,7 +86,9 @@ def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
 
     primary = [d for d in c.differences if d.primary]
     changed = [
-        d for d in c.differences if not d.primary and _visible(d) and (verdict(d) or d.p_value is None)
+        d
+        for d in c.differences
+        if not d.primary and d.metric != ONE_OPTIMAL and _visible(d) and (verdict(d) or d.p_value is None)
     ]
     striking = sorted(changed, key=order)[: max(SHOWN - len(primary), 0)]
     if any(entry(d.metric).pooled for d in striking):
