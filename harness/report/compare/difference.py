@@ -176,7 +176,8 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
     for metric in METRICS.values():
         if metric.name == ONE_OPTIMAL:  # it says what others are of, and is no figure of a policy
             first, second = float(len(judged_a.sure)), float(len(judged_b.sure))
-            count = Estimate(second - first, math.nan, math.nan, len(pair.episodes), 0)
+            n = len(pair.episodes) if first or second else 0
+            count = Estimate(second - first, math.nan, math.nan, n, 0)
             differences.append(Difference(metric.name, first, second, count, None))
         elif metric.pooled:
             first, second, change = reliability.difference(
