@@ -23,7 +23,8 @@ import msgspec
 import numpy as np
 from rows import Row, finish
 
-from harness.dataset.freeze import freeze, scene_id
+from harness.dataset.freeze import freeze
+from harness.dataset.schema import scene_id
 from harness.world import lockstep, scenarios
 from harness.world.scenario import Scenario
 from harness.world.world import World

@@ -93,7 +93,7 @@ def command(
     base = _base(settings, scenarios, budget)
     settings = structs.replace(settings, prompt=base.version)
     sizes = {} if reflect else choices(base)
-    own = given(tune, scenarios) if tune else []
+    own = given(tune, [manifest for manifest, _ in manifests]) if tune else []
     in_range("--layouts", layouts, 2, FIRST["train"])
     only_for("tune", "--first-seed", str(first_seed), first_seed, layouts)
     silent, who = as_json or quiet, options.workers_of(workers)

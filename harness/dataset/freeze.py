@@ -9,12 +9,10 @@ a decided episode.
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from harness.core.files import digest
-from harness.dataset.schema import Branching, Danger, Edge, End, Record
+from harness.dataset.schema import Branching, Danger, Edge, End, Record, scene_id
 from harness.world import lockstep
 from harness.world.beacons import known
 from harness.world.conflict_measures import rounded
@@ -115,11 +113,6 @@ def _drivers(
     known = list(zip(seen, truth_graphs(scenario, states), strict=True))
     actions = iter(choices(scenario, [(driver, *graphs) for graphs in known for driver in DRIVERS]))
     return [dict(zip(DRIVERS, actions, strict=False)) for _ in known]
-
-
-def scene_id(episode: int, state: WorldState) -> str:
-    """Return `<episode>-<step>-<digest>`; equal states have equal ids, frozen and in the closed loop."""
-    return f"{episode:05d}-{state.step}-{digest(msgspec.to_builtins(state))[:12]}"
 
 
 def record_of(world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]) -> Record:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
+from harness.core.files import digest
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, Purpose
 from harness.world.conflict_measures import HORIZON_S
 from harness.world.fields import Closed, Count, Number, Seed, VehicleId
@@ -29,6 +30,11 @@ FileName = Annotated[str, Meta(pattern=FILE_NAME)]
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 Seconds = Annotated[float, Meta(ge=0, le=HORIZON_S)]
 SceneId = Annotated[str, Meta(pattern="^[0-9]{5}-[0-9]-[0-9a-f]{12}$")]
+
+
+def scene_id(episode: int, state: WorldState) -> str:
+    """Return `<episode>-<step>-<digest>`; equal states have equal ids, frozen and in the closed loop."""
+    return f"{episode:05d}-{state.step}-{digest(msgspec.to_builtins(state))[:12]}"
 
 
 class Road(Closed, frozen=True):

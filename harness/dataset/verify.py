@@ -18,7 +18,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import bytes_of, sha256_bytes, sha256_file
 from harness.core.files import opened as opened_file
-from harness.dataset.schema import LAYOUTS, Manifest, Record, Tree, plain_type, record_type
+from harness.dataset.schema import LAYOUTS, Manifest, Record, Tree, plain_type, record_type, scene_id
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
 from harness.world.environments import environment
@@ -293,6 +293,7 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
         "scene is not <episode>-<step>-<digest>": record.scene.startswith(
             f"{record.episode:05d}-{record.step}-"
         ),
+        "its id is not the digest of its state": record.scene == scene_id(record.episode, state),
         "state is of another step": state.step == record.step,
         "state is of another episode seed": state.episode_seed == record.episode_seed,
         "two vehicles have one id": len(set(ids)) == len(ids),

@@ -11,6 +11,7 @@ from harness.core.files import digest
 from harness.core.formats import WORK
 from harness.core.parallel import Workers
 from harness.core.seeds import FIRST, LAST_SEED, Purpose, purpose
+from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, find, load
 from harness.world.scenario import Scenario
@@ -54,10 +55,11 @@ def refuse(kind: Purpose, what: str) -> None:
 def stored(dataset: str) -> Dataset:
     """Read a dataset, by its folder or name. Raises UserError for none, or one of report seeds.
 
-    The seeds count, and not what its manifest says that they are for.
+    The seeds count, and not what its manifest says that they are for; some layouts are rebuilt from them.
     """
     data = load(find(dataset))
     refuse(purpose(data.manifest.seed, data.manifest.episodes), f"dataset {printable(dataset)}")
+    rebuilt.refuse(data)
     return data
 
 

@@ -21,6 +21,7 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.files import write_whole
 from harness.core.seeds import stated
+from harness.dataset import rebuilt
 from harness.dataset.forest import Forest
 from harness.runs.folder import Run, dataset_of, read
 from harness.runs.records import FrozenScenes
@@ -81,6 +82,7 @@ def calibrate(
     forest = data.forest
     first, last = int(forest.seeds.min()), int(forest.seeds.max())
     check_seeds(name, first, last)
+    rebuilt.refuse(data)
     fitted = [each for role in ("ego", "helper") if (each := _of_role(run, role, forest, level))]
     if not fitted or fitted[0].role != "ego":
         raise UserError(f"{name}: no answer of the ego could be read, so there is nothing to fit")

@@ -22,6 +22,7 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.files import write_whole
 from harness.core.seeds import Purpose, purposes, stated
+from harness.dataset import rebuilt
 from harness.studies.choices import Choices, Choose, choices
 from harness.studies.replayed_run import ReplayedRun, counted
 
@@ -35,8 +36,12 @@ LEAST = 1e-3  # standard deviation of an input that varies
 THRESHOLDS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
 
 
-def layouts(stored: ReplayedRun, wanted: Purpose) -> str:
-    """Return a run with its layout seeds in words. Raises UserError unless all are for this purpose."""
+def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun] = ()) -> str:
+    """Return a run with its layout seeds in words.
+
+    Raises UserError unless all are for this purpose, and its layouts are those of the seeds and none of those
+    that are reported.
+    """
     seeds = stored.dataset.forest.seeds
     first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
     if purposes(first, count) != [wanted]:
@@ -44,6 +49,7 @@ def layouts(stored: ReplayedRun, wanted: Purpose) -> str:
             f"{printable(stored.run.path)}: {stated(first, count)}; give a run on {wanted} layouts, which "
             "`harness dataset build --seed` makes"
         )
+    rebuilt.refuse(stored.dataset, [run.dataset for run in reported])
     return f"{stored.name} on {stored.dataset.name}, {stated(first, count)}, {amount(len(seeds), 'layout')}"
 
 

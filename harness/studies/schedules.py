@@ -323,7 +323,7 @@ def run_schedules(
     """
     every = [*runs, *tune]
     for run in tune:
-        layouts(run, "tune")
+        layouts(run, "tune", runs)
     refuse_other(out, "schedule", {
         "sources": [run.manifest() for run in every], "condition": condition, "schedules": list(names),
         "budget": budget, "seeds": list(seeds),

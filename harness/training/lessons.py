@@ -26,9 +26,9 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.files import bytes_of, write_whole
 from harness.core.parallel import Workers, each
-from harness.dataset.freeze import edges, record_of, scene_id
+from harness.dataset.freeze import edges, record_of
 from harness.dataset.load import Scene
-from harness.dataset.schema import Record
+from harness.dataset.schema import Record, scene_id
 from harness.prompts.versions import Prompt
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import Outcome

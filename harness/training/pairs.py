@@ -16,6 +16,7 @@ from harness.backends.base import BARE
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.seeds import FIRST, purpose, stated
+from harness.dataset import rebuilt
 from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
@@ -35,8 +36,8 @@ def write(
 ) -> Path:
     """Write a run's pairs to a file, with a `margin` its preferences, and return its path.
 
-    Raises UserError if the run was driven, its dataset or prompt is not here as it was, or its layouts are
-    those that numbers are reported of and `report_seeds_too` is false.
+    Raises UserError if the run was driven, its dataset or prompt is not here as it was, or, where
+    `report_seeds_too` is false, its layouts are not those of their seeds or numbers are reported of them.
     """
     option = "--sft" if margin is None else "--dpo"
     if not isinstance(run.manifest.world, FrozenScenes):
@@ -48,7 +49,9 @@ def write(
         what = f"{option} {printable(path)}: {printable(run.path)}"
         _check_seeds(what, {episode.layout_seed for episode in run.episodes})
         # What a run says of its layouts is a table that may be edited; its questions are the dataset's.
-        _check_seeds(what, dataset_of(run, dataset).of_episodes(run.grid.episodes).seeds)
+        layouts = dataset_of(run, dataset).of_episodes(run.grid.episodes)
+        _check_seeds(what, layouts.seeds)
+        rebuilt.refuse(layouts)
     lines = pairs(run, dataset) if margin is None else preferences(run, margin, dataset)
     write_whole(path, msgspec.json.Encoder().encode_lines(lines))
     return path

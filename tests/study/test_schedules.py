@@ -1,6 +1,7 @@
 """Schedules on stored runs: choices against walks, the oracle as a bound, fronts and areas by hand."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -276,13 +277,16 @@ def test_an_area_has_the_best_rank_and_not_the_best_luck():
 
 @pytest.mark.slow
 def test_schedules_are_compared_from_the_command_line(
-    stored: ReplayedRun, harness: Callable[..., Any], tmp_path: Path
+    stored: ReplayedRun, two_run: Path, harness: Callable[..., Any], tmp_path: Path
 ):
     out = tmp_path / "out"
     chosen = ("--schedule", "entropy", "--schedule", "learnt", "--out", out)
-    code, said, _ = harness(
-        "study", "schedule", "compare", stored.run.path, "--tune", stored.run.path, *chosen
-    )
+    on_itself = ("study", "schedule", "compare", stored.run.path, "--tune", stored.run.path)
+    code, said, err = harness(*on_itself, *chosen)
+    assert (code, said, err.count("\n")) == (2, "", 1)
+    assert "and numbers are reported of that; build one of other seeds" in err
+    tune = shutil.copytree(two_run, tmp_path / "tune")
+    code, said, _ = harness("study", "schedule", "compare", stored.run.path, "--tune", tune, *chosen)
     assert code == 0
     assert max(map(len, said.splitlines()[:-1])) <= 80, "but for the path"
     names = {"index.html", "schedule.json"}

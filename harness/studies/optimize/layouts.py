@@ -10,7 +10,9 @@ from harness.core.formats import WORK
 from harness.core.parallel import Workers
 from harness.core.progress import Progress
 from harness.core.seeds import FIRST, Purpose, purposes, stated
-from harness.dataset import load
+from harness.dataset import load, rebuilt
+from harness.dataset.schema import Manifest
+from harness.dataset.verify import scenario_of
 from harness.evaluate import resolve
 from harness.evaluate.dry_run import count
 from harness.evaluate.frozen_world import FrozenSource
@@ -29,12 +31,16 @@ def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) ->
         )
 
 
-def given(names: Sequence[str], scenarios: Sequence[Scenario]) -> list[FrozenSource]:
-    """Return datasets of tune layouts. Raises UserError unless there is one of each scenario, in order."""
-    if len(names) != len(scenarios):
-        raise UserError(f"--tune: {len(names)} given for {len(scenarios)} datasets; give one each, in order")
+def given(names: Sequence[str], reported: Sequence[Manifest]) -> list[FrozenSource]:
+    """Return datasets of tune layouts for those that are reported.
+
+    Raises UserError unless there is one of each scenario, in order, whose layouts are those of its seeds.
+    """
+    if len(names) != len(reported):
+        raise UserError(f"--tune: {len(names)} given for {len(reported)} datasets; give one each, in order")
     sources = [resolve.frozen(FrozenSettings(), name) for name in names]
-    for name, source, scenario in zip(names, sources, scenarios, strict=True):
+    for name, source, other in zip(names, sources, reported, strict=True):
+        scenario = scenario_of(other)
         manifest = source.dataset.manifest
         only_for("tune", "--tune", name, manifest.seed, manifest.episodes)
         if source.scenario.name != scenario.name:
@@ -42,6 +48,12 @@ def given(names: Sequence[str], scenarios: Sequence[Scenario]) -> list[FrozenSou
                 f"--tune {printable(name)}: it is of {source.scenario.name}, and not of {scenario.name} as "
                 "--dataset is; give one of the same scenario"
             )
+        if not set(manifest.trees_sha256).isdisjoint(other.trees_sha256):
+            raise UserError(
+                f"--tune {printable(name)}: it has a layout of {printable(other.name)}, where the winner is "
+                "certified; build one of other seeds"
+            )
+        rebuilt.refuse(source.dataset)
     return sources
 
 

@@ -1,0 +1,93 @@
+"""Rebuild a few layouts of a dataset from the seeds that it states, so that its purpose is a fact.
+
+A folder can state any seeds, and layouts that numbers are reported of might be called tune layouts. What
+learns from a dataset, or chooses by it, holds it against the simulator first, and against others' scenes.
+"""
+
+import random
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.util import find_spec
+
+from msgspec import to_builtins
+
+from harness.core.errors import UserError, printable
+from harness.core.files import digest
+from harness.core.resources import folder
+from harness.dataset.load import Dataset, load, released
+from harness.dataset.schema import Branching, Edge
+from harness.dataset.verify import read_manifest
+
+REBUILT = 3  # layouts, drawn anew each time: nobody knows which
+
+
+def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
+    """Raise UserError unless a dataset's layouts are those of its seeds, and no reported ones.
+
+    Args:
+        dataset: one that something learns from, or is chosen by. A released one is known.
+        others: those that numbers of the same command are reported of, beside all that ship.
+
+    Where the simulator is not installed nothing is rebuilt.
+    """
+    if dataset.trusted:
+        return
+    for other in (*others, *_reported(dataset.scenario.name)):
+        starts, theirs = _starts(dataset), _starts(other)
+        for start in starts.keys() & theirs.keys():
+            raise UserError(
+                f"dataset {printable(dataset.path)} has scene {starts[start]}, which is {theirs[start]} of "
+                f"{printable(other.name)}, and numbers are reported of that; build one of other seeds"
+            )
+    for difference in differences(dataset):
+        raise UserError(f"dataset {printable(dataset.path)}: {difference}; build it again")
+
+
+def differences(dataset: Dataset, layouts: int = REBUILT) -> Iterator[str]:
+    """Yield which of some layouts, drawn at random, are not those of the seeds that a dataset states.
+
+    None where the simulator is not installed.
+    """
+    if find_spec("highway_env") is None:
+        return
+    from harness.dataset.freeze import freeze
+
+    numbers = random.SystemRandom().sample(dataset.episodes, min(layouts, len(dataset.episodes)))
+    seeds = {number: dataset.manifest.seed + number for number in numbers}
+    for number, frozen in zip(numbers, freeze(dataset.scenario, seeds), strict=True):
+        tree = dataset.trees.read(number)
+        dataset.scenes([point.scene for level in tree.levels for point in level])  # checks their content
+        if _courses(frozen.branchings) != _courses(tree.levels):
+            stated = dataset.manifest.versions.get("highway-env", "none")
+            here = _here()
+            versions = "" if here == stated else f" by highway-env {here}, of {printable(stated, 20)}"
+            yield f"layout {number} is not what layout seed {seeds[number]} gives{versions}"
+
+
+def _courses(levels: Sequence[Sequence[Branching]]) -> list[list[object]]:
+    """Return the decision points of a layout by step, where each action leads, and how each course ends."""
+    return [[(point.scene, list(map(_course, point.edges))) for point in level] for level in levels]
+
+
+def _course(edge: Edge) -> tuple[list[str], int | None, str | None]:
+    return edge.actions, edge.to, edge.end.result if edge.end else None
+
+
+def _reported(scenario: str) -> Iterator[Dataset]:
+    """Yield the released datasets of a scenario, all of which are of report seeds."""
+    for path in sorted(folder("datasets").glob("*/manifest.json")):
+        manifest, digest = read_manifest(path.parent)
+        if digest in released().values() and manifest.scenario == scenario and manifest.purpose == "report":
+            yield load(path.parent)
+
+
+def _starts(dataset: Dataset) -> dict[str, str]:
+    """Return the ids of all first scenes by the digest of what is there, whatever the seeds are."""
+    forest = dataset.forest
+    scenes = dataset.scenes([forest.ids[root] for root in forest.root.tolist()])
+    return {digest(to_builtins(scene.state.vehicles)): scene.id for scene in scenes}
+
+
+def _here() -> str:
+    from importlib.metadata import version
+
+    return version("highway-env")

@@ -1,0 +1,135 @@
+"""Layouts that numbers are reported of, under another purpose, teach and choose nothing."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from zipfile import ZipFile
+
+import msgspec
+import pytest
+from former import NAME
+
+from harness.core.errors import UserError
+from harness.core.files import sha256_bytes
+from harness.dataset import rebuilt
+from harness.dataset.build import build
+from harness.dataset.load import find, load
+from harness.dataset.schema import scene_id
+from harness.learning.layouts import stored
+from harness.studies.optimize.layouts import given
+from harness.world import scenarios
+from harness.world.state import WorldState
+
+Harness = Callable[..., tuple[int, str, str]]
+SEED = 3_000_000  # of no layout that ships
+
+
+@pytest.fixture(scope="session")
+def relabelled(once: Callable[..., Path]) -> Path:
+    """Three report layouts under tune seeds, with every digest and id in order."""
+
+    def fill(folder: Path) -> None:
+        build(scenarios.get(NAME), folder / "relabelled", 3, SEED, 1, lambda done: None)
+        relabel(folder / "relabelled", {n: n for n in range(3)})
+
+    return once("relabelled", fill) / "relabelled"
+
+
+def relabel(dataset: Path, seeds: dict[int, int]) -> None:
+    """Give a dataset's layouts other seeds, as somebody who means harm would."""
+    with ZipFile(dataset / "layouts.zip") as file:
+        entries = {each: file.read(each) for each in file.namelist()}
+    manifest = json.loads((dataset / "manifest.json").read_text())
+    for number, seed in seeds.items():
+        tree = json.loads(entries[f"{number:05d}/tree.json"])
+        tree["episode_seed"] = seed
+        for step, level in enumerate(tree["levels"]):
+            name = f"{number:05d}/{step}.jsonl"
+            records = [json.loads(line) for line in entries[name].splitlines()]
+            for point, record in zip(level, records, strict=True):
+                record["episode_seed"] = record["state"]["episode_seed"] = seed
+                state = msgspec.convert(record["state"], WorldState)
+                record["scene"] = point["scene"] = scene_id(number, state)
+            entries[name] = "".join(json.dumps(record) + "\n" for record in records).encode()
+        hashes = [sha256_bytes(entries[f"{number:05d}/{n}.jsonl"]) for n in range(len(tree["levels"]))]
+        tree["scenes_sha256"] = hashes
+        entries[f"{number:05d}/tree.json"] = json.dumps(tree).encode()
+        manifest["trees_sha256"][number] = sha256_bytes(entries[f"{number:05d}/tree.json"])
+    manifest |= {"seed": seeds[0], "purpose": "tune"}
+    (dataset / "manifest.json").write_text(json.dumps(manifest))
+    with ZipFile(dataset / "layouts.zip", "w") as file:
+        for name, data in entries.items():
+            file.writestr(name, data)
+
+
+@pytest.fixture(scope="session")
+def run_of_it(once: Callable[..., Path], relabelled: Path) -> Path:
+    """What the proxy answers there, helpers included."""
+    from evaluating import run, spec_of
+
+    spec = spec_of(load(relabelled), ask="all", seeds=(0,))
+    return once("run-of-relabelled", lambda folder: run(spec, folder / "run")) / "run"
+
+
+@pytest.mark.slow
+def test_a_check_rebuilds_a_few(relabelled: Path, small_path: Path, harness: Harness) -> None:
+    code, out, _ = harness("dataset", "check", relabelled)
+    assert code == 1
+    assert "is not what layout seed" in out
+    assert harness("dataset", "check", small_path)[0] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "typed",
+    [
+        "model calibrate {run} --dataset {data} --out calibrations/mine.toml",
+        "study schedule compare {other} --tune {run} --out schedules",
+        "run export {run} --sft pairs.jsonl",
+    ],
+)
+def test_nothing_fits_or_learns_there(
+    typed: str, relabelled: Path, run_of_it: Path, proxy_run: Path, harness: Harness, tmp_path: Path
+) -> None:
+    run, other = (shutil.copytree(each, tmp_path / each.parent.name) for each in (run_of_it, proxy_run))
+    code, out, error = harness(*typed.format(run=run, other=other, data=relabelled).split())
+    assert (code, error.count("\n")) == (2, 1), (out, error)
+    assert "is not what layout seed" in error
+    assert not list(tmp_path.glob("*.jsonl"))
+    assert not (tmp_path / "calibrations").exists()
+
+
+@pytest.mark.slow
+def test_no_prompt_is_searched_there(relabelled: Path) -> None:
+    with pytest.raises(UserError, match="is not what layout seed"):
+        given([str(relabelled)], [load(find("occluded-intersection-v2"), 1).manifest])
+    with pytest.raises(UserError, match=r"it has a layout of relabelled, where the winner is certified"):
+        given([str(relabelled)], [load(relabelled).manifest])
+
+
+@pytest.mark.slow
+def test_an_environment_of_rewards_refuses_them(relabelled: Path) -> None:
+    with pytest.raises(UserError, match="is not what layout seed"):
+        stored(str(relabelled))
+
+
+@pytest.mark.slow
+def test_scenes_that_a_command_reports_are_not_tuned_on(tmp_path: Path) -> None:
+    """Whatever seeds they have: the vehicles of a first scene tell."""
+    build(scenarios.get(NAME), tmp_path / "tune", 2, 10, 1, lambda done: None)
+    build(scenarios.get(NAME), tmp_path / "report", 2, SEED, 1, lambda done: None)
+    relabel(tmp_path / "report", {0: 7, 1: 8})
+    tune, report = load(tmp_path / "tune"), load(tmp_path / "report")
+    rebuilt.refuse(tune, [report])
+    with pytest.raises(UserError, match=r"has scene 0000\d-0-.*, which is 0000\d-0-.* of tune"):
+        rebuilt.refuse(tune, [tune])
+
+
+@pytest.mark.slow
+def test_released_layouts_under_other_seeds_are_known(tmp_path: Path) -> None:
+    shipped = load(find("occluded-intersection-v3"), 2)
+    build(shipped.scenario, tmp_path / "mine", 2, 200_000, 1, lambda done: None)
+    relabel(tmp_path / "mine", {0: 0, 1: 1})
+    with pytest.raises(UserError, match="of occluded-intersection-v3, and numbers are reported of that"):
+        rebuilt.refuse(load(tmp_path / "mine"))
