@@ -1,7 +1,7 @@
 """Evaluate, load and compare runs from Python; results show themselves in a notebook (docs/python.md)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from io import BytesIO
 from os import PathLike
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from harness.dataset.load import Scene
     from harness.learning.environment import Driving
+    from harness.report.compare.difference import AnswersHeld
 
 HEADLINE = {  # metrics of a run's own table, by their heads
     "balanced success": "balanced_success_rate",
@@ -128,10 +129,20 @@ class DecisionPoint:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Run B against run A. A notebook shows how success changed, and the differences."""
+    """Run B against run A. A notebook shows how success changed, how many answers, and the differences."""
 
-    report: Mapping[str, Any]  # what `harness compare --json` prints
+    report: Mapping[str, Any] = field(repr=False)  # what `harness compare --json` prints
     findings: tuple[str, ...]  # how success changed in each condition, in a sentence
+    held: "AnswersHeld" = field(repr=False)  # what both runs answered to the same questions
+
+    @cached_property
+    def answers(self) -> "pd.DataFrame":
+        """One row for each answer to the same question that changed: both texts and both verdicts."""
+        import pandas as pd
+
+        from harness.report.compare.text import ANSWERS, changed_answers
+
+        return pd.DataFrame(changed_answers(self.held), columns=list(ANSWERS))
 
     @cached_property
     def differences(self) -> "pd.DataFrame":
@@ -147,8 +158,11 @@ class Comparison:
         )
 
     def _repr_html_(self) -> str:
+        from harness.report.compare.words import answers_held
+
         names = [f"{letter}: {self.report[letter.lower()]['run']}" for letter in "AB"]
-        return _page([*names, *self.findings, *self.report["caveats"]], _frame(self.differences))
+        answers = f"answers: {answers_held(self.held)}"
+        return _page([*names, *self.findings, answers, *self.report["caveats"]], _frame(self.differences))
 
 
 @dataclass(frozen=True)
@@ -260,7 +274,9 @@ def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Compa
 
     difference = compared(pair(*(side.path if isinstance(side, Run) else Path(side) for side in (a, b))))
     return Comparison(
-        mapping(difference, (), most=10), tuple(sentence for sentence, _ in findings(difference))
+        mapping(difference, (), most=10),
+        tuple(sentence for sentence, _ in findings(difference)),
+        difference.held,
     )
 
 

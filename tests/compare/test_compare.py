@@ -54,6 +54,7 @@ def differences(c: Comparison, condition: str) -> Mapping[str, Difference]:
 def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> None:
     c = found(runs)
     assert (c.settings, c.answers) == ((), ())
+    assert (c.held.same, c.held.other, c.held.changed) == (len(answers_of(runs[0])), 0, ())
     scenes = len({answer.scene for answer in answers_of(runs[0])})
     assert c.answers_in_both == {"ego": scenes, "helper": 3 * scenes}
     for of in c.conditions:
@@ -260,6 +261,10 @@ def test_answers_that_are_read_otherwise_are_told_by_role(runs: tuple[Path, Path
         ("helper", "strict", "recovered"): (f"{other}/v3",),
     }
     mine = [[r["scene"] == last for r in over_6g if (r["episode"], r["seed"]) == (0, s)] for s in SEEDS]
+    texts = {each.request: each for each in c.held.changed}
+    assert texts.keys() == {request for requests in turned.values() for request in requests}
+    assert (c.held.same, c.held.other) == (sum(c.answers_in_both.values()), 0)
+    assert (texts[f"{last}/v1"].b, texts[f"{last}/v1"].verdicts) == ("no idea", ("strict", "failed"))
     share = sum(sum(of) / len(of) for of in mine) / len(SEEDS)
     assert differences(c, "6g")["fallback_rate"].change.value == pytest.approx(share / 4)
     assert "model.name" in {name for name, _, _ in c.settings}

@@ -16,6 +16,7 @@ from harness.report.compare.pair import Pair, Side
 from harness.runs import percentiles, reliability
 from harness.runs.leading import lead_of
 from harness.runs.metrics import ADJUSTED, METRICS, ONE_OPTIMAL, SUCCESS, difference, entry, known_in
+from harness.runs.records import Answer
 from harness.runs.sources import prompt_of
 from harness.runs.success import Success
 
@@ -86,6 +87,35 @@ class AnswersFlipped:
 
 
 @dataclass(frozen=True)
+class AnswerChanged:
+    """Two answers to the same question that say, or were read as, something else."""
+
+    request: str  # its id
+    role: str  # of who answered, as in `AnswersFlipped`
+    a: str  # text of A's answer
+    b: str  # text of B's
+    verdicts: tuple[str, str]  # how A's and B's were read
+
+
+@dataclass(frozen=True)
+class AnswersHeld:
+    """The answers of both runs to the same questions, held against each other.
+
+    The same question is the same messages and the same picture. Under another prompt no question is the same,
+    and a fusion call is another question as soon as one message in it is another.
+    """
+
+    same: int  # how many questions were the same
+    other: int  # how many were not, so that their answers are not compared
+    changed: tuple[AnswerChanged, ...]  # in the order of `AnswersFlipped.requests`
+
+    @property
+    def verdicts(self) -> int:
+        """How many answers to the same question were read with another verdict."""
+        return sum(before != after for before, after in (each.verdicts for each in self.changed))
+
+
+@dataclass(frozen=True)
 class Comparison:
     """B against A."""
 
@@ -94,6 +124,7 @@ class Comparison:
     conditions: tuple[InCondition, ...]  # what changed in each
     answers: tuple[AnswersFlipped, ...]  # which answers changed their verdict
     answers_in_both: dict[str, int]  # answers by role that both runs have
+    held: AnswersHeld  # which answers to the same questions changed, in their text too
     prompts: PromptChange | str | None  # what differs; None where nothing; a sentence why it is not known
 
 
@@ -101,23 +132,38 @@ def compare(pair: Pair) -> Comparison:
     """Hold B against A."""
     a, b = ({answer.id: answer for answer in side.run.answers} for side in (pair.a, pair.b))
     both = [request for request in a if request in b]
+    conditions = [_in_condition(pair, name) for name in pair.conditions]
+    lost = {f.scene: LOST_BY.index(f.lost_by) for c in reversed(conditions) for f in reversed(c.flips)}
+    both.sort(key=lambda request: lost.get(a[request].scene, len(LOST_BY)))
     flipped: dict[tuple[str, str, str], list[str]] = {}
     for request in both:
         before, after = a[request].verdict, b[request].verdict
         if before != after:
             flipped.setdefault((a[request].role, before, after), []).append(request)
-    conditions = [_in_condition(pair, name) for name in pair.conditions]
-    lost = {f.scene: LOST_BY.index(f.lost_by) for c in reversed(conditions) for f in reversed(c.flips)}
-    for requests in flipped.values():
-        requests.sort(key=lambda request: lost.get(a[request].scene, len(LOST_BY)))
     return Comparison(
         pair=pair,
         settings=tuple(_settings(pair)),
         conditions=_corrected(conditions),
         answers=tuple(AnswersFlipped(*how, tuple(ids)) for how, ids in sorted(flipped.items())),
         answers_in_both=dict(Counter(a[request].role for request in both)),
+        held=_held([(a[request], b[request]) for request in both]),
         prompts=_prompts(pair),
     )
+
+
+def _held(answers: Sequence[tuple[Answer, Answer]]) -> AnswersHeld:
+    """Hold answers of both runs against each other where they answer the same question."""
+    same = [(a, b) for a, b in answers if _question(a) == _question(b)]
+    changed = tuple(
+        AnswerChanged(a.id, a.role, a.raw, b.raw, (a.verdict, b.verdict))
+        for a, b in same
+        if (a.raw, a.verdict) != (b.raw, b.verdict)
+    )
+    return AnswersHeld(len(same), len(answers) - len(same), changed)
+
+
+def _question(answer: Answer) -> tuple[str, str | None]:
+    return answer.prompt_sha256, answer.image_sha256 or None
 
 
 def _prompts(pair: Pair) -> PromptChange | str | None:

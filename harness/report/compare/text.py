@@ -14,12 +14,13 @@ from harness.core.junit import Case
 from harness.core.junit import junit as test_suite
 from harness.prompts.difference import PromptChange
 from harness.report.compare import words
-from harness.report.compare.difference import Comparison, Difference, InCondition
+from harness.report.compare.difference import AnswersHeld, Comparison, Difference, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import where
 from harness.runs.leading import SUCCESS
 
 WIDTH = 80
+ANSWERS = ("request", "role", "verdict_a", "verdict_b", "raw_a", "raw_b")  # of an answer that changed
 WHOLE = 10**6  # lists are cut by number, never in the middle of an id
 
 
@@ -63,8 +64,11 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole
         yield words.decisions(c, pair)
         yield from (f"  {how}: {scenes}" for how, scenes in words.given_away(c, pair, most))
     yield words.many(comparison)
-    if not comparison.answers:
-        yield "answers: no answer changed its verdict"
+    held = comparison.held
+    yield f"answers: {words.answers_held(held)}"
+    if held.changed:
+        yield from (f"  {line}" for line in words.first_changed(held.changed[0]))
+        yield f"  all, side by side: --html FILE --show {len(held.changed)}"
     for turned, requests in words.answers_flipped(comparison, most):
         yield f"answers: {turned}"
         yield f"  {requests}"
@@ -104,8 +108,10 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int, who
         lines += [""]
     lines += [f"{words.many(comparison)}.", ""]
     lines += ["<details><summary>Answers and settings</summary>", ""]
+    lines += [f"- {words.answers_held(comparison.held)}"]
+    for changed in comparison.held.changed[:1]:
+        lines += [f"- {code(line.strip())}" for line in words.first_changed(changed)]
     lines += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(comparison, most)]
-    lines += [] if comparison.answers else ["- no answer changed its verdict"]
     lines += [f"- {code(setting)}" for setting in words.settings(comparison)]
     lines += [f"- {code(line.strip())}" for line in (*words.prompts(comparison), *words.paces(pair))]
     return "\n".join([*lines, "", "</details>"])
@@ -166,6 +172,11 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
             {"role": t.role, "a": t.a, "b": t.b, "count": len(t.requests), "requests": t.requests[:most]}
             for t in comparison.answers
         ],
+        "answers_changed": {
+            "count": len(comparison.held.changed), "verdicts": comparison.held.verdicts,
+            "of": comparison.held.same, "asked_otherwise": comparison.held.other,
+            "listed": changed_answers(comparison.held, most),
+        },
         "gates": [
             {"gate": v.gate, "passed": not v.failed,
              "failed_in": [{"condition": name, "value": value} for name, value in v.failed]}
@@ -173,6 +184,14 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
         ],
         "passed": not any(v.failed for v in verdicts),
     }  # fmt: skip
+
+
+def changed_answers(held: AnswersHeld, most: int | None = None) -> list[dict[str, Any]]:
+    """Return the answers that changed, each with both verdicts and texts; `most` of them, or all."""
+    return [
+        dict(zip(ANSWERS, (each.request, each.role, *each.verdicts, each.a, each.b), strict=True))
+        for each in held.changed[:most]
+    ]
 
 
 def _in_condition(c: InCondition, most: int) -> dict[str, Any]:

@@ -10,7 +10,16 @@ from harness.core.multiplicity import LEVEL
 from harness.prompts.difference import marked
 from harness.prompts.versions import as_it_was
 from harness.report.caveats import looked_at, no_prompt, void
-from harness.report.compare.difference import LOST_BY, Comparison, DecisionFlip, Difference, Flip, InCondition
+from harness.report.compare.difference import (
+    LOST_BY,
+    AnswerChanged,
+    AnswersHeld,
+    Comparison,
+    DecisionFlip,
+    Difference,
+    Flip,
+    InCondition,
+)
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.words import SHOWN_FROM, as_good_as, p_value, pace
@@ -23,6 +32,8 @@ BETTER, WORSE, HINT = "better", "worse", "hint"
 SIGNS = {BETTER: "✓", WORSE: "✗", HINT: "?", "": ""}
 HUNKS = 3  # changes of a prompt's text that are shown beside the numbers
 SHOWN = 6  # metrics that are shown first
+BEFORE = 20  # characters of an answer that are shown before its change
+EXCERPT = 140  # characters of an answer in a line
 
 
 @dataclass(frozen=True)
@@ -110,8 +121,12 @@ def findings(comparison: Comparison) -> list[tuple[str, str]]:
         for d in [d for d in c.differences if d.metric == lead]:
             row = line(d)
             p = "" if d.p_corrected is None else f", Holm's p {row.p}"
-            verdict = row.verdict or f"not clear, but within {within(d.change.low, d.change.high)}"
-            change = f"{IN_WORDS[lead]} {row.change} points {row.interval}: {verdict}"
+            if math.isnan(d.change.low):
+                verdict = "not clear, since there is no interval"
+            else:
+                verdict = row.verdict or f"not clear, but within {within(d.change.low, d.change.high)}"
+            interval = f" {row.interval}".removesuffix(" –")
+            change = f"{IN_WORDS[lead]} {row.change} points{interval}: {verdict}"
             findings.append((f"{c.condition}: {change}{p}", row.verdict))
     return findings
 
@@ -297,6 +312,50 @@ def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
         )
         for t in comparison.answers
     ]
+
+
+def answers_held(held: AnswersHeld) -> str:
+    """Return how many answers to the same questions changed, and what could not be compared."""
+    if not (held.same or held.other):
+        return "the runs have no question in common"
+    if not held.same:
+        return (
+            f"none can be compared: each of the {held.other} questions that both runs have was asked "
+            "otherwise (prompt, messages or picture)"
+        )
+    text = f"{len(held.changed)} of {held.same} to the same questions changed"
+    if held.changed:
+        text += f", {held.verdicts or 'none'} of them in their verdict"
+    if held.other:
+        text += f"; {amount(held.other, 'more question')} asked otherwise and not compared"
+    return text
+
+
+def first_changed(changed: AnswerChanged) -> list[str]:
+    """Return an answer that changed, and the text of both from a little before they part."""
+    start = max(_alike(changed.a, changed.b) - BEFORE, 0) if changed.a != changed.b else 0
+    texts = [
+        f"  {name} {verdict}: {'…' if start else ''}{printable(text[start:], EXCERPT) or 'nothing'}"
+        for name, verdict, text in zip("AB", changed.verdicts, (changed.a, changed.b), strict=True)
+    ]
+    return [f"first: {changed.request}, {role_word(changed.role)}", *texts]
+
+
+def both_texts(changed: AnswerChanged) -> list[tuple[str, str, str, str, str]]:
+    """Return A's answer and B's: letter of the run, verdict, and the text before, in and after its change."""
+    a, b = changed.a, changed.b
+    start = _alike(a, b)
+    end = _alike(a[start:][::-1], b[start:][::-1])
+    return [
+        (name, verdict, text[:start], text[start : len(text) - end], text[len(text) - end :])
+        for name, verdict, text in zip("AB", changed.verdicts, (a, b), strict=True)
+    ]
+
+
+def _alike(a: str, b: str) -> int:
+    """Return how many characters two texts begin with alike."""
+    shorter = min(len(a), len(b))
+    return next((n for n in range(shorter) if a[n] != b[n]), shorter)
 
 
 def _listed(some: Sequence[str], n: int, most: int) -> str:
