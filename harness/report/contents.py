@@ -4,7 +4,7 @@ from typing import Any
 
 from harness.core.files import bytes_of
 from harness.report import words
-from harness.report.library import picture
+from harness.report.library import on_dark_too, picture
 from harness.report.runs import Runs
 from harness.runs.folder import Run
 from harness.runs.metrics import entry
@@ -91,7 +91,7 @@ def sweeps(run: Run) -> list[dict[str, str]]:
     """Return pictures of the sweeps that lie in the run's folder; none that a link leads out of it to."""
     here = run.path.resolve()
     return [
-        {"name": f"{manifest.parent.name}: {svg.stem}", "src": picture(bytes_of(svg, "picture"))}
+        {"name": f"{manifest.parent.name}: {svg.stem}", "src": picture(on_dark_too(bytes_of(svg, "picture")))}
         for manifest in sorted(run.path.glob("*/sweep.json"))
         for svg in sorted(manifest.parent.glob("*.svg"))
         if svg.is_file() and svg.resolve().is_relative_to(here)

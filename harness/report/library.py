@@ -21,6 +21,7 @@ from markupsafe import Markup
 
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes, text_of
+from harness.report.drawing.colours import BLACK, FAINT, INK, PAGE, PALE, WHITE
 
 # In the order in which they need each other.
 SCRIPTS = (
@@ -30,6 +31,16 @@ FOLDER = Path(__file__).parent / "scripts"
 PACKAGE = "django-js-lib-vega-embed"  # of which nothing needs Django
 BUNDLE = "static/js_lib_vega_embed/vega-embed-full.js"
 BUNDLE_SHA256 = "b6f62605c995662b5682ff986bddf3a1e2fe7f309b8acc82db8b8a4feb4d9cef"  # of release 6.29.0.3
+
+# What figures are drawn on and around their data with, and the colours of dark pages for it. What has no
+# colour is black.
+_DARK = (
+    (f'path[style*="fill: {WHITE.lower()}"]', "fill", "paper"),
+    (f'[style*="fill: {INK}"], [style*="fill: {BLACK}"], text:not([style*="fill:"])', "fill", "ink"),
+    (f'[style*="stroke: {INK}"], [style*="stroke: {BLACK}"]', "stroke", "ink"),
+    (f'[style*="stroke: {PALE.lower()}"]', "stroke", "line"),
+    (f'[style*="fill: {FAINT.lower()}"]', "fill", "card"),
+)
 
 
 @cache
@@ -76,6 +87,13 @@ def packed(value: Any) -> Markup:
 def picture(content: bytes, kind: str = "svg+xml") -> str:
     """Return a picture as an address that a page which stands alone can show."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def on_dark_too(svg: bytes) -> bytes:
+    """Return a figure's SVG for a page, whose dark look it takes on; the file stays as papers print it."""
+    rules = "".join(f"{what} {{{how}: {PAGE[name][1]} !important}} " for what, how, name in _DARK)
+    style = f"<style>@media (prefers-color-scheme: dark) {{{rules}}}</style></defs>"
+    return svg.replace(b"</defs>", style.encode(), 1)
 
 
 def policy(*scripts: str) -> str:

@@ -1,6 +1,7 @@
 """The page of `harness study contents`: at equal bits and age, along axes, and by who sees the danger."""
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,10 +51,10 @@ def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
     points, by_group, figures = points_table(results), groups_table(results), {}
     for n, result in enumerate(results, 1):
         figures[f"cost-{n}"] = fronts(list(_costs(result)), result.words)
-        curves = _curves(result)
+        curves, colours = _curves(result), dict(zip(result.model.contents, cycle(COLOURS)))
         for first in range(0, len(curves), BESIDE):
             beside = curves[first : first + BESIDE]
-            figures[f"along-{n}-{first // BESIDE + 1}"] = along(beside, _marks(beside))
+            figures[f"along-{n}-{first // BESIDE + 1}"] = along(beside, _marks(beside), colours)
     runs = [run for result in results for run in result.model.runs.values()]
     lags_s = sorted({run.dataset.scenario.parameters.decision_lag_s for run in runs})
     return Study(

@@ -18,7 +18,7 @@ from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.document import Section, Table, document, strong
 from harness.report.drawing.pictures import FORMATS, save
-from harness.report.library import picture
+from harness.report.library import on_dark_too, picture
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,11 +79,10 @@ def write_study(study: Study, out: Path) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     pictures = {}
     for stem, figure in study.figures.items():
-        lay_out(figure)
         for kind in FORMATS:
             save(figure, out / f"{stem}.{kind}", kind, dpi=300)
         width_rem = round(min(WIDEST_REM, REM_PER_INCH * figure.get_size_inches()[0]))
-        pictures[stem] = picture(bytes_of(out / f"{stem}.svg", "picture")), width_rem
+        pictures[stem] = picture(on_dark_too(bytes_of(out / f"{stem}.svg", "picture"))), width_rem
     for stem, table in study.data.items():
         write_table(table, out / stem)
     section = Section(
@@ -108,13 +107,6 @@ def write_table(table: "pd.DataFrame", path: Path) -> None:
         safe.to_csv(part, index=False, lineterminator="\n", compression=None)
     with replacing(path.with_name(f"{path.name}.jsonl")) as part:
         table.to_json(part, orient="records", lines=True, compression=None)
-
-
-def lay_out(figure: Figure) -> None:
-    """Lay a figure out once, and not again for every format: it is half of the work."""
-    if layout := figure.get_layout_engine():
-        layout.execute(figure)
-        figure.set_layout_engine("none")
 
 
 def refuse_taken(out: Path, kind: str) -> None:

@@ -41,6 +41,9 @@ def pages(small, tmp_path_factory):
             "export": folder / "site/index.html"}  # fmt: skip
 
 
+# Of what may be wider than its place: whether it is, and whether it says so.
+SIGNS = """() => [...document.querySelectorAll(".scroll")].filter((e) => e.checkVisibility()).map((e) => [
+  e.ariaLabel, e.scrollWidth > e.clientWidth, getComputedStyle(e, "::before").maxHeight !== "0px"])"""
 WIDELY = pytest.mark.exhaustive
 
 
@@ -59,6 +62,9 @@ def test_a_document_fits_a_telephone_and_is_read_aloud(browser, pages, name, sch
     page = browser.new_page(viewport=NARROW, color_scheme=scheme)
     page.goto(pages[name].as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
+    said = page.evaluate(SIGNS)
+    assert [label for label, wider, sign in said if wider != sign] == []
+    assert any(sign for _, _, sign in said)
     assert Axe().run(page).response["violations"] == []
     picture(page, f"{name}-narrow-{scheme}")
     page.close()

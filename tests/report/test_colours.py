@@ -68,10 +68,18 @@ def test_conditions_outcomes_and_roles_stand_out_from_the_paper(paper):
         assert {name: c for name, c in family.items() if contrast(c, paper) < 3} == {}
 
 
+@pytest.mark.parametrize("paper", PAPERS)
+def test_what_only_studies_draw_stands_out_too_and_has_no_colour_of_another_meaning(paper):
+    *drawn, ink = colours.COLOURS
+    assert ink == colours.INK, "dark pages turn it light"
+    assert [c for c in drawn if contrast(c, paper) < 3] == []
+    assert not {*drawn} & {c for family in FAMILIES for c in family.values()}
+
+
 @pytest.mark.parametrize("eyes", SEEN_BY)
 def test_the_colour_blind_tell_apart_what_stands_side_by_side(eyes):
-    for family in FAMILIES:
-        for one, other in combinations(family.values(), 2):
+    for family in (*(family.values() for family in FAMILIES), colours.COLOURS):
+        for one, other in combinations(family, 2):
             seen = [lab(np.array(SEEN_BY[eyes]) @ linear(colour)) for colour in (one, other)]
             assert np.linalg.norm(seen[0] - seen[1]) > 10, (one, other)
 

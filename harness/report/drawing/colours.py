@@ -7,7 +7,7 @@ of vehicles, browns are actions. Conditions, outcomes and roles stand out from w
 
 from collections.abc import Iterable
 
-INK, GREY, PALE, FAINT, WHITE = "#222222", "#777777", "#DDDDDD", "#ECECEC", "#FFFFFF"
+INK, GREY, PALE, FAINT, WHITE, BLACK = "#222222", "#777777", "#DDDDDD", "#ECECEC", "#FFFFFF", "#000000"
 GOOD, LATE, BAD = "#009E73", "#BA7F00", "#C8321F"
 OUTCOMES = {"good": GOOD, "late": LATE, "bad": BAD}
 ROLES = {"ego": "#9645B0", "helper": "#B07CC6", "danger": "#D6246E", "fusion": "#85709F", "other": "#FFFFFF"}
@@ -28,10 +28,11 @@ SCENE = {
 }  # fmt: skip
 LIGHT = {name: light for name, (light, _) in SCENE.items()}
 BUILDING_NAME = "#877E68"
+ON_DATA = PAGE["ink"][0]  # of a number on a coloured cell, which stays light on dark paper
 _MORE = ("#5B5BD0", "#8094AC")
 _SLOW_TO_FAST = ("#E6D7AE", "#CBB176", "#AE8A42", "#866828", "#5F430F")
 # Of sources that a study draws along one axis; no page of a run has them.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", INK)
+COLOURS = ("#0979AA", "#E67300", "#38948B", "#7033FF", "#A6683F", "#3D87F5", INK)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 

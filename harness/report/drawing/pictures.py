@@ -25,6 +25,10 @@ STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 8.0,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
     "pdf.fonttype": 42,  # text stays text, as journals ask
     "hatch.linewidth": 0.7,
     "svg.fonttype": "none",
@@ -52,6 +56,7 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
     if format not in FORMATS:
         raise unknown("picture format", format, FORMATS)
     data = io.BytesIO()
+    lay_out(figure)
     with warnings.catch_warnings():
         # A name in a script that the measuring font lacks is still text in the SVG.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
@@ -70,6 +75,25 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
         write_whole(out, data.getvalue())
     else:
         out.write(data.getvalue())
+
+
+def lay_out(figure: Figure) -> None:
+    """Lay a figure out once, and not again for every format: it is half of the work.
+
+    A figure that something sticks out of, such as a long name in its legend, grows.
+    """
+    layout = figure.get_layout_engine()
+    if layout is None:
+        return
+    layout.execute(figure)
+    width, height = figure.get_size_inches()
+    around = figure.get_tightbbox()
+    beside = max(-around.x0, around.x1 - width, 0.0)
+    above = max(-around.y0, around.y1 - height, 0.0)
+    if beside or above:
+        figure.set_size_inches(width + 2 * beside, height + 2 * above)
+        layout.execute(figure)
+    figure.set_layout_engine("none")
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """What figures of studies share: plain axes, letters, intervals, and the paper's values."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,6 +10,9 @@ from harness.runs.leading import leading
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
+
+ROOM_IN = 0.5  # for names below a figure, in its height
 
 
 def paper_values(marks: "pd.DataFrame | None", panel: str, metric: str, **place: str) -> "pd.DataFrame":
@@ -50,6 +54,23 @@ def plain(axes: Any, lines: str) -> None:
     axes.grid(axis=lines, color=PALE, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def key(figure: "Figure", named: Mapping[str, Any], most: int = 4) -> None:
+    """Name what is drawn below a figure, in `most` columns or as few as fit, and make room for the rows."""
+    if not named:
+        return
+    for columns in range(min(most, len(named)), 0, -1):
+        legend = figure.legend(
+            list(named.values()), list(named), loc="outside lower center", ncols=columns, frameon=False,
+            fontsize=7,
+        )  # fmt: skip
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
+    width, height = figure.get_size_inches()
+    tall = legend.get_window_extent().height / figure.dpi
+    figure.set_size_inches(width, height + max(tall - ROOM_IN, 0.0))
 
 
 def lettered(drawn: Any) -> None:

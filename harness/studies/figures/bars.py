@@ -11,7 +11,7 @@ from harness.report.drawing.colours import GREY, INK, conditions
 from harness.report.drawing.pictures import styled
 from harness.runs.leading import IN_WORDS, SUCCESS
 from harness.studies.axes import CORE
-from harness.studies.figures.axes import cross, interval_of, lead_in, lettered, paper_values, plain
+from harness.studies.figures.axes import cross, interval_of, key, lead_in, lettered, paper_values, plain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,12 +62,12 @@ def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) 
         axes.margins(y=margin)
         plain(axes, "y")
     success.set_ylim(0, 108)
-    key: list[Any] = []
+    named: dict[str, Any] = {}
     if in_legend:
-        key += [Patch(facecolor=colour, edgecolor=INK, label=name) for name, colour in colours.items()]
-    key += success.get_legend_handles_labels()[0][:1]  # the paper's values
-    if key:
-        figure.legend(handles=key, loc="outside lower center", ncols=3, frameon=False, fontsize=7)
+        named |= {name: Patch(facecolor=colour, edgecolor=INK) for name, colour in colours.items()}
+    handles, labels = success.get_legend_handles_labels()
+    named |= dict(zip(labels[:1], handles, strict=False))  # the paper's values
+    key(figure, named, most=3)
     rate = talk.twinx()
     for n, name in enumerate(talking):
         mean, down, up = _value(core, name, "trigger_rate", 100.0)

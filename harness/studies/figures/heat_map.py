@@ -7,10 +7,11 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.core.arrays import Floats
-from harness.report.drawing.colours import INK
+from harness.report.drawing.colours import ON_DATA, WHITE
 from harness.report.drawing.pictures import styled
 
 MOST_BESIDE = 3  # columns of panels that stand beside each other
+COLUMN_IN, CHARACTER_IN = 0.72, 0.065  # widths
 
 
 @styled
@@ -19,12 +20,13 @@ def heat_map(
 ) -> Figure:
     """Draw percent (R, C) by title, with the names of rows and columns, and of what they are.
 
-    Panels of few columns stand beside each other, others below each other.
+    Panels of few columns stand beside each other where their titles have room, others below each other.
     """
-    beside = len(columns) <= MOST_BESIDE
+    room = COLUMN_IN * len(columns) / CHARACTER_IN
+    beside = len(columns) <= MOST_BESIDE and max(map(len, panels)) <= room
     shape = (1, len(panels)) if beside else (len(panels), 1)
     size = (
-        1.3 + 0.08 * max(map(len, rows)) + 0.72 * len(columns) * shape[1],
+        1.3 + 0.08 * max(map(len, rows)) + COLUMN_IN * len(columns) * shape[1],
         0.7 + 0.08 * max(map(len, columns)) + (0.35 + 0.24 * len(rows)) * shape[0],
     )
     figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.06))
@@ -42,7 +44,6 @@ def heat_map(
         axes.spines[:].set_visible(False)
         for (i, j), value in np.ndenumerate(percent):
             light = high > low and value > low + 0.55 * (high - low)
-            axes.text(
-                j, i, f"{value:.0f}", ha="center", va="center", fontsize=7, color="white" if light else INK
-            )
+            ink = WHITE if light else ON_DATA
+            axes.text(j, i, f"{value:.0f}", ha="center", va="center", fontsize=7, color=ink)
     return figure

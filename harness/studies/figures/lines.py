@@ -1,6 +1,7 @@
 """Lines: success along an axis, and what radios receive along distance or among vehicles."""
 
 from collections.abc import Mapping, Sequence
+from itertools import chain, cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,11 +11,11 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from harness.core.arrays import Floats
 from harness.core.figures import amount
 from harness.radio.reception import by_sight
-from harness.report.drawing.colours import COLOURS, FAINT, GREY, INK, MARKERS
+from harness.report.drawing.colours import COLOURS, FAINT, GREY, INK, MARKERS, conditions
 from harness.report.drawing.pictures import styled
 from harness.runs.leading import IN_WORDS, SUCCESS
 from harness.studies.axes import axis_of
-from harness.studies.figures.axes import cross, interval_of, lead_in, lettered, paper_values, plain
+from harness.studies.figures.axes import cross, interval_of, key, lead_in, lettered, paper_values, plain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,33 +23,50 @@ if TYPE_CHECKING:
     from harness.radio.channel import Physical
     from harness.radio.reception import Compared, Drawn
 
+Curve = tuple[str, str]  # a source and a condition
 PAPER_LOSS = ((2, 0.6), (4, 6.6), (8, 18.6))  # vehicles, % lost: the paper's panel of swarm sizes
+LEAST_IN = 3.6  # width of a figure
 BEST_BAND = (0.65, 0.70)  # of tau, the paper's
 BESIDE = {"size": ("effective_loss", "packet loss"), "tau": ("trigger_rate", "trigger rate")}  # of success
 
 
 @styled
-def along(panels: "Sequence[pd.DataFrame]", paper: "pd.DataFrame | None" = None) -> Figure:
+def along(
+    panels: "Sequence[pd.DataFrame]",
+    paper: "pd.DataFrame | None" = None,
+    colours: Mapping[str, str] | None = None,
+) -> Figure:
     """Draw success along one axis a panel, several sources in one, with loss or trigger rate beside it.
 
     Panels are parts of a study's summary. With the paper's values (`ledger.marks`), its best band of tau is
-    drawn.
+    drawn. Conditions have their own colours, or those of `colours`; of several sources, each curve has one.
     """
-    figure = Figure(figsize=(2.5 * len(panels) + 0.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    width = max(2.5 * len(panels) + 0.2, LEAST_IN)
+    figure = Figure(figsize=(width, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     drawn = figure.subplots(1, len(panels), squeeze=False)[0]
+    of_curves = _colours(panels, colours)
     for axes, panel in zip(drawn, panels, strict=True):
-        _along(axes, panel, paper)
+        _along(axes, panel, paper, of_curves)
     lettered(drawn)
-    key: dict[str, Any] = {}
+    named: dict[str, Any] = {}
     for axes in figure.axes:
-        key |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(
-        list(key.values()), list(key), loc="outside lower center", ncols=3, frameon=False, fontsize=7
-    )
+        named |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    key(figure, named, most=3)
     return figure
 
 
-def _along(axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None") -> None:
+def _colours(panels: "Sequence[pd.DataFrame]", given: Mapping[str, str] | None) -> dict[Curve, str]:
+    pairs = (zip(panel.source, panel.condition, strict=True) for panel in panels)
+    curves = list(dict.fromkeys(chain.from_iterable(pairs)))
+    if len({source for source, _ in curves}) > 1:
+        return dict(zip(curves, cycle(COLOURS)))
+    named = given or conditions(condition for _, condition in curves)
+    return {curve: named[curve[1]] for curve in curves}
+
+
+def _along(
+    axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None", colours: Mapping[Curve, str]
+) -> None:
     variable = str(panel.variable.iloc[0])
     lead = lead_in(panel)
     curves = [(axes, lead, IN_WORDS[lead])]
@@ -66,7 +84,7 @@ def _along(axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None") -> No
             at = rows[(rows.metric == metric) & (rows.interval == interval_of(rows))]
             mean, low, high = (100 * at[k].to_numpy(dtype=float) for k in ("mean", "ci_low", "ci_high"))
             look: dict[str, Any] = {
-                "color": COLOURS[n % len(COLOURS)] if where is axes else GREY,
+                "color": colours[source, condition] if where is axes else GREY,
                 "marker": MARKERS[n % len(MARKERS)],
                 "label": f"{label}, {name}",
             }
@@ -147,7 +165,7 @@ def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], title: str) ->
     radios = dict(losses)
     axes.plot(vehicles, 100 * radios.pop("paper"), color=INK, linewidth=1.2, label="the paper's line")
     axes.plot(*zip(*PAPER_LOSS, strict=True), "x", color=INK, label="the paper's three points")
-    for (name, loss), colour, marker in zip(radios.items(), COLOURS, MARKERS, strict=False):
+    for (name, loss), colour, marker in zip(radios.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
         axes.plot(vehicles, 100 * loss, marker=marker, markersize=3, linewidth=1.0, color=colour, label=name)
     axes.set(
         xscale="log",

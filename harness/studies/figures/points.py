@@ -11,7 +11,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from harness.core.statistics import Estimate
 from harness.report.drawing.colours import GREY, INK, MARKERS, conditions
 from harness.report.drawing.pictures import styled
-from harness.studies.figures.axes import lettered, plain
+from harness.studies.figures.axes import key, lettered, plain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,7 +69,7 @@ def intervals(panels: Sequence[Rows], colours: Mapping[str, str]) -> Figure:
         plain(axes, "x")
     lettered(drawn)
     handles, labels = drawn[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=7)
+    key(figure, dict(zip(labels, handles, strict=True)))
     return figure
 
 
@@ -97,10 +97,7 @@ def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]], success: str) -> 
                 textcoords="offset points", ha="right" if right else "left", fontsize=6.5, color=INK,
             )  # fmt: skip
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    key = dict(zip(labels, handles, strict=True))
-    figure.legend(
-        list(key.values()), list(key), loc="outside lower center", ncols=4, frameon=False, fontsize=7
-    )
+    key(figure, dict(zip(labels, handles, strict=True)))
     return figure
 
 
@@ -112,7 +109,7 @@ def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
         table: of `harness.studies.fidelity`.
         models: who drove, of each row.
     """
-    figure = Figure(figsize=(5.6, 3.4), layout="constrained")
+    figure = Figure(figsize=(4.4, 4.2), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 100], [0, 100], color=GREY, linewidth=0.8, linestyle="--", label="the same")
     markers = {model: MARKERS[n % len(MARKERS)] for n, model in enumerate(dict.fromkeys(models))}
@@ -135,5 +132,6 @@ def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
     )
     axes.set_aspect("equal")
     plain(axes, "both")
-    figure.legend(loc="outside right upper", frameon=False, fontsize=7)
+    handles, labels = axes.get_legend_handles_labels()
+    key(figure, dict(zip(labels, handles, strict=True)), most=3)
     return figure

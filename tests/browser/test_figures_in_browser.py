@@ -1,0 +1,73 @@
+"""Every study's figures in a browser: all texts lie in them, and a dark page has no white card."""
+
+from io import BytesIO
+
+import pytest
+
+pytest.importorskip("playwright", reason="needs the dev extra")
+
+from evaluating import run as evaluate
+from evaluating import spec_of
+from opening import WIDE, picture
+from PIL import Image
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.coordination.operating_point import named_point
+
+LONG = "v2x:consensus=geometric-median,tau=0.5,max_helpers=2"
+CONDITIONS = ("6g", "v2x", LONG, "6g:consensus=median,tau=0.5")
+OUTSIDE = """() => { const all = document.documentElement.getBoundingClientRect();
+  return [...document.querySelectorAll("text")].filter((text) => { const box = text.getBoundingClientRect();
+    return box.left < all.left - 1 || box.right > all.right + 1 || box.top < all.top - 1
+      || box.bottom > all.bottom + 1; }).map((text) => text.textContent); }"""
+DARK = 70  # of 255: the brightest that the corner of a figure on a dark page is
+
+
+@pytest.fixture(scope="module")
+def studies(small, tmp_path_factory):
+    """Folders of studies that draw, by name."""
+    folder = tmp_path_factory.mktemp("figures")
+    run = folder / "proxy"
+    evaluate(spec_of(small, points=[*map(named_point, CONDITIONS)], seeds=(0,)), run)
+    every = [option for name in CONDITIONS for option in ("--condition", name)]
+    commands = {
+        "sweep": ["sweep", run, "--over", "loss", "--grid", "0,0.5", *every],
+        "panels": ["sweep", run, *every],
+        "words": ["sweep", run, "--over", "consensus", *every[:4]],
+        "crossed": ["sweep", run, "--over", "tau", "--over", "max_helpers", "--over", "loss", "--grid",
+                    "0.5,0.7", "--grid", "1,2", "--grid", "0,0.2", "--condition", LONG],
+        "contents": ["contents", run],
+        "trust": ["trust", run],
+        "schedule": ["schedule", "compare", run],
+        "twins": ["twins", "--model", "proxy", "--dataset", small.path, "--limit", "2"],
+        "paper": ["paper"],
+    }  # fmt: skip
+    for name, typed in commands.items():
+        done = CliRunner().invoke(app, ["study", *map(str, typed), "--out", str(folder / name), "--quiet"])
+        assert done.exit_code == 0, (name, done.exception)
+    return {name: folder / name for name in commands}
+
+
+@pytest.mark.exhaustive
+def test_every_text_of_every_studys_figures_lies_in_its_figure(browser, studies):
+    page = browser.new_page(viewport={"width": 2400, "height": 2400})
+    drawn = [svg for folder in studies.values() for svg in sorted(folder.glob("*.svg"))]
+    assert {svg.parent.name for svg in drawn} == studies.keys()
+    for svg in drawn:
+        page.goto(svg.as_uri())
+        assert page.evaluate(OUTSIDE) == [], svg
+    page.close()
+
+
+@pytest.mark.exhaustive
+def test_a_dark_page_has_no_white_figure(browser, studies):
+    page = browser.new_page(viewport=WIDE, color_scheme="dark")
+    for name, folder in studies.items():
+        page.goto((folder / "index.html").as_uri())
+        for place, figure in enumerate(page.locator("figure img").all()):
+            shown = Image.open(BytesIO(figure.screenshot())).convert("L")
+            assert shown.getpixel((12, 12)) < DARK, (name, place)
+            assert shown.getextrema()[1] > 200, "its axes are light"
+        picture(page, f"study-{name}-dark")
+    page.close()
