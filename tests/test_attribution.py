@@ -20,6 +20,7 @@ from harness.coordination.consensus import Fused, linear_pool
 from harness.coordination.operating_point import named_point
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
+from harness.core.statistics import Estimate
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate.agent import Agent
@@ -31,7 +32,7 @@ from harness.runs import folder
 from harness.runs.attribution import Attribution, LeftOut
 from harness.runs.records import Decision
 from harness.studies import attribution, replayed_run
-from harness.studies.attribution import attribute, draw, headline, rows
+from harness.studies.attribution import Row, attribute, draw, headline, rows
 from harness.studies.axes import Setting
 from harness.studies.replayed_run import ReplayedRun
 from harness.world.perception.graph import scene_graph
@@ -293,7 +294,11 @@ def test_an_answer_that_fails_is_counted_and_moves_nothing(
     for row in rows(found):
         if row.role != "fusion":
             assert (row.shift.n, row.flips.n, row.failed.value) == (0, 0, 1.0)
-    assert headline(rows(found)).startswith("The message of a helper with")
+    said = headline(rows(found))
+    assert said.startswith("What moves answers most is not clear: ")
+    assert "overlap: message of a helper with" in said
+    sure = Row("ego", "car", Estimate(0.9, 0.8, 0.95, 9, 0), *[Estimate(0.5, 0.2, 0.8, 9, 0)] * 2)
+    assert headline([*rows(found), sure]).startswith("The car in the ego's prompt moves answers most: ")
 
 
 @pytest.mark.slow
@@ -358,7 +363,7 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
     code, out, _ = harness("study", "attribute", "run", "--sample", "10")
     assert code == 0
     assert max(map(len, out.splitlines())) <= 80
-    assert out.splitlines()[1].startswith("The ")
+    assert out.splitlines()[1].startswith(("The ", "What moves answers most is not clear: "))
     assert "10 of the " in out
     assert "decision points of 6g:loss=0, drawn with sample seed 0" in " ".join(out.split())
     told = json.loads(harness("study", "attribute", "run", "--sample", "10", "--json")[1])

@@ -1,6 +1,7 @@
 """The one way in which a number is written for people, and plain values of estimates for machines."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -78,6 +79,12 @@ def within(low: float, high: float) -> str:
 def amount(n: int, noun: str) -> str:
     """Write how many there are: `1 layout`, `2 layouts`."""
     return f"{n} {noun}{'s' * (n != 1)}"
+
+
+def some_of(names: Sequence[str], most: int = 3) -> str:
+    """Name up to so many things: `a`, `a and b`, `a, b, c and 2 more`."""
+    parts = [*names[:most], *([f"{len(names) - most} more"] if len(names) > most else [])]
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if parts[1:] else parts)
 
 
 def crossed(episodes: int, seeds: int) -> str:

@@ -8,6 +8,7 @@ from statistics import median
 import numpy as np
 
 from harness.core.arrays import Floats
+from harness.core.figures import some_of
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.runs import Runs
@@ -205,24 +206,36 @@ def uneven(runs: Runs) -> str | None:
 
 def figures(results: Sequence[Line]) -> list[dict[str, str]]:
     """Return the best run's leading success under each condition, with what it is and its interval."""
+    of_best = [(line, line.success) for line in results if line.mark == BEST]
     return [
-        {"what": f"{IN_WORDS[line.lead]} with {line.condition}, best: {line.name}", **shown(line.success)}
-        for line in results
-        if line.mark == BEST and line.success
+        {"what": f"{IN_WORDS[line.lead]} with {line.condition}, {_rank(line, results)}", **shown(success)}
+        for line, success in of_best
+        if success
     ]
 
 
+def _rank(best: Line, results: Sequence[Line]) -> str:
+    """Name the best run of a condition, unless others cannot be told from it."""
+    close = _close(best.condition, results)
+    return f"the most of {len(close) + 1} runs that cannot be told apart" if close else f"best: {best.name}"
+
+
+def _close(condition: str, results: Sequence[Line]) -> list[str]:
+    return [line.name for line in results if line.condition == condition and line.mark == CLOSE]
+
+
 def headline(results: Sequence[Line]) -> str:
-    """Name the best of several runs under each condition, and which cannot be told from it."""
+    """Name the best of several runs under each condition, or those that cannot be told apart there."""
     outcomes = []
     for condition in dict.fromkeys(line.condition for line in results):
         of_condition = [line for line in results if line.condition == condition]
         best = next((line for line in of_condition if line.mark == BEST), None)
         if best is not None and (success := best.success):
-            close = [line.name for line in of_condition if line.mark == CLOSE]
-            rivals = f"{len(close)} others" if len(close) > 1 else "".join(close)
-            rest = f", which cannot be told from {rivals}" if close else ""
-            outcomes.append(f"{condition}: {best.name} {shown(success)['value']}{rest}")
+            if close := _close(condition, results):
+                apart = f"{some_of([best.name, *close])} cannot be told apart"
+                outcomes.append(f"{condition}: none clearly, {shown(success)['value']} at the most; {apart}")
+            else:
+                outcomes.append(f"{condition}: {best.name} {shown(success)['value']}")
         elif len(of_condition) > 1:
             outcomes.append(
                 f"{condition}: no run, since each is behind another or shares no episodes with it"

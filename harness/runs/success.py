@@ -3,8 +3,9 @@
 All that picks, orders or tests by success of single episodes does so here.
 """
 
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import comb
 
 import numpy as np
 
@@ -72,6 +73,20 @@ class Success:
     def p_value(self, a: Floats, b: Floats) -> float | None:
         """Return the p-value of no such difference; None without an interval."""
         return p_of_mean([(self, a, b)])
+
+    def most(self, successes: Mapping[str, Floats]) -> list[str]:
+        """Return the name with the most success, (S, E) each, and then those that cannot be told from it.
+
+        These are the names whose difference from it, paired by episode, has a p above `LEVEL`, by Holm's
+        method for all pairs, since the first was picked for being the best; or that have no p.
+        """
+        best = max(successes, key=lambda name: self.mean(successes[name]))
+        rest = [name for name in successes if name != best]
+        found = [self.p_value(successes[best], successes[name]) for name in rest]
+        p_values = [1.0 if p is None else p for p in found]
+        corrected = multiplicity.holm(p_values, comb(len(successes), 2))
+        close = [name for name, p in zip(rest, corrected, strict=True) if p > multiplicity.LEVEL]
+        return [best, *close]
 
     def spread(self, a: Floats, b: Floats, counts: Ints) -> Spread:
         """Return how much success b - a, both (S, E), varies where episodes count so often, (..., E)."""

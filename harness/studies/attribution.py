@@ -19,7 +19,7 @@ from harness.coordination.coordinate import FusionInputs, fuse
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.errors import UserError, printable, unknown
-from harness.core.figures import PERCENT, Unit, as_mapping
+from harness.core.figures import PERCENT, Unit, as_mapping, some_of
 from harness.core.figures import shown as figure
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate, rate_interval
@@ -224,19 +224,29 @@ def _row(role: str, kind: str, left_out: Sequence[LeftOut]) -> Row:
     )  # fmt: skip
 
 
+def _what(row: Row) -> str:
+    return {
+        "ego": f"{row.kind} in the ego's prompt",
+        "helper": f"{row.kind} in a helper's prompt",
+        "fusion": f"message of a {row.kind} of a {HIDDEN}",
+    }[row.role]
+
+
 def headline(table: Sequence[Row]) -> str:
-    """Say what moved most."""
+    """Say what moved most, or that nothing clearly did."""
     known = [row for row in table if row.shift.n]
     if not known:
         return "Nothing was left out: no prompt of the sample lists an object, and no message was in time."
     most = max(known, key=lambda row: row.shift.value)
-    what = {
-        "ego": f"{most.kind} in the ego's prompt",
-        "helper": f"{most.kind} in a helper's prompt",
-        "fusion": f"message of a {most.kind} of a {HIDDEN}",
-    }[most.role]
+    close = [row for row in known if row is not most and not row.shift.high < most.shift.low]
+    if close:
+        return (
+            f"What moves answers most is not clear: {figure(most.shift, SHIFT)} of the probability moves to "
+            f"other actions at the most (n = {most.shift.n}), and the intervals of these overlap: "
+            f"{some_of([_what(row) for row in (most, *close)])}."
+        )
     return (
-        f"The {what} moves answers most: without it, {figure(most.shift, SHIFT)} of the "
+        f"The {_what(most)} moves answers most: without it, {figure(most.shift, SHIFT)} of the "
         f"probability moves to other actions, and {figure(most.flips)} % of the most probable actions "
         f"change (n = {most.shift.n})."
     )

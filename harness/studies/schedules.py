@@ -20,7 +20,7 @@ from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
-from harness.core.figures import DASH, shown
+from harness.core.figures import DASH, shown, some_of
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, resampled_estimate
 from harness.core.versions import versions
@@ -434,10 +434,15 @@ def headline(compared: Compared) -> list[str]:
     ]
     within = [row for row in compared.rows[1:-1] if row.messages.value <= SLACK * compared.budget]
     if compared.tune and within:
-        best = max(within, key=lambda row: row.success.value)
+        by_name = {name_of(row): row for row in within}
+        first, *close = compared.counting.most({name: row.play.success for name, row in by_name.items()})
+        best = by_name[first]
+        within_budget = f"Chosen on tune layouts within {100 * compared.budget:g} % of the paper's messages, "
         sentences.append(
-            f"Chosen on tune layouts within {100 * compared.budget:g} % of the paper's messages, "
-            f"{name_of(best)} has the most {words}, {shown(best.success)} %, a difference of "
+            f"{within_budget}no schedule clearly has the most {words}: it is {shown(best.success)} %, and "
+            f"these cannot be told apart there: {some_of([first, *close])}."
+            if close
+            else f"{within_budget}{first} has the most {words}, {shown(best.success)} %, a difference of "
             f"{shown(best.over_paper)} points from the paper's schedule: it closes {shown(best.closed)} % "
             f"of that gap with {shown(best.messages)} % of the messages."
         )

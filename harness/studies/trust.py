@@ -19,7 +19,7 @@ from harness.coordination.rules import EGO_PROMPT, RULES, reads_plans
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
-from harness.core.figures import as_mapping, crossed, shown
+from harness.core.figures import as_mapping, crossed, shown, some_of
 from harness.core.files import digest
 from harness.core.multiplicity import LEVEL
 from harness.core.progress import Progress
@@ -234,8 +234,12 @@ class Bench:
 
     def mean(self, rule: str, share: float) -> Estimate:
         """Return the same as a mean over all attacks."""
+        return self.counting.estimate(self.over_attacks(rule, share))
+
+    def over_attacks(self, rule: str, share: float) -> Floats:
+        """Return success of every seed and episode, (S, E), as a mean over all attacks."""
         values = [self.at(rule, attack, share).success for attack in self.attacks]
-        return self.counting.estimate(np.asarray(np.mean(values, axis=0)))
+        return np.asarray(np.mean(values, axis=0))
 
 
 def run_bench(
@@ -362,15 +366,11 @@ def headline(bench: Bench) -> list[str]:
             f"{words} is {shown(bench.success(BASE, worst, share))} %. No rule fuses anything, since "
             f"{bench.unfused}; what is called linear is the ego's own answer.",
         ]
-    best = max(bench.rules, key=lambda rule: bench.mean(rule, share).value)
     sentences = [
         f"While nobody attacks, {words} is {shown(peace)} % under the linear pool, and {shown(alone)} % with "
         "an ego that never asks.",
-        f"If {100 * share:.0f} % of the helpers attack, {worst} harms the linear pool most: "
-        f"{words} is {shown(bench.success(BASE, worst, share))} %.",
-        f"On average over all {len(bench.attacks)} attacks, {best} has the most, "
-        f"{shown(bench.mean(best, share))} % (linear: {shown(bench.mean(BASE, share))}); its price in "
-        f"peace, in points: {_price(bench, best)}.",
+        f"If {100 * share:.0f} % of the helpers attack, {_worst(bench, share)}",
+        f"On average over all {len(bench.attacks)} attacks, {_best(bench, share)}",
     ]
     if "liar+spoof" in bench.attacks:
         robust = [
@@ -384,6 +384,32 @@ def headline(bench: Bench) -> list[str]:
             f"point or less in peace: {', '.join(robust) or 'none'}."
         )
     return sentences
+
+
+def _worst(bench: Bench, share: float) -> str:
+    """Say which attack harms the linear pool most, or that none clearly does."""
+    harm = {attack: 1.0 - bench.at(BASE, attack, share).success for attack in bench.attacks}
+    worst, *close = bench.counting.most(harm)
+    left = f"{bench.counting.words} is {shown(bench.success(BASE, worst, share))} %"
+    if not close:
+        return f"{worst} harms the linear pool most: {left}."
+    return (
+        f"no attack clearly harms the linear pool most: {left} at the least, and these attacks cannot be "
+        f"told apart there: {some_of([worst, *close])}."
+    )
+
+
+def _best(bench: Bench, share: float) -> str:
+    """Say which rule has the most over all attacks, or that none clearly does."""
+    best, *close = bench.counting.most({rule: bench.over_attacks(rule, share) for rule in bench.rules})
+    most, linear = (shown(bench.mean(rule, share)) for rule in (best, BASE))
+    if not close:
+        price = _price(bench, best)
+        return f"{best} has the most, {most} % (linear: {linear}); its price in peace, in points: {price}."
+    return (
+        f"no rule clearly has the most: it is {most} % (linear: {linear}), and these rules cannot be told "
+        f"apart there: {some_of([best, *close])}."
+    )
 
 
 def _price(bench: Bench, rule: str) -> str:

@@ -109,11 +109,16 @@ def test_a_run_has_a_line_under_each_condition_and_a_place_in_each_grid(both):
 
 def test_the_headline_names_the_best_or_says_that_there_is_none(both):
     lines = matrix.lines(both)
-    assert matrix.headline(lines).startswith("Best under single-local: ")
+    assert matrix.headline(lines).startswith("Best under single-local: none clearly, 0.0 % at the most; ")
     best = [line for line in lines if line.mark == matrix.BEST]
+    apart = "the most of 2 runs that cannot be told apart"
     assert [(f["what"], f["value"]) for f in matrix.figures(lines)] == [
-        (f"success with {line.condition}, best: {line.name}", shown(line.scores[SUCCESS])["value"])
-        for line in best
+        (f"success with {line.condition}, {apart}", shown(line.scores[SUCCESS])["value"]) for line in best
+    ]
+    clear = [replace(line, mark=matrix.WORSE if line.mark == matrix.CLOSE else line.mark) for line in lines]
+    assert f"single-local: {best[0].name} " in matrix.headline(clear)
+    assert [f["what"] for f in matrix.figures(clear)] == [
+        f"success with {line.condition}, best: {line.name}" for line in best
     ]
     assert len(best) == len(both.conditions)
     bare = [replace(line, mark="", behind=None) for line in lines]

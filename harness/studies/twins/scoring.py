@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core.errors import UserError, printable, unknown
+from harness.core.figures import some_of
 from harness.core.statistics import Estimate, rate_interval
 from harness.report.compare.gate import OPERATORS, Gate, Verdict
 from harness.studies.twins.declared import Twin
@@ -91,10 +92,15 @@ def headline(table: Sequence[Row]) -> str:
     if not least.broken:
         return f"All {len(table)} pairs of twin and role hold in every question."
     rate = least.invariance_rate
+    shown = f"{100 * rate.value:.1f} % [{100 * rate.low:.1f}, {100 * rate.high:.1f}], n = {rate.n}"
+    text = f"{whole} of {len(table)} pairs of twin and role hold in every question."
+    close = [row for row in table if row is not least and not row.invariance_rate.low > rate.high]
+    if not close:
+        return f"{text} Least often holds {least.twin.name}, {least.role}: {shown}."
+    names = [f"{row.twin.name}, {row.role}" for row in (least, *close)]
     return (
-        f"{whole} of {len(table)} pairs of twin and role hold in every question. Least often holds "
-        f"{least.twin.name}, {least.role}: {100 * rate.value:.1f} % "
-        f"[{100 * rate.low:.1f}, {100 * rate.high:.1f}], n = {rate.n}."
+        f"{text} No pair clearly holds least often: it is {shown}, and the intervals of these overlap: "
+        f"{some_of([f'({name})' for name in names])}."
     )
 
 
