@@ -23,10 +23,14 @@ if TYPE_CHECKING:
 
 ALL = "all"
 SHARE = "agent_share"
+LATE = Column("late", "late_rate")
+TIME_OUT = Column(
+    "time-out", "time_out_rate"
+)  # instead of it where several decide, since nobody is late there
 COLUMNS = (
     Column("success % [95 % CI]", "success_rate", interval=True),
     Column("crash", "collision_rate"),
-    Column("late", "late_rate"),
+    LATE,
     Column("latency", "latency_proxy_ms"),
     Column("missed", "deadline_miss_rate"),
     Column("gap", "least_gap_m"),
@@ -152,7 +156,9 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
         "gap: smallest distance to a vehicle; clear: time until the ego had cleared, if\n"
         "it did; both are means over episodes",
     )
-    show(done, f"closed loop · {world.title}", COLUMNS, notes)
+    several = any(score.metric == "arrived_rate" for score in done.scores)
+    columns = tuple(TIME_OUT if several and each == LATE else each for each in COLUMNS)
+    show(done, f"closed loop · {world.title}", columns, notes)
 
 
 def write_failures(run: Path, most: int, quiet: bool) -> list[Path]:

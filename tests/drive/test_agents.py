@@ -266,6 +266,24 @@ def test_a_liar_is_one_vehicle_and_lies_to_whoever_asks(tmp_path: Path) -> None:
     assert len({episode for episode, _ in liars[0]}) == 2 == len(liars[0])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("agents", "head", "said"), [("all", "time-out", "100.0 %"), ("ego", "late", "0.0 %")]
+)
+def test_time_outs_of_agents_have_a_column_and_nobody_is_late(
+    agents: str, head: str, said: str, tmp_path: Path, harness: Callable[..., tuple[int, str, str]]
+) -> None:
+    """Who brakes forever meets nobody and arrives nowhere."""
+    of = ("--scenario", "all-way-crossing", "--agents", agents, "--model", "brake", "--workers", 1)
+    drawn = ("--condition", "single-local", "--episodes", 1, "--first-seed", 50_000, "--seeds", 0)
+    lines = harness("drive", *of, *drawn, "--out", tmp_path / "run")[1].splitlines()
+    heads = next(line for line in lines if "crash" in line)
+    row = lines[lines.index(heads) + 1]
+    ends = heads.index(f" {head} ") + len(head) + 1
+    assert row[:ends].endswith(said)
+    assert max(len(heads), len(row)) <= 80
+
+
 @pytest.mark.exhaustive
 def test_shards_change_no_byte(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harness: Callable[..., tuple[int, str, str]]
