@@ -235,7 +235,8 @@ def answer_times(times: Mapping[str, Times]) -> str:
     parts = []
     for role, took in times.items():
         low, half, high = (f"{1000 * s:.0f}" for s in (took.p5_s, took.median_s, took.p95_s))
-        parts.append(f"{role_word(role)} {half} ms (5 to 95 %: {low} to {high}; n = {took.n})")
+        spread = f"5 to 95 %: {low} to {high}; " if took.n > 1 else ""
+        parts.append(f"{role_word(role)} {half} ms ({spread}n = {took.n})")
     return ", ".join(parts) or "unknown, since no answer was asked alone"
 
 
@@ -257,13 +258,14 @@ def pace(m: Manifest) -> Iterator[str]:
         for what, of in (("TTFT", first), ("TPOT", took.token)):
             if of:
                 half, high = _milliseconds(of.median_s, of.median_ci_s), _milliseconds(of.p95_s, of.p95_ci_s)
-                yield f"  {word} {what} {half} ms, p95 {high}, n = {of.n}"
+                tail = f", p95 {high}" if of.n > 1 else ""
+                yield f"  {word} {what} {half} ms{tail}, n = {of.n}"
 
 
 def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:
-    """With a decimal, or two below ten, and the interval."""
-    low, high = ends or (None, None)
-    return Unit("ms", 1 if seconds >= 0.01 else 2, 1000.0).interval(seconds, low, high)
+    """With a decimal, or two below ten, and the interval where there is one."""
+    unit = Unit("ms", 1 if seconds >= 0.01 else 2, 1000.0)
+    return unit.interval(seconds, *ends) if ends else unit.number(seconds)
 
 
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:
