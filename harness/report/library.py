@@ -35,7 +35,7 @@ BUNDLE_SHA256 = "b6f62605c995662b5682ff986bddf3a1e2fe7f309b8acc82db8b8a4feb4d9ce
 # What figures are drawn on and around their data with, and the colours of dark pages for it. What has no
 # colour is black.
 _DARK = (
-    (f'path[style*="fill: {WHITE.lower()}"]', "fill", "paper"),
+    (f'path[style*="fill: {WHITE.lower()}"], rect[fill="{WHITE.lower()}"]', "fill", "paper"),
     (f'[style*="fill: {INK}"], [style*="fill: {BLACK}"], text:not([style*="fill:"])', "fill", "ink"),
     (f'[style*="stroke: {INK}"], [style*="stroke: {BLACK}"]', "stroke", "ink"),
     (f'[style*="stroke: {PALE.lower()}"]', "stroke", "line"),

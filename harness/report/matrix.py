@@ -220,6 +220,11 @@ def _rank(best: Line, results: Sequence[Line]) -> str:
     return f"the most of {len(close) + 1} runs that cannot be told apart" if close else f"best: {best.name}"
 
 
+def shared(results: Sequence[Line]) -> set[str]:
+    """Return the conditions in which some runs cannot be told from the one with the most."""
+    return {line.condition for line in results if line.mark == CLOSE}
+
+
 def _close(condition: str, results: Sequence[Line]) -> list[str]:
     return [line.name for line in results if line.condition == condition and line.mark == CLOSE]
 
@@ -233,7 +238,7 @@ def headline(results: Sequence[Line]) -> str:
         if best is not None and (success := best.success):
             if close := _close(condition, results):
                 apart = f"{some_of([best.name, *close])} cannot be told apart"
-                outcomes.append(f"{condition}: none clearly, {shown(success)['value']} at the most; {apart}")
+                outcomes.append(f"{condition}: none clearly ({shown(success)['value']} at the most; {apart})")
             else:
                 outcomes.append(f"{condition}: {best.name} {shown(success)['value']}")
         elif len(of_condition) > 1:

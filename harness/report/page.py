@@ -147,6 +147,7 @@ def _pieces(
         lines=lines,
         lead=IN_WORDS[lines[0].lead],
         grids=matrix.grids(lines),
+        shared=matrix.shared(lines),
         uneven=matrix.uneven(runs),
         summaries=[contents.summary(run) for run in runs.runs],
         answers=contents.answers(runs),

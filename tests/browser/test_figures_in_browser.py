@@ -8,12 +8,14 @@ pytest.importorskip("playwright", reason="needs the dev extra")
 
 from evaluating import run as evaluate
 from evaluating import spec_of
-from opening import WIDE, picture
+from opening import NARROW, WIDE, picture
 from PIL import Image
 from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.coordination.operating_point import named_point
+from harness.report.page import write_report
+from harness.report.runs import gather
 
 LONG = "v2x:consensus=geometric-median,tau=0.5,max_helpers=2"
 CONDITIONS = ("6g", "v2x", LONG, "6g:consensus=median,tau=0.5")
@@ -58,6 +60,24 @@ def test_every_text_of_every_studys_figures_lies_in_its_figure(browser, studies)
         page.goto(svg.as_uri())
         assert page.evaluate(OUTSIDE) == [], svg
     page.close()
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("size", [WIDE, NARROW], ids=["wide", "narrow"])
+def test_every_name_of_a_reports_legends_lies_in_its_chart(opened, small, tmp_path, size):
+    paths = [tmp_path / name for name in ("one", "other")]
+    for path, model in zip(paths, ("proxy", "proxy-faulty"), strict=True):
+        evaluate(spec_of(small, model, points=[*map(named_point, CONDITIONS)], seeds=(0,)), path)
+    write_report(gather(paths), tmp_path / "report.html")
+    page = opened(tmp_path / "report.html", size=size)
+    charts = page.locator(".chart svg")
+    assert charts.count() > 3
+    for chart in charts.all():
+        right = chart.bounding_box()["x"] + chart.bounding_box()["width"]
+        names = [name.bounding_box() for name in chart.locator(".role-legend-label text").all()]
+        assert [box for box in names if box["x"] + box["width"] > right + 1] == []
+    shown = page.locator(".role-legend-label text").all_text_contents()
+    assert LONG in shown if size is WIDE else any(name.endswith("…") for name in shown)
 
 
 @pytest.mark.exhaustive

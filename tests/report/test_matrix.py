@@ -109,7 +109,7 @@ def test_a_run_has_a_line_under_each_condition_and_a_place_in_each_grid(both):
 
 def test_the_headline_names_the_best_or_says_that_there_is_none(both):
     lines = matrix.lines(both)
-    assert matrix.headline(lines).startswith("Best under single-local: none clearly, 0.0 % at the most; ")
+    assert matrix.headline(lines).startswith("Best under single-local: none clearly (0.0 % at the most; ")
     best = [line for line in lines if line.mark == matrix.BEST]
     apart = "the most of 2 runs that cannot be told apart"
     assert [(f["what"], f["value"]) for f in matrix.figures(lines)] == [

@@ -21,17 +21,35 @@ const LOOK = {
     gridColor: "currentColor", gridOpacity: 0.14, titleFontWeight: "normal", labelFontSize: 11, titleFontSize: 11.5,
   },
   legend: {
-    labelColor: "currentColor", titleColor: "currentColor", titleFontWeight: "normal", labelLimit: 220,
+    labelColor: "currentColor", titleColor: "currentColor", titleFontWeight: "normal",
     symbolLimit: 0, symbolBaseFillColor: "currentColor", symbolBaseStrokeColor: "currentColor",
   },
 };
+
+const widest = (names) => 6.5 * Math.max(0, ...names.map((name) => name?.length ?? 0));
+
+// In a legend names stand in as many columns as the longest has room for, and legends below each other: what is
+// wider than its chart would be cut.
+function legend(spec, width) {
+  const names = [];
+  JSON.stringify(spec, (key, value) => {
+    if (key === "domain" && typeof value?.[0] === "string") names.push(...value);
+    return value;
+  });
+  const axis = Math.max(Math.min(widest((spec.data.values ?? []).map((row) => row.bar)), 260), 50);
+  const room = Math.max(width - axis - 24, 80); // right of where the chart's own axis ends
+  return {
+    ...LOOK.legend, columns: Math.min(Math.max(Math.floor(room / (widest(names) + 36)), 1), 4), labelLimit: room - 36,
+    layout: { top: { direction: "vertical", anchor: "start" } },
+  };
+}
 
 async function chart(place, name, spec, values = {}) {
   const embed = await vega();
   const found = await embed(place, spec, {
     ast: true, // expressions are interpreted: the page's policy forbids to compile them
     renderer: "svg",
-    config: { ...LOOK, legend: { ...LOOK.legend, columns: place.clientWidth < 520 ? 2 : 4 } },
+    config: { ...LOOK, legend: legend(spec, place.clientWidth) },
     actions: { export: { svg: true, png: true }, source: false, compiled: false, editor: false },
     downloadFileName: name,
     tooltip: { disableDefaultStyle: true },
