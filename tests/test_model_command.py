@@ -37,7 +37,8 @@ def test_the_list_has_every_card_in_eighty_columns(
     listed = {line.split()[0]: line for line in out.splitlines() if not line.startswith((" ", "name"))}
     assert sorted(listed) == cards.names()
     assert "card 145 ms" in listed["proxy"]
-    assert "yes" in listed["proxy"]
+    assert listed["proxy"].endswith(" yes")
+    assert listed["kev-4b"].endswith(" if its server runs"), "nobody is asked whether it does"
     assert listed["qwen3-4b"].split()[3] == "paper"
     assert "cited 12 ms" in listed["kev-4b"]
     assert "\n  Deterministic rule on what its viewer sees\n" in out

@@ -19,7 +19,7 @@ from harness.backends.base import Completion
 from harness.backends.tokens import counter, tokenizer
 from harness.core.errors import UserError
 from harness.core.resources import folder
-from harness.dataset.load import Dataset
+from harness.dataset.load import Dataset, load
 from harness.evaluate.asking import answer_of, fusion_request, requests
 from harness.prompts import versions as prompts
 from harness.prompts.densest import EVIDENCE, densest_messages
@@ -458,3 +458,15 @@ def test_a_block_question_ends_every_question_unless_a_letter_is_asked_for(role:
         question = with_it["content"].removeprefix(without["content"])
         assert question.startswith("\nAnswer in JSON with ")
         assert "JSON" not in without["content"]
+
+
+@pytest.mark.slow
+def test_without_a_scene_the_datasets_first_is_shown(
+    small_path: Path, harness: Callable[..., tuple[int, str, str]]
+) -> None:
+    first = next(iter(load(small_path).forest.place))
+    shown = [
+        harness("prompt", "show", "v2", "--dataset", small_path, *more) for more in ((), ("--scene", first))
+    ]
+    assert shown[0] == shown[1]
+    assert shown[0][0] == 0

@@ -44,7 +44,7 @@ def list_models(as_json: options.Json = False) -> None:
     def show(name: str, card: "Card") -> None:
         seconds, lack = card.latency.inference_s, missing(card)
         latency = "paper" if seconds is None else f"{card.latency.source} {seconds * 1000:g} ms"
-        here = f"no: {lack}" if lack else "yes"
+        here = f"no: {lack}" if lack else "if its server runs" if card.server else "yes"
         stem, _, engine = name.partition(":")
         # A card's other engines stand below it.
         typer.echo(line.format("" if engine else printable(stem), card.engine, card.thinking, latency, here))

@@ -66,7 +66,9 @@ def list_prompts(as_json: options.Json = False) -> None:
 
 def show(
     version: Version,
-    scene: str = typer.Option(..., help="Scene id, such as 00003-0."),
+    scene: str | None = typer.Option(
+        None, help="Scene to render, such as 00003-0. Default: the dataset's first."
+    ),
     viewer: str | None = typer.Option(
         None, help="Vehicle that is asked, such as v1 (the ego). Default: every viewer."
     ),
@@ -93,7 +95,7 @@ def show(
     from harness.world.perception.camera import Sight
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
-    at = data.scene(scene)
+    at = data.scene(scene or next(iter(data.forest.place)))
     viewers = at.viewers if viewer is None else [at.viewer(viewer)]
     words = data.scenario.prompt_words
     reader = pictures.picture_model(prompt, model)

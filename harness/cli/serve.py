@@ -56,7 +56,8 @@ def command(
     service = Service(ServedModel(agent, backend), batch_size, token, local)
 
     def listening(url: str) -> None:
-        typer.echo(f"{url}/v1 serves {printable(agent.card.name)} until Ctrl-C")
+        # Some clients add /v1 to the address that they are given.
+        typer.echo(f"{url}/v1, or {url} for some clients, serves {printable(agent.card.name)} until Ctrl-C")
 
     try:
         web.serve(service.app(), host, port, listening, limit_concurrency=CONNECTIONS)
