@@ -6,9 +6,11 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 
 from harness.core.files import canonical_json, digest, read_once, write_whole
+from harness.runs.decisions import arrow_file
 
 
 @pytest.mark.parametrize(
@@ -73,3 +75,13 @@ def test_where_no_file_can_be_made_is_no_missing_file(path: str) -> None:
     with pytest.raises(PermissionError, match="no file can be made there") as refused:
         write_whole(Path(path), "x")
     assert refused.value.filename == path
+
+
+@pytest.mark.parametrize("content", [b"", b"scene,value\n", bytes(10**6)])
+def test_arrow_holds_a_file_in_memory_of_its_own(content: bytes, tmp_path: Path) -> None:
+    """Its threads need the interpreter to let go of Python's, and abort the process as that ends."""
+    (tmp_path / "file").write_bytes(content)
+    before = pa.total_allocated_bytes()
+    with arrow_file(tmp_path / "file") as file:
+        assert pa.total_allocated_bytes() - before >= len(content)
+        assert file.read() == content

@@ -1,5 +1,6 @@
 """The table of decisions, `decisions.parquet`: one row for each decision point, condition and seed."""
 
+import os
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.files import bytes_of, replacing
+from harness.core.files import opened, replacing
 from harness.runs import formats
 from harness.runs.records import Decision, Message
 
@@ -333,11 +334,15 @@ def _row_group(tables: Sequence[pa.Table]) -> pa.Table:
 
 
 def arrow_file(path: Path) -> pa.BufferReader:
-    """Open a file for Arrow.
+    """Open a file for Arrow, which gets its content in memory of its own.
 
-    Arrow's threads can abort the process when they release a file object of Python, so it gets the content.
+    Arrow's threads let go of a file after the call that read it. Of an object of Python, bytes as well, they
+    need the interpreter for that, and abort the process if it has begun to end.
     """
-    return pa.BufferReader(bytes_of(path, "rows"))
+    with opened(path, "rows") as file:
+        content = pa.allocate_buffer(os.fstat(file.fileno()).st_size)
+        size = file.readinto(memoryview(content).cast("B"))
+    return pa.BufferReader(content.slice(0, size))
 
 
 # pyarrow loads pandas when it converts a foreign array to its own or back; going by buffers avoids that.
