@@ -1,17 +1,23 @@
 """Hooks that are told of a run, and the trackers that are made of them, each with its own package offline."""
 
 import json
+import os
+import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Event, get_ident
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import typer
 from misbehaving import Asked, serving
 from served import answer
 
 from harness.core import plugins
+from harness.evaluate import hooks
 from harness.evaluate.hooks import HOOKS
 from harness.runs.folder import read
 
@@ -107,6 +113,80 @@ def test_a_hook_that_fails_costs_a_run_one_line(
     assert bad.told[-1][0] == fails_at
     assert good.told[-1][0] == "end"
     assert read(Path("run")).scores
+
+
+def leave_by_typer() -> None:
+    raise typer.Exit(0)
+
+
+def press_ctrl_c() -> None:
+    """Raise what Ctrl-C does, which nobody typed."""
+    raise KeyboardInterrupt
+
+
+class Bad(Note):
+    """A hook that ends the program, leaves its folder or hangs where it is told to."""
+
+    def __init__(self, at: str, does: Callable[[], object]) -> None:
+        super().__init__()
+        self._at, self._does = at, does
+
+    def _note(self, what: str, *about: Any) -> None:
+        super()._note(what, *about)
+        if what == self._at:
+            self._does()
+
+
+@pytest.mark.parametrize("does", [partial(sys.exit, 0), leave_by_typer, press_ctrl_c], ids=str)
+@pytest.mark.parametrize("at", ["begin", "end"])
+def test_a_hook_that_ends_the_program_costs_a_run_one_line(
+    at: str, does: Callable[[], object], two_path: Path, harness: Typed, install: Callable[..., None]
+) -> None:
+    install(bad=Bad(at, does))
+    code, _, said = harness(*typed_eval(two_path, "--tracker", "bad", "--quiet"))
+    assert code == 0
+    [line] = [line for line in said.splitlines() if "tracker bad" in line]
+    assert line.startswith("harness: tracker bad: ")
+    assert line.endswith("; the run goes on without it")
+    assert read(Path("run")).scores
+
+
+def test_a_hook_that_hangs_is_left_behind(
+    two_path: Path, harness: Typed, install: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hooks, "PATIENCE_S", 0.2)
+    hangs, good = Bad("answered", Event().wait), Note()
+    install(bad=hangs, good=good)
+    typed = typed_eval(two_path, "--tracker", "bad", "--tracker", "good", "--json")
+    code, out, said = harness(*typed, "--quiet")
+    assert (code, json.loads(out)["run"]) == (0, "run"), "what is printed is printed where it was"
+    line = "harness: tracker bad: its answered takes longer than 0.2 s; the run goes on without it"
+    assert said.splitlines().count(line) == 1
+    assert hangs.told[-1][0] == "answered"
+    assert good.told[-1][0] == "end"
+
+
+def test_a_hook_that_leaves_the_folder_does_not_take_the_run_along(
+    two_path: Path, harness: Typed, install: Callable[..., None], tmp_path: Path
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    install(bad=Bad("begin", partial(os.chdir, tmp_path / "elsewhere")))
+    code, _, said = harness(*typed_eval(two_path, "--tracker", "bad", "--quiet"))
+    assert code == 0
+    assert f"tracker bad changed the working folder; it is {tmp_path} again" in said
+    assert read(tmp_path / "run").scores
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_a_hook_is_called_in_one_thread(two_path: Path, harness: Typed, install: Callable[..., None]) -> None:
+    """MLflow keeps its run by thread."""
+    threads = list[int]()
+    note = Note()
+    note._note = lambda *_: threads.append(get_ident())  # type: ignore[method-assign]
+    install(mine=note)
+    assert harness(*typed_eval(two_path, "--tracker", "mine", "--quiet"))[0] == 0
+    assert len(threads) >= 3
+    assert len(set(threads)) == 1
 
 
 def test_a_hook_is_told_of_a_run_that_is_stopped(

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from harness.backends.base import AnswerMode, Backend
 from harness.core import extras
-from harness.core.errors import UserError, unknown
+from harness.core.errors import UserError, printable, unknown
 from harness.core.plugins import Plugins
+from harness.core.strangers import strangers
 
 if TYPE_CHECKING:
     from harness.backends.card import Card
@@ -155,7 +156,9 @@ def open_backend(
         raise UserError(f"{card.shown} needs {package}, which is not installed; run `{engine.install}`")
     if batch_size < 1:
         raise UserError(f"batch size {batch_size}; allowed: 1 or more")
-    backend: Backend = import_object(engine.opens)(card, device=device, dtype=dtype, batch_size=batch_size)
+    options = {"device": device, "dtype": dtype, "batch_size": batch_size}
+    with strangers(f"engine {printable(card.engine)}"):
+        backend: Backend = import_object(engine.opens)(card, **options)
     return backend
 
 

@@ -13,6 +13,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from harness.cli.commands import COMMANDS, GROUPS, OLD, PANELS, SHORT
+from harness.core.strangers import ended, ends_the_program
 
 UNREAD = object()
 DIGITS = 18  # most of a number that is read here
@@ -78,11 +79,15 @@ class Group(TyperGroup):
         self.path = path
 
     def invoke(self, ctx: Any) -> Any:
-        """Invoke the command. Raises Stopped if it is interrupted."""
+        """Invoke the command. Raises Stopped if it is interrupted, and UserError if a package ends it."""
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt as stopped:
-            raise Stopped from stopped
+        except BaseException as error:
+            if ends_the_program(error):
+                raise ended("a package", error) from error
+            if isinstance(error, KeyboardInterrupt):
+                raise Stopped from error
+            raise
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command that is typed. Of an old spelling, a line on stderr says the new one."""

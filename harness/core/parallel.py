@@ -18,6 +18,7 @@ from typing import Any, Protocol, TypeVar
 
 from harness.core import extras
 from harness.core.errors import Unfinished, UserError, printable
+from harness.core.strangers import strangers
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -94,7 +95,7 @@ def each(
     inputs = list(items)
     if workers == 1 or not inputs:
         for place, item in enumerate(inputs):
-            on_result(place, work(item))
+            on_result(place, done(work, item))
         return
     executor = _executor(work, inputs, workers, label, repeatable)
     todo, busy, deaths = deque(range(len(inputs))), 0, Counter[int]()
@@ -126,6 +127,12 @@ def each(
             f"{printable(names)}: the worker was killed {TRIES} times, perhaps because memory ran out; try "
             f"fewer --workers; the other {n_done} are done"
         )
+
+
+def done(work: Callable[[Item], Result], item: Item) -> Result:
+    """Return the result of an item, whose work may call a package's code."""
+    with strangers():
+        return work(item)
 
 
 def spread(
@@ -174,7 +181,7 @@ class _Processes:
     def give(self, place: int, item: Any) -> None:
         number, pool = self._idle.pop()
         pool = pool or ProcessPoolExecutor(1, initializer=_begin, initargs=(self._at_work, number))
-        self._busy[pool.submit(self._work, item)] = place, number, pool
+        self._busy[pool.submit(done, self._work, item)] = place, number, pool
         self._waiting -= 1
 
     def take(self) -> tuple[int, Any]:

@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 
 from harness.core import resources
 from harness.core.errors import UserError, printable
+from harness.core.strangers import strangers
 
 T = TypeVar("T")
 
@@ -61,11 +62,15 @@ class Plugins(Mapping[str, T], Generic[T]):
         what = f"plug-in {printable(name)!r} ({self.group}): {printable(entry.value)}"
         repair = "repair or uninstall the package that registers it"
         try:
-            plugin: T = entry.load()
+            with strangers(what):
+                plugin: T = entry.load()
+                # A class has the methods of its instances, so it would pass the check of the protocol.
+                fits = not isinstance(plugin, type) and isinstance(plugin, self.kind)
+        except UserError:
+            raise
         except Exception as error:  # whatever a package's import raises
             raise UserError(f"{what} does not load ({printable(error)}); {repair}") from error
-        # A class has the methods of its instances, so it would pass the check of the protocol.
-        if isinstance(plugin, type) or not isinstance(plugin, self.kind):
+        if not fits:
             raise UserError(
                 f"{what} is of type {type(plugin).__name__} and no {self.kind.__name__}; {repair}"
             )

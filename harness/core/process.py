@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -11,6 +12,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 STOPS = {signal.SIGTERM: "terminated", signal.SIGINT: "interrupted"}
+LEAVE_S = 120.0  # in which the process is gone once its work is done; a tracker may still send things
 AGAIN_S = 0.05  # after which a stop that fell where nothing can be raised is raised again
 LEAST_MB = 768  # of address space; with less, libraries end the process in ways that cannot be caught
 # Texts of the errors, other than MemoryError, of a process whose memory ran out.
@@ -66,6 +68,26 @@ def run(program: Callable[[], object]) -> None:
         raise
     finally:
         stops.let_go()
+        _leave(sys.exception())
+
+
+def _leave(error: BaseException | None) -> None:
+    """Have the process end with this error within `LEAVE_S`, whatever packages left behind.
+
+    Python waits for threads that are no daemons, and calls what was registered with `atexit`: both may hang.
+    """
+    code = getattr(error, "code", 1 if error else 0)
+    code = code if isinstance(code, int) else int(code is not None)
+
+    def end() -> None:
+        time.sleep(LEAVE_S)
+        names = ", ".join(ascii(t.name) for t in threading.enumerate() if not t.daemon and t is not main)
+        what = f"threads that packages left ({names})" if names else "what packages do at the end"
+        print(f"harness: {what} took longer than {LEAVE_S:g} s; all is written, and it ends", file=sys.stderr)
+        os._exit(code)
+
+    main = threading.main_thread()
+    threading.Thread(target=end, daemon=True).start()
 
 
 class _Stops:

@@ -18,7 +18,7 @@ from ray import exceptions
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from harness.core.errors import Unanswered, UserError, printable
-from harness.core.parallel import WorkerDied
+from harness.core.parallel import WorkerDied, done
 from harness.core.process import Stop
 from harness.core.versions import differing, node_versions
 
@@ -153,7 +153,7 @@ def _on_node(job: tuple[Callable[[Any], Any], dict[str, str], str], item: Any) -
     with suppress(OSError):  # a project's own files are looked up from its folder
         os.chdir(folder)
     try:
-        return node, name, work(item)
+        return node, name, done(work, item)
     except Unanswered:  # the words of its server come first
         raise
     except UserError as error:

@@ -18,8 +18,9 @@ from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.errors import Unanswered
+from harness.core.errors import Unanswered, printable
 from harness.core.files import canonical_bytes, sha256_bytes
+from harness.core.strangers import strangers
 from harness.dataset.load import Scene
 from harness.evaluate import flip, repair, servers
 from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of, plan_keys, source_of
@@ -265,6 +266,10 @@ class Asker:
 
     def _answered(self, backend: Backend, chunk: Sequence[Request]) -> dict[str, Answer]:
         """Answer each request, and ask what its answer calls for: a repair turn, or the reversed list."""
+        with strangers(f"the engine of {printable(self.spec.ego.card.name, 40)}"):
+            return self._answers(backend, chunk)
+
+    def _answers(self, backend: Backend, chunk: Sequence[Request]) -> dict[str, Answer]:
         answers = [answer_of(r, c) for r, c in zip(chunk, backend.complete(chunk), strict=True)]
         repairs, flips = {}, {}
         for place, (request, answer) in enumerate(zip(chunk, answers, strict=True)):

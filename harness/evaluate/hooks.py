@@ -1,19 +1,23 @@
 """Hooks that follow a run while it goes, of which a user chooses some by name.
 
-A package adds one by an entry point in the group `swarmdrive.hooks`. A hook that fails costs a run nothing:
-one line on stderr says so, and it follows that run no further.
+A package adds one by an entry point in the group `swarmdrive.hooks`. A hook that fails, ends the program or
+hangs costs a run nothing but time: one line on stderr says so, and it follows that run no further.
 """
 
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, wait
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from harness.core import extras
 from harness.core.errors import one_line, printable, unknown
 from harness.core.plugins import Plugins
+from harness.core.strangers import strangers
 from harness.evaluate.trackers.mlflow import Mlflow
 from harness.evaluate.trackers.trackio import Trackio
 from harness.evaluate.trackers.wandb import Wandb
@@ -22,6 +26,8 @@ if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
 
 CHOSEN = "SWARMDRIVE_TRACKERS"  # environment variable: names, with commas, where a command names none
+PATIENCE_S = 120.0  # within which a hook must come back; one may send a page over a slow line
+STOPPED_S = 10.0  # the same where the run was stopped, and somebody waits
 
 
 @runtime_checkable
@@ -65,11 +71,43 @@ def chosen(names: Iterable[str]) -> dict[str, Hook]:
     return {name: HOOKS[name] for name in typed}
 
 
+class _Caller:
+    """A thread that calls one hook, in the order in which it is asked to, since hooks keep things by thread.
+
+    A hook that hangs leaves its thread, which ends with the program.
+    """
+
+    def __init__(self, name: str, hook: Hook) -> None:
+        self._what, self._hook = f"tracker {printable(name)}", hook
+        self._calls: SimpleQueue[tuple[Future[None], str, tuple[Any, ...]]] = SimpleQueue()
+        Thread(target=self._work, daemon=True).start()
+
+    def call(self, method: str, arguments: tuple[Any, ...], patience_s: float) -> None:
+        """Call a method. Raises what it raises, and TimeoutError if it takes longer than `patience_s`."""
+        done: Future[None] = Future()
+        self._calls.put((done, method, arguments))
+        if not wait([done], patience_s).done:
+            raise TimeoutError(f"its {method} takes longer than {patience_s:g} s")
+        done.result()
+
+    def _work(self) -> None:
+        while True:
+            done, method, arguments = self._calls.get()
+            try:
+                with strangers(self._what):
+                    getattr(self._hook, method)(*arguments)
+            except Exception as error:  # a stranger's code
+                done.set_exception(error)
+            else:
+                done.set_result(None)
+
+
 class Followers:
     """Some hooks during one run. It begins for them with its first answer, or when it ends with none new."""
 
     def __init__(self, hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]) -> None:
-        self._hooks, self._begun, self._total = dict(hooks), False, 0
+        self._callers = {name: _Caller(name, hook) for name, hook in hooks.items()}
+        self._begun, self._total = False, 0
         self._folder, self._settings = folder, settings
 
     def counting(self, progress: Callable[[int], None]) -> Callable[[int], None]:
@@ -81,31 +119,29 @@ class Followers:
             self._total += new
             self._call("answered", self._total)
 
-        return count if self._hooks else progress
+        return count if self._callers else progress
 
     def end(self, done: "Evaluated | None") -> None:
         if done:
             self._begin()
         if self._begun:
-            self._call("end", done)
+            self._call("end", done, patience_s=PATIENCE_S if done else STOPPED_S)
 
     def _begin(self) -> None:
         if not self._begun:
             self._begun = True
             self._call("begin", self._folder, self._settings)
 
-    def _call(self, method: str, *arguments: Any) -> None:
-        for name, hook in list(self._hooks.items()):
+    def _call(self, method: str, *arguments: Any, patience_s: float | None = None) -> None:
+        for name, caller in list(self._callers.items()):
             try:
                 with redirect_stdout(sys.stderr):  # what a command prints may be read by a program
-                    getattr(hook, method)(*arguments)
+                    caller.call(method, arguments, patience_s or PATIENCE_S)
             except Exception as error:  # a stranger's code
-                shown = one_line(error) or type(error).__name__
-                print(
-                    f"harness: tracker {printable(name)}: {shown}; the run goes on without it",
-                    file=sys.stderr,
-                )
-                del self._hooks[name]
+                who = f"tracker {printable(name)}"
+                shown = one_line(error).removeprefix(f"{who} ") or type(error).__name__
+                print(f"harness: {who}: {shown}; the run goes on without it", file=sys.stderr)
+                del self._callers[name]
 
 
 @contextmanager

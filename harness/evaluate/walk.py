@@ -22,6 +22,7 @@ from harness.coordination.plans import NO_PLANS, Plans
 from harness.coordination.scheduling import Outlook
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
+from harness.core.strangers import strangers
 from harness.dataset.load import Scene
 from harness.evaluate.attackers import Attackers, SentIntents
 from harness.evaluate.claims import claims
@@ -168,6 +169,18 @@ def walk(
 
     Of actions that are equally likely, `ties` takes the `first`, or one that is `drawn`.
     """
+    steps = _steps(world, points, ask, ties)
+    while True:
+        with strangers():  # rules, channels, attacks, schedules and worlds may be a package's
+            step = next(steps, None)
+        if step is None:
+            return
+        yield step
+
+
+def _steps(
+    world: World[DecisionPoint], points: Sequence[OperatingPoint], ask: Ask[DecisionPoint], ties: str
+) -> Iterator[Sequence[Decided[DecisionPoint]]]:
     memories = {point: Memory() for point in points}
     attackers = {point: Attackers(point) for point in points}
     physical = {point for point in points if point.physical}

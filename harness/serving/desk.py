@@ -8,6 +8,7 @@ from threading import Thread
 
 from harness.backends.base import Backend, Completion, Request
 from harness.core.errors import UserError
+from harness.core.strangers import strangers
 from harness.serving.asked import Refusal
 
 PLACES = 64  # questions that may wait
@@ -51,7 +52,8 @@ class Desk:
     def _answer(self, batch: Sequence[tuple[Request, "Future[Completion]"]]) -> bool:
         """Answer a batch; return False if it failed as a whole and is to be asked one by one."""
         try:
-            completions = self._backend.complete([request for request, _ in batch])
+            with strangers():
+                completions = self._backend.complete([request for request, _ in batch])
         except Exception as error:
             if len(batch) > 1 and isinstance(error, UserError):
                 return False

@@ -13,6 +13,7 @@ import numpy as np
 from harness.backends.base import Backend, Request
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.files import canonical_json, sha256_bytes
+from harness.core.strangers import strangers
 from harness.prompts.versions import Prompt
 from harness.studies.optimize.candidate import Candidate, chosen, rewritten, space, systems
 from harness.studies.optimize.feedback import of_course
@@ -85,13 +86,14 @@ class Reflecting:
         adapter = _Adapter(tuning)
         layouts = list(range(len(tuning.layouts)))
         own = systems(tuning.base)
-        gepa.optimize(
-            {role: own[role] for role in self._roles if role in own}, trainset=layouts, valset=layouts,
-            adapter=adapter, reflection_lm=lambda prompt: self._reply(str(prompt), adapter),
-            reflection_prompt_template=ASKED, reflection_minibatch_size=min(BATCH, len(layouts)),
-            stop_callbacks=adapter.over, skip_perfect_score=False, seed=GEPA_SEED, logger=_Silent(),
-            raise_on_exception=False,
-        )  # fmt: skip
+        with strangers("gepa"):
+            gepa.optimize(
+                {role: own[role] for role in self._roles if role in own}, trainset=layouts, valset=layouts,
+                adapter=adapter, reflection_lm=lambda prompt: self._reply(str(prompt), adapter),
+                reflection_prompt_template=ASKED, reflection_minibatch_size=min(BATCH, len(layouts)),
+                stop_callbacks=adapter.over, skip_perfect_score=False, seed=GEPA_SEED, logger=_Silent(),
+                raise_on_exception=False,
+            )  # fmt: skip
         if adapter.error and not isinstance(adapter.error, Spent):
             raise adapter.error
 

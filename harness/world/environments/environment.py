@@ -14,6 +14,7 @@ from typing import Any
 
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json
+from harness.core.strangers import strangers
 from harness.world.road import Lane
 
 PREFIX, CHANGES = "env:", ":config="
@@ -95,7 +96,10 @@ def reset(name: str, seed: int) -> Any:
     env = _create(name)
     _constants().restore()
     try:
-        env.reset(seed=seed)
+        with strangers(shown(name)):
+            env.reset(seed=seed)
+    except UserError:
+        raise
     except Exception as error:
         raise UserError(f"{shown(name)} cannot be reset: {raised(error)}; mind its config") from None
     meta_actions(name, env)
@@ -116,7 +120,10 @@ def _create(name: str) -> Any:
         raise UserError(f"{shown(name)}: give its version too, as in merge-v0")
     _constants().restore()
     try:
-        env = gymnasium.make(env_id, disable_env_checker=True).unwrapped
+        with strangers(shown(name)):
+            env = gymnasium.make(env_id, disable_env_checker=True).unwrapped
+    except UserError:
+        raise
     except ModuleNotFoundError as error:
         missing = printable(str(error).partition(". ")[0])
         raise UserError(

@@ -1,0 +1,68 @@
+"""The door to the code of packages: it runs between lines that it can neither end nor move the program past.
+
+An error of a package is raised as it is, for the caller to word. Two things are no errors, and not a
+package's to do: to end the program, as `sys.exit` does, and to leave it in another working folder, from which
+relative paths lead elsewhere.
+"""
+
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from harness.core.errors import UserError, printable
+from harness.core.process import Stop
+
+
+@contextmanager
+def strangers(what: str = "a package") -> Iterator[None]:
+    """Run code that may be a package's; `what` names it in messages.
+
+    Raises UserError for what would end the program, unless somebody did type Ctrl-C. A changed working folder
+    is put back, and a line on stderr says so.
+    """
+    here = _folder()
+    try:
+        yield
+    except BaseException as error:
+        if not ends_the_program(error) and not _exits(error):
+            raise
+        raise ended(what, error) from error
+    finally:
+        if here and _folder() != here:
+            os.chdir(here)
+            line = f"{what} changed the working folder; it is {printable(here)} again"
+            print(f"harness: {line}", file=sys.stderr)
+
+
+def ends_the_program(error: BaseException) -> bool:
+    """Return whether this is no error, and nobody typed Ctrl-C: code that runs here has no right to it."""
+    if isinstance(error, Stop):
+        return False
+    if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
+        return signal.getsignal(signal.SIGINT) is not signal.default_int_handler  # as in a notebook
+    return not isinstance(error, Exception)
+
+
+def ended(what: str, error: BaseException) -> UserError:
+    """Build the error for what a package raised to end the program; it says what, and where."""
+    words = ": ".join(filter(None, (type(error).__name__, str(error))))
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    raised = printable(f"{words} at {last.filename}:{last.lineno}", 200)
+    return UserError(f"{what} ends the program ({raised}); repair or uninstall the package")
+
+
+def _exits(error: BaseException) -> bool:
+    """Return whether this ends a command of click or typer with an exit code, as commands here do."""
+    kind = type(error)
+    return kind.__name__ in ("Exit", "Abort") and kind.__module__.partition(".")[0] in ("click", "typer")
+
+
+def _folder() -> str | None:
+    try:
+        return os.getcwd()
+    except OSError:  # it was deleted
+        return None

@@ -1,0 +1,167 @@
+"""The code of packages can neither end nor move the program that calls it."""
+
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from packaged import register
+
+from harness.backends.base import Completion, Request
+from harness.coordination.consensus import Pool
+from harness.coordination.rules import RULES
+from harness.core import parallel
+from harness.core.errors import UserError
+from harness.core.process import Stop
+from harness.core.strangers import strangers
+from harness.serving.desk import Desk
+
+ROOT = Path(__file__).parents[1]
+Typed = Callable[..., tuple[int, str, str]]
+
+
+class Odd(BaseException):
+    """What is no error, and no exit."""
+
+
+def leave(raised: BaseException) -> None:
+    raise raised
+
+
+@pytest.mark.parametrize(
+    ("raised", "words"),
+    [
+        (SystemExit(0), "SystemExit: 0"), (SystemExit(), "SystemExit"), (Odd("x\n\x1b"), r"Odd: x\n\x1b"),
+        (typer.Exit(0), "Exit"), (GeneratorExit(), "GeneratorExit"),
+    ],
+)  # fmt: skip
+def test_what_would_end_the_program_is_bad_input_and_says_where(raised: BaseException, words: str) -> None:
+    with pytest.raises(UserError) as error, strangers("rule mine"):
+        leave(raised)
+    assert str(error.value).startswith(f"rule mine ends the program ({words}")
+    assert f" at {__file__}:" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("raised", [ValueError("x"), Stop(2), KeyboardInterrupt()])
+def test_an_error_and_a_typed_ctrl_c_are_raised_as_they_are(raised: BaseException) -> None:
+    """In a notebook, as here, what Ctrl-C raises is no `Stop`."""
+    with pytest.raises(type(raised)) as error, strangers():
+        leave(raised)
+    assert error.value is raised
+
+
+def test_a_ctrl_c_that_nobody_typed_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("signal.getsignal", lambda number: None)  # as in a command, which raises `Stop`
+    with pytest.raises(UserError, match=r"ends the program \(KeyboardInterrupt at "), strangers():
+        leave(KeyboardInterrupt())
+    with pytest.raises(Stop), strangers():
+        leave(Stop(2))
+
+
+@pytest.mark.parametrize("raised", [None, ValueError("x"), SystemExit(1)])
+def test_the_working_folder_is_put_back(
+    raised: BaseException | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").mkdir()
+    try:
+        with strangers("rule mine"):
+            os.chdir("there")
+            if raised:
+                raise raised
+    except (UserError, ValueError):
+        assert raised
+    assert Path.cwd() == tmp_path
+    said = capsys.readouterr().err
+    assert said == f"harness: rule mine changed the working folder; it is {tmp_path} again\n"
+
+
+@pytest.mark.parametrize("source", ["raise SystemExit(0)", "exit()", "class A(BaseException): ...\nraise A"])
+def test_a_package_that_ends_at_its_import_is_one_line(
+    source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    register(tmp_path, "[swarmdrive.rules]\nmine = ends_at_import:RULE\n", ends_at_import=source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(RULES, "_loaded", dict(RULES.built_in))
+    with pytest.raises(UserError, match=r"^plug-in 'mine' \(swarmdrive.rules\): .* ends the program \("):
+        RULES["mine"]
+    sys.modules.pop("ends_at_import", None)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_work_that_ends_the_program_is_bad_input_in_every_process(workers: int) -> None:
+    with pytest.raises(UserError, match=r"^a package ends the program \(SystemExit: 0 at "):
+        parallel.each(partial(sys.exit), [0, 0], workers, lambda place, result: None)
+
+
+class Leaving:
+    """An engine that ends the program once, and then answers."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        self.asked += 1
+        if self.asked == 1:
+            sys.exit(0)
+        return [Completion(r.id, "yes", None, 1, "stop", 0.0, 1) for r in requests]
+
+
+def test_a_served_engine_that_ends_the_program_answers_the_next_question() -> None:
+    async def ask() -> list[Completion]:
+        desk: Any = Desk(Leaving(), 1)  # type: ignore[arg-type]
+        request = Request("a", "ego", (), ("SLOWER", "IDLE", "FASTER"), 1)
+        with pytest.raises(UserError, match="ends the program"):
+            await asyncio.wait_for(desk.ask([request]), 10)
+        return list(await asyncio.wait_for(desk.ask([request]), 10))
+
+    assert [answer.text for answer in asyncio.run(ask())] == ["yes"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", [SystemExit(0), typer.Exit(0), Odd()], ids=repr)
+def test_a_rule_that_ends_the_program_is_bad_input_of_the_run(
+    ending: BaseException, two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(RULES._loaded, "mine", Pool(lambda p, weights: leave(ending)))
+    monkeypatch.setattr(type(RULES), "__iter__", lambda self: iter(self._loaded))
+    typed = (
+        "eval",
+        "--dataset",
+        two_path,
+        "--condition",
+        "6g:consensus=mine",
+        "--limit",
+        "1",
+        "--out",
+        "run",
+    )
+    code, _, said = harness(*typed, "--out", "run", "--quiet")
+    assert code == 2
+    assert f"harness: a package ends the program ({type(ending).__name__}" in said
+    assert not Path("run/run.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "left",
+    ["threading.Thread(target=threading.Event().wait).start()", "atexit.register(threading.Event().wait)"],
+)
+def test_what_a_package_leaves_behind_does_not_keep_the_process(left: str) -> None:
+    code = (
+        "import atexit, sys, threading\nfrom harness.core import process\nprocess.LEAVE_S = 0.2\n"
+        f"def program():\n    {left}\n    print('done')\n    sys.exit(3)\nprocess.run(program)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=30, check=False
+    )
+    assert (done.returncode, done.stdout) == (3, "done\n")
+    assert "took longer than 0.2 s; all is written, and it ends\n" in done.stderr
