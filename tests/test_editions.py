@@ -132,7 +132,7 @@ def test_a_file_of_results_has_the_answers_and_the_editions_figures_and_is_compu
     assert (code, err) == (0, "")
     assert out.splitlines() == [
         f"{made}: proxy-faulty · v2 · json, made by A. N. Author",
-        f"mine-1, digest {named('mine-1').digest[:12]}, as it is here",
+        f"mine-1, digest {named('mine-1').digest}, as it is here",
         "equal to the last digit: 7 figures of 4 layouts in 1 families",
     ]
 
@@ -220,6 +220,10 @@ HOSTILE: dict[str, tuple[Change, str]] = {
     "a file too many": (lambda files: files.update({"small/x.py": b""}), "it has other files than it should"),
     "a file too few": (lambda files: files.pop("small/episodes.csv"), "it has other files than it should"),  # type: ignore[dict-item]
     "a bomb": (lambda files: files.update({"small/run.json": b" " * (17 << 20)}), "small/run.json is larger"),
+    "nothing but blanks": (
+        lambda files: files.update({"small/answers.jsonl": b" " * (16 << 20)}), "would unpack to 16 MB",
+    ),
+    "runs of another edition": (with_contents(runs=["small", "theirs"]), "unknown dataset of mine-1"),
     "no contents": (lambda files: files.update({CONTENTS: b"{"}), "is no file of results"),
     "another format": (with_contents(format="swarmdrive-results/9"), "its format is not"),
     "another edition": (with_contents(edition="theirs-1"), "unknown edition 'theirs-1'"),

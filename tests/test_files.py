@@ -2,14 +2,18 @@
 
 import math
 import os
+import random
+from contextlib import nullcontext
 from datetime import date
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile
 
 import pyarrow as pa
 import pytest
 
-from harness.core.files import canonical_json, digest, read_once, write_whole
+from harness.core.files import canonical_json, digest, read_once, refuse_bomb, write_whole
 from harness.runs.decisions import arrow_file
 
 
@@ -85,3 +89,33 @@ def test_arrow_holds_a_file_in_memory_of_its_own(content: bytes, tmp_path: Path)
     with arrow_file(tmp_path / "file") as file:
         assert pa.total_allocated_bytes() - before >= len(content)
         assert file.read() == content
+
+
+def archive(times: int, **members: bytes) -> bytes:
+    """Members, as often as that in the list of files, which all share one place."""
+    data = BytesIO()
+    with ZipFile(data, "w", ZIP_DEFLATED) as file:
+        for name, content in members.items():
+            file.writestr(name, content)
+        file.filelist *= times
+    return data.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("data", "most", "refused"),
+    [
+        (archive(1, a=bytes(10**6)), math.inf, False),
+        (archive(1, a=bytes(4 * 10**6)), math.inf, True),
+        (archive(1, a=random.Random(0).randbytes(2 * 10**6)), math.inf, False),
+        (archive(1, a=random.Random(0).randbytes(2 * 10**6)), 10**6, True),
+        (archive(500, a=random.Random(0).randbytes(2 * 10**5)), math.inf, True),
+    ],
+    ids=["small", "zeros", "packs badly", "too large", "one place"],
+)
+def test_an_archive_that_unpacks_to_too_much_is_refused_before(
+    data: bytes, most: float, refused: bool
+) -> None:
+    with ZipFile(BytesIO(data)) as file:
+        file.read = file.open = lambda *_: pytest.fail("unpacked")  # type: ignore
+        with pytest.raises(BadZipFile, match="would unpack to") if refused else nullcontext():
+            refuse_bomb(file, len(data), most)

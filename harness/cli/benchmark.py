@@ -111,7 +111,7 @@ def pack(
     file = out or runs[0].absolute().with_name(runs[0].absolute().name + ".zip")
     results.pack(contents, entry, of.figures, file)
     if not quiet:
-        typer.echo(f"packed {printable(of.name)}, digest {of.digest[:12]}, into {printable(file)}")
+        typer.echo(f"packed {printable(of.name)}, digest {of.digest}, into {printable(file)}")
 
 
 def verify(
@@ -158,7 +158,7 @@ def _mapping(file: Path, done: "Rescored") -> dict[str, Any]:
 def _show(file: Path, done: "Rescored") -> None:
     by = f", made by {printable(done.contents.made_by)}" if done.contents.made_by else ""
     typer.echo(f"{printable(file)}: {printable(done.suite.variant)}{by}")
-    typer.echo(f"{printable(done.edition.name)}, digest {done.edition.digest[:12]}, as it is here")
+    typer.echo(f"{printable(done.edition.name)}, digest {done.edition.digest}, as it is here")
     wrong = {name: found for name, found in done.differences.items() if found}
     for name, found in wrong.items():
         echo_text(f"{name}: {len(found)} differ: {', '.join(found)}")

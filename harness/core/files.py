@@ -7,6 +7,7 @@ block, a device would never end, and a large one would fill memory.
 import errno
 import hashlib
 import json
+import math
 import os
 import shutil
 import stat
@@ -17,9 +18,12 @@ from functools import lru_cache, wraps
 from glob import escape
 from io import BufferedReader
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from harness.core.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from zipfile import ZipFile
 
 _EXACT = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False, check_circular=False
@@ -58,6 +62,8 @@ LARGEST: dict[Kind, int] = {
 }
 """The largest file of each kind, bytes."""
 
+MOST_TIMES = 200  # its size that an archive may unpack to: JSON takes some 30, nothing but zeros 1000
+
 
 def opened(path: str | Path, kind: Kind) -> BufferedReader:
     """Open a file for reading; it is checked after it is opened, so nothing can take its place in between.
@@ -83,7 +89,7 @@ def _at_once(path: str, flags: int) -> int:
 
 
 def _size(size: int) -> str:
-    return f"{size / (1 << 30):g} GB" if size >= 1 << 30 else f"{size / _MB:g} MB"
+    return f"{size / (1 << 30):.3g} GB" if size >= 1 << 30 else f"{size / _MB:.3g} MB"
 
 
 def bytes_of(path: str | Path, kind: Kind) -> bytes:
@@ -130,6 +136,18 @@ def neutral(cell: T) -> T | str:
     except ValueError:
         return f"'{cell}"
     return cell
+
+
+def refuse_bomb(archive: "ZipFile", packed: int, most: float = math.inf) -> None:
+    """Raise BadZipFile, before anything is unpacked, for an archive that states too much.
+
+    It may unpack to `most` bytes, and to `MOST_TIMES` the bytes that it has, `packed`, and a megabyte.
+    """
+    from zipfile import BadZipFile  # imported here, since few commands need it
+
+    unpacked = sum(member.file_size for member in archive.infolist())
+    if unpacked > min(most, MOST_TIMES * packed + _MB):
+        raise BadZipFile(f"it has {_size(packed)} and would unpack to {_size(unpacked)}")
 
 
 def sha256_bytes(data: bytes) -> str:

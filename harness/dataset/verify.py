@@ -16,7 +16,7 @@ import msgspec
 
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import bytes_of, sha256_bytes, sha256_file
+from harness.core.files import bytes_of, refuse_bomb, sha256_bytes, sha256_file
 from harness.core.files import opened as opened_file
 from harness.dataset.schema import LAYOUTS, Manifest, Record, Tree, plain_type, record_type, scene_id
 from harness.world import scenarios
@@ -147,6 +147,7 @@ def _layouts(file: Path, state: tuple[int, int, int], process: int) -> ZipFile:
     data = opened_file(file, "rows")
     try:
         layouts = ZipFile(data)
+        refuse_bomb(layouts, state[1])
     except BaseException:
         data.close()
         raise

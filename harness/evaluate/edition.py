@@ -164,7 +164,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def _differs(self, what: str, here: str, stated: str) -> UserError:
         return UserError(
-            f"{what} has digest {here[:12]}…, and {printable(self.name)} is of {printable(stated, 13)}; "
+            f"{what} has digest {here}, and {printable(self.name)} is of {printable(stated)}; "
             "restore it, or install the release that has it"
         )
 

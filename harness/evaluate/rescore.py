@@ -1,6 +1,7 @@
 """Compute the runs in a file of results again from their answers alone, and say which figures differ."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -8,7 +9,7 @@ from tempfile import TemporaryDirectory
 
 from msgspec import structs
 
-from harness.core.errors import Unanswered, UserError, printable
+from harness.core.errors import Unanswered, UserError, printable, unknown
 from harness.core.figures import amount
 from harness.core.files import sha256_file
 from harness.evaluate import edition as editions
@@ -17,7 +18,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.recompute import computed
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode
-from harness.runs.results import Contents, unpack
+from harness.runs.results import Contents, contents_of, unpack
 from harness.runs.suite import SuiteRun
 
 
@@ -80,20 +81,23 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
     Raises UserError if the file is broken, too large or of another edition than the one here, or has not the
     answer to every question, or one to another question; or if figures are computed otherwise here.
     """
-    contents = unpack(file, folder / "stated")
-    try:
-        stated = [read(folder / "stated" / name) for name in contents.runs]
+    contents, stated = contents_of(file), folder / "stated"
+    with _about(file, stated):
         edition = editions.named(contents.edition)
         limit = edition.layouts(sha256_file(file, "record"))
         if contents.digest != edition.digest and limit is None:
             raise UserError(
-                f"{printable(edition.name)} has digest {edition.digest[:12]}… here, and the file is of "
-                f"{printable(contents.digest, 13)}; install the release that has that edition"
+                f"{printable(edition.name)} has digest {edition.digest} here, and the file is of "
+                f"{printable(contents.digest)}; install the release that has that edition"
             )
+        if strange := [name for name in contents.runs if name not in edition.datasets]:
+            raise unknown(f"dataset of {printable(edition.name)}", strange[0], edition.datasets)
+    unpack(file, contents, stated)
+    with _about(file, stated):
         if limit is None:
             here.check(edition)
         runs, differences, compared = dict[str, Run](), dict[str, list[str]](), 0
-        for name, run in edition.entry(stated, limit).items():
+        for name, run in edition.entry([read(stated / name) for name in contents.runs], limit).items():
             source = here.source(edition, name) if limit is None else edition.source(name, limit)
             place = folder / "computed" / name
             ours, otherwise = computed(run, edition.spec(run, source), place, progress)
@@ -102,11 +106,17 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
             if otherwise:
                 differences[name].append(f"{amount(otherwise, 'answer')} of a rule that is here")
             compared += len(edition.figures(ours))
-    except (UserError, Unanswered, OverflowError) as error:
-        where = f"{folder / 'stated'}/"
-        raise UserError(f"{printable(file)}: {str(error).replace(where, '')}") from None
     suite = SuiteRun(folder / "computed", edition.name, edition.description, runs)
     return Rescored(contents, edition, suite, differences, compared, golden=limit is not None)
+
+
+@contextmanager
+def _about(file: Path, stated: Path) -> Iterator[None]:
+    """Have errors name the file, and leave out the folder that it is unpacked to."""
+    try:
+        yield
+    except (UserError, Unanswered, OverflowError) as error:
+        raise UserError(f"{printable(file)}: {str(error).replace(f'{stated}/', '')}") from None
 
 
 def differing(stated: Run, computed: Run, edition: Edition) -> Iterator[str]:

@@ -53,8 +53,8 @@ def vega() -> str:
     bundle = (files("js_lib_vega_embed") / BUNDLE).read_bytes()
     if (actual := sha256_bytes(bundle)) != BUNDLE_SHA256:
         raise UserError(
-            f"the charting library of {PACKAGE} {version(PACKAGE)} has sha256 {actual[:12]}…, not "
-            f"{BUNDLE_SHA256[:12]}…, and would run in every report; install the harness again, whose "
+            f"the charting library of {PACKAGE} {version(PACKAGE)} has sha256 {actual}, not "
+            f"{BUNDLE_SHA256}, and would run in every report; install the harness again, whose "
             "requirements name the release"
         )
     return bundle.decode()

@@ -413,7 +413,7 @@ def dataset_of(run: Run, given: Path | None = None) -> Dataset:
         sha256 = _sha256_of(folders[0]) or read_manifest(folders[0])[1]  # which says what is wrong with it
         raise UserError(
             f"dataset {printable(folders[0])} is not the one that {printable(run.path)} was made on "
-            f"(sha256 {sha256[:12]}…, not {printable(stated.sha256, 13)}); {repair}"
+            f"(sha256 {sha256}, not {printable(stated.sha256)}); {repair}"
         )
     raise UserError(
         f"{printable(run.path)} was made on dataset {printable(stated.name, 40)}, which is neither at "

@@ -4,9 +4,11 @@ In it are `results.json`, and of each dataset's run a folder with its manifest, 
 ended, and the figures that its edition names. Its bytes follow from these.
 """
 
+import errno
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from zipfile import ZipFile, ZipInfo
 
@@ -15,7 +17,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from harness.core.errors import UserError, printable
-from harness.core.files import BROKEN, LARGEST, bytes_of, opened, replacing, write_whole
+from harness.core.files import BROKEN, LARGEST, bytes_of, opened, refuse_bomb, replacing, write_whole
 from harness.runs.folder import Run, csv_text
 from harness.runs.listing import own_name
 from harness.runs.records import FrozenScenes, Score
@@ -25,6 +27,7 @@ CONTENTS = "results.json"
 FILES = {  # of each run, with the most bytes that each may have
     "run.json": 16 << 20, "answers.jsonl": 1 << 30, "episodes.csv": 256 << 20, "summary.csv": 16 << 20,
 }  # fmt: skip
+MOST_UNPACKED = 1 << 30  # bytes of all files together
 MOST_RUNS = 100
 MOST_LETTERS = 200  # of who made it
 LARGEST_LIST = 1 << 20  # bytes of the archive's list of files
@@ -79,28 +82,44 @@ def _files(
         yield f"{name}/summary.csv", csv_text(Score, figures(run), manifest.variant).encode()
 
 
-def unpack(file: Path, folder: Path) -> Contents:
-    """Write a file's runs to a folder, by dataset, and return what the file says of itself.
+def contents_of(file: Path) -> Contents:
+    """Return what a file says of itself. Raises UserError if it is no such file; nothing else is unpacked."""
+    with _archive(file) as archive:
+        return msgspec.json.decode(_piece(archive, CONTENTS, CHUNK), type=Contents)
 
-    Only the files that `results.json` calls for are written, each under a name that is made here and no
-    larger than `FILES` allows. Raises UserError if it is no such file, or has any other.
+
+def unpack(file: Path, contents: Contents, folder: Path) -> None:
+    """Write a file's runs to a folder, by dataset.
+
+    Only the files that `contents` call for are written, each under a name that is made here and no larger
+    than `FILES` allows. Raises UserError, before anything is unpacked, if it states others or larger ones.
     """
+    with _archive(file) as archive:
+        wanted = {f"{name}/{each}": most for name in contents.runs for each, most in FILES.items()}
+        if sorted(archive.namelist()) != sorted([CONTENTS, *wanted]):
+            raise ValueError("it has other files than it should, or one twice")
+        for name, most in wanted.items():
+            _refuse_larger(name, archive.getinfo(name).file_size, most)
+        refuse_bomb(archive, file.stat().st_size, MOST_UNPACKED)
+        for name, most in wanted.items():
+            write_whole(folder / name, _piece(archive, name, most))
+
+
+@contextmanager
+def _archive(file: Path) -> Iterator[ZipFile]:
+    """Open a file of results. Raises UserError if it, or what is read of it, is none."""
     try:
         _refuse_long_list(file)
         with opened(file, "record") as whole, ZipFile(whole) as archive:
-            contents = msgspec.json.decode(_piece(archive, CONTENTS, CHUNK), type=Contents)
-            wanted = {f"{name}/{each}": most for name in contents.runs for each, most in FILES.items()}
-            if sorted(archive.namelist()) != sorted([CONTENTS, *wanted]):
-                raise ValueError("it has other files than it should, or one twice")
-            for name, most in wanted.items():
-                write_whole(folder / name, _piece(archive, name, most))
+            yield archive
     except BROKEN_ZIP as error:
+        if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):  # of where it is unpacked
+            raise
         reason = getattr(error, "strerror", None) or error
         raise UserError(
             f"{printable(file)} is no file of results ({printable(reason)}); give one that `harness "
             "benchmark run` or `pack` wrote"
         ) from None
-    return contents
 
 
 def _plain(name: str) -> bool:
@@ -123,6 +142,10 @@ def _piece(archive: ZipFile, name: str, most: int) -> bytes:
     """Return a file's content; never more than `most` bytes are unpacked."""
     with archive.open(name) as packed:
         data = packed.read(most + 1)
-    if len(data) > most:
-        raise ValueError(f"{name} is larger than {most >> 20} MB")
+    _refuse_larger(name, len(data), most)
     return data
+
+
+def _refuse_larger(name: str, size: int, most: int) -> None:
+    if size > most:
+        raise ValueError(f"{name} is larger than {most >> 20} MB")
