@@ -3,14 +3,16 @@
 import math
 
 import pytest
-from jinja2 import StrictUndefined, UndefinedError
+from jinja2 import Environment, StrictUndefined, UndefinedError
 from jinja2.exceptions import SecurityError, TemplateAssertionError
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
+from harness.core import templates
 from harness.prompts.sandbox import Sandbox
 from harness.prompts.template import Template
 
 SANDBOX = Sandbox(undefined=StrictUndefined)
+PLAIN_SANDBOX = templates.Sandbox(undefined=StrictUndefined)
 
 
 def rendered(template: str, **context: object) -> str:
@@ -112,3 +114,16 @@ def test_what_draws_is_rendered_each_time():
     template = Template("{% block system %}{{ actions | random }}{{ lipsum() }}{% endblock %}")
     actions = tuple("ABCDEFGH")
     assert len({template.render({"actions": actions}, ("system",))[0] for _ in range(9)}) > 1
+
+
+@pytest.mark.parametrize("sandbox", [SANDBOX, PLAIN_SANDBOX], ids=["prompts", "chats"])
+@pytest.mark.parametrize(
+    "written",
+    ["''.maketrans", "graph.items", "[''.upper]", "''.upper ~ 1", "graph.keys ~ ''", "['a'] | map('upper')",
+     "range", "cycler(1)", "''.upper | string"],
+)  # fmt: skip
+def test_what_has_no_text_but_its_address_is_not_written(written: str, sandbox: Environment):
+    """It would be another text in every process."""
+    template = sandbox.from_string(f"{{{{ {written} }}}}")
+    with pytest.raises(SecurityError, match=r"^an? \w+ has no text; call it, or write what it makes$"):
+        template.render(graph={})

@@ -20,7 +20,7 @@ from harness.backends.registry import registration
 from harness.backends.vision import Vision, read_vision
 from harness.core import resources
 from harness.core.config import convert
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import UserError, printable, sayable, unknown
 from harness.core.files import bytes_of, text_of
 
 DISTILLED = "training.json"  # stands beside weights that were distilled here
@@ -165,6 +165,7 @@ def _local_card(text: str, engine: str | None) -> Card | None:
 
 def _new_card(name: str, engine: str, weights: str, description: str, **settings: Any) -> Card:
     latency = Latency("paper", None, "none declared: the paper's")
+    sayable("model", name)
     return Card(name, engine, description, latency, weights=weights, **settings)
 
 

@@ -92,6 +92,8 @@ def _program() -> Any:
 
 
 def _typed() -> None:
+    if strange := [word for word in sys.argv if not _is_text(word)]:
+        _fail(f"`{printable(strange[0])}` is no UTF-8, as all that is kept is; rename what it names")
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # Arrow's own takes 20 MB more, and time
     try:
         sys.exit(_program()(standalone_mode=False))
@@ -113,6 +115,14 @@ def _typed() -> None:
         path = context.command_path if context else "harness"
         typed = printable(" ".join(["harness", *sys.argv[1:]]))
         _fail(f"{printable(message.removesuffix('.'), 300)} in `{typed}`; see `{path} --help`")
+
+
+def _is_text(word: str) -> bool:
+    try:
+        word.encode()
+    except UnicodeEncodeError:  # bytes of a name that are no UTF-8
+        return False
+    return True
 
 
 def _with_notes(words: str, error: BaseException | None) -> str:

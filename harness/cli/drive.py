@@ -114,10 +114,10 @@ def command(
     if silent:
         return
     if videos:
-        typer.echo(f"wrote {where / 'videos'}: {', '.join(video.name for video in videos)}")
+        typer.echo(f"wrote {printable(where / 'videos')}: {', '.join(video.name for video in videos)}")
     elif save_video:
         typer.echo(f"no episode failed under {printable(spec.points[-1].name)}: no video")
-    typer.echo(f"wrote {page}")
+    typer.echo(f"wrote {printable(page)}")
 
 
 def deciding(scenario: str, agents: str) -> str:

@@ -146,7 +146,7 @@ def command(
     )
     rows = {label(name, dataset.scenario): scores for name, scores in beside.items()}
     show(done, dataset.name, (SUCCESS, *gain, *COLUMNS), notes, rows)
-    typer.echo(f"wrote {page}")
+    typer.echo(f"wrote {printable(page)}")
 
 
 def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: str) -> None:

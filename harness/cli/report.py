@@ -27,7 +27,8 @@ def command(
     """Write one HTML page about a run or suite, or about several. It works offline."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
-    typer.echo(f"wrote {write(runs, out, dataset=dataset, workers=options.workers_of(workers), full=full)}")
+    page = write(runs, out, dataset=dataset, workers=options.workers_of(workers), full=full)
+    typer.echo(f"wrote {printable(page)}")
 
 
 def write(

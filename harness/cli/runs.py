@@ -209,7 +209,7 @@ def merge(
     work.tidy(out)
     drive.tell(done, as_json, quiet)
     if not silent:
-        typer.echo(f"wrote {page}")
+        typer.echo(f"wrote {printable(page)}")
 
 
 def export(
@@ -329,4 +329,4 @@ def video(
     played = find(run, episode, condition, seed)
     with bar("drawing", sum(1 for _ in stills(played))) as progress:
         write_video(played, out, progress)
-    typer.echo(f"wrote {out}")
+    typer.echo(f"wrote {printable(out)}")

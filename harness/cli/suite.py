@@ -79,7 +79,7 @@ def evaluate(
         echo_json(_mapping(done, lines))
     elif not quiet:
         _show(done, lines)
-        typer.echo(f"wrote {page}")
+        typer.echo(f"wrote {printable(page)}")
     return folder
 
 

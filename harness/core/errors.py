@@ -43,6 +43,16 @@ def printable(text: object, limit: int = 120) -> str:
     return escaped if len(escaped) <= limit else escaped[: limit - 1] + "…"
 
 
+def sayable(what: str, name: str, repair: str = "rename it") -> str:
+    """Return a name if terminals, pages and records carry it as it is. Raises UserError otherwise.
+
+    Control characters, those that turn the direction of text, and bytes that are no UTF-8 are none of these.
+    """
+    if not name.isprintable():
+        raise UserError(f"{what} `{printable(name)}` has characters that nothing can show; {repair}")
+    return name
+
+
 def one_line(error: Exception) -> str:
     """Return an error's message on one line, made safe to show."""
     return printable(" ".join(str(error).split()), 200)

@@ -20,7 +20,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, sayable
 
 if TYPE_CHECKING:
     from zipfile import ZipFile
@@ -173,6 +173,7 @@ def replacing(path: Path) -> Iterator[Path]:
     Temporary files of killed processes are deleted as well. Raises OSError if `path` cannot be written, which
     is never FileNotFoundError.
     """
+    sayable("file", path.name, "give another name")
     if path.is_dir():  # fail now, and not only after all is written
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     # Arrow takes a relative path with a colon, such as `6g:loss=0/x`, for an address.
@@ -206,6 +207,7 @@ def making(folder: Path) -> Iterator[Path]:
 
     Temporary folders of killed processes are deleted as well. Raises OSError if it cannot be made.
     """
+    sayable("folder", folder.name, "give another name")
     whole = folder.absolute()
     forget_halves(whole.parent, escape(whole.name))
     part = whole.with_name(f".{whole.name}.{os.getpid()}.part")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, sayable
 
 T = TypeVar("T")
 DATASET = "occluded-intersection-v3"  # taken if none is named
@@ -54,7 +54,7 @@ def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserEr
 def find(kind: str, name: str) -> Path:
     """Return the path of a resource; if it does not exist, its path among the shipped ones.
 
-    Raises UserError if the project and the harness both have a resource of that name.
+    Raises UserError if the project and the harness both have a resource of that name, or nothing can show it.
     """
     candidates = list(dict.fromkeys(where / name for where in _folders(kind)))  # one, if `name` is absolute
     existing = [path for path in candidates if os.path.lexists(path)]
@@ -62,6 +62,8 @@ def find(kind: str, name: str) -> Path:
         raise UserError(
             f"{kind}/{printable(name)} is in this project and ships with the harness; give yours another name"
         )
+    if existing and "/" not in name:
+        sayable(f"file of {kind}", name)
     return existing[0] if existing else candidates[0]
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import wraps
 from itertools import chain
 from threading import local
-from types import CodeType, MappingProxyType
+from types import BuiltinFunctionType, CodeType, FunctionType, GeneratorType, MappingProxyType, MethodType
 from typing import Any
 
 from jinja2 import Environment, Template, TemplateSyntaxError, nodes
@@ -36,7 +36,10 @@ _STEP = "spent step"  # name of the node that pays; as those with the prefix, no
 _VIEWS: tuple[type[Any], ...] = (type({}.keys()), type({}.values()), type({}.items()))
 _LISTS: tuple[type[Any], ...] = (list, tuple, set, frozenset, range, *_VIEWS)
 _MAPPINGS = (dict, MappingProxyType)
+_FUNCTIONS = (FunctionType, BuiltinFunctionType, MethodType)
+_ADDRESSED = (GeneratorType, Cycler, Joiner)  # beside these, whose text is where they lie in memory
 _SMALL = frozenset({float, bool, type(None)})
+PLAIN = _SMALL | {str, int, dict}  # what nearly all that a prompt writes is of
 # Filters that read one thing of a value, whatever its size.
 _FREE = frozenset({"attr", "count", "d", "default", "first", "last", "length"})
 # Filters whose result may be as large as the value times an argument.
@@ -60,10 +63,17 @@ class TooMuch(SecurityError):
         super().__init__(what)
 
 
-class _Account(local):
-    """The steps that a thread's rendering has left."""
+class Unwritten(SecurityError):
+    """A template writes a thing whose text is where it lies in memory, another one in every process."""
 
-    left = MOST_STEPS
+    def __init__(self, thing: object) -> None:
+        super().__init__(f"a {type(thing).__name__} has no text; call it, or write what it makes")
+
+
+class _Account(local):
+    """The steps that a thread's rendering has left, and whether it compiles a template instead."""
+
+    left, compiles = MOST_STEPS, False
 
 
 _account = _Account()
@@ -89,6 +99,13 @@ def read(value: Any) -> Any:
     return value
 
 
+def written(value: Any) -> Any:
+    """Return a value that is to be written, as `read` does. Raises Unwritten if its text is its address."""
+    if isinstance(value, _ADDRESSED):
+        raise Unwritten(value)
+    return read(value)
+
+
 def looked_in(value: Any) -> Any:
     """Return a value after paying for a search in it."""
     return value if isinstance(value, _MAPPINGS) else read(value)
@@ -97,7 +114,8 @@ def looked_in(value: Any) -> Any:
 def _size(value: Any) -> int:
     """Return what reading the whole of a value costs: 1, and 1 for each 8 characters and for each item.
 
-    A list that is there several times counts as often, as in its text. Raises TooMuch if it is too large.
+    A list that is there several times counts as often, as in its text. Raises TooMuch if it is too large, and
+    Unwritten for a function.
     """
     most, total, unread = _account.left, 0, [value]
     while unread:
@@ -105,6 +123,8 @@ def _size(value: Any) -> int:
         total += 1
         if isinstance(item, str | bytes):
             total += len(item) >> 3
+        elif isinstance(item, _FUNCTIONS):
+            raise Unwritten(item)
         elif isinstance(item, int):
             total += item.bit_length() >> 6
         elif isinstance(item, _LISTS):
@@ -271,7 +291,7 @@ class Code(CodeGenerator):
         escapes = "markup_join" if frame.eval_ctx.autoescape else "str_join"
         self.write(f"{marked if frame.eval_ctx.volatile else escapes}((")
         for part in node.nodes:
-            self._side(part, "read", frame)
+            self._side(part, "written", frame)
             self.write(", ")
         self.write("))")
 
@@ -346,7 +366,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
     template_class = Bounded
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(finalize=read, **options)
+        super().__init__(finalize=written, **options)
         own = {"format": _format, "join": _join, "replace": _replace, "sum": _sum}
         for name, function in list(self.filters.items()):
             self.filters[f"{FREE}{name}"] = function
@@ -369,14 +389,17 @@ class Sandbox(ImmutableSandboxedEnvironment):
     def _generate(
         self, source: nodes.Template, name: str | None, filename: str | None, defer_init: bool = False
     ) -> str:
-        _account.left = 0  # so that no filter is applied to a constant here, where nothing pays for it
+        # So that no filter is applied to a constant, where nothing pays for it, and no method becomes one.
+        _account.left, _account.compiles = 0, True
         try:
             self._put_steps_into(source)
             code = super()._generate(source, name, filename, defer_init)
         except RecursionError:
             raise TemplateSyntaxError("its parts are nested too deeply", 1) from None
+        finally:
+            _account.compiles = False
         # At the end, so that lines keep their numbers.
-        return f"{code}\nfrom {__name__} import _charged as made, looked_in, read, spend\n"
+        return f"{code}\nfrom {__name__} import PLAIN, _charged as made, looked_in, read, spend, written\n"
 
     def is_small(self, node: nodes.Node) -> bool:
         """Return whether it is known of an expression that its value costs nothing to read."""
@@ -448,6 +471,12 @@ class Sandbox(ImmutableSandboxedEnvironment):
             spend(len(items) * size)
             return (items, *given[1:])
         return given
+
+    def getattr(self, obj: Any, attribute: str) -> Any:
+        """Return an attribute; not while a template is compiled."""
+        if _account.compiles:
+            raise nodes.Impossible
+        return super().getattr(obj, attribute)
 
     def getitem(self, obj: Any, argument: Any) -> Any:
         """Return an item; one that is not named by a text or number is paid for."""

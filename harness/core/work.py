@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from harness.core.errors import Unanswered, Unfinished, UserError, printable
+from harness.core.errors import Unanswered, Unfinished, UserError, printable, sayable
 from harness.core.files import alone, forget_halves, text_of, write_whole
 from harness.core.formats import CONFIG, WORK
 
@@ -43,6 +43,7 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
 
     Raises UserError if the file is damaged, or the folder holds something else.
     """
+    sayable("--out", out.name, "give another name")
     shown, file = printable(out), out / WORK / CONFIG
     try:
         if file.is_file() and not idle(out):

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import structs
 
 from harness.core.arrays import Bools, Floats
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import UserError, printable, sayable, unknown
 from harness.core.files import text_of
 from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
@@ -270,6 +270,7 @@ class Dataset:
 def find(name: str) -> Path:
     """Return the folder of a dataset, given by its path, or by its name if it is shipped or the project's."""
     if os.path.isdir(name):  # unlike Path.is_dir, false for a name too long to be one
+        sayable("dataset", os.path.basename(name))
         return Path(name)
     names = {manifest.parent.name for manifest in entries("datasets", "*/manifest.json")}
     if name in names:

@@ -62,9 +62,18 @@ class Code(templates.Code):
         self.writeline(f"yield {text!r} % (", node)
         for part in node.nodes:
             if not isinstance(part, nodes.TemplateData):
-                self._side(part, "read", frame)
+                self._part(part, frame)
                 self.write(", ")
         self.write(")")
+
+    def _part(self, node: nodes.Expr, frame: Frame) -> None:
+        """Write the code of a part of the text; a path may lead to a method, which has no text."""
+        if not (_is_path(node) and self.environment.is_small(node)):
+            self._side(node, "written", frame)
+            return
+        self.write("(_at if type(_at := ")
+        self.visit(node, frame)
+        self.write(") in PLAIN else written(_at))")
 
 
 def _is_path(node: nodes.Node) -> bool:
