@@ -3,10 +3,12 @@
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from harness.backends.base import Completion, Request, failed
 from harness.core import resources
 from harness.core.errors import UserError
 from harness.core.files import making, write_whole
@@ -58,3 +60,14 @@ def test_what_is_typed_in_no_utf_8_is_refused_in_one_line(harness: Typed, tmp_pa
         assert (code, out, said.count("\n")) == (2, "", 1)
         assert "a\\udcffb` is no UTF-8, as all that is kept is; rename what it names" in said
     assert {path.name for path in tmp_path.iterdir()} == {"swarmdrive.toml", "models"}
+
+
+@pytest.mark.parametrize(
+    ("said", "kept"),
+    [("\ud800", "?"), ("a\udc00b é", "a?b é"), ("😀 \ud83d", "😀 ?"), ("whole é", "whole é"), ("", "")],
+)
+def test_no_completion_has_a_lone_surrogate(said: str, kept: str) -> None:
+    """It is legal JSON, and no file can hold it; whichever model said it, and whoever asked."""
+    done = Completion("a", said, None, 1, "stop", 0.0, 1, said)
+    assert (done.text, done.error) == (kept, kept)
+    assert replace(failed(Request("a", "ego", (), ("IDLE",), 1), said)).error == kept

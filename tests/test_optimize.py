@@ -517,11 +517,23 @@ def test_gepa_rewrites_the_system_text_by_what_went_wrong(
 
 
 @pytest.mark.slow
-def test_what_a_reflecting_model_breaks_is_worth_nothing(
+def test_a_lone_surrogate_of_a_reflecting_model_is_a_text_of_its_own(
     optimize: Typed, model: Model, tmp_path: Path
 ) -> None:
     pytest.importorskip("gepa")
-    model.written = "```\n{{ no end\n```"
+    model.written = "```\nDrive \ud800.\n```"
+    code, _, wrong = optimize("--reflect", "m", "--budget", 200)
+    assert code == 0, wrong
+    assert history(tmp_path)["tried"][1]["system"] == {"ego": "Drive ?."}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("written", ["{{ no end", "\ud83d {{ graph.items }}"], ids=ascii)
+def test_what_a_reflecting_model_breaks_is_worth_nothing(
+    written: str, optimize: Typed, model: Model, tmp_path: Path
+) -> None:
+    pytest.importorskip("gepa")
+    model.written = f"```\n{written}\n```"
     code, _, wrong = optimize("--reflect", "m", "--budget", 200)
     assert code == 0, wrong
     assert "None is better" in (tmp_path / "reports" / "new" / "index.html").read_text()

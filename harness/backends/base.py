@@ -106,7 +106,9 @@ class Completion:
     """One answer to a request."""
 
     request_id: str
-    text: str  # the model's text, unchanged; empty on an error
+    # the model's text, unchanged but for lone surrogates, which are legal JSON and which no file can hold;
+    # empty on an error
+    text: str
     # None if the engine has no tokenizer. Of several orders, what they begin with counts once in process, and
     # as often as a server counts it.
     prompt_tokens: int | None
@@ -130,6 +132,11 @@ class Completion:
     follows_letter: bool | None = None
     server: str | None = None  # address of the server that gave it; None in process, or of several servers
     flipped: bool | None = None  # of a replayed read-out, whether its likeliest changed in the reversed list
+
+    def __post_init__(self) -> None:
+        for name in ("text", "error"):
+            if (said := getattr(self, name)) and not said.isascii():
+                object.__setattr__(self, name, said.encode("utf-8", "replace").decode())
 
 
 def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Completion:

@@ -121,8 +121,6 @@ def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
 def answer_of(request: Request, completion: Completion) -> Answer:
     """Parse a completion into an answer."""
     raw = completion.text
-    if not raw.isascii():  # a lone surrogate cannot be written to a file; the rest of the text stays as it is
-        raw = raw.encode("utf-8", "replace").decode("utf-8")
     scene, _, viewers = request.id.partition("/")
     viewer, *heard = viewers.split("+")
     role: RecordedRole = "merge" if heard else "blind" if viewer.endswith(BLIND) else request.role
