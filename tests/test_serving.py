@@ -11,8 +11,9 @@ import threading
 from base64 import b64encode
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from http.client import HTTPResponse
 from io import BytesIO
 from pathlib import Path
@@ -39,7 +40,7 @@ from harness.core.image import Image
 from harness.dataset.load import Dataset, find, load
 from harness.prompts.decision import Question
 from harness.runs import folder
-from harness.serving.app import Service
+from harness.serving.app import CONNECTIONS, Service
 from harness.serving.asked import Refusal
 from harness.serving.desk import Desk
 from harness.serving.model import ServedModel, served
@@ -470,6 +471,32 @@ def test_a_head_that_does_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyP
             sleep(0.6)
             slow.sendall(whole)
             assert answered(slow) == 200, "between requests uvicorn's time holds"
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET /v1/models HTTP/1.1\r\nHost: local", b"\r\n"], ids=ascii)
+def test_connections_without_a_head_take_nobodys_place(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web, "server_of", partial(web.server_of, limit_concurrency=CONNECTIONS))
+    with answering("sparrow-robot", Patient(), token="secret-123") as there, ExitStack() as stack:
+        address = "127.0.0.1", urlsplit(there).port
+        slow = [stack.enter_context(socket.create_connection(address, timeout=5)) for _ in range(140)]
+        for each in slow:
+            each.sendall(sent)
+        asked = httpx.get(f"{there}/models", headers={"Authorization": "Bearer secret-123"}, timeout=5)
+        assert asked.status_code == 200
+
+
+@pytest.mark.parametrize("head", [b"Authorization: Bearer wrong", b"Origin: http://evil"])
+def test_a_body_of_who_may_not_ask_is_not_waited_for(head: bytes) -> None:
+    start = b"POST /v1/decisions HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000\r\n" + head + b"\r\n\r\n"
+    with answering("sparrow-robot", Patient(), token="secret-123") as there:
+        with socket.create_connection(("127.0.0.1", urlsplit(there).port), timeout=5) as slow:
+            slow.sendall(start)
+            said = b""
+            with suppress(ConnectionError):
+                while part := slow.recv(4096):
+                    said += part
+        assert said.partition(b" ")[2][:3] in (b"401", b"403")
+        assert b"connection: close" in said.lower()
 
 
 def test_who_waits_too_long_is_told_so_and_is_not_asked_about_later() -> None:

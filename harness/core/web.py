@@ -2,6 +2,7 @@
 
 import asyncio
 import errno
+import math
 import socket
 from collections.abc import Callable
 from ipaddress import ip_address
@@ -18,12 +19,14 @@ LOOPBACK = "127.0.0.1"
 BACKLOG = 512  # connections that wait to be taken
 NAMES = (LOOPBACK, "localhost", "::1")  # of this machine, as who is on it writes them
 HEAD_S = 10.0  # within which a request's head, its line and headers, must have come
+WAITING = 64  # connections on which a head is waited for; of more, the one that took longest is closed
 
 
 class HeadInTime(H11Protocol):
     """HTTP that closes a connection on which a request's head takes longer than `HEAD_S`.
 
     uvicorn waits for a head for ever, however slowly it drips. Between requests its own, shorter time holds.
+    Who sends no head takes nobody's place: no more than `WAITING` connections wait for one.
     """
 
     _late: asyncio.TimerHandle | None = None
@@ -48,6 +51,14 @@ class HeadInTime(H11Protocol):
             self._relax()
         elif self._late is None:
             self._late = self.loop.call_later(HEAD_S, self.transport.close)
+            waiting = [each for each in self.connections if isinstance(each, HeadInTime) and each._late]
+            if len(waiting) > WAITING:
+                oldest = min(waiting, key=HeadInTime._closes_at)
+                oldest._relax()  # it is chosen once
+                oldest.transport.close()
+
+    def _closes_at(self) -> float:
+        return self._late.when() if self._late else math.inf
 
     def _relax(self) -> None:
         if self._late is not None:

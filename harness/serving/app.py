@@ -34,6 +34,7 @@ MOST_SEEN_BYTES = 5 * 2**20  # of one with a picture
 BODY_S = 30.0  # within which a request must have come
 ANSWER_S = 120.0  # within which it is answered; a client's usual patience
 CONNECTIONS = 128  # open at the same time
+UNREAD = (401, 403, 404, 405, 408, 413)  # statuses of requests whose body was not read, or not to its end
 _OVERFLOW = "context overflow"
 
 
@@ -183,6 +184,6 @@ def _refused(refusal: Refusal) -> Response:
     )
     error = {"message": refusal.words, "type": kind, "param": None, "code": refusal.code}
     headers = {"retry-after": str(AGAIN_S)} if refusal.status in (429, 503) else {}
-    if refusal.status == 413 or refusal.status == 408:
+    if refusal.status in UNREAD:
         headers["connection"] = "close"  # what is left of it is not read
     return JSONResponse({"error": error}, refusal.status, headers)

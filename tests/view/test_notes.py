@@ -1,16 +1,23 @@
 """Notes on decision points: they stay with the run, and nobody else writes them."""
 
+import asyncio
 import json
 import os
+from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
 from starlette.testclient import TestClient
 from viewing import SECRET, TOKEN, said
 
 from harness.report.page import render
 from harness.report.runs import gather
+from harness.report.view import app
 from harness.report.view.access import cookie
+from harness.report.view.app import View
 from harness.runs.folder import read
 from harness.runs.notes import LONGEST, MOST, notes
 
@@ -156,3 +163,31 @@ def test_broken_notes_are_one_line(text: str, browser: TestClient, reports: Path
     answer = browser.get("/notes?path=first")
     assert answer.status_code == 400
     assert "notes.json is broken (" in said(answer)
+
+
+def posted(receive: Callable[[], Awaitable[Any]]) -> Request:
+    """A note that is being sent."""
+    headers = [(b"origin", b"x")]
+    return Request({"type": "http", "method": "POST", "path": "/notes", "headers": headers}, receive)
+
+
+def test_a_browser_that_leaves_while_it_sends_a_note_is_no_bug(reports: Path) -> None:
+    async def receive() -> dict[str, object]:
+        return next(messages)
+
+    first: dict[str, object] = {"type": "http.request", "body": b"path=first", "more_body": True}
+    messages = iter([first, {"type": "http.disconnect"}])
+    with pytest.raises(HTTPException, match="the browser is gone") as gone:
+        asyncio.run(View(reports).note(posted(receive)))
+    assert gone.value.status_code == 400
+    assert not (reports / "first/notes.json").exists()
+
+
+def test_a_note_that_never_comes_is_not_waited_for(reports: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def receive() -> dict[str, object]:
+        await asyncio.sleep(60)
+        return {}
+
+    monkeypatch.setattr(app, "SENT_S", 0.05)
+    with pytest.raises(HTTPException, match=r"a note did not come within 0.05 s"):
+        asyncio.run(View(reports).note(posted(receive)))

@@ -62,4 +62,5 @@ def _of_another_site(request: Request) -> bool:
 
 
 def _refused(reason: str) -> Response:
-    return HTMLResponse(pages.wrong(reason), 403)
+    # What is left of the request is not read.
+    return HTMLResponse(pages.wrong(reason), 403, {"connection": "close"})

@@ -29,7 +29,7 @@ from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -42,6 +42,8 @@ from harness.report.view.folder import PICTURES, own_file, pictures, whole
 from harness.runs.listing import Listed, runs
 from harness.runs.notes import FILE as NOTES
 
+SENT_S = 30.0  # within which a form must have come
+CLOSED = {"connection": "close"}  # of what is left of a request nothing is read
 MOST_SENT = 1 << 16  # bytes of a form: every character of a note may take twelve
 HOSTS = ("127.0.0.1", "localhost")
 HEADERS = {
@@ -163,10 +165,17 @@ class View:
         if "origin" not in request.headers:
             raise HTTPException(403, "it is not said which site sends this; send it from a page of this list")
         sent = b""
-        async for chunk in request.stream():
-            sent += chunk
-            if len(sent) > MOST_SENT:
-                raise HTTPException(413, "this is longer than a note may be; shorten it")
+        try:
+            async with asyncio.timeout(SENT_S):
+                async for chunk in request.stream():
+                    sent += chunk
+                    if len(sent) > MOST_SENT:
+                        raise HTTPException(413, "this is longer than a note may be; shorten it", CLOSED)
+        except TimeoutError:
+            late = f"a note did not come within {SENT_S:g} s; send it again"
+            raise HTTPException(408, late, CLOSED) from None
+        except ClientDisconnect:
+            raise HTTPException(400, "the browser is gone, and nothing was written", CLOSED) from None
         form = parse_qs(sent.decode("ascii", "replace"), keep_blank_values=True, errors="replace")
         keys = ("path", "scene", "text", "before")
         name, *note = (form.get(key, [""])[0] for key in keys)
