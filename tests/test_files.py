@@ -3,17 +3,30 @@
 import math
 import os
 import random
+import subprocess
+import sys
 from contextlib import nullcontext
 from datetime import date
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile
 
 import pyarrow as pa
 import pytest
 
-from harness.core.files import canonical_json, digest, read_once, refuse_bomb, write_whole
+from harness.core.errors import printable
+from harness.core.files import (
+    appending,
+    canonical_json,
+    digest,
+    read_once,
+    refuse_bomb,
+    replacing,
+    write_whole,
+)
+from harness.core.junit import Case, junit
 from harness.runs.decisions import arrow_file
 
 
@@ -119,3 +132,36 @@ def test_an_archive_that_unpacks_to_too_much_is_refused_before(
         file.read = file.open = lambda *_: pytest.fail("unpacked")  # type: ignore
         with pytest.raises(BadZipFile, match="would unpack to") if refused else nullcontext():
             refuse_bomb(file, len(data), most)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a /dev/full, as Linux has")
+def test_a_full_disk_names_the_file_that_is_written(tmp_path: Path) -> None:
+    full_at = pytest.raises(OSError, match="No space left")
+    with full_at as full, replacing(tmp_path / "run.json"), open("/dev/full", "w") as file:
+        file.write("x")
+    assert full.value.filename == str(tmp_path / "run.json")
+    (tmp_path / "answers.jsonl").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left") as full, appending(tmp_path / "answers.jsonl") as end:
+        end.write(b"x")
+    assert full.value.filename == str(tmp_path / "answers.jsonl")
+    assert {path.name for path in tmp_path.iterdir()} == {"answers.jsonl"}
+
+
+def test_a_file_that_grows_too_large_is_named(tmp_path: Path) -> None:
+    code = (
+        "import resource, signal, sys\nfrom pathlib import Path\nfrom harness.core.files import write_whole\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\nresource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))\n"
+        "try:\n    write_whole(Path(sys.argv[1]), 'x' * 99)\n"
+        "except OSError as error:\n    print(error.filename)\n"
+    )
+    out = tmp_path / "page.html"
+    said = subprocess.run([sys.executable, "-c", code, out], capture_output=True, text=True, check=True)
+    assert (said.stdout, out.exists()) == (f"{out}\n", False)
+
+
+@pytest.mark.parametrize("text", ["\x00\x1b", "\ufffe\ud800", "a & b <c>"], ids=ascii)
+def test_every_text_of_junit_is_xml(text: str) -> None:
+    cases = [Case(text, text), Case(text, text, failure=text), Case(text, text, error=text)]
+    suite = ElementTree.fromstring(junit(text, cases))
+    assert suite.attrib["name"] == printable(text)
+    assert [case.attrib["name"] for case in suite] == [printable(text)] * 3

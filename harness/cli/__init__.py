@@ -78,8 +78,8 @@ def main() -> None:
 
         if error.errno not in MACHINE and not isinstance(error, Refused):
             raise
-        where = f"{printable(error.filename)}: " if error.filename else ""
-        _fail(f"{where}{error.strerror}; fix that, and type the same command again")
+        where = printable(error.filename) if error.filename else "the output, or a temporary file"
+        _fail(f"{where}: {error.strerror}; fix that, and type the same command again")
 
 
 @cache

@@ -18,7 +18,7 @@ from functools import lru_cache, wraps
 from glob import escape
 from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar
 
 from harness.core.errors import UserError, printable, sayable
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _EXACT = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False, check_circular=False
 )
+NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a formula begins with, and what spreadsheets skip before it
 T = TypeVar("T")
 
@@ -167,6 +168,24 @@ def digest(value: Any) -> str:
 
 
 @contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Have an error that a disk has no room, which comes without a name, name the file that is written."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in NO_ROOM and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
+def appending(path: Path) -> Iterator[BinaryIO]:
+    """Open a file, a new one as well, to write at its end. Raises OSError, which names it."""
+    with naming(path), path.open("ab") as file:
+        yield file
+
+
+@contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary file to write to; it replaces `path` on success and is deleted on an error.
 
@@ -186,7 +205,7 @@ def replacing(path: Path) -> Iterator[Path]:
     except FileNotFoundError:  # what /proc says to whoever makes a file there
         raise PermissionError(errno.EACCES, "no file can be made there", str(path)) from None
     try:
-        with alone(part):
+        with naming(path), alone(part):
             yield part
             with part.open("rb+") as f:
                 os.fsync(f.fileno())
@@ -213,7 +232,7 @@ def making(folder: Path) -> Iterator[Path]:
     part = whole.with_name(f".{whole.name}.{os.getpid()}.part")
     try:
         part.mkdir(parents=True)
-        with alone(part):
+        with naming(folder), alone(part):
             yield part
             part.rename(whole)
     finally:

@@ -28,7 +28,7 @@ def junit(name: str, cases: Sequence[Case]) -> str:
         "failures": str(failed),
         **({"errors": str(errors)} if errors else {}),
     }
-    suite = Element("testsuite", {"name": name, **counts})
+    suite = Element("testsuite", {"name": printable(name), **counts})
     for case in cases:
         element = SubElement(suite, "testcase", classname=printable(case.of), name=printable(case.name))
         if case.error is not None:

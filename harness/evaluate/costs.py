@@ -21,7 +21,7 @@ from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.price import Price
 from harness.core.errors import Unanswered, UserError, printable
-from harness.core.files import bytes_of, text_of
+from harness.core.files import appending, bytes_of, text_of
 from harness.runs.records import Cost
 
 if TYPE_CHECKING:
@@ -49,8 +49,8 @@ class Budget:
     file: Path
 
     def spend(self, amount: float) -> None:
-        with self.file.open("a") as file:
-            file.write(f"{amount!r}\n")
+        with appending(self.file) as file:
+            file.write(f"{amount!r}\n".encode())
 
     def check(self) -> None:
         """Raise Unanswered if it is spent."""
@@ -136,7 +136,7 @@ class Metered:
         uncounted = len(completions) - len(counted)
         self._unsaid = not counted and any(each.error is None for each in completions)
         if self._work:
-            with (self._work / FILE).open("ab") as file:
+            with appending(self._work / FILE) as file:
                 file.write(
                     msgspec.json.encode(Asked(self._model, len(completions), uncounted, read, written))
                     + b"\n"

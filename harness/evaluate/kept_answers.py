@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from harness.core.errors import UserError, printable
-from harness.core.files import bytes_of
+from harness.core.files import appending, bytes_of
 from harness.runs.records import Answer
 
 MORE_FOLLOWS = b" \n"  # ends every line but the last of its chunk, so that a torn chunk can be told
@@ -50,7 +50,7 @@ class KeptAnswers:
         """Append a chunk of answers."""
         lines = _ENCODER.encode_lines(answers)
         chunk = lines[:-1].replace(b"\n", MORE_FOLLOWS) + lines[-1:]
-        with self.file.open("ab") as file:
+        with appending(self.file) as file:
             file.write(chunk)
             file.flush()
             if time.monotonic() - self._on_disk_s >= SYNC_S:

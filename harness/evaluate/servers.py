@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 from harness.backends.base import Served
-from harness.core.files import bytes_of, write_whole
+from harness.core.files import appending, bytes_of, write_whole
 
 FILE = "servers.jsonl"
 
@@ -23,7 +23,7 @@ def lines(served: Iterable[Served]) -> bytes:
 def keep(work: Path, served: Iterable[Served] | bytes) -> None:
     """Append answers, or their lines, to the file in a working folder."""
     if data := served if isinstance(served, bytes) else lines(served):
-        with (work / FILE).open("ab") as file:
+        with appending(work / FILE) as file:
             file.write(data)
 
 

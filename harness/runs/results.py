@@ -4,7 +4,6 @@ In it are `results.json`, and of each dataset's run a folder with its manifest, 
 ended, and the figures that its edition names. Its bytes follow from these.
 """
 
-import errno
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +16,17 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from harness.core.errors import UserError, printable
-from harness.core.files import BROKEN, LARGEST, bytes_of, opened, refuse_bomb, replacing, write_whole
+from harness.core.files import (
+    BROKEN,
+    LARGEST,
+    NO_ROOM,
+    Refused,
+    bytes_of,
+    opened,
+    refuse_bomb,
+    replacing,
+    write_whole,
+)
 from harness.runs.folder import Run, csv_text
 from harness.runs.listing import own_name
 from harness.runs.records import FrozenScenes, Score
@@ -113,8 +122,8 @@ def _archive(file: Path) -> Iterator[ZipFile]:
         with opened(file, "record") as whole, ZipFile(whole) as archive:
             yield archive
     except BROKEN_ZIP as error:
-        if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):  # of where it is unpacked
-            raise
+        if getattr(error, "errno", None) in NO_ROOM and not isinstance(error, Refused):
+            raise  # it is of where this is unpacked
         reason = getattr(error, "strerror", None) or error
         raise UserError(
             f"{printable(file)} is no file of results ({printable(reason)}); give one that `harness "

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT
-from harness.core.files import bytes_of, neutral, replacing, text_of, write_whole
+from harness.core.files import appending, bytes_of, neutral, replacing, text_of, write_whole
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.document import Section, Table, document, strong
@@ -171,7 +171,7 @@ class Cells:
         values = compute()
         line = json.dumps({"of": self._of, "key": key, "cell": values}, default=np.ndarray.tolist)
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("ab") as file:
+        with appending(self._path) as file:
             file.write(b"\n" * self._torn + line.encode() + b"\n")
         self._torn = False
         return values

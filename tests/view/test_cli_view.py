@@ -148,15 +148,24 @@ def test_a_run_that_has_the_name_of_a_page_is_left_out_and_all_others_are_export
     assert (tmp_path / "site/first/report.html").is_file()
 
 
-def test_an_exported_folder_has_studies_whose_page_can_run_no_script(
-    reports: Path, harness: Callable[..., Said], tmp_path: Path
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("<meta", "<script></script><meta"),
+        ("</body>", '<meta http-equiv="refresh" content="0; url=http://evil"></body>'),
+        ("</body>", "<META content='0;http://evil' HTTP-Equiv=refresh></body>"),
+        ("<title>", "<meta\nhttp-equiv\n=\nrefresh content=0><title>"),
+    ],
+)
+def test_an_exported_folder_has_studies_whose_page_can_run_no_script_and_leads_nowhere(
+    old: str, new: str, reports: Path, harness: Callable[..., Said], tmp_path: Path
 ) -> None:
     page = document([Section("A sweep of many points")])
     (reports / "first/sweep-tau/index.html").write_text(page)
     spy = reports / "second/sweep-tau"
     spy.mkdir()
     (spy / "sweep.json").write_text('{"sources": []}')
-    (spy / "index.html").write_text(page.replace("<meta", "<script></script><meta", 1))
+    (spy / "index.html").write_text(page.replace(old, new, 1))
     code, _, err = harness("view", str(reports), "--export", str(tmp_path / "site"))
     assert (code, err.count("left out")) == (0, 1)
     assert "left out second/sweep-tau: a sweep without a page that this version wrote" in err

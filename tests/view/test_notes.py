@@ -3,7 +3,7 @@
 import asyncio
 import json
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -175,8 +175,8 @@ def test_a_browser_that_leaves_while_it_sends_a_note_is_no_bug(reports: Path) ->
     async def receive() -> dict[str, object]:
         return next(messages)
 
-    first: dict[str, object] = {"type": "http.request", "body": b"path=first", "more_body": True}
-    messages = iter([first, {"type": "http.disconnect"}])
+    first = {"type": "http.request", "body": b"path=first", "more_body": True}
+    messages: Iterator[dict[str, object]] = iter([first, {"type": "http.disconnect"}])
     with pytest.raises(HTTPException, match="the browser is gone") as gone:
         asyncio.run(View(reports).note(posted(receive)))
     assert gone.value.status_code == 400

@@ -110,8 +110,9 @@ def _page(folder: Path, run: Listed) -> tuple[str, Run | SuiteRun | None]:
 def _study(folder: Path, run: Listed) -> str:
     file = own_file(folder, run.name, INDEX)
     page = whole_text(file) if file else ""
-    # What stands there forbids scripts in all that follows.
-    if not page.startswith(document([Section("")]).partition("<title>")[0]):
+    # What stands there forbids scripts in all that follows, and only a `http-equiv` could lead elsewhere.
+    head = document([Section("")]).partition("<title>")[0]
+    if not page.startswith(head) or "http-equiv" in page.removeprefix(head).casefold():
         raise UserError(f"a {run.kind} without a page that this version wrote; make it again")
     return page
 
