@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from harness.learning.environment import Driving
     from harness.report.compare.difference import AnswersHeld
 
+MOST_SHOWN = 6  # findings of a comparison where it is shown as text
 HEADLINE = {  # metrics of a run's own table, by their heads
     "balanced success": "balanced_success_rate",
     "success": "success_rate",
@@ -143,6 +144,11 @@ class Comparison:
         from harness.report.compare.text import ANSWERS, changed_answers
 
         return pd.DataFrame(changed_answers(self.held), columns=list(ANSWERS))
+
+    def __repr__(self) -> str:
+        of = [f"{letter}: {self.report[letter.lower()]['run']}" for letter in "AB"]
+        more = "in full: .differences, a row for each condition and metric, and .report"
+        return "\n".join(["Comparison of B with A", *of, *self.findings[:MOST_SHOWN], more])
 
     @cached_property
     def differences(self) -> "pd.DataFrame":

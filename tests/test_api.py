@@ -99,6 +99,9 @@ def test_a_comparison_is_the_command_lines(folder: Path) -> None:
     assert [sentence.partition(":")[0] for sentence in difference.findings] == ["single-local", "6g"]
     page = difference._repr_html_()
     assert all(sentence.replace("'", "&#39;") in page for sentence in difference.findings)
+    shown = repr(difference)
+    assert len(shown) < 1500
+    assert all(sentence in shown for sentence in (*difference.findings, ".differences", "B: "))
     with pytest.raises(harness.UserError, match="give two of a kind"):
         harness.compare(folder / "proxy", folder / "driven")
 

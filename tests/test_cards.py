@@ -453,7 +453,7 @@ def test_a_run_is_replayed_by_its_directory(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("qwen3-4", ["'qwen3-4'", "did you mean 'qwen3-4b'", "cruise", "replay:RUN_DIR"]),
+        ("qwen3-4", ["'qwen3-4'", "did you mean 'qwen3-4b'", "`harness model list`", "replay:RUN_DIR"]),
         ("./no/such/dir", ["'./no/such/dir'", "no directory", ".gguf", "hub id"]),
         ("./no/such.gguf", ["'./no/such.gguf'", "no .gguf file"]),
         ("replay:nowhere", ["'replay:nowhere'", "no such run directory"]),

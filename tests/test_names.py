@@ -10,7 +10,7 @@ import pytest
 
 from harness.backends.base import Completion, Request, failed
 from harness.core import resources
-from harness.core.errors import UserError
+from harness.core.errors import UserError, unknown
 from harness.core.files import making, write_whole
 from harness.core.work import WorkStart, begun
 from harness.dataset.load import find
@@ -71,3 +71,39 @@ def test_no_completion_has_a_lone_surrogate(said: str, kept: str) -> None:
     done = Completion("a", said, None, 1, "stop", 0.0, 1, said)
     assert (done.text, done.error) == (kept, kept)
     assert replace(failed(Request("a", "ego", (), ("IDLE",), 1), said)).error == kept
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "said"),
+    [
+        ("model", "name-77x", "unknown model 'name-77x'; did you mean 'name-77'? known: name-77, name-"),
+        ("model", "?", "unknown model '?'; known: name-"),
+        ("metric", "name-7", "unknown metric 'name-7'; did you mean one of name-7, name-70, "),
+    ],
+)
+def test_of_many_names_a_message_lists_the_nearest_and_what_lists_all(
+    kind: str, name: str, said: str
+) -> None:
+    words = str(unknown(kind, name, [f"name-{n}" for n in range(100)]))
+    assert words.startswith(said)
+    assert len(words) < 300
+    assert " and 94 more" in words
+    assert ("; `harness model list` lists all" in words) == (kind == "model")
+    assert str(unknown(kind, "x", "abc")) == f"unknown {kind} 'x'; known: a, b, c"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("typed", "code"),
+    [
+        (("--letters", "raw"), 2), (("--letters", "raw", "--answer", "constrained"), 2),
+        (("--letters", "raw", "--helper-answer", "json"), 2),
+        (("--letters", "raw", "--model", "sparrow-robot", "--answer", "decision", "--dry-run"), 0),
+    ],
+)  # fmt: skip
+def test_how_letters_are_read_is_said_where_none_are(
+    typed: tuple[str, ...], code: int, two_path: Path, harness: Typed
+) -> None:
+    ended, _, said = harness("eval", "--model", "smollm2-135m", "--dataset", two_path, "--limit", "1", *typed)
+    assert ended == code, said
+    assert ("--letters raw: no letters are read of an answer in" in said) == (code == 2)

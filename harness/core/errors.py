@@ -21,6 +21,10 @@ EXIT_CODES = {
 }
 
 
+MOST_LISTED, FEW, NEAR = 60, 24, 6  # names that a message lists, and how many it lists of more
+LISTS = {"model": "harness model list", "prompt": "harness prompt list"}  # what prints all of a kind
+
+
 class UserError(Exception):
     """Bad input. The message names the thing, the value, what is allowed and what to do."""
 
@@ -59,14 +63,25 @@ def one_line(error: Exception) -> str:
 
 
 def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserError:
-    """Build the `UserError` for a name that does not exist; it suggests the nearest name and lists all."""
+    """Build the `UserError` for a name that does not exist; it suggests the nearest name and lists all.
+
+    Of more than `MOST_LISTED`, or `FEW` if a command of `LISTS` prints all, the nearest are listed.
+    """
     names = sorted(known)
     nearest = get_close_matches(name, names, n=1)
     suggestion = f"; did you mean {nearest[0]!r}?" if nearest else ";"
     # Of several names that begin so, the nearest is only the shortest.
     if len(begin := [known for known in names if name and known.startswith(name)]) > 1:
-        suggestion = f"; did you mean one of {', '.join(begin)}?"
-    listed = ", ".join(names) or "(none)"
+        suggestion = f"; did you mean one of {', '.join(begin[:MOST_LISTED])}?"
+    shown = (
+        names
+        if len(names) <= (FEW if kind in LISTS else MOST_LISTED)
+        else get_close_matches(name, names, NEAR, cutoff=0)
+    )
+    listed = ", ".join(shown) or "(none)"
+    if len(shown) < len(names):
+        all_of = f"; `{LISTS[kind]}` lists all" if kind in LISTS else ""
+        listed += f" and {len(names) - len(shown)} more{all_of}"
     return UserError(f"unknown {kind} {printable(name)!r}{suggestion} known: {listed}{hint}")
 
 

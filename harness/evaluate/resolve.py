@@ -100,6 +100,11 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
     how = (settings.answer, settings.thinking, settings.image, settings.letters, settings.sums, settings.flip)
     ego = Agent(card, versions.load(version), *how)  # type: ignore[arg-type]
     prompt, mode = versions.load(own.prompt or version), own.answer or settings.answer
+    if settings.letters and not {settings.answer, mode} & {*BARE}:
+        raise UserError(
+            f"--letters {settings.letters}: no letters are read of an answer in {settings.answer}; leave it "
+            "out, or give --answer readout"
+        )
     helper_cards = [cards.resolve(name.strip()) for name in own.model.split(",")] if own.model else [card]
     with helper_options({"--answer": own.answer, "--thinking": own.thinking}):
         theirs = (

@@ -131,7 +131,7 @@ def test_a_condition_with_colons_in_its_name_has_gates_too(runs: tuple[Path, Pat
         ("success_rate < 0 or so", "cannot be read"),
         ("\x1b[31m", "cannot be read"),
         ("", "cannot be read"),
-        ("sucess_rate < 0", "'sucess_rate'; did you mean 'success_rate'? known: adjusted_"),
+        ("sucess_rate < 0", "'sucess_rate'; did you mean 'success_rate'? known: success_rate, "),
         ("success_rate.middle < 0", "interval in --fail-if 'middle'; known: high, low"),
         ("5g:success_rate < 0", "unknown condition of --fail-if '5g:success_rate < 0' '5g'"),
     ],
