@@ -46,5 +46,6 @@ def test_a_full_disk(command: tuple[str, ...], tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         process = started(tmp_path, command, stdout=full)
         _, said = process.communicate(timeout=60)
-    said_of = "No space left on device; fix that, and type the same command again"
+    what, repair = "the output, or a temporary file", "fix that, and type the same command again"
+    said_of = f"{what}: No space left on device; {repair}"
     assert (process.returncode, said) == (2, f"harness: {said_of}\n")
