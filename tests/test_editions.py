@@ -609,3 +609,18 @@ def test_an_id_that_is_not_whole_is_one_line(harness: Harness, commit: str) -> N
     code, out, err = harness("benchmark", "seeds", "--", commit)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "give a whole id" in err
+
+
+@pytest.mark.slow
+def test_a_try_of_some_layouts_is_counted_first_and_is_no_entry(project: Harness) -> None:
+    code, out, _ = project("benchmark", "run", "mine-1", "--model", "proxy", "--dry-run")
+    assert code == 0
+    assert "no model was called" in " ".join(out.split())
+    assert not Path("reports").exists()
+    code, out, _ = project("benchmark", "run", "mine-1", "--model", "proxy", "--limit", "1", "--out", "try")
+    assert code == 0
+    assert out.endswith("a try of 1 layout of each dataset is no entry: nothing was packed\n")
+    assert not Path("try.zip").exists()
+    code, _, err = project("benchmark", "pack", "try", "--edition", "mine-1")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "it has 1 layout that were selected, and all count" in err

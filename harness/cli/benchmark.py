@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from harness.cli import options, suite
+from harness.cli.eval import show_counted
 from harness.cli.progress import bar
 from harness.cli.run import evaluate
 from harness.cli.terminal import echo_json, echo_text, table
 from harness.core.errors import UserError, printable
-from harness.core.figures import shown
+from harness.core.figures import amount, shown
 from harness.core.formats import SUITE
 
 if TYPE_CHECKING:
@@ -42,6 +43,14 @@ def run(
     server: Annotated[list[str] | None, typer.Option(help=options.HELP["server"])] = None,
     device: options.Device = None,
     dtype: options.Dtype = None,
+    limit: Annotated[
+        int | None,
+        typer.Option(min=1, help="Try only the first layouts of each dataset; nothing is packed."),
+    ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Only count requests and tokens; write nothing."),
+    ] = False,
     made_by: MadeBy = "",
     out: Annotated[
         Path | None,
@@ -59,11 +68,13 @@ def run(
     from harness.dataset.suites import Suite
     from harness.evaluate import edition as editions
     from harness.evaluate import resolve
+    from harness.evaluate.dry_run import count
     from harness.evaluate.rescore import Here
 
     of = editions.named(edition)
-    Here().check(of)
-    sources = {name: of.source(name) for name in of.datasets}
+    if not dry_run:
+        Here().check(of)
+    sources = {name: of.source(name, limit) for name in of.datasets}
     asked = {
         "model": model, "engine": engine, "prompt": prompt, "answer": answer, "thinking": thinking,
         "batch_size": batch_size, "server": tuple(server or ()), "device": device, "dtype": dtype,
@@ -80,8 +91,15 @@ def run(
     cache = None if no_cache else default_file()
     evaluated = partial(evaluate, cache=cache, quiet=quiet, workers=options.workers_of(workers or "2"))
     frozen = [source.dataset for source in sources.values()]
+    if dry_run:
+        for spec, dataset in zip(specs, frozen, strict=True):
+            show_counted(spec, count(spec, dataset, None))
+        return
     folder = suite.evaluate(datasets, specs, frozen, out, evaluated, quiet, as_json=False)
-    pack([folder], edition, made_by, None, quiet)
+    if limit is None:
+        pack([folder], edition, made_by, None, quiet)
+    elif not quiet:
+        typer.echo(f"a try of {amount(limit, 'layout')} of each dataset is no entry: nothing was packed")
 
 
 def pack(

@@ -108,7 +108,7 @@ def command(
             echo_json(counted if named else counted[0])
         elif not quiet:
             for each in zip(specs, counted, strict=True):
-                _show_counted(*each)
+                show_counted(*each)
         return
     trackers = hooks.chosen(tracker or ())
     at_servers = any(agent.card.server for spec in specs for agent in spec.agents)
@@ -165,7 +165,8 @@ def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: st
             )
 
 
-def _show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
+def show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
+    """Print what an evaluation would ask."""
     repeated = f" × {counted['repeats']} repeats" if "repeats" in counted else ""
     by_role, requests = counted["requests_by_role"], f"{counted['requests']} requests"
     if "helper" in by_role and not spec.asks_all:
