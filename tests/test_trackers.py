@@ -137,7 +137,9 @@ class Bad(Note):
             self._does()
 
 
-@pytest.mark.parametrize("does", [partial(sys.exit, 0), leave_by_typer, press_ctrl_c], ids=str)
+@pytest.mark.parametrize(
+    "does", [partial(sys.exit, 0), leave_by_typer, press_ctrl_c], ids=["exit", "typer", "ctrl-c"]
+)
 @pytest.mark.parametrize("at", ["begin", "end"])
 def test_a_hook_that_ends_the_program_costs_a_run_one_line(
     at: str, does: Callable[[], object], two_path: Path, harness: Typed, install: Callable[..., None]
