@@ -21,6 +21,7 @@ from harness.runs.records import Manifest, Score
 
 CARD = cards.resolve("qwen3-0.6b")
 AGENT = Agent(CARD, versions.load("v2"))
+AGAIN = 2 * 8  # halves of pairs of scenes that are asked with letters read the other way
 
 
 class Model:
@@ -35,7 +36,7 @@ class Model:
     def _answer(self, request: Request) -> Completion:
         self.asked += 1
         first, *others = request.actions
-        p = self.p(request.messages[-1]["content"])
+        p = self.p(request.messages[-1]["content"], bool(request.orders))
         text = json.dumps({"action_distribution": {first: p, **{a: (1 - p) / len(others) for a in others}}})
         more: dict[str, Any] = {"letter_share": 0.97, "follows_letter": True} if request.orders else {}
         return Completion(request.id, text, 9, 1, "stop", 0.1, 1, label_mass=0.2, **more)
@@ -45,12 +46,12 @@ def examined(p: Any) -> Findings:
     model = Model(p)
     found = examine(model, AGENT)  # type: ignore[arg-type]
     assert isinstance(found, Findings)
-    assert model.asked == COUNT
+    assert model.asked == COUNT + (0 if found.reads_scene else AGAIN)
     return found
 
 
 def test_a_model_that_brakes_for_a_listed_conflict_reads_the_scene() -> None:
-    found = examined(lambda text: 0.2 if "none in sight" in text else 0.8)
+    found = examined(lambda text, cyclic: 0.2 if "none in sight" in text else 0.8)
     assert {pair.fact: pair.moved for pair in found.pairs} == {
         "conflict": 4, "gap": 0, "danger": 0, "number": 0,
     }  # fmt: skip
@@ -61,9 +62,19 @@ def test_a_model_that_brakes_for_a_listed_conflict_reads_the_scene() -> None:
 
 
 def test_a_model_that_answers_ever_the_same_does_not_read_the_scene() -> None:
-    first, *_ = examined(lambda text: 0.5).sentences()
+    first, *_ = examined(lambda text, cyclic: 0.5).sentences()
     assert first.startswith("it does not read the scene: a conflict put in or taken out, or a gap")
-    assert "in 0 of 8 pairs" in first
+    assert "in 0 of 8 pairs; with --letters raw in 0 of 8 (model check, answer readout, prompt v2)" in first
+
+
+def test_weights_that_learnt_one_order_of_the_letters_are_asked_in_it() -> None:
+    """Over cyclic orders they follow the letter; in the order of the list they brake for a conflict."""
+    found = examined(lambda text, cyclic: 0.5 if cyclic or "none in sight" in text else 0.8)
+    assert not found.reads_scene
+    assert {pair.fact: (pair.moved, pair.n) for pair in found.others} == {"conflict": (4, 4), "gap": (0, 4)}
+    first, *_ = found.sentences()
+    assert first.startswith("with letters read cyclic it does not read the scene: a conflict")
+    assert "in 0 of 8 pairs; with --letters raw in 4 of 8 (" in first
 
 
 def test_a_question_without_an_answer_finds_nothing() -> None:

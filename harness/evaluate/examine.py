@@ -8,12 +8,13 @@ from it. It is never read from a run: a stranger's file could say anything.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from statistics import fmean
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import replace as replace_struct
 
-from harness.backends.base import BARE, AnswerMode, Backend, Completion, Request
+from harness.backends.base import BARE, AnswerMode, Backend, Completion, Letters, Request
 from harness.core import kept
 from harness.core.errors import UserError
 from harness.core.files import digest
@@ -23,7 +24,7 @@ from harness.evaluate.asking import answer_of
 from harness.evaluate.questions import Fact, Pair
 
 LEAST_MOVED = 0.05  # by how much the expected action becomes likelier where a fact counts
-COUNT = 12 + 2 * 16  # requests that an examination asks
+COUNT = 12 + 2 * 16  # requests that an examination asks, but for those of scenes that moved nothing
 MOST_SHARE = 0.5  # letter share from which the letter explains more than all else
 
 
@@ -57,21 +58,29 @@ class Findings(Struct, frozen=True):
     follows_letter: int  # in how many questions one letter was the likeliest in every order
     label_mass: float  # mean probability of the letters
     pairs: tuple[Moved, ...]
+    others: tuple[Moved, ...] = ()  # the pairs with letters read the other way, where these showed nothing
 
     @property
     def reads_scene(self) -> bool:
         """Whether a conflict in the scene, or its gap, moves the answer."""
-        return any(pair.read for pair in self.pairs if pair.fact in ("conflict", "gap"))
+        return any(pair.read for pair in _of_scene(self.pairs))
+
+    @property
+    def other_letters(self) -> str:
+        """The other way to read letters."""
+        return "raw" if self.letters == "cyclic" else "cyclic"
 
     def sentences(self) -> Iterator[str]:
         """Yield what a reader of runs that asked the model so has to know."""
         if not self.reads_scene:
-            scene = [pair for pair in self.pairs if pair.fact in ("conflict", "gap")]
-            moved, n = sum(pair.moved for pair in scene), sum(pair.n for pair in scene)
+            others = _of_scene(self.others)
+            otherwise = f"; with --letters {self.other_letters} in {_moved_of(others)}" if others else ""
+            reads = any(pair.read for pair in others)
+            found = f"with letters read {self.letters} it does not" if reads else "it does not"
             yield (
-                "it does not read the scene: a conflict put in or taken out, or a gap of 0.2 or 5 s, moved "
-                f"its answer in {moved} of {n} pairs (model check, answer {self.answer}, "
-                f"prompt {self.prompt})."
+                f"{found} read the scene: a conflict put in or taken out, or a gap of 0.2 or 5 s, moved its "
+                f"answer in {_moved_of(_of_scene(self.pairs))} pairs{otherwise} (model check, answer "
+                f"{self.answer}, prompt {self.prompt})."
             )
         # A model that learnt one order of the letters is read in that order.
         if self.letters == "cyclic" and self.letter_share > MOST_SHARE:
@@ -81,12 +90,21 @@ class Findings(Struct, frozen=True):
             )
 
 
+def _of_scene(pairs: Sequence[Moved]) -> list[Moved]:
+    return [pair for pair in pairs if pair.fact in ("conflict", "gap")]
+
+
+def _moved_of(pairs: Sequence[Moved]) -> str:
+    return f"{sum(pair.moved for pair in pairs)} of {sum(pair.n for pair in pairs)}"
+
+
 def examine(
     backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None
 ) -> Findings | str:
     """Ask a model the fixed questions by read-outs; return what was found, or why a question got no answer.
 
-    Letters are read over cyclic orders to see what follows them, and in the pairs as the agent reads them.
+    Letters are read over cyclic orders to see what follows them, and in the pairs as the agent reads them. If
+    no scene moved these, the pairs are asked the other way as well: weights may have learnt one order alone.
     """
     reader = replace(agent, answer="readout", letters=agent.letters if agent.answer in BARE else None)
     pairs = [*questions.scene_pairs(reader), *questions.plain_pairs(reader)]
@@ -94,17 +112,11 @@ def examine(
         *questions.requests(replace(reader, letters="cyclic")),
         *(half for pair in pairs for half in (pair.present, pair.absent)),
     ]
-    done: list[Completion] = []
-    for request in asked:
-        try:
-            done += backend.complete([request])
-        except UserError as error:
-            return str(error)
-        if done[-1].error is not None:
-            return done[-1].error
-        progress(1)
+    done = _answers(backend, asked, progress)
+    if isinstance(done, str):
+        return done
     of_letters, rest = done[: -2 * len(pairs)], iter(done[-2 * len(pairs) :])
-    return Findings(
+    found = Findings(
         prompt=agent.prompt.version,
         prompt_sha256=agent.prompt.sha256,
         answer=reader.answer,
@@ -115,6 +127,29 @@ def examine(
         label_mass=round(fmean(c.label_mass or 0.0 for c in of_letters), 4),
         pairs=moved(pairs, rest),
     )
+    if found.reads_scene:
+        return found
+    turned = replace(reader, letters=cast("Letters", found.other_letters))
+    scenes = [*questions.scene_pairs(turned)]
+    halves = [half for pair in scenes for half in (pair.present, pair.absent)]
+    again = _answers(backend, halves, lambda count: None)
+    return again if isinstance(again, str) else replace_struct(found, others=moved(scenes, iter(again)))
+
+
+def _answers(
+    backend: Backend, requests: Sequence[Request], progress: Callable[[int], None]
+) -> list[Completion] | str:
+    """Return the answers to some requests, asked one by one, or why one got none."""
+    done: list[Completion] = []
+    for request in requests:
+        try:
+            done += backend.complete([request])
+        except UserError as error:
+            return str(error)
+        if done[-1].error is not None:
+            return done[-1].error
+        progress(1)
+    return done
 
 
 def moved(pairs: Sequence[Pair], completions: Iterator[Completion]) -> tuple[Moved, ...]:
