@@ -20,6 +20,7 @@ from harness.coordination.consensus import Fused, linear_pool
 from harness.coordination.operating_point import named_point
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
+from harness.core.process import Stop
 from harness.core.statistics import Estimate
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
@@ -264,7 +265,7 @@ def test_the_draw_is_no_choice_and_a_larger_one_has_the_smaller(made: Callable[.
 
 @pytest.mark.slow
 def test_a_killed_one_goes_on_and_asks_nothing_twice(made: Callable[..., Path], judging: Judging) -> None:
-    class Killed(BaseException):
+    class Killed(Stop):
         pass
 
     def die(count: int) -> None:

@@ -28,6 +28,7 @@ from run_on_disk import answers_of
 from harness.backends.base import Completion, Request
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
+from harness.core.process import Stop
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate.asking import requests
@@ -139,7 +140,7 @@ def test_other_conditions_are_the_same_without_it(done: Evaluated, small: Datase
 def test_killed_among_the_blind_it_goes_on(
     after: int, spec: Spec, done: Evaluated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Killed(BaseException):
+    class Killed(Stop):
         pass
 
     calls = 0

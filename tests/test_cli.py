@@ -106,7 +106,7 @@ def one_line(said: Said) -> str:
         (["evaluate"], "No such command 'evaluate'"),
         (["--verbose"], "No such option: --verbose"),
         (["prompt", "shwo"], "No such command 'shwo'"),
-        (["prompt", "show", "v2"], "Missing option '--scene'"),
+        (["dataset", "show", "small"], "Missing argument 'scene'"),
         (["prompt", "show", "v99", "--scene", "00000-0"], "unknown prompt 'v99'"),
         (["prompt", "show", "v2", "--scene", "99999-9"], "unknown scene '99999-9'"),
         (["prompt", "show", "v2", "--scene", "00000-0", "--viewer", "v77"], "unknown viewer of scene"),

@@ -36,6 +36,7 @@ from harness.coordination.operating_point import POINTS, OperatingPoint, named_p
 from harness.core.arrays import Ints
 from harness.core.errors import UserError
 from harness.core.files import digest
+from harness.core.process import Stop
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate import timing
@@ -258,7 +259,7 @@ def test_a_replay_scores_the_same_in_other_batches(done: Evaluated, two: Dataset
 def killed(spec: Spec, out: Path, how: str, after: int) -> None:
     """A run that dies when so many fusion calls are there, or as they are announced."""
 
-    class Killed(BaseException):
+    class Killed(Stop):
         pass
 
     called = False

@@ -380,3 +380,8 @@ def test_a_letter_is_worth_its_action(make: Make) -> None:
     assert row["prompt"][-1]["content"].endswith("Answer with one letter: A SLOWER, B IDLE, C FASTER.")
     said = ["A", "B", " C\n", "B: it is clear", "BRAKE", "D", "b", ""]
     assert env.advantage([], said, **columns([row] * 8)) == [-1, 0, 0, 0, -1, -1, -1, -1]
+    call = {"role": "assistant", "content": None, "tool_calls": [{"name": "brake"}]}
+    without_text: list[Any] = [[call], [], [{"role": "assistant"}], [{"content": 3}], None]
+    assert env.advantage([], without_text, **columns([row] * 5)) == [-1] * 5
+    in_parts = [{"content": [{"type": "text", "text": said[1][:9]}, {"type": "text", "text": said[1][9:]}]}]
+    assert env.advantage([], [in_parts], **columns([row])) == [0]

@@ -23,6 +23,7 @@ from harness.backends.base import AGAIN, Completion, Request
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import Unanswered, UserError
+from harness.core.process import Stop
 from harness.core.resources import folder
 from harness.dataset.load import Dataset
 from harness.evaluate import repair
@@ -353,7 +354,7 @@ def test_batches_and_a_kill_change_nothing(small: Dataset, tmp_path: Path) -> No
     single = run(faulty(small, batch_size=1), tmp_path / "single")
     assert same_files(whole.out, single.out)
 
-    class Killed(BaseException):
+    class Killed(Stop):
         pass
 
     def progress(count: int) -> None:

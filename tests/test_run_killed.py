@@ -19,6 +19,7 @@ from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.core.files import alone
 from harness.core.formats import CONFIG
+from harness.core.process import Stop
 from harness.dataset.load import Dataset, load
 from harness.evaluate.kept_answers import MORE_FOLLOWS, read_kept
 from harness.evaluate.latency import PAPER
@@ -116,7 +117,7 @@ def _becomes_whole(out: Path, whole: Path, spec: Spec) -> None:
 def unfinished(spec: Spec, out: Path, kept: bytes) -> Path:
     """A run whose process was killed when it had these answers."""
 
-    class Killed(BaseException):
+    class Killed(Stop):
         pass
 
     def die(done: int) -> None:

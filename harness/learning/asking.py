@@ -138,7 +138,7 @@ def advantage(
 
     Args:
         prompts: as the trainer has them; not read.
-        completions: texts, or chats whose last message is the answer.
+        completions: texts, or chats whose last message is the answer; one without a text cannot be read.
         values: like the further columns, those of the rows that the prompts are from.
         constant: the action beside which each is judged.
         columns: the further columns of `rows`; others are left alone.
@@ -164,7 +164,17 @@ def _rewards(
 ) -> list[float]:  # fmt: skip
     rewards = []
     for n, completion in enumerate(completions):
-        text = completion if isinstance(completion, str) else completion[-1]["content"]
         read_by = {name: columns[name][n] for name in READ_BY}
-        rewards.append(earned(text, values[n], constant[n], worth, **read_by))
+        rewards.append(earned(_text(completion), values[n], constant[n], worth, **read_by))
     return rewards
+
+
+def _text(completion: Any) -> str:
+    """Return the text of a completion, or of a chat's last message; empty if it has none."""
+    if isinstance(completion, Sequence) and not isinstance(completion, str):
+        last = completion[-1] if completion else {}
+        completion = last.get("content") if isinstance(last, Mapping) else None
+    if isinstance(completion, list):  # a message in parts
+        parts = (part.get("text") for part in completion if isinstance(part, Mapping))
+        completion = "".join(part for part in parts if isinstance(part, str))
+    return completion if isinstance(completion, str) else ""

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from evaluating import FILES, run, spec_of
 
+from harness.core.process import Stop
 from harness.dataset.load import Dataset
 from harness.evaluate.run import evaluate
 from harness.report.compare.difference import compare
@@ -16,7 +17,7 @@ from harness.runs.listing import runs
 Said = tuple[int, str, str]
 
 
-class Killed(BaseException):
+class Killed(Stop):
     pass
 
 

@@ -9,7 +9,14 @@ from tiers import QUICK
 
 from harness.core.arrays import Floats
 from harness.world import lockstep, scenarios
-from harness.world.conflict_measures import HORIZON_S, Conflicts, columns, observe, times_to_collision
+from harness.world.conflict_measures import (
+    HORIZON_S,
+    MOMENTS_HZ,
+    Conflicts,
+    columns,
+    observe,
+    times_to_collision,
+)
 from harness.world.state import separation_m
 from harness.world.world import World
 
@@ -151,6 +158,20 @@ def test_what_comes_after_the_horizon_is_no_conflict() -> None:
     slow = straight((48.0, 0.0, 0.0, 1.0), 1), straight((50.0 + 43.0 + 5.0, 0.0, 0.0, 1.0), 1)
     assert measured(driven(straight((0.0, 0.0, 0.0, 10.0), 1), slow[0])).ttc_s == pytest.approx(43.0 / 9.0)
     assert measured(driven(straight((0.0, 0.0, 0.0, 10.0), 1), slow[1])).ttc_s == np.inf
+
+
+@pytest.mark.parametrize("hz", [10, 15, 19, 23, 28, 31, 34, 35, 50, 60])
+def test_no_rate_of_frames_sees_beyond_the_horizon(hz: int) -> None:
+    """At 15 Hz moments are 133 ms apart, and 38 of them are more than five seconds."""
+    every = max(1, round(hz / MOMENTS_HZ))
+    stands = np.array([(0.0, 0.0, 0.0, 0.0)])
+    gone = np.array([(1000.0, 0.0, 0.0, 0.0)])
+    for away in range(round(4.5 * hz), round(5.5 * hz)):
+        ego = np.concatenate([np.repeat(stands, hz, axis=0), np.repeat(gone, away, axis=0)])
+        other = np.concatenate([np.repeat(-gone, len(ego) - every, axis=0), np.repeat(stands, every, axis=0)])
+        pet_s = measured(driven(ego, other), hz=hz).pet_s
+        assert pet_s == np.inf or pet_s <= HORIZON_S
+        assert pet_s < np.inf or away > hz * HORIZON_S - 2 * every
 
 
 def wandering(seed: int, vehicles: int, frames: int, hz: int = HZ) -> Floats:

@@ -4,6 +4,7 @@ import html
 import io
 import json
 import threading
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 from evaluating import scenes_of
 from highway_env.envs import HighwayEnv, MergeEnv
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.controller import ControlledVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from my_roads import Breakdown
 
@@ -64,8 +67,87 @@ class Crashed(Breakdown):
         self.road.vehicles.append(Vehicle(self.road, self.vehicle.position + np.array([2.0, 0.0]), 0, 10))
 
 
-for kind in (Without, Roadless, Crashed):
+class Ghost(Vehicle):
+    """A vehicle that follows the ego, and that nothing collides with."""
+
+    def __init__(self, road, position, heading=0, speed=0):
+        super().__init__(road, position, heading, speed)
+        self.check_collisions = self.collidable = False
+        self.follows = road.vehicles[0]
+
+    def step(self, dt):
+        self.position, self.heading = self.follows.position.copy(), self.follows.heading
+
+
+class Haunted(Breakdown):
+    def _reset(self):
+        super()._reset()
+        for _ in range(2):
+            self.road.vehicles.append(Ghost(self.road, self.vehicle.position, 0, 14))
+
+
+class OwnVehicle(ControlledVehicle):
+    pass
+
+
+class OwnEgo(Breakdown):
+    """The ego is of a class of its own, which has no target speeds."""
+
+    ego_class = OwnVehicle
+
+    def _reset(self):
+        super()._reset()
+        ego = self.ego_class(self.road, self.vehicle.position, speed=14)
+        self.road.vehicles[0] = self.vehicle = ego
+
+
+class IdmEgo(OwnEgo):
+    ego_class = IDMVehicle
+
+
+class PlainEgo(OwnEgo):
+    ego_class = Vehicle
+
+
+for kind in (Without, Roadless, Crashed, Haunted, OwnEgo, IdmEgo, PlainEgo):
     gymnasium.register(f"{kind.__name__.lower()}-v0", entry_point=kind)
+
+
+@pytest.mark.parametrize("kind", [OwnEgo, IdmEgo, PlainEgo])
+def test_an_ego_of_another_class_is_named(kind):
+    with pytest.raises(UserError, match=r"its ego is a \w+, which has no target_speeds; make it of self"):
+        scenarios.get(f"env:{kind.__name__.lower()}-v0:decisions=2")
+
+
+def test_what_collides_with_nothing_hides_nothing_and_helps_nobody(tmp_path):
+    own, haunted = (scenarios.get(f"{name}:decisions=1,helpers=2") for name in (OWN, "env:haunted-v0"))
+    seen = [World.start(each, 0).state() for each in (own, haunted)]
+    assert seen[1].vehicles == seen[0].vehicles
+    graphs = [scene_graph(each, state, "v1") for each, state in zip((own, haunted), seen, strict=True)]
+    assert graphs[0].sectors == graphs[1].sectors
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "seed"), [("u-turn-v0", 40), ("highway-v0", 0)])
+def test_an_environment_at_its_own_15_frames_a_second_freezes(name, seed, tmp_path):
+    config = {"vehicles_count": 6} if name == "highway-v0" else {}
+    scenario = scenarios.get(named(f"{name}:decisions=3", config))
+    assert scenario.parameters.simulation_hz == 15
+    build(scenario, tmp_path / "set", 2, seed, 1, lambda done: None)  # which drives one of them, too
+    assert check(tmp_path / "set") == []
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(
+    "name",
+    sorted(name for name, spec in gymnasium.registry.items() if "highway_env" in str(spec.entry_point)),
+)
+def test_every_environment_of_highway_env_freezes_or_says_why_not(name, tmp_path):
+    continuous = name.startswith(("parking", "racetrack", "lane-keeping")) or name == "intersection-v1"
+    says = pytest.raises(UserError, match="has no meta-actions but ContinuousAction; config")
+    with says if continuous else nullcontext():
+        build(scenarios.get(f"env:{name}:decisions=2"), tmp_path / "set", 1, 0, 1, lambda done: None)
+    assert continuous or check(tmp_path / "set") == []
 
 
 @pytest.mark.parametrize("kind", [Without, Roadless])

@@ -63,7 +63,7 @@ class EnvironmentWorld(World):
         world = cls(scenario, seed, layout, env.road, env=env, here=here, constants=Constants.now())
         ego.to_go_m = p.goal_s * first_target_mps(ego)
         world._enter(ego, "ego")
-        traffic = (v for v in env.road.vehicles if v is not ego)
+        traffic = (v for v in _solid(env.road) if v is not ego)
         nearest = sorted(traffic, key=lambda v: (v not in env.controlled_vehicles, _apart_m(v, ego)))
         for n, v in enumerate(nearest):
             world._enter(v, "helper" if n < p.helpers else "other")
@@ -166,14 +166,14 @@ class EnvironmentWorld(World):
     def _recast(self) -> None:
         """Remove vehicles that have left, and add new ones."""
         present, places = (
-            {id(v) for v in self.road.vehicles},
+            {id(v) for v in _solid(self.road)},
             {id(v): n for n, v in enumerate(self.everybody)},
         )
         self.everybody = [v for v in self.everybody if id(v) in present]
         known = {id(v) for v in self.everybody}
         for v in self.everybody:
             self._place(v)
-        for v in self.road.vehicles:
+        for v in _solid(self.road):
             if id(v) not in known:
                 self._enter(v, "other")
         now = [places.get(id(v), -1) for v in self.everybody]
@@ -235,6 +235,11 @@ def _kind(v: Any) -> Kind:
     """Return the kind whose size is nearest to the vehicle's."""
     kinds: tuple[Kind, ...] = ("car", "van", "truck")
     return min(kinds, key=lambda kind: abs(SIZES_M[kind][0] - v.LENGTH) + abs(SIZES_M[kind][1] - v.WIDTH))
+
+
+def _solid(road: Any) -> list[Any]:
+    """Return the vehicles that can be hit: one that collides with nothing hides nothing, and helps nobody."""
+    return [v for v in road.vehicles if v.collidable]
 
 
 def _buildings(env: Any, origin_m: tuple[float, float]) -> tuple[Building, ...]:
