@@ -115,6 +115,8 @@ def one_line(said: Said) -> str:
         (["prompt", "release", "v99"], "unknown prompt 'v99'"),
         (["prompt", "show", "v2", "--viewer"], "Option '--viewer' requires an argument"),
         (["model", "check"], "Missing argument 'name'"),
+        (["dataset", "check", __file__], "is a file; a dataset is a folder that `harness dataset"),
+        (["eval", "--dataset", __file__], "is a file; a dataset is a folder that `harness dataset"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_that_says_what_is_allowed(

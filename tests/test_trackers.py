@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.util import find_spec
@@ -166,6 +167,16 @@ def test_a_hook_that_hangs_is_left_behind(
     assert said.splitlines().count(line) == 1
     assert hangs.told[-1][0] == "answered"
     assert good.told[-1][0] == "end"
+
+
+def test_a_hook_that_takes_long_is_waited_for_aloud(
+    two_path: Path, harness: Typed, install: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hooks, "SAID_S", 0.01)
+    install(slow=Bad("begin", partial(time.sleep, 0.2)))
+    code, _, said = harness(*typed_eval(two_path, "--tracker", "slow", "--quiet"))
+    assert code == 0
+    assert said.splitlines().count("harness: waiting for tracker slow, 20 s at most") == 1
 
 
 def test_a_hook_that_leaves_the_folder_does_not_take_the_run_along(

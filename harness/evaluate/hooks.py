@@ -26,8 +26,10 @@ if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
 
 CHOSEN = "SWARMDRIVE_TRACKERS"  # environment variable: names, with commas, where a command names none
-PATIENCE_S = 120.0  # within which a hook must come back; one may send a page over a slow line
+PATIENCE_S = 20.0  # within which a hook must come back: its server may be away
+SENDING_S = 120.0  # the same at the end of a run: it may send a page over a slow line
 STOPPED_S = 10.0  # the same where the run was stopped, and somebody waits
+SAID_S = 3.0  # after which it is said that a hook is waited for
 
 
 @runtime_checkable
@@ -86,7 +88,9 @@ class _Caller:
         """Call a method. Raises what it raises, and TimeoutError if it takes longer than `patience_s`."""
         done: Future[None] = Future()
         self._calls.put((done, method, arguments))
-        if not wait([done], patience_s).done:
+        if not wait([done], min(SAID_S, patience_s)).done and patience_s > SAID_S:
+            print(f"harness: waiting for {self._what}, {patience_s:g} s at most", file=sys.stderr)
+        if not wait([done], max(patience_s - SAID_S, 0.0)).done:
             raise TimeoutError(f"its {method} takes longer than {patience_s:g} s")
         done.result()
 
@@ -125,7 +129,7 @@ class Followers:
         if done:
             self._begin()
         if self._begun:
-            self._call("end", done, patience_s=PATIENCE_S if done else STOPPED_S)
+            self._call("end", done, patience_s=SENDING_S if done else STOPPED_S)
 
     def _begin(self) -> None:
         if not self._begun:

@@ -1,6 +1,5 @@
 """Reception against distance: a channel's own curve, the messages it delivers, and others' curves."""
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,12 +15,12 @@ from harness.core.arrays import Floats, Ints
 from harness.core.config import changed
 from harness.core.errors import UserError, printable
 from harness.core.figures import known
-from harness.core.files import text_of
 from harness.core.pairs import pairs
 from harness.core.statistics import Estimate, episode_interval, rate_interval, resampled
 from harness.radio.channel import CLEAR, Channel, Draws, Links, Physical, Site
 from harness.radio.constant import density_coupled_loss
 from harness.radio.fading import Trips
+from harness.radio.tables import rows_of
 from harness.radio.trace import SIGHTS, Trace
 from harness.radio.transceiver import Transceiver
 from harness.radio.wrapped import heard_s
@@ -158,12 +157,9 @@ def curves_of(path: Path) -> list[Curve]:
     Raises UserError, with file, line and value, if it is none or a value is not allowed.
     """
     shown = printable(path)
-    try:
-        rows = list(csv.DictReader(text_of(path).splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{shown} cannot be read as a table: {printable(error)}") from None
+    _, rows = rows_of(path, ("distance_m", "reception"), _Row.__struct_fields__)
     curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for line, row in enumerate(rows, 2):
+    for line, row in rows:
         try:
             point = msgspec.convert({k: _plain(v) for k, v in row.items()}, _Row, strict=False, str_keys=True)
         except msgspec.ValidationError as error:

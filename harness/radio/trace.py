@@ -7,11 +7,9 @@ nothing is received. Values are interpolated linearly between distances; below t
 hold, and beyond the last its latencies.
 """
 
-import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from io import StringIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -20,8 +18,8 @@ import numpy as np
 
 from harness.core.arrays import Floats, Ints
 from harness.core.config import Seconds, convert
-from harness.core.errors import UserError, printable, unknown
-from harness.core.files import sha256_file, text_of
+from harness.core.errors import UserError, printable
+from harness.core.files import sha256_file
 from harness.radio.channel import (
     BUILDING,
     CLEAR,
@@ -35,6 +33,7 @@ from harness.radio.channel import (
     Way,
 )
 from harness.radio.constant import link_up
+from harness.radio.tables import rows_of
 
 SIGHTS = {"clear": CLEAR, "vehicle": VEHICLE, "building": BUILDING}
 MEAN, SPREAD = "latency_ms", ("latency_p50_ms", "latency_p95_ms")
@@ -171,17 +170,9 @@ def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Tra
 def read(path: Path) -> tuple[Point, ...]:
     """Read the rows of a table, sorted by sight and distance. Raises UserError if the table is wrong."""
     shown = printable(path)
-    try:
-        rows = csv.DictReader(StringIO(text_of(path), newline=""))
-        if missing := {"distance_m", "reception"} - {*(rows.fieldnames or ())}:
-            raise UserError(f"{shown}: has no column {' or '.join(sorted(missing))}")
-        for name in rows.fieldnames or ():
-            if name not in COLUMNS:
-                raise unknown(f"column of {shown}", name, COLUMNS)
-        _refuse_mixed_latencies(shown, rows.fieldnames or ())
-        points = [_point(f"{shown}, line {rows.line_num}", row) for row in rows]
-    except (OSError, UnicodeDecodeError, csv.Error) as problem:
-        raise UserError(f"{shown}: cannot be read as a table ({printable(problem)})") from None
+    columns, rows = rows_of(path, ("distance_m", "reception"), COLUMNS)
+    _refuse_mixed_latencies(shown, columns)
+    points = [_point(f"{shown}, line {line}", row) for line, row in rows]
     if not points:
         raise UserError(f"{shown}: has no rows; give reception at one distance at least")
     sights = {p.sight for p in points}

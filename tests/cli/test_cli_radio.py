@@ -157,12 +157,21 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
         (("check", "mode4", "--out", "x.gif"), "known: .pdf, .png, .svg"),
         (("check", "mode4", "--against", "bad.csv"), "bad.csv, line 3: Expected `float` <= 1.0"),
         (("check", "mode4", "--against", "other.csv"), "did you mean 'rate_hz'"),
-        (("check", "mode4", "--against", "no.csv"), "no.csv cannot be read as a table"),
+        (
+            ("check", "mode4", "--against", "theirs.csv"),
+            "has no column distance_m or reception; its first line names Distance (m), PRR, and may name",
+        ),
+        (("check", "mode4", "--against", "named.csv"), "did you mean 'configuration'?"),
+        (("check", "mode4", "--against", "trace.xml"), "its first line names <fcd-export>, and may name"),
+        (("check", "mode4", "--against", "no.csv"), "no.csv: cannot be read as a table"),
     ],
 )
 def test_a_mistake_is_one_line(harness: Callable[..., Said], arguments: tuple[str, ...], says: str) -> None:
     Path("bad.csv").write_text("distance_m,reception\n10,0.9\n20,1.9\n")
     Path("other.csv").write_text("distance_m,reception,configuration\n10,0.9,rat_hz=10\n")
+    Path("theirs.csv").write_text("Distance (m),PRR\n20,1.0\n")
+    Path("named.csv").write_text("distance_m,reception,configuratoin\n20,1.0,\n")
+    Path("trace.xml").write_text("<fcd-export>\n<timestep/>\n</fcd-export>\n")
     code, out, err = harness("radio", *arguments)
     assert (code, out) == (2, "")
     assert says in err

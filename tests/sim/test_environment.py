@@ -97,7 +97,7 @@ class OwnEgo(Breakdown):
 
     def _reset(self):
         super()._reset()
-        ego = self.ego_class(self.road, self.vehicle.position, speed=14)
+        ego = self.ego_class(self.road, self.road.vehicles[0].position, speed=14)
         self.road.vehicles[0] = self.vehicle = ego
 
 

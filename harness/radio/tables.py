@@ -1,0 +1,33 @@
+"""Read tables that users bring, such as curves of another simulator."""
+
+import csv
+from collections.abc import Collection
+from io import StringIO
+from pathlib import Path
+
+from harness.core.errors import UserError, printable, unknown
+from harness.core.files import text_of
+
+
+def rows_of(
+    path: Path, needed: Collection[str], known: Collection[str]
+) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Return the columns of a CSV, and its rows, each with the number of its line.
+
+    Raises UserError if it is no table, lacks a column that is `needed`, or has one that is not `known`.
+    """
+    shown = printable(path)
+    try:
+        table = csv.DictReader(StringIO(text_of(path), newline=""))
+        columns = list(table.fieldnames or ())
+        if missing := [name for name in needed if name not in columns]:
+            raise UserError(
+                f"{shown}: has no column {' or '.join(missing)}; its first line names "
+                f"{printable(', '.join(columns) or 'none', 60)}, and may name {', '.join(known)}"
+            )
+        for name in columns:
+            if name not in known:
+                raise unknown(f"column of {shown}", name, known)
+        return columns, [(table.line_num, row) for row in table]
+    except (OSError, UnicodeDecodeError, csv.Error) as problem:
+        raise UserError(f"{shown}: cannot be read as a table ({printable(problem)})") from None
