@@ -183,8 +183,10 @@ def test_errors_are_asked_again(file: Path) -> None:
 def test_any_text_comes_back_as_it_was_said(text: str, tmp_path_factory: pytest.TempPathFactory) -> None:
     store = CompletionFile(tmp_path_factory.getbasetemp() / "texts.sqlite")
     name = str(hash(text))
-    store.add({name: Completion("", text, None, None, "stop", None, 1)})
-    assert store.find([name])[name].text == text
+    said = Completion("", text, None, None, "stop", None, 1)  # which holds no lone surrogate
+    store.add({name: said})
+    assert store.find([name])[name].text == said.text
+    assert said.text == text.encode("utf-8", "replace").decode()
 
 
 def test_neither_prompt_nor_model_can_be_read_in_the_file(file: Path) -> None:

@@ -58,6 +58,7 @@ def build(
         scenario = replace(scenario, parameters=replace(scenario.parameters, decision_lag_s=lag))
     from harness.dataset.build import build as build_dataset
     from harness.world import scenarios
+    from harness.world.environments import environment
 
     begun_s, part = time.monotonic(), options.shard_of(shard)
     mine = len(part.part(range(episodes))) if part else episodes
@@ -71,6 +72,9 @@ def build(
         f"{dataset_size(manifest['episodes'], manifest['nodes'])}, "
         f"in {time.monotonic() - begun_s:.0f} s"
     )
+    if env and (module := environment.module_of(name)):
+        shown = printable(module)
+        typer.echo(f"commands that read it import {shown}, if you set {environment.IMPORTS}={shown}")
 
 
 def check(dataset: Dataset, as_json: options.Json = False) -> None:

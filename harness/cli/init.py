@@ -23,7 +23,7 @@ def command(
 
     starter = Path(__file__).parent / "starter"
     try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - {".git"}):
             raise UserError(f"{printable(folder)} is not empty; give a new folder, or an empty one")
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder) as draft:  # so that a full disk leaves nothing half-written

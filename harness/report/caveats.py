@@ -128,7 +128,8 @@ def of_run(run: Run) -> Iterator[str]:
     """What else a reader of a run's page has to know first: few episodes, a stumbling engine, another lag."""
     n = len(run.grid.episodes)
     if n < FEW:
-        yield f"Only {n} episodes: the interval of a rate may reach {98 / n**0.5:.0f} points to either side."
+        reach = f"{98 / n**0.5:.0f} points to either side"
+        yield f"Only {amount(n, 'episode')}: the interval of a rate may reach {reach}."
     yield from _saturated(run)
     if any(score.metric in GAINS.values() and score.interval == pinned.KIND for score in run.scores):
         yield "Gains have the wider intervals of an earlier version, as the run wrote them."

@@ -102,6 +102,12 @@ def test_a_card_with_a_mistake_is_what_a_doctor_tells(harness: Harness, project:
     assert "engine = 3; allowed: a text" in told["remedy"]
 
 
+def test_a_new_repository_becomes_a_project(harness: Harness, tmp_path: Path) -> None:
+    (tmp_path / "here/.git").mkdir(parents=True)
+    assert harness("init", "here")[0] == 0
+    assert {".git", "prompts", "README.md"} <= {path.name for path in (tmp_path / "here").iterdir()}
+
+
 def test_a_folder_that_is_not_empty_is_refused_and_left(harness: Harness, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full/x\x1b").touch()

@@ -51,8 +51,13 @@ def allow(name: str) -> None:
 
     A name from a file, such as a dataset's manifest or a run's, is never given to this function.
     """
-    if module := _id_and_changes(name)[0].rpartition(":")[0]:
+    if module := module_of(name):
         os.environ[IMPORTS] = ",".join([*_allowed(), module])
+
+
+def module_of(name: str) -> str:
+    """Return the module that an environment's name has imported; empty for one of highway-env's own."""
+    return _id_and_changes(name)[0].rpartition(":")[0]
 
 
 def _allowed() -> list[str]:
