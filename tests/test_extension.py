@@ -344,6 +344,10 @@ def test_a_member_named_as_an_action_is_refused_where_that_is_one(
         "harness: prompt mine has slower in answer.json, which is an action of occluded-intersection; give "
         "another --dataset, or fix the prompt\n",
     )  # fmt: skip
+    Path("answer.txt").write_text("{}")
+    code, out, error = harness("prompt", "parse", "answer.txt", "--prompt", "mine")
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert "--prompt mine has slower in answer.json, which is an action of occluded-intersection" in error
 
 
 def test_the_largest_that_is_allowed_is_walked_in_time() -> None:

@@ -43,10 +43,13 @@ def command(
 
     if finish_reason not in FINISH_REASONS:
         raise errors.unknown("finish reason", finish_reason, FINISH_REASONS)
-    actions = scenarios.get(options.typed_scenario(scenario)).actions
+    of = scenarios.get(options.typed_scenario(scenario))
+    actions = of.actions
     shape = Shape(role, actions)
     if prompt is not None:
         version = versions.load(prompt)
+        if reason := versions.unfit(version, of):
+            raise errors.UserError(f"--prompt {errors.printable(version.version)} {reason}; give {of.prompt}")
         shape, reasons_first = version.shape(role, actions), reasons_first or role in version.reasons_first
     parsed = parse(
         _read(file), **shape._asdict(), thinking=thinking, reasons_first=reasons_first,
