@@ -321,7 +321,8 @@ def test_a_model_of_texts_is_asked_no_picture(
     # Letter A is the likeliest whatever it stands for.
     assert "letters      100 % of a read-out follows the letter; the likeliest action does in 12 of 12" in out
     assert "it does not read the scene" in out
-    examined = 3 * (12 + 2 * 8) + 2 * (2 * 8)  # three orders of the actions, two of yes and no
+    # Three orders of the actions, two of yes and no; and the pairs of scenes with letters read once.
+    examined = 3 * (12 + 2 * 8) + 2 * (2 * 8) + 2 * 8
     assert len(there.asked) == 2 * 3 + examined
 
 

@@ -13,24 +13,14 @@ from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
 from harness.core.files import BROKEN, opened, text_of
-from harness.core.formats import CONFIG, SOURCES, SUITE, WORK
+from harness.core.formats import CONFIG, SOURCES, STUDIES, SUITE, WORK
 from harness.runs import formats
 from harness.runs.doubts import OFF_LAG, doubted
 from harness.runs.leading import ANY_TIME, BALANCED, SUCCESS, best_of, leading
 
 DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
-STUDIES = {
-    "sweep.json": "sweep",
-    "contents.json": "contents",
-    "grid.json": "grid",
-    "repeats.json": "repeats",
-    "trust.json": "trust",
-    "schedule.json": "schedule",
-    "study.json": "study",
-    "closed-loop.json": "study",
-    "fidelity.csv": "study",
-}
+MARKS = {**{f"{kind}.json": word for kind, word in STUDIES.items()}, "fidelity.csv": "study"}  # by file
 FAILED = "failed_rate_ego"
 UNREAD = 0.5  # share of failed answers from which a run's headline mentions them
 Rows = Sequence[dict[str, str]]  # of a summary
@@ -42,7 +32,7 @@ class Listed:
     """One run or study."""
 
     name: str  # its folder, relative to the folder that is listed
-    kind: str  # `eval`, `drive`, `suite`, or one of `STUDIES`; `run` if it is broken and does not say
+    kind: str  # `eval`, `drive`, `suite`, a word of `STUDIES`, or `run` if it is broken and does not say
     state: Literal["finished", "unfinished", "broken"]  # `finished`, `unfinished` or `broken`
     # when it began. For a suite, when the last of its runs began; for a study or a broken run, when it
     # was last written.
@@ -119,11 +109,11 @@ def _entry(path: str, root: str) -> Listed | None:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
     if has(SUITE):
         return _suite_entry(path, root, has("summary.csv"), written)
-    for name, kind in STUDIES.items():
+    for name, kind in MARKS.items():
         if has(name):
             written = datetime.fromtimestamp(os.stat(os.path.join(path, name)).st_mtime, UTC)
             try:
-                sources = _json(path, name)["sources"] if kind != "study" else ()
+                sources = _json(path, name).get("sources", ()) if kind != "study" else ()
                 model = ", ".join(str(source["name"]) for source in sources if "name" in source)
                 return Listed("", kind, "finished", written, model=model or None)
             except _BROKEN:

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT
 from harness.core.files import appending, bytes_of, neutral, replacing, text_of, write_whole
+from harness.core.formats import STUDIES
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.document import Section, Table, document, strong
@@ -25,11 +26,6 @@ if TYPE_CHECKING:
 
 WIDEST_REM, REM_PER_INCH = 66, 10.5
 SOURCE = ("name", "latency")  # of a source, what makes a study another one
-# What else may lie in a folder, each as `<name>.json`; some of their files have the names of a study's.
-MANIFESTS = (
-    "run", "suite", "sweep", "grid", "repeats", "trust", "schedule", "fidelity", "twins", "study",
-    "closed-loop", "contents", "optimize",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -111,7 +107,7 @@ def write_table(table: "pd.DataFrame", path: Path) -> None:
 
 def refuse_taken(out: Path, kind: str) -> None:
     """Raise UserError if a folder has a finished run, or a finished study of another kind."""
-    for name in MANIFESTS:
+    for name in ("run", "suite", *STUDIES):
         if name != kind and (out / f"{name}.json").exists():
             raise UserError(
                 f"--out {printable(out)} holds something else, as its {name}.json says; name another folder"
