@@ -290,7 +290,7 @@ class Episode(Struct, frozen=True, kw_only=True):
     agents_lost_s: float | None = None
     most_lost_s: float | None = None  # the same of the one who lost most
     gave_way: str | None = None  # id of that one; None if nobody lost time
-    journeys: str | None = None  # how each of them ended: JSON, a list of `harness.world.swarm.End`
+    journeys: str | None = None  # how each of them ended: JSON, a list of `harness.world.outcome.End`
 
 
 class Variant(Struct, frozen=True):

@@ -13,7 +13,7 @@ from msgspec import structs
 from harness.core.files import bytes_of
 from harness.runs.folder import Run, read, whole
 from harness.runs.records import TURNS, Answer
-from harness.world.swarm import End
+from harness.world.outcome import End
 
 if TYPE_CHECKING:
     import pandas as pd

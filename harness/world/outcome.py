@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from msgspec import Struct
 from shapely import Polygon
 from shapely.ops import nearest_points
 
@@ -59,6 +60,17 @@ class Outcome:
     def ending(self, result: Result, time_s: float, **how: str) -> "Outcome":
         gap = 0.0 if result == "collision" else self.least_gap_m
         return replace(self, result=result, time_s=time_s, least_gap_m=gap, **how)  # type: ignore[arg-type]
+
+
+class End(Struct, frozen=True, array_like=True):
+    """How an agent's journey ended."""
+
+    agent: str  # its id
+    result: str  # `cleared` if it reached its goal, else how it failed
+    time_s: float | None  # when that was decided
+    lost_s: float | None  # how much later than alone on the road it arrived; None unless it did
+    partner: str | None  # the vehicle that it collided with
+    met: bool  # whether that is another agent
 
 
 def rating(failure: str, parameters: Parameters) -> Rating | None:

@@ -4,9 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from msgspec import Struct
-
 from harness.world import lockstep
+from harness.world.outcome import End
 from harness.world.scenario import Layout, Scenario
 from harness.world.seats import agents_of, places_by, seat_of
 from harness.world.simulator import populated
@@ -14,17 +13,6 @@ from harness.world.world import Journey, World
 
 GRAVEST = ("collision", "off_road", "time_out")
 W = TypeVar("W", bound=World)
-
-
-class End(Struct, frozen=True, array_like=True):
-    """How an agent's journey ended."""
-
-    agent: str  # its id
-    result: str  # `cleared` if it reached its goal, else how it failed
-    time_s: float | None  # when that was decided
-    lost_s: float | None  # how much later than alone on the road it arrived; None unless it did
-    partner: str | None  # the vehicle that it collided with
-    met: bool  # whether that is another agent
 
 
 def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float]]:
